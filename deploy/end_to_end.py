@@ -37,7 +37,7 @@ START_NS = 1_800_000_000 * NS
 REPORT_S = 30.0
 
 
-def drive(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
+def drive_fleet(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
     """Return the columns of all observations, with `vehicle`; write the truth."""
     vehicles = len(fleet.vehicles)
     config = AgentConfig()
@@ -62,9 +62,9 @@ def drive(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
     return columns | {"vehicle": np.concatenate([part.vehicle for part in parts])}
 
 
-def write(fleet: SimulatedFleet, duration_s: float, folder: Path) -> None:
+def write_drive(fleet: SimulatedFleet, duration_s: float, folder: Path) -> None:
     """Drive, and write both files into an existing folder."""
-    columns = drive(fleet, duration_s, folder / "truth.parquet")
+    columns = drive_fleet(fleet, duration_s, folder / "truth.parquet")
     arrays = {
         name: pa.array(list(map(bytes, c)) if c.ndim == 2 else c) for name, c in columns.items()
     }
@@ -95,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     fleet = SimulatedFleet(
         args.scenario, args.vehicles, args.seed, RATE_HZ, rough=args.rough, winter=args.winter
     )
-    write(fleet, args.duration, args.out)
+    write_drive(fleet, args.duration, args.out)
     return 0
 
 

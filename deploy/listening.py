@@ -36,7 +36,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.lab.end_to_end import observations_in
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.encode import arrow_stream, batch_of
-from fleet_service.serve.view import view
+from fleet_service.serve.view import view_cells
 from schemas import grid, keys, mugrid, wire
 from schemas.config import AgentConfig
 from schemas.numeric import FloatArray, IntArray
@@ -176,7 +176,9 @@ class ListeningTown:
         slots = np.arange(self.fusion.size)
         tiles = grid.tile_of(self.fusion.live.key[: self.fusion.size] // grid.SECTORS)
         for tile in np.unique(tiles).tolist():
-            payload = arrow_stream(batch_of(view(self.fusion, slots[tiles == tile], now), now))
+            payload = arrow_stream(
+                batch_of(view_cells(self.fusion, slots[tiles == tile], now), now)
+            )
             self.heard.take(*decode_cells(keys.map_key(tile), payload, now), now)
 
     def _look(self) -> None:

@@ -44,10 +44,11 @@ def main(words: list[str]) -> int:
     )
     names = [name for name, _ in known_estimators() if name != DEFAULT] if papers else [DEFAULT]
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count()) as workers:
-        service = [] if papers else [workers.submit(_run, folder, SERVICE)]
-        lines = _run(folder, AGENT, "simulate", *DRIVE)
+        service = [] if papers else [workers.submit(_run_process, folder, SERVICE)]
+        lines = _run_process(folder, AGENT, "simulate", *DRIVE)
         replays = [
-            workers.submit(_run, folder, AGENT, "replay", *_estimate(name)) for name in names
+            workers.submit(_run_process, folder, AGENT, "replay", *_estimate_command(name))
+            for name in names
         ]
         for done in (*service, *replays):
             lines += done.result()
@@ -55,11 +56,11 @@ def main(words: list[str]) -> int:
     return 0
 
 
-def _estimate(name: str) -> tuple[str, ...]:
+def _estimate_command(name: str) -> tuple[str, ...]:
     return "drive.parquet", "--vehicle", "car.json", "--estimator", name, "--out", f"{name}.parquet"
 
 
-def _run(folder: str, code: str, *words: str) -> list[str]:
+def _run_process(folder: str, code: str, *words: str) -> list[str]:
     """Run a process; return its lines with errors."""
     done = subprocess.run(
         [sys.executable, "-c", code, *words], cwd=Path(folder), capture_output=True, text=True

@@ -26,7 +26,9 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 CONFIG = Path(__file__).with_name("router.json5")
 
 
-def configuration(config: Path = CONFIG, listen: str | Sequence[str] | None = None) -> zenoh.Config:
+def load_configuration(
+    config: Path = CONFIG, listen: str | Sequence[str] | None = None
+) -> zenoh.Config:
     """Return the router's configuration from a file, with other endpoints if some are given.
 
     Raises:
@@ -54,7 +56,7 @@ def open_router(
     Raises:
         InputError: the configuration is wrong, or the endpoint is in use.
     """
-    settings = configuration(config, listen)
+    settings = load_configuration(config, listen)
     try:
         session = zenoh.open(settings)
     except zenoh.ZError as error:

@@ -144,7 +144,7 @@ def all_metrics(root: Path) -> Shown:
     engine = Engine(config, root)
     try:
         pulse = service_metrics.Pulse(turn_age_s=0.0, queued=0, routers=1, clock_lag_s=0.0)
-        of_service = service_metrics.metrics(engine, pulse, config, root)
+        of_service = service_metrics.collect_metrics(engine, pulse, config, root)
     finally:
         engine.close()
     counts: Any = SimpleNamespace(

@@ -167,7 +167,7 @@ TABLES: Final = (
         "A dry road after the last pass: lower end of the interval, and the deceleration it "
         "supports [m/s²]",
         re.compile(re.escape(fading.PREFIX)),
-        fading.table,
+        fading.format_table,
     ),
     Table(
         "study",

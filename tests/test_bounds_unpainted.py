@@ -29,7 +29,7 @@ from fleet_service.archive.maintenance import rollup
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.cli import main
 from fleet_service.fusion import Fusion
-from fleet_service.serve.encode import cell_table, encode
+from fleet_service.serve.encode import cell_table, encode_tile
 from schemas import grid
 from schemas.query import Format
 from tests.fleet_service.examples import CELL, START, at_least, observations, value
@@ -45,14 +45,14 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     files before 1.2 do.
     """
     root = tmp_path_factory.mktemp("bounds") / "archive"
-    synthetic.write(root, WORLD, 2000)
+    synthetic.write_archive(root, WORLD, 2000)
     compact(root)
-    rollup.complete(root)
+    rollup.complete_parts(root)
     told = two_cells()
     old = told.set_column(
         told.schema.get_field_index("mu"), "mu", pa.array([0.7, 0.7], pa.float32())
     )
-    snapshots.write(root, old, synthetic.START_NS + 20 * 3600 * 10**9)
+    snapshots.write_snapshot(root, old, synthetic.START_NS + 20 * 3600 * 10**9)
     return root
 
 
@@ -89,7 +89,7 @@ def is_measured(row: dict[str, Any]) -> bool:
 @pytest.mark.parametrize("form", Format)
 def test_an_answer_of_the_service_has_no_mu_for_a_bound(form: Format) -> None:
     (batch,) = two_cells().to_batches()
-    payload = encode(batch, form, int(grid.tile_of(CELL)))
+    payload = encode_tile(batch, form, int(grid.tile_of(CELL)))
     if form is Format.ARROW:
         rows = pa.ipc.open_stream(payload).read_all().to_pylist()
     elif form is Format.JSON:
@@ -172,7 +172,7 @@ def test_a_picture_hatches_what_was_not_measured() -> None:
 def test_the_sql_of_the_pages_takes_values_only(
     archive: Path, page: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = readme.text() if page == "archive" else (ROOT / page).read_text()
+    text = readme.page_text() if page == "archive" else (ROOT / page).read_text()
     (sql,) = re.findall(r"duckdb\.sql\((?:\"{3}|'{3})(.*?)(?:\"{3}|'{3})", text, re.DOTALL)
     monkeypatch.chdir(archive)
     ask: Callable[[str], Any] = duckdb.sql
@@ -201,4 +201,4 @@ def test_a_page_of_an_answer_without_rows_is_still_a_page(tmp_path: Path) -> Non
         "p_slippery": pa.float32(),
     }
     empty = pa.schema([pa.field(name, kind) for name, kind in columns.items()]).empty_table()
-    assert "<title>" in output.page(empty, QUESTIONS["replay"])
+    assert "<title>" in output.make_page(empty, QUESTIONS["replay"])

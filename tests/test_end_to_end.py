@@ -178,7 +178,7 @@ def _most_slippery_first(cell: dict[str, object]) -> float:
 def list_archived(folder: Path) -> list[tuple[object, ...]]:
     """Identities of all archived observations."""
     columns = ("vehicle", "boot", "region", "seq", "row")
-    tables = reading.read(folder / "archive", Kind.OBSERVATION, columns)
+    tables = reading.read_tables(folder / "archive", Kind.OBSERVATION, columns)
     return [
         row
         for table in tables

@@ -38,18 +38,18 @@ BORDER_MU: Final = 0.1  # visits to one cell differ by less where a surface ends
 LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 
 
-def works(found: Sequence[Figure]) -> bool:
+def demo_works(found: Sequence[Figure]) -> bool:
     """Return True if the demo did its work.
 
     A late alert, a wide map, few passes or a busy machine do not count as a failure.
     """
 
-    def breaks(figure: Figure) -> bool:
+    def breaks_promise(figure: Figure) -> bool:
         wide = figure.name == COVERAGE and figure.value > WIDEST
         goal = figure.name in (DELAY, WALL) or figure.name.startswith(PASSES)
         return not (figure.holds or goal or wide)
 
-    return not any(map(breaks, found))
+    return not any(map(breaks_promise, found))
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class MapComparison:
 def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], float]:
     """Return the friction of each visited (cell, sector) at the end: mean over visits since the
     change, else over all."""
-    keys = _keys(visits)
+    keys = _cell_keys(visits)
     after = visits["enter_time"].cast(pa.int64()).to_numpy() >= changed_ns
     mu = visits["mu"].to_numpy()
     groups: dict[tuple[int, int], list[int]] = {}
@@ -118,7 +118,7 @@ def write_truth(visits: pa.Table, changed_ns: int, path: Path) -> None:
 def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison:
     """Join the map with the truth by (cell, sector)."""
     truth = final_truth(visits, changed_ns)
-    found = np.array([truth.get(key, np.nan) for key in _keys(cells)])
+    found = np.array([truth.get(key, np.nan) for key in _cell_keys(cells)])
     known = np.isfinite(found)
     return MapComparison(cells.filter(pa.array(known)), found[known])
 
@@ -143,7 +143,7 @@ def delay_passes(
     delays = []
     for cells, known in known_patches(visits, patch, alerts, changed_ns):
         rows = visits.filter(pa.array(patch & excited & np.isin(cell, cells) & (left <= known)))
-        delays.append(float(passes(rows)) if known < NEVER else float("inf"))
+        delays.append(float(count_passes(rows)) if known < NEVER else float("inf"))
     return float(np.median(delays)) if delays else float("inf")
 
 
@@ -162,7 +162,7 @@ def known_patches(
     return found
 
 
-def passes(rows: pa.Table) -> int:
+def count_passes(rows: pa.Table) -> int:
     """Return the number of passes: successive visits of one vehicle to neighbouring cells are
     one pass.
     """
@@ -174,7 +174,7 @@ def passes(rows: pa.Table) -> int:
     return 1 + int(np.sum((vehicle[1:] != vehicle[:-1]) | (enter[1:] - left[:-1] > PASS_GAP_NS)))
 
 
-def figures(
+def demo_figures(
     comparison: MapComparison,
     visits: pa.Table,
     alerts: list[tuple[int, Alert]],
@@ -192,8 +192,10 @@ def figures(
     false, _ = false_ice([alert for _, alert in alerts if alert.raised], visits)
     return [
         Figure("demo.vehicles", vehicles, "", 30, "more"),
-        Figure(COVERAGE, _mean(comparison.is_covered[several]), "", (0.80, WIDEST), "within"),
-        Figure("demo.map.rmse", float(np.sqrt(_mean(error[value] ** 2))), "", 0.12),
+        Figure(
+            COVERAGE, _mean_or_nan(comparison.is_covered[several]), "", (0.80, WIDEST), "within"
+        ),
+        Figure("demo.map.rmse", float(np.sqrt(_mean_or_nan(error[value] ** 2))), "", 0.12),
         Figure(
             DELAY,
             delay_passes(visits, patch, alerts, changed_ns),
@@ -232,7 +234,7 @@ class LostGrip:
         """Return the shares of passes that lost grip, and their number."""
         kinds = (("warned", self.warned), ("unwarned", ~self.warned))
         shares = [
-            Figure(f"demo.lost_grip.{name}", _mean(self.lost[rows]), "of passes")
+            Figure(f"demo.lost_grip.{name}", _mean_or_nan(self.lost[rows]), "of passes")
             for name, rows in kinds
             if rows.any()
         ]  # of no pass there is no share
@@ -263,7 +265,7 @@ def lost_grip(
     for cells, known in known_patches(visits, on, alerts, changed_ns):
         since[np.isin(visits["cell"].to_numpy(), cells)] = known
     vehicles = [str(name) for name in visits["vehicle"].to_pylist()]
-    count = max((_number(name) for name in vehicles), default=0)
+    count = max((_vehicle_number(name) for name in vehicles), default=0)
     warned = warned_ones(count, share)
     rows: dict[tuple[str, int], tuple[bool, int]] = {}
     enter, left = (
@@ -281,12 +283,12 @@ def lost_grip(
         before = rows.get((name, number))
         if before is None or (lost and not before[0]):
             rows[name, number] = (lost, cell)
-    warned_passes = np.array([warned[_number(name) - 1] for name, _ in rows], np.bool_)
+    warned_passes = np.array([warned[_vehicle_number(name) - 1] for name, _ in rows], np.bool_)
     lost_, cell_ = (np.array([row[k] for row in rows.values()]) for k in (0, 1))
     return LostGrip(warned_passes, lost_.astype(np.bool_), cell_.astype(np.int64))
 
 
-def _number(vehicle: str) -> int:
+def _vehicle_number(vehicle: str) -> int:
     return int(vehicle.rpartition("-")[2])
 
 
@@ -325,7 +327,7 @@ def per_stretch(alerts: list[tuple[int, Alert]], visits: pa.Table) -> float:
 def archive_counts(archive: Path) -> tuple[int, int, int]:
     """Return rows, distinct rows and distinct vehicles of the archived observations."""
     identity = ["vehicle", "boot", "region", "seq", "row"]
-    tables = list(reading.read(archive, Kind.OBSERVATION, identity))
+    tables = list(reading.read_tables(archive, Kind.OBSERVATION, identity))
     if not tables:
         return 0, 0, 0
     whole = pa.concat_tables(tables)
@@ -341,11 +343,11 @@ def start_time(visits: pa.Table) -> int:
     return int(visits["enter_time"].cast(pa.int64()).to_numpy().min())
 
 
-def _keys(table: pa.Table) -> list[tuple[int, int]]:
+def _cell_keys(table: pa.Table) -> list[tuple[int, int]]:
     return list(
         zip(table["cell"].to_numpy().tolist(), table["sector"].to_numpy().tolist(), strict=True)
     )
 
 
-def _mean(values: FloatArray | BoolArray) -> float:
+def _mean_or_nan(values: FloatArray | BoolArray) -> float:
     return float(np.mean(values)) if len(values) else float("nan")

@@ -29,7 +29,7 @@ NAMES = (
 )
 
 
-def write(comparison: MapComparison, figures: list[Figure], path: Path) -> None:
+def write_page(comparison: MapComparison, figures: list[Figure], path: Path) -> None:
     """Write two maps and the table of figures; nothing is loaded from elsewhere."""
     cells = comparison.cells
     boxes = np.stack(
@@ -39,7 +39,7 @@ def write(comparison: MapComparison, figures: list[Figure], path: Path) -> None:
     truth = comparison.truth.round(4).tolist()
     found = comparison.values.round(4).tolist()
     panels = {"truth": truth, "map": [mu if np.isfinite(mu) else None for mu in found]}
-    lines = [_words(one, true) for one, true in zip(cells.to_pylist(), truth, strict=True)]
+    lines = [_table_row(one, true) for one, true in zip(cells.to_pylist(), truth, strict=True)]
     drawn = DrawnCells(boxes.round(7).tolist(), sector, panels, NAMES, lines)
     several = int(comparison.has_several_vehicles.sum())
     about = (
@@ -53,7 +53,7 @@ def write(comparison: MapComparison, figures: list[Figure], path: Path) -> None:
     )
 
 
-def _words(cell: dict[str, Any], truth: float) -> list[str]:
+def _table_row(cell: dict[str, Any], truth: float) -> list[str]:
     mu = "not measured" if cell["mu"] is None else f"{cell['mu']:.2f}"
     return [
         f"{truth:.2f}",

@@ -16,7 +16,7 @@ from schemas.numeric import IntArray
 from schemas.runtime.palette import SURFACES, UNKNOWN
 
 
-def draw(comparison: MapComparison, path: Path, grip: LostGrip | None = None) -> None:
+def draw_maps(comparison: MapComparison, path: Path, grip: LostGrip | None = None) -> None:
     """Draw three panels: the truth, the map (median), and the width of the map's interval.
 
     The truth also shows where drivers lost their grip on the new ice and where they kept it, warned
@@ -32,7 +32,7 @@ def draw(comparison: MapComparison, path: Path, grip: LostGrip | None = None) ->
     wide = paint(width, shapes, upper - lower, (0.0, 1.1))
     truth.set_title("truth")
     if grip is not None and len(grip.cell):
-        _mark(truth, grip, cells["cell"].to_numpy())
+        _mark_passes(truth, grip, cells["cell"].to_numpy())
     found.set_title(f"map: median\n(hatched: {UNKNOWN})", fontsize="medium")
     width.set_title("map: width of the 90 % interval")
     bar = figure.colorbar(
@@ -50,7 +50,7 @@ def draw(comparison: MapComparison, path: Path, grip: LostGrip | None = None) ->
     figure.savefig(path, dpi=130)
 
 
-def _mark(axes: Axes, grip: LostGrip, drawn: IntArray) -> None:
+def _mark_passes(axes: Axes, grip: LostGrip, drawn: IntArray) -> None:
     """Mark passes over the new ice: circles of warned drivers, squares of others; black if grip was
     lost, else white."""
     shapes = cell_shapes(np.concatenate([drawn, grip.cell]))[

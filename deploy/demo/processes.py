@@ -88,7 +88,7 @@ class ManagedProcess:
 
 
 @contextmanager
-def system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
+def run_system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
     """Router and fleet service on a free port of loopback; yields the endpoint and the service.
 
     The agents' configuration is left in `folder/agent.json`.
@@ -122,12 +122,12 @@ def system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
 
 
 @contextmanager
-def page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Iterator[str]:
+def run_page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Iterator[str]:
     """Run the live page on the town's streets; yield its address. The truth can be drawn over
     the map.
     """
     metrics = service.line_with("ready").rpartition(", ")[2]
-    tiles, roads = town.write(scenario_named(SCENARIO), folder)
+    tiles, roads = town.write_files(scenario_named(SCENARIO), folder)
     options = {
         "--connect": endpoint,
         "--archive": folder / "archive",
@@ -147,7 +147,7 @@ def page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Ite
         shown.stop()
 
 
-def fleet(
+def start_fleet(
     folder: Path, vehicles: int, duration_s: float, seed: int, warned: float
 ) -> ManagedProcess:
     """Return the process of the simulated vehicles, with one session and identity each; a share of

@@ -14,7 +14,7 @@ WAIT_MS: Final = 20_000
 SETTLED_MS: Final = 2_000  # for what is still on its way after the first picture
 
 
-def take(address: str, path: Path) -> None:
+def take_screenshot(address: str, path: Path) -> None:
     """Open the page in the system's Chromium and save a screenshot.
 
     Raises:

@@ -28,7 +28,7 @@ FOLDER = Path(".demo")
 REPORT_S = 5.0
 
 
-def drive(
+def drive_fleet(
     folder: Path, endpoint: str, args: argparse.Namespace
 ) -> tuple[Listener, dict[str, float]]:
     """Let the fleet drive; return the received data and the fleet's counts."""
@@ -36,18 +36,18 @@ def drive(
     if session is None:
         raise processes.DemoError(f"no session to {endpoint}")
     listener = Listener(session)
-    fleet = processes.fleet(folder, args.vehicles, args.duration, args.seed, args.warned)
+    fleet = processes.start_fleet(folder, args.vehicles, args.duration, args.seed, args.warned)
     began = time.monotonic()
 
-    def tick() -> None:
+    def print_progress() -> None:
         print(f"  {time.monotonic() - began:4.0f} s  {listener.progress()}", flush=True)
 
-    if fleet.wait(REPORT_S, tick) != 0:
+    if fleet.wait(REPORT_S, print_progress) != 0:
         raise processes.DemoError(f"the fleet ended with an error; see {fleet.log}")
     return listener, fleet.report()
 
 
-def show(folder: Path, endpoint: str, comparison: compare.MapComparison) -> None:
+def show_clients(folder: Path, endpoint: str, comparison: compare.MapComparison) -> None:
     """Show one query by a client without GripMap code, and how to read the Parquet files."""
     sides = [comparison.cells[side].to_numpy() for side in ("west", "south", "east", "north")]
     bbox = ",".join(
@@ -63,7 +63,7 @@ The observations, as any Parquet reader sees them:
                     from '{folder}/archive/observations/*/*/*.parquet' where value group by sector"))""")
 
 
-def report(
+def report_figures(
     folder: Path,
     comparison: compare.MapComparison,
     measured: list[figures.Figure],
@@ -75,8 +75,8 @@ def report(
     """
     found = [*measured, *grip.figures()]
     figures.write(folder / "figures.json", "demo", [seed], found)
-    picture.draw(comparison, folder / "map.png", grip)
-    page.write(comparison, found, folder / "map.html")
+    picture.draw_maps(comparison, folder / "map.png", grip)
+    page.write_page(comparison, found, folder / "map.html")
     table = figures.markdown(found)
     print(
         f"\n{grip.line()}\n\n{table}\n\npicture {folder}/map.png, page {folder}/map.html, ", end=""
@@ -100,28 +100,28 @@ def run(args: argparse.Namespace) -> int:
         "ice appears."
     )
     with (
-        processes.system(FOLDER) as (endpoint, service),
-        processes.page(FOLDER, endpoint, service, args.page_port) as address,
+        processes.run_system(FOLDER) as (endpoint, service),
+        processes.run_page(FOLDER, endpoint, service, args.page_port) as address,
     ):
         print(f"\n  See it: {address}\n", flush=True)
         if args.open:
             webbrowser.open(address)
-        listener, counts = drive(FOLDER, endpoint, args)
+        listener, counts = drive_fleet(FOLDER, endpoint, args)
         visits = pq.read_table(FOLDER / "truth.parquet")
         changed_ns = compare.start_time(visits) + int(appears_s * NS)
         comparison = compare.compare(listener.whole_map(), visits, changed_ns)
         compare.write_truth(visits, changed_ns, FOLDER / "overlay.parquet")
-        show(FOLDER, endpoint, comparison)
+        show_clients(FOLDER, endpoint, comparison)
         listener.close()
         wall_s = time.monotonic() - began
-        measured = compare.figures(
+        measured = compare.demo_figures(
             comparison, visits, listener.alerts, changed_ns, counts, FOLDER / "archive", wall_s
         )
         grip = compare.lost_grip(visits, listener.alerts, changed_ns, args.warned)
-        found = report(FOLDER, comparison, measured, grip, args.seed)
+        found = report_figures(FOLDER, comparison, measured, grip, args.seed)
         if args.screenshot is not None:
-            screenshot.take(address, args.screenshot)
+            screenshot.take_screenshot(address, args.screenshot)
         if args.stay:
             print(f"\n{address} stays until Ctrl-C; the truth can be laid over it.", flush=True)
             stop_on_signals().wait()
-    return 0 if compare.works(found) else 1
+    return 0 if compare.demo_works(found) else 1

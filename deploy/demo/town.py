@@ -1,7 +1,7 @@
 """Base map and named roads of the demo's simulated town, so that its page looks like a town and
 needs no network.
 
-`write` makes an MBTiles file of vector tiles (streets, buildings, parks, water, names) and a
+`write_files` makes an MBTiles file of vector tiles (streets, buildings, parks, water, names) and a
 GeoJSON file of the roads. The geometry of the streets is the simulation's; houses, parks and the
 lake are drawn around them by a seeded generator.
 """
@@ -62,22 +62,22 @@ def town_of(scenario: Scenario) -> StreetPlan:
     for number, road in enumerate(scenario.roads):
         name = STREETS[number % len(STREETS)]
         kind = "secondary" if "Ring" in name else "tertiary"
-        found.streets.append((name, _centre(scenario, road), kind))
+        found.streets.append((name, _centre_line(scenario, road), kind))
     centres = np.concatenate([line for _, line, _ in found.streets])
-    found.areas.append(("water", _blob(LAKE, 3)))
-    found.areas += [("park", _blob(park, 7 + k)) for k, park in enumerate(PARKS)]
-    found.areas += [("building", house) for house in _houses(centres)]
+    found.areas.append(("water", _blob_outline(LAKE, 3)))
+    found.areas += [("park", _blob_outline(park, 7 + k)) for k, park in enumerate(PARKS)]
+    found.areas += [("building", house) for house in _place_houses(centres)]
     found.streets += _lanes_around(centres)
     found.names += [("place", NAME, 0.0, 46.0), ("water", "Frostsjön", LAKE[0], LAKE[1])]
     return found
 
 
-def _centre(scenario: Scenario, road: Road) -> FloatArray:
+def _centre_line(scenario: Scenario, road: Road) -> FloatArray:
     corners = [scenario.junctions[road.start], *road.bends, scenario.junctions[road.end]]
     return rounded(corners, road.radius)[::16]
 
 
-def _blob(shape: tuple[float, float, float, float], seed: int) -> FloatArray:
+def _blob_outline(shape: tuple[float, float, float, float], seed: int) -> FloatArray:
     """Return a smooth closed outline around x, y with two radii."""
     x, y, a, b = shape
     rng = np.random.default_rng(seed)
@@ -87,7 +87,7 @@ def _blob(shape: tuple[float, float, float, float], seed: int) -> FloatArray:
     return np.stack([x + a * radius * np.cos(angle), y + b * radius * np.sin(angle)], 1)
 
 
-def _houses(centres: FloatArray) -> Iterable[FloatArray]:
+def _place_houses(centres: FloatArray) -> Iterable[FloatArray]:
     """Yield houses along the streets, turned like them and clear of streets, parks and each
     other.
     """
@@ -135,36 +135,38 @@ def _lanes_around(centres: FloatArray) -> list[tuple[str, FloatArray, str]]:
     return out
 
 
-def write(scenario: Scenario, folder: Path) -> tuple[Path, Path]:
+def write_files(scenario: Scenario, folder: Path) -> tuple[Path, Path]:
     """Write the base map (MBTiles) and the roads (GeoJSON); return their paths."""
     found = town_of(scenario)
     tiles = folder / "town.mbtiles"
     roads = folder / "roads.geojson"
-    roads.write_text(json.dumps(_roads(scenario, found)), encoding="utf-8")
+    roads.write_text(json.dumps(_roads_geojson(scenario, found)), encoding="utf-8")
     _write_tiles(scenario, found, tiles)
     return tiles, roads
 
 
-def _roads(scenario: Scenario, found: StreetPlan) -> dict[str, object]:
-    def feature(shape: str, coordinates: object, **about: str) -> dict[str, object]:
+def _roads_geojson(scenario: Scenario, found: StreetPlan) -> dict[str, object]:
+    def make_feature(shape: str, coordinates: object, **about: str) -> dict[str, object]:
         return {
             "type": "Feature",
             "geometry": {"type": shape, "coordinates": coordinates},
             "properties": about,
         }
 
-    def degrees(line: FloatArray) -> list[list[float]]:
+    def to_degrees(line: FloatArray) -> list[list[float]]:
         latitude, longitude = scenario.to_latlon(line[:, 0], line[:, 1])
         points: list[list[float]] = np.stack([longitude, latitude], 1).round(7).tolist()
         return points
 
     lines = [
-        feature("LineString", degrees(line), id=str(number), name=name)
+        make_feature("LineString", to_degrees(line), id=str(number), name=name)
         for number, (name, line, _) in enumerate(found.streets)
         if name in STREETS
     ]
     latitude, longitude = scenario.to_latlon(np.zeros(1), np.zeros(1))
-    place = feature("Point", [float(longitude[0]), float(latitude[0])], name=NAME, kind="place")
+    place = make_feature(
+        "Point", [float(longitude[0]), float(latitude[0])], name=NAME, kind="place"
+    )
     return {"type": "FeatureCollection", "features": [*lines, place]}
 
 
@@ -186,18 +188,18 @@ def _write_tiles(scenario: Scenario, found: StreetPlan, path: Path) -> None:
         }
         table.executemany("insert into metadata values (?, ?)", about.items())
         for zoom in ZOOMS:
-            box = _world(scenario, corners) * 2**zoom
+            box = _to_mercator(scenario, corners) * 2**zoom
             for x in range(int(box[0, 0]), int(box[1, 0]) + 1):
                 for y in range(int(box[1, 1]), int(box[0, 1]) + 1):
-                    tile = _tile(scenario, found, zoom, x, y)
+                    tile = _make_tile(scenario, found, zoom, x, y)
                     row = (zoom, x, (1 << zoom) - 1 - y, gzip.compress(tile, mtime=0))
                     table.execute("insert into tiles values (?, ?, ?, ?)", row)
     table.close()
 
 
-def _tile(scenario: Scenario, found: StreetPlan, zoom: int, x: int, y: int) -> bytes:
-    def units(line: FloatArray) -> list[tuple[int, int]]:
-        at = (_world(scenario, line) * 2**zoom - (x, y)) * _PER_TILE
+def _make_tile(scenario: Scenario, found: StreetPlan, zoom: int, x: int, y: int) -> bytes:
+    def to_tile_units(line: FloatArray) -> list[tuple[int, int]]:
+        at = (_to_mercator(scenario, line) * 2**zoom - (x, y)) * _PER_TILE
         return [(int(px), int(py)) for px, py in np.rint(at)]
 
     layers: dict[str, list[TileShape]] = {
@@ -208,14 +210,14 @@ def _tile(scenario: Scenario, found: StreetPlan, zoom: int, x: int, y: int) -> b
         "place": [],
     }
     for layer, outline in found.areas:
-        ring = units(outline)
-        if _touches(ring) and (layer != "building" or zoom >= 14):
+        ring = to_tile_units(outline)
+        if _touches_tile(ring) and (layer != "building" or zoom >= 14):
             layers[layer].append(TileShape(POLYGON, [ring], {"class": layer}))
     for name, line, kind in found.streets:
-        for part in _inside(units(line)):
+        for part in _clip_line(to_tile_units(line)):
             layers["transportation"].append(TileShape(LINE, [part], {"class": kind, "name": name}))
     for layer, name, px, py in found.names:
-        (point,) = units(np.array([[px, py]]))
+        (point,) = to_tile_units(np.array([[px, py]]))
         if min(point) >= 0 and max(point) < EXTENT:
             kind = "town" if layer == "place" else "lake"
             layers.setdefault("place" if layer == "place" else "water_name", []).append(
@@ -224,7 +226,7 @@ def _tile(scenario: Scenario, found: StreetPlan, zoom: int, x: int, y: int) -> b
     return encode_tile(layers)
 
 
-def _touches(points: Sequence[tuple[int, int]]) -> bool:
+def _touches_tile(points: Sequence[tuple[int, int]]) -> bool:
     xs = [p[0] for p in points]
     ys = [p[1] for p in points]
     return (
@@ -235,11 +237,11 @@ def _touches(points: Sequence[tuple[int, int]]) -> bool:
     )
 
 
-def _inside(points: list[tuple[int, int]]) -> Iterable[list[tuple[int, int]]]:
+def _clip_line(points: list[tuple[int, int]]) -> Iterable[list[tuple[int, int]]]:
     """Yield the parts of a line within a tile and its buffer."""
     part: list[tuple[int, int]] = []
     for first, second in itertools.pairwise(points):
-        if _touches((first, second)):
+        if _touches_tile((first, second)):
             part = part or [first]
             part.append(second)
         elif part:
@@ -249,7 +251,7 @@ def _inside(points: list[tuple[int, int]]) -> Iterable[list[tuple[int, int]]]:
         yield part
 
 
-def _world(scenario: Scenario, line: FloatArray) -> FloatArray:
+def _to_mercator(scenario: Scenario, line: FloatArray) -> FloatArray:
     """Return points [m] as parts of the Web Mercator square, x to the east and y to the south."""
     latitude, longitude = (np.asarray(one) for one in scenario.to_latlon(line[:, 0], line[:, 1]))
     y = (1.0 - np.arcsinh(np.tan(np.radians(latitude))) / math.pi) / 2.0

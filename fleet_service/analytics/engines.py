@@ -77,7 +77,7 @@ class QueryEngine:
         pattern = "*.parquet" if table == "map" else "*/*.parquet"
         return [
             path
-            for folder in layout.days(self.root, NAMES[table], first, last)
+            for folder in layout.day_folders(self.root, NAMES[table], first, last)
             for path in sorted(folder.glob(pattern))
         ]
 
@@ -149,7 +149,7 @@ class QueryEngine:
         return self.connection.table(name)
 
 
-def value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
+def has_value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
     """Return which rows give a value of mu and not only a bound: they used EXCITED_SHARE of it (see
     the contract).
 

@@ -26,16 +26,19 @@ from schemas.wire import Kind
 WORLD = synthetic.SyntheticFleet(rows=60_000, days=3, vehicles=60, roads=16, length=80, icy=4)
 
 
-def whole(root: Path) -> Extract:
+def whole_archive(root: Path) -> Extract:
     """Return the selection of all days of an archive."""
-    days = [layout.day_of(folder) for folder in layout.days(root, layout.TABLES[Kind.OBSERVATION])]
+    days = [
+        layout.day_of(folder)
+        for folder in layout.day_folders(root, layout.TABLES[Kind.OBSERVATION])
+    ]
     return Extract(min(days) * layout.DAY_NS, (max(days) + 1) * layout.DAY_NS)
 
 
-def figures(root: Path, folder: Path) -> dict[str, pa.Table]:
+def draw_figures(root: Path, folder: Path) -> dict[str, pa.Table]:
     """Ask, draw, and return the answers."""
     folder.mkdir(parents=True, exist_ok=True)
-    engine = QueryEngine("duckdb", root, whole(root))
+    engine = QueryEngine("duckdb", root, whole_archive(root))
     middle = (engine.part.since + engine.part.until) // 2
     answers = {}
     for name, ending in (
@@ -48,7 +51,9 @@ def figures(root: Path, folder: Path) -> dict[str, pa.Table]:
         question = QUESTIONS[name]
         answers[name] = question.ask(engine, Options(at=middle))
         output.write(answers[name], question, folder / f"{name}.{ending}")
-        print(f"\n{name}: {question.about}\n{output.text(answers[name].slice(0, 5), question)}")
+        print(
+            f"\n{name}: {question.about}\n{output.format_text(answers[name].slice(0, 5), question)}"
+        )
     return answers
 
 
@@ -63,9 +68,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     root = arguments.archive
     if root is None:
         root = arguments.out / "archive"
-        synthetic.write(root, WORLD)
+        synthetic.write_archive(root, WORLD)
         compact(root)
-    figures(root, arguments.out)
+    draw_figures(root, arguments.out)
     print(f"\nfigures in {arguments.out}")
     return 0
 

@@ -17,7 +17,7 @@ from fleet_service.archive.format.layout import require_archive
 from schemas.config import moment
 
 
-def _part(since: str | None, until: str | None, bbox: Box | None) -> Extract:
+def _make_extract(since: str | None, until: str | None, bbox: Box | None) -> Extract:
     begin = 0 if since is None else moment(since, "since")
     return Extract(begin, time.time_ns() if until is None else moment(until, "until"), bbox)
 
@@ -43,7 +43,7 @@ def ask_archive(
     require_archive(root)
     asked = question_of(question)
     return asked.ask(
-        QueryEngine(engine, root, _part(since, until, bbox)),
+        QueryEngine(engine, root, _make_extract(since, until, bbox)),
         options or Options(report=lambda _: None),
     )
 
@@ -54,7 +54,7 @@ def map_of_archive(
     """Return the map as of a time, or of now, replayed from the archive, as a GeoParquet table."""
     root = Path(archive)
     require_archive(root)
-    return map_at(root, _part(None, at, bbox))
+    return map_at(root, _make_extract(None, at, bbox))
 
 
 def write_answer(table: pa.Table, question: str, path: Path | str) -> None:

@@ -37,7 +37,7 @@ HIDDEN: Final = (
 TIMES: Final = ("onset", "last", "end", "time", "begin")  # seconds since 1970
 
 
-def text(table: pa.Table, question: Question) -> str:
+def format_text(table: pa.Table, question: Question) -> str:
     """Return the first rows in the question's order, for the terminal."""
     shown = add_places(order_rows(table, question).slice(0, SHOWN_ROWS))
     names = [
@@ -45,7 +45,10 @@ def text(table: pa.Table, question: Question) -> str:
     ]
     cells = [
         names,
-        *([_text(name, row[name]) for name in names] for row in shown.select(names).to_pylist()),
+        *(
+            [_cell_text(name, row[name]) for name in names]
+            for row in shown.select(names).to_pylist()
+        ),
     ]
     widths = [max(len(row[k]) for row in cells) for k in range(len(names))]
     lines = [
@@ -61,15 +64,15 @@ def text(table: pa.Table, question: Question) -> str:
     )
 
 
-def lines(table: pa.Table, question: Question) -> str:
+def format_json_lines(table: pa.Table, question: Question) -> str:
     """Return all rows in the question's order as JSON lines; times are ISO 8601, UTC."""
     return "\n".join(
-        json.dumps({name: _json(name, v) for name, v in row.items()}, allow_nan=False)
+        json.dumps({name: _json_value(name, v) for name, v in row.items()}, allow_nan=False)
         for row in add_places(order_rows(table, question)).to_pylist()
     )
 
 
-def _json(name: str, value: object) -> object:
+def _json_value(name: str, value: object) -> object:
     if isinstance(value, float) and not np.isfinite(value):
         return None
     if name in TIMES and isinstance(value, int):
@@ -85,7 +88,7 @@ def order_rows(table: pa.Table, question: Question) -> pa.Table:
     return table.sort_by(keys + [(other, "ascending") for other in others])
 
 
-def _text(name: str, value: object) -> str:
+def _cell_text(name: str, value: object) -> str:
     if value is None or value != value:  # NaN
         return "-"
     if name == "sector":
@@ -118,7 +121,7 @@ def write(table: pa.Table, question: Question, path: Path) -> None:
             plot(table, question, path)
         elif path.suffix == ".html":
             with open_durably(path) as file:
-                file.write(page(table, question).encode())
+                file.write(make_page(table, question).encode())
         elif path.name.endswith(".geo.parquet"):
             extract.write(add_geometry(table, question), path)
         elif path.suffix == ".geojson":
@@ -160,13 +163,13 @@ def add_geometry(table: pa.Table, question: Question) -> pa.Table:
             "out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png"
         )
     return (
-        geo.with_stretches(table, _members(table))
+        geo.with_stretches(table, _row_cells(table))
         if PARTS in table.schema.names
         else geo.with_cells(table)
     )
 
 
-def _members(table: pa.Table) -> list[list[int]]:
+def _row_cells(table: pa.Table) -> list[list[int]]:
     """Return the cells of each row."""
     found: list[Any] = table[PARTS].to_pylist()
     return found
@@ -187,7 +190,7 @@ def plot(table: pa.Table, question: Question, path: Path) -> None:
     draw(table, question.name, question.about, path)
 
 
-def page(table: pa.Table, question: Question) -> str:
+def make_page(table: pa.Table, question: Question) -> str:
     """Return an HTML page with the answer's coloured cells, with frames if it has any; it needs
     no network.
     """
@@ -200,17 +203,19 @@ def page(table: pa.Table, question: Question) -> str:
     part = None
     cells = table["cell"].to_numpy()
     if PARTS in table.schema.names:
-        parts = _members(table)
+        parts = _row_cells(table)
         part = [row for row, own in enumerate(parts) for _ in own]
         cells = np.array([cell for own in parts for cell in own], np.int64)
     boxes = np.stack(list(grid.bounds(cells)), axis=1).round(7).tolist()
-    frames = _frames(table)
+    frames = _frame_labels(table)
     known = sorted(set(frames))
     number = {name: k for k, name in enumerate(known)}
     names = [
         f.name for f in table.schema if f.name not in HIDDEN and not pa.types.is_nested(f.type)
     ]
-    rows = [[_text(name, row[name]) for name in names] for row in table.select(names).to_pylist()]
+    rows = [
+        [_cell_text(name, row[name]) for name in names] for row in table.select(names).to_pylist()
+    ]
     values = [
         None if v is None or np.isnan(v) else round(float(v), 4)
         for v in table[question.colour].to_pylist()
@@ -224,10 +229,10 @@ def page(table: pa.Table, question: Question) -> str:
     about = (
         f"{rest:,} rows more are not drawn: ask for a smaller box or fewer days." if rest else ""
     )
-    return render(question.about, drawn, _scale(question, values), about=about)
+    return render(question.about, drawn, _colour_scale(question, values), about=about)
 
 
-def _scale(question: Question, values: list[Value]) -> Scale:
+def _colour_scale(question: Question, values: list[Value]) -> Scale:
     if question.colour is not None and question.colour.startswith("mu"):
         return GRIP_SCALE
     top = max((v for v in values if v is not None), default=1.0) or 1.0
@@ -240,15 +245,15 @@ def _scale(question: Question, values: list[Value]) -> Scale:
     return Scale(label, 0.0, top, ticks, dark_is_high=True, unknown="not measured")
 
 
-def _frames(table: pa.Table) -> list[str]:
+def _frame_labels(table: pa.Table) -> list[str]:
     for name in ("frame", "day"):
         if name in table.schema.names:
             return [
-                f"{v:%Y-%m-%d %H:%M:%S}" if isinstance(v, datetime) else _day(v)
+                f"{v:%Y-%m-%d %H:%M:%S}" if isinstance(v, datetime) else _day_text(v)
                 for v in table[name].to_pylist()
             ]
     return [""] * table.num_rows
 
 
-def _day(value: object) -> str:
+def _day_text(value: object) -> str:
     return value.isoformat() if isinstance(value, date) else str(value)

@@ -83,16 +83,16 @@ def paint(
     return patches
 
 
-def _grip(figure: Figure, table: pa.Table) -> None:
+def _draw_grip(figure: Figure, table: pa.Table) -> None:
     days = np.array([str(day) for day in table["day"].to_pylist()])
-    middle = _floats(table, "mu_p50")
+    middle = _float_column(table, "mu_p50")
     axes = figure.subplots()
     names = np.unique(days)
     for k, day in enumerate(names):
         own = middle[(days == day) & np.isfinite(middle)]
         bounded = int(((days == day) & ~np.isfinite(middle)).sum())
         if len(own):
-            _band(
+            _draw_band(
                 axes,
                 k,
                 np.quantile(own, (0.1, 0.5, 0.9)),
@@ -105,7 +105,7 @@ def _grip(figure: Figure, table: pa.Table) -> None:
     axes.legend(fontsize=8)
 
 
-def _band(axes: Axes, at: float, three: FloatArray, label: str | None = None) -> None:
+def _draw_band(axes: Axes, at: float, three: FloatArray, label: str | None = None) -> None:
     low, middle, high = three
     axes.errorbar(
         [at],
@@ -118,9 +118,9 @@ def _band(axes: Axes, at: float, three: FloatArray, label: str | None = None) ->
     )
 
 
-def _worst(figure: Figure, table: pa.Table) -> None:
+def _draw_worst(figure: Figure, table: pa.Table) -> None:
     rows: list[Any] = table.slice(0, MOST_PANELS).to_pylist()
-    panels = _panels(figure, len(rows))
+    panels = _make_panels(figure, len(rows))
     for k, (axes, one) in enumerate(zip(panels, rows, strict=False), 1):
         cells = np.array(one["members"], np.int64)
         patches = paint(
@@ -137,7 +137,7 @@ def _worst(figure: Figure, table: pa.Table) -> None:
     figure.colorbar(patches, ax=panels, label=f"mean {MU} where slippery", shrink=0.8)
 
 
-def _panels(figure: Figure, count: int) -> list[Axes]:
+def _make_panels(figure: Figure, count: int) -> list[Axes]:
     """Return `count` axes, three per row."""
     columns = min(count, 3) or 1
     rows = -(-count // 3) or 1
@@ -151,8 +151,8 @@ def _panels(figure: Figure, count: int) -> list[Axes]:
     return panels
 
 
-def _spells(figure: Figure, table: pa.Table) -> None:
-    order = np.argsort(-_floats(table, "duration_s"), kind="stable")[:MOST_ROWS]
+def _draw_spells(figure: Figure, table: pa.Table) -> None:
+    order = np.argsort(-_float_column(table, "duration_s"), kind="stable")[:MOST_ROWS]
     rows = sorted(table.take(order).to_pylist(), key=lambda one: one["onset"])
     axes = figure.subplots()
     for k, one in enumerate(rows):
@@ -188,7 +188,7 @@ def _before_after(figure: Figure, table: pa.Table) -> None:
     )
     left.set_xticks([0, 1], ["before", "after"])
     left.set(ylabel=MU, ylim=(0.0, 1.2), xlim=(-0.5, 1.5))
-    _band(
+    _draw_band(
         right,
         0,
         np.array([after[name] for name in ("lower", "difference", "upper")]),
@@ -208,8 +208,8 @@ def _before_after(figure: Figure, table: pa.Table) -> None:
         axes.legend(fontsize=8)
 
 
-def _vehicles(figure: Figure, table: pa.Table) -> None:
-    z = _floats(table, "z")
+def _draw_vehicles(figure: Figure, table: pa.Table) -> None:
+    z = _float_column(table, "z")
     order = np.argsort(-np.nan_to_num(z, nan=-1.0), kind="stable")[:MOST_ROWS]
     rows = [row for row in table.take(order).to_pylist() if row["bias"] is not None]
     axes = figure.subplots()
@@ -236,7 +236,7 @@ def _vehicles(figure: Figure, table: pa.Table) -> None:
     axes.legend(fontsize=8)
 
 
-def _calibration(figure: Figure, table: pa.Table) -> None:
+def _draw_calibration(figure: Figure, table: pa.Table) -> None:
     axes = figure.subplots()
     basis = np.array(table["basis"].to_pylist(), str)
     for name, marker, colour in (
@@ -248,8 +248,8 @@ def _calibration(figure: Figure, table: pa.Table) -> None:
         if own.num_rows:
             for column, line in (("held", "-"), ("compatible", ":")):
                 axes.plot(
-                    _floats(own, "age_h"),
-                    _floats(own, column),
+                    _float_column(own, "age_h"),
+                    _float_column(own, column),
                     line,
                     marker=marker,
                     color=colour,
@@ -264,31 +264,31 @@ def _calibration(figure: Figure, table: pa.Table) -> None:
     axes.legend(fontsize=8)
 
 
-def _weather(figure: Figure, table: pa.Table) -> None:
+def _draw_weather(figure: Figure, table: pa.Table) -> None:
     table = table.sort_by("temperature")
     left, right = figure.subplots(1, 2)
-    t, p10, p50 = (_floats(table, name) for name in ("temperature", "mu_p10", "mu_p50"))
+    t, p10, p50 = (_float_column(table, name) for name in ("temperature", "mu_p10", "mu_p50"))
     left.plot(t, p50, "o-", color=_DARK, label="median")
     left.plot(t, p10, "s:", color=_LIGHT, label="worst tenth")
     left.axvline(0.0, color="0.6", linewidth=1)
     left.set(xlabel="temperature of the nearest station [°C]", ylabel=MU, ylim=(0.0, 1.2))
     left.legend(fontsize=8)
-    right.bar(t, _floats(table, "share_slippery"), width=1.6, color=_DARK)
+    right.bar(t, _float_column(table, "share_slippery"), width=1.6, color=_DARK)
     right.set(
         xlabel="temperature [°C]", ylabel=f"share of values below {SLIPPERY_MU}", ylim=(0.0, 1.0)
     )
 
 
-def _replay(figure: Figure, table: pa.Table) -> None:
+def _draw_replay(figure: Figure, table: pa.Table) -> None:
     frame = table["frame"].cast(pa.int64()).to_numpy()
     times = np.unique(frame)
     times = times[
         np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_PANELS)).astype(int))
     ]
-    panels = _panels(figure, len(times))
+    panels = _make_panels(figure, len(times))
     shapes = cell_shapes(table["cell"].to_numpy(), table["sector"].to_numpy().astype(np.int64))
     for axes, time in zip(panels, times.tolist(), strict=False):
-        patches = paint(axes, shapes[frame == time], _floats(table, "mu")[frame == time])
+        patches = paint(axes, shapes[frame == time], _float_column(table, "mu")[frame == time])
         axes.set_title(f"{np.datetime64(time, 'us').astype('datetime64[s]')} UTC", fontsize=9)
     figure.colorbar(patches, ax=panels, label=f"{MU}; hatched: {UNKNOWN}", shrink=0.8)
 
@@ -299,22 +299,22 @@ def _first_two(figure: Figure, table: pa.Table) -> None:
         f.name for f in table.schema if pa.types.is_floating(f.type) or pa.types.is_integer(f.type)
     ][:2]
     axes = figure.subplots()
-    axes.plot(*(_floats(table, name) for name in numbers), "o", color=_DARK)
+    axes.plot(*(_float_column(table, name) for name in numbers), "o", color=_DARK)
     axes.set(xlabel=numbers[0], ylabel=numbers[-1])
 
 
 _DRAWN: Final[dict[str, Callable[[Figure, pa.Table], None]]] = {
-    "grip": _grip,
-    "worst": _worst,
-    "spells": _spells,
+    "grip": _draw_grip,
+    "worst": _draw_worst,
+    "spells": _draw_spells,
     "before-after": _before_after,
-    "vehicles": _vehicles,
-    "calibration": _calibration,
-    "weather": _weather,
-    "replay": _replay,
+    "vehicles": _draw_vehicles,
+    "calibration": _draw_calibration,
+    "weather": _draw_weather,
+    "replay": _draw_replay,
 }
 
 
-def _floats(table: pa.Table, name: str) -> FloatArray:
+def _float_column(table: pa.Table, name: str) -> FloatArray:
     values: list[Any] = table[name].to_pylist()
     return np.array([np.nan if value is None else float(value) for value in values])

@@ -119,13 +119,13 @@ def rebuild_zone(wanted: Rebuild, zone: int) -> RebuildResult:
             place(path.parent / named / path.name, snapshot_table(cells, wanted.until), MAP)
         parts = 0
         for path in layout.compacted_files(wanted.root, Kind.OBSERVATION):
-            if layout.partition_of(path).zone == zone and (part := _part(path)) is not None:
+            if layout.partition_of(path).zone == zone and (part := _compute_part(path)) is not None:
                 place(rollup.part_of(path, wanted.out), part, ROLLUP)
                 parts += 1
     return RebuildResult(zone, cells.num_rows, parts)
 
 
-def _part(path: Path) -> pa.Table | None:
+def _compute_part(path: Path) -> pa.Table | None:
     try:
         return rollup.compute_part(path, skip_damaged)
     except FileNotFoundError:

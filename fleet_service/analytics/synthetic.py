@@ -44,20 +44,20 @@ class SyntheticFleet:
     seed: int = 0
 
 
-def write(root: Path, world: SyntheticFleet, segment_rows: int = 20_000) -> None:
+def write_archive(root: Path, world: SyntheticFleet, segment_rows: int = 20_000) -> None:
     """Write the inbox of an archive, segment by segment, in order of time.
 
     Raises:
         OSError: the disk is full.
     """
     writer = Writer(root, "shard-0")
-    for rows in chunks(world):
+    for rows in make_chunks(world):
         for start in range(0, len(rows["cell"]), segment_rows):
             part = slice(start, start + segment_rows)
             writer.write(Kind.OBSERVATION, {name: column[part] for name, column in rows.items()})
 
 
-def chunks(world: SyntheticFleet, hours: int = 6) -> Iterator[Rows]:
+def make_chunks(world: SyntheticFleet, hours: int = 6) -> Iterator[Rows]:
     """Yield rows of a few hours each, in order of time."""
     rng = np.random.default_rng(world.seed)
     bias = rng.normal(0.0, 0.04, world.vehicles)
@@ -65,10 +65,10 @@ def chunks(world: SyntheticFleet, hours: int = 6) -> Iterator[Rows]:
     for span in range(spans):
         rows = world.rows * (span + 1) // spans - world.rows * span // spans
         if rows:
-            yield _chunk(world, rng, bias, span * hours * 3600, hours * 3600, rows)
+            yield _make_chunk(world, rng, bias, span * hours * 3600, hours * 3600, rows)
 
 
-def _chunk(
+def _make_chunk(
     world: SyntheticFleet,
     rng: np.random.Generator,
     bias: FloatArray,
@@ -83,7 +83,7 @@ def _chunk(
     along = np.tile(np.arange(world.length), trips)[:rows]
     trip = np.repeat(np.arange(trips), world.length)[:rows]
     seconds = begin[trip] + along * CELL_S + rng.normal(0.0, 0.05, rows)
-    latitude, longitude, yaw = _places(road[trip], along, rng)
+    latitude, longitude, yaw = _draw_positions(road[trip], along, rng)
     truth = truth_of(world, road[trip], along, seconds)
     excited = rng.random(rows) < _EXCITED
     used = np.clip(
@@ -122,11 +122,13 @@ def _chunk(
         "mu_lower": np.maximum(mu - half, 0.05).astype(np.float32),
         "mu_upper": np.minimum(mu + half, 1.2).astype(np.float32),
         "mu_utilised": used.astype(np.float32),
-        "log_likelihood": _likelihoods(rng, mu, used, excited),
+        "log_likelihood": _make_likelihoods(rng, mu, used, excited),
         "with_likelihood": np.ones(rows, bool),
         "health": np.where(rng.random(rows) < 0.01, 16, 0).astype(np.int32),
         "tyre_season": zeros.astype(np.int8),
-        "air_temperature": (5.0 - 8.0 * night(seconds) + rng.normal(0, 1, rows)).astype(np.float32),
+        "air_temperature": (5.0 - 8.0 * night_factor(seconds) + rng.normal(0, 1, rows)).astype(
+            np.float32
+        ),
         "abs_active": np.full(rows, -1, np.int8),
         "used_longitudinal": np.full(rows, np.nan, np.float32),
         "used_lateral": np.full(rows, np.nan, np.float32),
@@ -153,7 +155,7 @@ def _chunk(
     return {name: column[order] for name, column in round_to_steps(found).items()}
 
 
-def _places(
+def _draw_positions(
     road: IntArray, along: IntArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return position with the receiver's noise, and yaw; a road is straight, one in two runs
@@ -173,7 +175,7 @@ def _places(
     )
 
 
-def night(seconds: FloatArray) -> FloatArray:
+def night_factor(seconds: FloatArray) -> FloatArray:
     """Return a factor between 0 by day and 1 at four in the morning."""
     return np.clip(np.cos(2 * np.pi * (seconds / DAY_S - 4 / 24)), 0.0, 1.0)
 
@@ -183,10 +185,10 @@ def truth_of(
 ) -> FloatArray:
     """Return the friction: dry, and ice on the middle fifth of icy roads in the small hours."""
     middle = np.abs(along - world.length // 2) < world.length // 10
-    return np.where((road % world.icy == 0) & middle & (night(seconds) > 0.5), ICE, DRY)
+    return np.where((road % world.icy == 0) & middle & (night_factor(seconds) > 0.5), ICE, DRY)
 
 
-def _likelihoods(
+def _make_likelihoods(
     rng: np.random.Generator, mu: FloatArray, used: FloatArray, excited: BoolArray
 ) -> ByteArray:
     """Return likelihoods (n, 32): a flank on each side of a value, or up to the grip used for a

@@ -48,15 +48,17 @@ def handle_requests(
     rows = answered = 0
     for question in erasure_requests.open_requests(root):
         try:
-            outcome = _erase(engine, config, root, erasure_requests.read(question), stop)
+            outcome = _run_erasure(
+                engine, config, root, erasure_requests.read_request(question), stop
+            )
         except InputError as error:
-            erasure_requests.settle(question, error)
+            erasure_requests.answer_request(question, error)
             continue
         if outcome is None:  # the service stops; the next one does it
             break
         if engine.copy is not None:
             outcome["copy"] = _erase_in_copy(engine.copy)
-        erasure_requests.settle(question, outcome)
+        erasure_requests.answer_request(question, outcome)
         rows = rows + outcome["rows"]
         answered = answered + 1
     return f"erased: {answered} requests, {rows} rows" if answered else None
@@ -73,7 +75,7 @@ def _erase_in_copy(copy: BucketReplica) -> str | None:
     return None
 
 
-def _erase(
+def _run_erasure(
     engine: Engine, config: ServiceConfig, root: Path, wanted: Erasure, stop: threading.Event
 ) -> dict[str, Any] | None:
     """Return the result; None if the service stops before the end.
@@ -130,10 +132,12 @@ def run_erasure_process(root: Path, request: dict[str, Any]) -> dict[str, Any]:
     Raises:
         InputError, OSError: as for `retention.forget_vehicle`.
     """
-    known = weather.files(root)  # one that comes meanwhile is read again, which changes nothing
+    known = weather.weather_files(
+        root
+    )  # one that comes meanwhile is read again, which changes nothing
     with erase_files(root, request["vehicle"], request["month"]) as done:
         cut = Cut(*request["cut"])
-        checkpoints.save(
+        checkpoints.save_checkpoint(
             root, load_state(root, ServiceConfig(**request["config"]), until=cut).image(cut, known)
         )
     return {"rows": done.rows, "files": [str(path.relative_to(root)) for path in done.files]}

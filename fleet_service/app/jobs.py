@@ -65,7 +65,7 @@ def archive_jobs(
             return "compaction waits for the copy"
         disk_reserve.allocate(root)
         weather.join_daily_files(root)
-        if not config.put_to and not any(segments.paths(root, kind) for kind in Kind):
+        if not config.put_to and not any(segments.list_segments(root, kind) for kind in Kind):
             return None
         words = ["compact", "--archive", str(root), "--round-rows", str(ROUND_ROWS)]
         words += ["--to", config.put_to] if config.put_to else []
@@ -76,13 +76,13 @@ def archive_jobs(
         now = moment().now
         table = engine.queries.whole_map(now)
         if table.num_rows:
-            snapshots.write(root, table, now)
+            snapshots.write_snapshot(root, table, now)
         return None
 
     def checkpoint(stop: threading.Event) -> str | None:
         taken = engine.checkpoint(stop)
         if taken is not None:
-            checkpoints.save(root, taken)
+            checkpoints.save_checkpoint(root, taken)
         return None
 
     def retention(_: threading.Event) -> str | None:
@@ -90,7 +90,7 @@ def archive_jobs(
         if not at.sure:
             return "retention waits: no report has confirmed the clock yet"
         done = retire_rows(root, config.raw_days, datetime.fromtimestamp(at.now // NS, UTC).date())
-        weather.retire(root, at.now // layout.DAY_NS - config.raw_days - 1)
+        weather.retire_files(root, at.now // layout.DAY_NS - config.raw_days - 1)
         return f"retired: {done.days} days" if done.days else None
 
     def old_cells(stop: threading.Event) -> str | None:
@@ -106,7 +106,7 @@ def archive_jobs(
     ) -> Callable[[threading.Event], str | None]:
         """Release the reserve to a job that makes room, if the disk is full."""
 
-        def done(stop: threading.Event) -> str | None:
+        def run_job(stop: threading.Event) -> str | None:
             try:
                 return work(stop)
             except (OSError, InputError):
@@ -114,7 +114,7 @@ def archive_jobs(
                     raise
                 return work(stop)
 
-        return done
+        return run_job
 
     def following(_: threading.Event) -> str | None:
         if engine.copy is not None:

@@ -49,21 +49,23 @@ class Pulse(NamedTuple):
     answer_s: float = 0.0
 
 
-def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> list[Metric]:
+def collect_metrics(
+    engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path
+) -> list[Metric]:
     """Return all current values."""
     counts = dict(engine.counts)
     report_lag_s = engine.intake.report_lag_s
     away_s = 0.0 if engine.copy is None else engine.copy.away_s
     found = [
-        Metric(name, "counter", text, _below(counts, prefix), label)
+        Metric(name, "counter", text, _strip_prefix(counts, prefix), label)
         for prefix, name, label, text in _FAMILIES
     ]
     found += [
         Metric(name, "counter", text, {"": counts.get(name, 0)}) for name, text in _SINGLE.items()
     ]
     kinds = {"observation": counts.get(Kind.OBSERVATION, 0), "state": counts.get(Kind.STATE, 0)}
-    failures = _ending(counts, "_failures")
-    runs = _ending(counts, "_runs")
+    failures = _strip_ending(counts, "_failures")
+    runs = _strip_ending(counts, "_runs")
     return [
         *found,
         Metric("rows", "counter", "rows admitted", kinds, "kind"),
@@ -73,7 +75,7 @@ def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> 
             "segments",
             "gauge",
             "segments waiting for compaction",
-            _per_kind(root, segments.paths),
+            _per_kind(root, segments.list_segments),
             "kind",
         ),
         gauge("queue_messages", "waiting messages", pulse.queued),
@@ -101,7 +103,7 @@ def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> 
             "time for which the service may acknowledge without renewing its lease",
             engine.holding.left_s,
         ),
-        _serves(config, 1.0),
+        _serves_metric(config, 1.0),
         gauge("cells", "cells and sectors with a belief", engine.state.fusion.size),
         gauge(
             "window_observations",
@@ -119,10 +121,10 @@ def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> 
 
 def standby_metrics(config: ServiceConfig) -> list[Metric]:
     """Return all values of a waiting service."""
-    return [_serves(config, 0.0)]
+    return [_serves_metric(config, 0.0)]
 
 
-def _serves(config: ServiceConfig, value: float) -> Metric:
+def _serves_metric(config: ServiceConfig, value: float) -> Metric:
     text = "1 if this service serves its regions, 0 if it is their standby"
     return Metric("serves", "gauge", text, {" ".join(sorted(config.regions)): value}, "regions")
 
@@ -151,11 +153,11 @@ def health_problems(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list
     return found
 
 
-def _below(counts: Mapping[str, int], prefix: str) -> dict[str, float]:
+def _strip_prefix(counts: Mapping[str, int], prefix: str) -> dict[str, float]:
     return {name.removeprefix(prefix): n for name, n in counts.items() if name.startswith(prefix)}
 
 
-def _ending(counts: Mapping[str, int], ending: str) -> dict[str, float]:
+def _strip_ending(counts: Mapping[str, int], ending: str) -> dict[str, float]:
     return {name.removesuffix(ending): n for name, n in counts.items() if name.endswith(ending)}
 
 

@@ -23,7 +23,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.replay.rebuild import Box, Heard, past_fusion, rows_near, too_much
 from fleet_service.serve.map_state import MapState
 from fleet_service.serve.public_cells import PublicCells
-from fleet_service.serve.query import answer
+from fleet_service.serve.query import answer_query
 from fleet_service.serve.tile_cache import TileCache
 from fleet_service.serve.visitors import Visitors
 from schemas import grid
@@ -80,7 +80,7 @@ class HistoricalMaps:
         most = MOST_ROWS if box is None else LOOKED_ROWS
         if rows_near(self._root, question.at, box, most) > most:
             raise too_much()
-        process, head = self._asked(question)
+        process, head = self._ask_process(question)
         ended = False
         try:
             while not ended:
@@ -93,17 +93,17 @@ class HistoricalMaps:
                     yield tile, payload
                 head = b"" if ended else process.head()
         finally:
-            if left := self._kept(process) if ended else process:
+            if left := self._keep_process(process) if ended else process:
                 left.end()
 
     def close(self) -> None:
         """End the idle process."""
-        if process := self._kept(None):
+        if process := self._keep_process(None):
             process.end()
 
-    def _asked(self, question: PastQuery) -> tuple[_Process, bytes]:
+    def _ask_process(self, question: PastQuery) -> tuple[_Process, bytes]:
         """Return a process that answers the question, and the head of its first reply."""
-        if process := self._kept(None):
+        if process := self._keep_process(None):
             with suppress(BrokenPipeError, ChildProcessError):  # it has just left
                 return process, process.ask(question)
             process.end()
@@ -114,7 +114,7 @@ class HistoricalMaps:
             process.end()
             raise
 
-    def _kept(self, process: _Process | None) -> _Process | None:
+    def _keep_process(self, process: _Process | None) -> _Process | None:
         """Keep a process for the next question, or none; return the one kept before."""
         self._idle, before = process, self._idle
         return before
@@ -177,11 +177,11 @@ def replies_to(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
     """
     heard: list[PublicCells] = []
 
-    def listener(fusion: Fusion) -> Heard:
+    def make_listener(fusion: Fusion) -> Heard:
         heard.append(PublicCells(fusion, Visitors(fusion), question.public))
         return heard[0].follow
 
-    listening = listener if question.public > 1 else None
+    listening = make_listener if question.public > 1 else None
     try:
         then = past_fusion(
             root, question.lateness_s, question.at, box_of(question), MOST_ROWS, listening
@@ -191,7 +191,7 @@ def replies_to(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
             "at", f"the archive cannot be read ({error.strerror})", "ask again later"
         ) from error
     cache = TileCache(MapState(then), nullcontext(), question.public, heard[0] if heard else None)
-    yield from answer(cache, question.query, lambda _: True, question.at, question.only)
+    yield from answer_query(cache, question.query, lambda _: True, question.at, question.only)
 
 
 def encode_question(question: PastQuery) -> bytes:

@@ -14,9 +14,9 @@ import numpy as np
 
 from fleet_service.fusion import Fusion, Observations
 from fleet_service.fusion.constants import EPOCH_NS
-from fleet_service.fusion.likelihoods import at_least, levelled, supported
+from fleet_service.fusion.likelihoods import at_least, bound_by_used, level_above_used
 from fleet_service.fusion.reported import as_reported
-from fleet_service.fusion.space import shares
+from fleet_service.fusion.space import cell_shares
 from fleet_service.ingest.grouping import group_rows, largest_of
 from fleet_service.ingest.paths import VehiclePaths
 from fleet_service.serve.alerts import Alerts
@@ -25,7 +25,7 @@ from schemas import mugrid
 from schemas.runtime.jit import kernel_cache
 
 CELLS: Final = 1 << 14  # more than a map has room for at first
-COMPILE: Final = "from fleet_service.app.precompile import live; live()"
+COMPILE: Final = "from fleet_service.app.precompile import exercise_map; exercise_map()"
 DONE: Final = "fleet_service.compiled"  # in the cache, once all of it is there
 
 
@@ -41,30 +41,30 @@ def warm_up() -> None:
             with suppress(OSError):  # then it is looked for again at the next start
                 done.parent.mkdir(parents=True, exist_ok=True)
                 done.touch()
-    live()
+    exercise_map()
 
 
-def live() -> None:
+def exercise_map() -> None:
     """Run a temporary map through its life: update, grow, advance, update late within the
     window, commit, believe.
     """
     fusion = Fusion(2 * EPOCH_NS * 1e-9)
     for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2)):
-        o = _visits(epoch * EPOCH_NS, cells)
+        o = _make_visits(epoch * EPOCH_NS, cells)
         Alerts(fusion).update(fusion.update(o).slots)
         fusion.slots_of(o.cell, o.sector)
     at_least(np.zeros(1))
-    supported(levelled(np.zeros((1, mugrid.BINS), np.uint8), np.zeros(1)), np.zeros(1))
+    bound_by_used(level_above_used(np.zeros((1, mugrid.BINS), np.uint8), np.zeros(1)), np.zeros(1))
     column = np.zeros(1, np.int64)  # as Arrow hands it out: not to be written to
     column.flags.writeable = False
     group, _ = group_rows(np.zeros(1, np.int64), column, column)
     largest_of(column, group, 1)
     VehiclePaths().find_implausible(column, np.zeros(1, np.int64), np.zeros(1), np.zeros(1))
-    shares(np.ones(1), np.ones(1))
+    cell_shares(np.ones(1), np.ones(1))
     cell_table(fusion, np.arange(2), 10 * EPOCH_NS)
 
 
-def _visits(time: int, cells: int) -> Observations:
+def _make_visits(time: int, cells: int) -> Observations:
     """Return one visit to each of `cells` cells, each by a vehicle of its own."""
     one = np.ones(cells, np.int64)
     number = np.arange(cells)

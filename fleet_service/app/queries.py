@@ -11,7 +11,7 @@ import pyarrow as pa
 from fleet_service.app.past import HistoricalMaps, PastQuery
 from fleet_service.app.state import SLOTS, SharedState
 from fleet_service.serve.encode import batch_of
-from fleet_service.serve.query import AnswerSize, answer, size_asked
+from fleet_service.serve.query import AnswerSize, answer_query, size_asked
 from schemas.config import ServiceConfig, nanoseconds
 from schemas.errors import InputError
 from schemas.query import MapQuery
@@ -70,7 +70,7 @@ class Queries:
         self, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None
     ) -> Iterator[tuple[int, bytes]]:
         """Yield tile and payload of every reply to a query, computed on demand; see
-        `serve.query.answer`.
+        `serve.query.answer_query`.
 
         Raises:
             InputError: the route is too long, the time is in the future, or the archive cannot be
@@ -79,7 +79,7 @@ class Queries:
         least = max(query.min_vehicles, self._config.public_vehicles)
         query = query.model_copy(update={"min_vehicles": least})
         if query.at is None:
-            return answer(self._shared.tiles, query, wanted, now, only)
+            return answer_query(self._shared.tiles, query, wanted, now, only)
         at = nanoseconds(query.at)
         if at > now:
             raise InputError("at", "lies in the future", "give a time that has been")

@@ -20,7 +20,7 @@ import zenoh
 from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
 from fleet_service.app.jobs import BackgroundJobs, archive_jobs
-from fleet_service.app.metrics import Pulse, health_problems, metrics
+from fleet_service.app.metrics import Pulse, collect_metrics, health_problems
 from fleet_service.enrolment.fleet import Enrolment
 from fleet_service.ingest.inbox import Inbox, Message
 from fleet_service.ingest.rate_limit import RateLimiter
@@ -111,7 +111,7 @@ class Service:
         if self.engine.holding.lease is not None:
             self.engine.holding.lease.serves = self._works
         try:
-            with self._monitored() as address:
+            with self._serve_monitoring() as address:
                 session = zenoh_session.open_session(self._config.zenoh, stop, self._config.name)
                 if session is not None:
                     self._serve(session, stop, f", {address}" if address else "")
@@ -138,7 +138,7 @@ class Service:
             ) as mine,
             watch_successors(session, mine) as came,
             self._upkeep,
-            self._declared(session),
+            self._declare_inputs(session),
             serving_regions(session, mine),
         ):
             self._session = session
@@ -148,7 +148,9 @@ class Service:
             )
             watchdog.notify_alive()
             try:
-                while not (stop.is_set() or self._lost(came) or self.engine.holding.leaves):
+                while not (
+                    stop.is_set() or self._has_lost_archive(came) or self.engine.holding.leaves
+                ):
                     self._step(session, stop)
                 self._shut_down(session, stop)
             except BaseException as error:
@@ -156,7 +158,7 @@ class Service:
                 stop.set()
                 raise
 
-    def _lost(self, came: Callable[[], bool]) -> bool:
+    def _has_lost_archive(self, came: Callable[[], bool]) -> bool:
         """Return True if another service has taken over, by the lease, or by its tokens while the
         bucket does not answer."""
         holding = self.engine.holding
@@ -184,7 +186,7 @@ class Service:
             session is not None and turn_age_s < STUCK_S and bool(list(session.info.routers_zid()))
         )
 
-    def _monitored(self) -> AbstractContextManager[str | None]:
+    def _serve_monitoring(self) -> AbstractContextManager[str | None]:
         """Serve metrics and health if the settings ask for it."""
         config = self._config
         engine = self.engine
@@ -199,12 +201,12 @@ class Service:
         return serve_metrics(
             config.metrics_host,
             config.metrics_port,
-            lambda: metrics(engine, pulse(), config, root),
+            lambda: collect_metrics(engine, pulse(), config, root),
             lambda: health_problems(engine, pulse(), config) + self._upkeep.health_problems(),
         )
 
     @contextmanager
-    def _declared(self, session: zenoh.Session) -> Iterator[None]:
+    def _declare_inputs(self, session: zenoh.Session) -> Iterator[None]:
         regions = self._config.regions
         own = keys.shard_key(self._config.name)
         inputs = [
@@ -321,16 +323,16 @@ class Service:
 
     def _acknowledge(self, session: zenoh.Session, acks: list[tuple[str, bytes]]) -> None:
         for vehicle, ack in acks:
-            publish(session, keys.ack_key(vehicle), ack, wire.ACK_ENCODING)
+            publish_message(session, keys.ack_key(vehicle), ack, wire.ACK_ENCODING)
 
     def _put_tile(self, tile: int) -> None:
         stream = self.engine.queries.tile(tile, self._clock.now())
         if stream and self._session is not None:
-            publish(self._session, keys.map_key(tile), stream, wire.ARROW)
+            publish_message(self._session, keys.map_key(tile), stream, wire.ARROW)
 
     def _put_alerts(self, session: zenoh.Session, alerts: list[Alert]) -> None:
         for alert in alerts:
-            publish(
+            publish_message(
                 session,
                 keys.alert_key(int(grid.tile_of(alert.cell))),
                 wire.encode_alert(alert),
@@ -381,6 +383,6 @@ def ingest_messages(engine: Engine, clock: SteadyClock, messages: list[Message])
     return alerts
 
 
-def publish(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> None:
+def publish_message(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> None:
     """Publish with the quality of service of the key's topic."""
     session.put(key, payload, encoding=encoding, **zenoh_session.quality_of(keys.parse(key).topic))

@@ -22,7 +22,14 @@ from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.weather import archived_reports
 from fleet_service.replay.checkpoints import Taken
-from fleet_service.replay.rebuild import Begin, Since, first_day, nobody, replay, restore_streams
+from fleet_service.replay.rebuild import (
+    Begin,
+    Since,
+    first_day,
+    ignore_observations,
+    replay,
+    restore_streams,
+)
 from fleet_service.replay.restart import image_of, load_restart
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.idle_roads import IdleRoads
@@ -150,7 +157,7 @@ def load_state(
     )
     restored = np.array_split(np.arange(fusion.size), fusion.size // SLOTS + 1)
     matters = Begin(first_day(root), begin.cut, until)
-    heard = nobody if public is None else public.follow
+    heard = ignore_observations if public is None else public.follow
     rest = replay(root, fusion, Since(matters, streams if begin.cut else None), damaged, heard)
     with ThreadPoolExecutor(1, "streams") as beside:
         noted = partial(restore_streams, root, streams, matters, damaged)

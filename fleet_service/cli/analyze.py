@@ -10,7 +10,7 @@ from typing import Final
 
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import Question, known_questions, question_of
-from fleet_service.cli.common import add_part, compact_first, duration_s, span
+from fleet_service.cli.common import add_part, compact_first, duration_s, time_span
 from schemas import mugrid
 from schemas.config import moment
 from schemas.errors import InputError
@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
             "engine", f"{arguments.engine!r} is none", f"use one of {', '.join(engines.ENGINES)}"
         )
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
-    part = Extract(*span(arguments), bbox)
+    part = Extract(*time_span(arguments), bbox)
     if not arguments.as_it_lies:
         compact_first(arguments.archive)
     engine = engines.QueryEngine(arguments.engine, arguments.archive, part, progress=False)
@@ -105,22 +105,26 @@ def run(arguments: argparse.Namespace) -> int:
         step_s=arguments.step,
         roads=arguments.roads,
         level=arguments.level,
-        within_s=_seconds(arguments.within),
-        report=_report,
+        within_s=_within_seconds(arguments.within),
+        report=_print_progress,
     )
-    _report(
+    _print_progress(
         f"{question.name}: {len(engine.files('observations'))} files, {engine.rows():,} "
         "observations"
     )
     found = question.ask(engine, options)
-    print(output.lines(found, question) if arguments.json else output.text(found, question))
+    print(
+        output.format_json_lines(found, question)
+        if arguments.json
+        else output.format_text(found, question)
+    )
     if arguments.out is not None:
         output.write(found, question, arguments.out)
-        _report(f"written: {arguments.out}")
+        _print_progress(f"written: {arguments.out}")
     return 0
 
 
-def _seconds(text: str | None) -> float | None:
+def _within_seconds(text: str | None) -> float | None:
     return None if text is None else duration_s("within", text)
 
 
@@ -145,7 +149,7 @@ def _checked_question(arguments: argparse.Namespace) -> Question:
     if arguments.level is not None and not mugrid.LOWER < arguments.level < mugrid.UPPER:
         problem = f"{arguments.level} lies outside {mugrid.LOWER} to {mugrid.UPPER}"
         raise InputError("level", problem, "give a friction, e.g. .35")
-    _seconds(arguments.within)
+    _within_seconds(arguments.within)
     if arguments.min_vehicles is not None and arguments.min_vehicles < 1:
         raise InputError(
             "min-vehicles", f"{arguments.min_vehicles} is below 1", "give a whole number from 1"
@@ -153,5 +157,5 @@ def _checked_question(arguments: argparse.Namespace) -> Question:
     return question
 
 
-def _report(line: str) -> None:
+def _print_progress(line: str) -> None:
     progress_messages.report(line)

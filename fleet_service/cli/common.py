@@ -125,7 +125,7 @@ def duration_s(field: str, text: str) -> float:
     return float(found[1]) * UNITS[found[2]]
 
 
-def span(arguments: argparse.Namespace) -> tuple[int, int]:
+def time_span(arguments: argparse.Namespace) -> tuple[int, int]:
     """Return begin and end [ns] from the options of `add_part`.
 
     Raises:
@@ -192,7 +192,7 @@ def compact_first(root: Path) -> None:
     from schemas.wire import Kind
 
     layout.require_archive(root)
-    waiting = len(segments.paths(root, Kind.OBSERVATION))
+    waiting = len(segments.list_segments(root, Kind.OBSERVATION))
     if not waiting:
         return
     progress_messages.set_status(f"compacting {waiting} segments of the log")

@@ -30,10 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command on its archive."""
-    return on_archive(arguments, _compact)
+    return on_archive(arguments, _compact_archive)
 
 
-def _compact(arguments: argparse.Namespace) -> ArchiveReport:
+def _compact_archive(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.archive.export import mirror
     from fleet_service.archive.maintenance import rollup
     from fleet_service.archive.maintenance.compaction import ROUND_ROWS, compact
@@ -42,7 +42,7 @@ def _compact(arguments: argparse.Namespace) -> ArchiveReport:
     if rows < 1:
         raise InputError("round-rows", f"{rows} is below 1", "give the rows of one round")
     done = compact(arguments.archive, rows)
-    parts = rollup.complete(arguments.archive)
+    parts = rollup.complete_parts(arguments.archive)
     summary = (
         f"{done.rows} rows of {done.segments} segments moved into {done.files} files, "
         f"{parts} rolled up"

@@ -20,8 +20,8 @@ from fleet_service.cli.common import (
     add_part,
     add_supplier,
     on_archive,
-    span,
     supplier_of,
+    time_span,
 )
 from schemas.errors import InputError
 from schemas.runtime import commandline, progress_messages
@@ -123,13 +123,13 @@ def run(arguments: argparse.Namespace) -> int:
         if getattr(arguments, name) is None:
             raise InputError(name, f"is missing for export {arguments.what}", f"give --{name}")
     if arguments.what == DATEX:
-        return _datex(arguments)
+        return _publish_datex(arguments)
     if arguments.what in ROUTERS:
         return _route_costs(arguments)
-    return on_archive(arguments, _iceberg if arguments.what == ICEBERG else _export)
+    return on_archive(arguments, _register_iceberg if arguments.what == ICEBERG else _export_rows)
 
 
-def _iceberg(arguments: argparse.Namespace) -> ArchiveReport:
+def _register_iceberg(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.archive.maintenance.iceberg import NAMESPACE, Place, register
 
     root = arguments.archive.resolve()
@@ -172,7 +172,7 @@ def _route_costs(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _datex(arguments: argparse.Namespace) -> int:
+def _publish_datex(arguments: argparse.Namespace) -> int:
     from fleet_service.cli.common import stop_on_signals
     from fleet_service.client.datex_feed import DatexFeed, DatexFile, publish_alerts
     from fleet_service.client.map_client import connection_settings
@@ -189,7 +189,7 @@ def _datex(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _export(arguments: argparse.Namespace) -> ArchiveReport:
+def _export_rows(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.archive.export import extract
     from schemas import query
 
@@ -199,18 +199,18 @@ def _export(arguments: argparse.Namespace) -> ArchiveReport:
             "min-vehicles", f"{arguments.min_vehicles} is below 1", "give a whole number from 1"
         )
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
-    part = extract.Extract(*span(arguments), bbox)
+    part = extract.Extract(*time_span(arguments), bbox)
     as_of = ""
     if arguments.what == "map" and not arguments.snapshot:
         from fleet_service.analytics.past_map import map_at
 
         progress_messages.set_status("replaying the archive")
         table = map_at(arguments.archive, part)
-        as_of = _text(part.until)
+        as_of = _format_time(part.until)
     else:
         table = extract.WHAT[arguments.what](arguments.archive, part)
         if arguments.what == "map":
-            as_of = _text(extract.snapshot_time(arguments.archive, part))
+            as_of = _format_time(extract.snapshot_time(arguments.archive, part))
     if arguments.what == "map":
         table = extract.with_vehicles(table, arguments.min_vehicles)
     extract.write(table, arguments.out)
@@ -223,5 +223,5 @@ def _export(arguments: argparse.Namespace) -> ArchiveReport:
     )
 
 
-def _text(ns: int) -> str:
+def _format_time(ns: int) -> str:
     return f"{datetime.fromtimestamp(ns // NS, UTC):%Y-%m-%dT%H:%M:%SZ}"

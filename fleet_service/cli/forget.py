@@ -38,10 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command on its archive."""
-    return on_archive(arguments, _forget)
+    return on_archive(arguments, _forget_data)
 
 
-def _forget(arguments: argparse.Namespace) -> ArchiveReport:
+def _forget_data(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.archive.export import mirror
     from fleet_service.archive.identity.erasure_requests import Erasure
     from fleet_service.archive.maintenance.retention import key_of, rows_of_vehicle
@@ -60,7 +60,7 @@ def _forget(arguments: argparse.Namespace) -> ArchiveReport:
         return ArchiveReport(f"would be done: {what}", {"rows": 0, "key": False})
     if not confirm(arguments, what):
         return ArchiveReport("nothing forgotten", {"rows": 0, "key": False})
-    done = _erase(root, Erasure(month, vehicle), arguments.config)
+    done = _erase_or_request(root, Erasure(month, vehicle), arguments.config)
     still = (
         ""
         if done.kept is None
@@ -86,7 +86,7 @@ def _forget(arguments: argparse.Namespace) -> ArchiveReport:
     return ArchiveReport(line, report)
 
 
-def _erase(root: Path, wanted: Erasure, config: str | None) -> ErasureResult:
+def _erase_or_request(root: Path, wanted: Erasure, config: str | None) -> ErasureResult:
     """Erase, in the archive's copy too, or let the service that holds the archive do it.
 
     Raises:

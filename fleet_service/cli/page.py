@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.base_map is None
         else base_map(arguments.base_map, arguments.attribution),
         roads=None if arguments.roads is None else read_roads(arguments.roads),
-        datex=_publication(arguments),
+        datex=_datex_file(arguments),
     )
     server.run(settings, stop_on_signals(), lambda line: print(line, flush=True))
     return 0
@@ -120,7 +120,7 @@ def _check_archive(root: Path) -> None:
         )
 
 
-def _publication(arguments: argparse.Namespace) -> DatexFile | None:
+def _datex_file(arguments: argparse.Namespace) -> DatexFile | None:
     if arguments.datex is None:
         for name in ("country", "supplier"):
             if getattr(arguments, name) is not None:

@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Query, and print or write the answer; 1 if a part of the area has no service."""
-    form = _form(arguments.out, arguments.format)
+    form = _output_format(arguments.out, arguments.format)
     from fleet_service.client import map_client
 
     asked = {
@@ -117,7 +117,7 @@ def _say_what_is_covered(arguments: argparse.Namespace) -> None:
     print(words, file=sys.stderr)
 
 
-def _form(out: Path | None, given: str | None) -> str | None:
+def _output_format(out: Path | None, given: str | None) -> str | None:
     if out is None:
         return given
     commandline.out_folder("out", out)

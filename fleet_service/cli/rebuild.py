@@ -38,10 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command on its archive."""
-    return on_archive(arguments, _rebuild)
+    return on_archive(arguments, _rebuild_maps)
 
 
-def _rebuild(arguments: argparse.Namespace) -> ArchiveReport:
+def _rebuild_maps(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.analytics.rebuilding import Rebuild, rebuild, require_empty
 
     until = time.time_ns() if arguments.until is None else moment(arguments.until, "to")

@@ -19,10 +19,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command on its archive."""
-    return on_archive(arguments, _retention)
+    return on_archive(arguments, _retire_rows)
 
 
-def _retention(arguments: argparse.Namespace) -> ArchiveReport:
+def _retire_rows(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.archive.maintenance.retention import due_folders, retire_rows
 
     today = datetime.now(UTC).date()

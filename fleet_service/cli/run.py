@@ -118,7 +118,7 @@ def _open_archive(
         return acquire_archive(config, root, stop, log_line)
     latest = [""]
 
-    def say(line: str) -> None:
+    def log_status(line: str) -> None:
         latest[0] = line
         log_line(f"{line}, {address}" if address else line)
 
@@ -131,7 +131,7 @@ def _open_archive(
         ) as address,
         standby_signs(config, stop, watchdog.notify_waiting()) as signs,
     ):
-        return None if stop.is_set() else acquire_archive(config, root, stop, say, signs)
+        return None if stop.is_set() else acquire_archive(config, root, stop, log_status, signs)
 
 
 def _force_exit_when_stuck(

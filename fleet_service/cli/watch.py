@@ -55,10 +55,10 @@ def run(arguments: argparse.Namespace) -> int:
         for name in ("webhook_queue", "health_port"):
             if getattr(arguments, name) is not None:
                 raise InputError(name, "has no meaning without a webhook", "add --webhook URL")
-        watching.watch_map(settings, wishes, stop, _say)
+        watching.watch_map(settings, wishes, stop, _print_line)
         return 0
     return _watch_with_webhook(
-        arguments, lambda hear: watching.watch_map(settings, wishes, stop, _say, hear)
+        arguments, lambda hear: watching.watch_map(settings, wishes, stop, _print_line, hear)
     )
 
 
@@ -81,5 +81,5 @@ def _watch_with_webhook(
     return 1 if hook.lost_count or hook.waiting_count else 0
 
 
-def _say(line: str) -> None:
+def _print_line(line: str) -> None:
     print(line, flush=True)

@@ -86,7 +86,7 @@ def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Sec
         "access_control": access_control(fleet),
         "low_pass_filter": [_no_larger(), _no_larger_private(), _no_payload()],
         "downsampling": rate_caps(fleet, name),
-        "qos": {"network": [_priority(keys.TOPICS[kind]) for kind in wire.Kind]},
+        "qos": {"network": [_topic_priority(keys.TOPICS[kind]) for kind in wire.Kind]},
     }
 
 
@@ -100,16 +100,16 @@ def rate_caps(fleet: Enrolment, name: str) -> list[Section]:
     vehicles, and where there is one router.
     """
     router = fleet.routers[name]
-    caps = [_cap("quic", {"link_protocols": ["quic"]})] if router.quic else []
+    caps = [_rate_cap("quic", {"link_protocols": ["quic"]})] if router.quic else []
     if len(fleet.routers) == 1:
-        return [*caps, _cap("tls", {"link_protocols": ["tls"]})]
+        return [*caps, _rate_cap("tls", {"link_protocols": ["tls"]})]
     if router.vehicle_interfaces:
         where = {"interfaces": router.vehicle_interfaces, "link_protocols": ["tls"]}
-        return [*caps, _cap("tls", where)]
+        return [*caps, _rate_cap("tls", where)]
     return caps
 
 
-def _cap(name: str, where: Section) -> Section:
+def _rate_cap(name: str, where: Section) -> Section:
     capped = (*wire.Kind, *keys.PRIVATE)
     rules = [{"key_expr": f"{keys.ROOT}/{kind}/**", "freq": wire.MESSAGES_PER_S} for kind in capped]
     return {
@@ -124,26 +124,28 @@ def _cap(name: str, where: Section) -> Section:
 def access_control(fleet: Enrolment) -> Section:
     """Return the access list of all routers."""
     rules = [
-        _rule("everything", ("ingress", "egress"), MESSAGES, [EVERYTHING]),
-        _rule("private", ("ingress", "egress"), MESSAGES, keys.private_keys("*"))
+        _allow_rule("everything", ("ingress", "egress"), MESSAGES, [EVERYTHING]),
+        _allow_rule("private", ("ingress", "egress"), MESSAGES, keys.private_keys("*"))
         | {"permission": "deny"},
-        _rule("ask", ("ingress",), ("declare_subscriber", "query"), PUBLIC),
-        _rule("told", ("egress",), ("put", "reply"), PUBLIC),
+        _allow_rule("ask", ("ingress",), ("declare_subscriber", "query"), PUBLIC),
+        _allow_rule("told", ("egress",), ("put", "reply"), PUBLIC),
         # Declared publishers and queriers send nothing, silently, until they are told that somebody
         # listens.
-        _rule(
+        _allow_rule(
             "listened",
             ("egress",),
             ("declare_subscriber",),
             [f"{keys.ROOT}/{kind}/**" for kind in wire.Kind],
         ),
-        _rule("weather", ("ingress",), ("put",), [WEATHER]),
-        _rule("weathered", ("egress",), ("declare_subscriber",), [WEATHER]),
+        _allow_rule("weather", ("ingress",), ("put",), [WEATHER]),
+        _allow_rule("weathered", ("egress",), ("declare_subscriber",), [WEATHER]),
         # Who serves which region is no secret: else a region without a service looks like one
         # without grip reports.
-        _rule("who", ("ingress",), ("liveliness_query", "declare_liveliness_subscriber"), [SERVED]),
-        _rule("there", ("egress",), ("liveliness_token",), [SERVED]),
-        _rule("answered", ("egress",), ("declare_queryable",), [f"{keys.ROOT}/map/**"]),
+        _allow_rule(
+            "who", ("ingress",), ("liveliness_query", "declare_liveliness_subscriber"), [SERVED]
+        ),
+        _allow_rule("there", ("egress",), ("liveliness_token",), [SERVED]),
+        _allow_rule("answered", ("egress",), ("declare_queryable",), [f"{keys.ROOT}/map/**"]),
     ]
     roles = {
         "routers": list(fleet.routers),
@@ -168,12 +170,14 @@ def access_control(fleet: Enrolment) -> Section:
     if fleet.vehicles:
         policies.append({"rules": ["listened"], "subjects": fleet.vehicles})
     for name in fleet.vehicles:
-        own = _own(name)
+        own = _own_rules(name)
         rules += own
         policies.append({"rules": [rule["id"] for rule in own], "subjects": [name]})
     for name, owned in fleet.owners.items():
         if owned:
-            sees = _sees(name, [key for vehicle in owned for key in keys.private_keys(vehicle)])
+            sees = _subscriber_rules(
+                name, [key for vehicle in owned for key in keys.private_keys(vehicle)]
+            )
             rules += sees
             policies.append({"rules": [rule["id"] for rule in sees], "subjects": [name]})
     return {
@@ -185,31 +189,31 @@ def access_control(fleet: Enrolment) -> Section:
     }
 
 
-def _own(name: str) -> list[Section]:
+def _own_rules(name: str) -> list[Section]:
     return [
-        _rule(
+        _allow_rule(
             f"put/{name}",
             ("ingress",),
             ("put",),
             [*(f"{keys.ROOT}/{kind}/*/*/*/{name}" for kind in wire.Kind), *keys.private_keys(name)],
         ),
         # a declared publisher sends nothing until it is told that its owner listens
-        _rule(f"seen/{name}", ("egress",), ("declare_subscriber",), keys.private_keys(name)),
-        *_sees(name, keys.private_keys(name)),
-        _rule(f"alive/{name}", ("ingress",), ("liveliness_token",), [keys.alive_key(name)]),
-        _rule(f"hear/{name}", ("ingress",), ("declare_subscriber",), [keys.ack_key(name)]),
-        _rule(f"ack/{name}", ("egress",), ("put",), [keys.ack_key(name)]),
+        _allow_rule(f"seen/{name}", ("egress",), ("declare_subscriber",), keys.private_keys(name)),
+        *_subscriber_rules(name, keys.private_keys(name)),
+        _allow_rule(f"alive/{name}", ("ingress",), ("liveliness_token",), [keys.alive_key(name)]),
+        _allow_rule(f"hear/{name}", ("ingress",), ("declare_subscriber",), [keys.ack_key(name)]),
+        _allow_rule(f"ack/{name}", ("egress",), ("put",), [keys.ack_key(name)]),
     ]
 
 
-def _sees(name: str, expressions: list[str]) -> list[Section]:
+def _subscriber_rules(name: str, expressions: list[str]) -> list[Section]:
     return [
-        _rule(f"look/{name}", ("ingress",), ("declare_subscriber",), expressions),
-        _rule(f"private/{name}", ("egress",), ("put",), expressions),
+        _allow_rule(f"look/{name}", ("ingress",), ("declare_subscriber",), expressions),
+        _allow_rule(f"private/{name}", ("egress",), ("put",), expressions),
     ]
 
 
-def _rule(
+def _allow_rule(
     name: str, flows: Sequence[str], messages: Sequence[str], expressions: Sequence[str]
 ) -> Section:
     return {
@@ -256,7 +260,7 @@ def _no_payload() -> Section:
     }
 
 
-def _priority(topic: keys.Topic) -> Section:
+def _topic_priority(topic: keys.Topic) -> Section:
     """Replace the sender's priority by that of the topic."""
     return {
         "id": f"priority-{topic.name}",

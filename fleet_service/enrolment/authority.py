@@ -36,28 +36,28 @@ class KeyPair(NamedTuple):
     key: Key
 
     def write(self, stem: Path) -> None:
-        """Write STEM.pem and STEM.key; `read` detects a pair that was written half."""
+        """Write STEM.pem and STEM.key; `read_pair` detects a pair that was written half."""
         secret = self.key.private_bytes(
             serialization.Encoding.PEM,
             serialization.PrivateFormat.PKCS8,
             serialization.NoEncryption(),
         )
-        write(stem.with_name(stem.name + ".key"), secret, 0o600)
-        write(stem.with_name(stem.name + ".pem"), pem(self.certificate), 0o644)
+        write_atomically(stem.with_name(stem.name + ".key"), secret, 0o600)
+        write_atomically(stem.with_name(stem.name + ".pem"), to_pem(self.certificate), 0o644)
 
 
-def pem(certificate: x509.Certificate) -> bytes:
+def to_pem(certificate: x509.Certificate) -> bytes:
     """Return a certificate as text."""
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
-def write(path: Path, data: bytes, mode: int) -> None:
+def write_atomically(path: Path, data: bytes, mode: int) -> None:
     """Replace a file atomically; its mode is never wider than `mode`."""
     with open_durably(path, mode) as file:
         file.write(data)
 
 
-def read(stem: Path) -> KeyPair | None:
+def read_pair(stem: Path) -> KeyPair | None:
     """Return the pair at STEM.pem and STEM.key; None if it is missing or its halves do not match.
 
     Raises:
@@ -97,17 +97,17 @@ def read_certificate(path: Path) -> x509.Certificate | None:
 def new_authority(days: float, now: datetime) -> KeyPair:
     """Create a self-signed authority that cannot sign other authorities."""
     key = ec.generate_private_key(ec.SECP256R1())
-    name = _subject(f"gripmap authority {now:%Y-%m-%d} {x509.random_serial_number():x}"[:64])
+    name = _subject_name(f"gripmap authority {now:%Y-%m-%d} {x509.random_serial_number():x}"[:64])
     certificate = (
-        _builder(name, name, key, now, now + timedelta(days=days))
+        _certificate_builder(name, name, key, now, now + timedelta(days=days))
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(signs=True), critical=True)
+        .add_extension(_key_usage(signs=True), critical=True)
         .sign(key, hashes.SHA256())
     )
     return KeyPair(certificate, key)
 
 
-def issue(
+def issue_certificate(
     authority: KeyPair, name: str, hosts: Sequence[str], days: float, now: datetime
 ) -> KeyPair:
     """Issue a certificate for a name; with `hosts` it is also valid for a server under them.
@@ -126,11 +126,11 @@ def issue(
     key = ec.generate_private_key(ec.SECP256R1())
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
     certificate = (
-        _builder(_subject(name), authority.certificate.subject, key, now, until)
+        _certificate_builder(_subject_name(name), authority.certificate.subject, key, now, until)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(signs=False), critical=True)
+        .add_extension(_key_usage(signs=False), critical=True)
         .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
-        .add_extension(x509.SubjectAlternativeName(alternatives(name, hosts)), critical=False)
+        .add_extension(x509.SubjectAlternativeName(alternative_names(name, hosts)), critical=False)
         .add_extension(
             x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()),
             critical=False,
@@ -140,7 +140,7 @@ def issue(
     return KeyPair(certificate, key)
 
 
-def alternatives(name: str, hosts: Sequence[str]) -> list[x509.GeneralName]:
+def alternative_names(name: str, hosts: Sequence[str]) -> list[x509.GeneralName]:
     """Return the names and addresses that a certificate is valid for."""
     found: list[x509.GeneralName] = [x509.DNSName(name)]
     for host in hosts:
@@ -164,11 +164,11 @@ def is_signed_by(certificate: x509.Certificate, authority: x509.Certificate) -> 
     return True
 
 
-def _subject(name: str) -> x509.Name:
+def _subject_name(name: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
 
 
-def _builder(
+def _certificate_builder(
     subject: x509.Name, issuer: x509.Name, key: Key, now: datetime, until: datetime
 ) -> x509.CertificateBuilder:
     return (
@@ -183,7 +183,7 @@ def _builder(
     )
 
 
-def _usage(*, signs: bool) -> x509.KeyUsage:
+def _key_usage(*, signs: bool) -> x509.KeyUsage:
     return x509.KeyUsage(
         digital_signature=not signs,
         key_cert_sign=signs,

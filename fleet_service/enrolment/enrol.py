@@ -87,7 +87,7 @@ class Registry:
                 done.kept.append(name)
             else:
                 self._refuse_revoked(name, signer.certificate)
-                ca.issue(signer, name, hosts, self._terms.days, self._now).write(
+                ca.issue_certificate(signer, name, hosts, self._terms.days, self._now).write(
                     self._folder / name
                 )
                 done.made.append(name)
@@ -95,19 +95,19 @@ class Registry:
         self._trust()
         for name in fleet.routers:
             text = json.dumps(router_configuration(fleet, name, self._used_at), indent=1)
-            ca.write(self._folder / f"{name}.json5", text.encode() + b"\n", 0o644)
+            ca.write_atomically(self._folder / f"{name}.json5", text.encode() + b"\n", 0o644)
         return done
 
     def _signer(self, step: Step | None) -> ca.KeyPair:
         current = self._authority / "ca"
         coming = self._authority / "next"
-        if step == "next" and ca.read(coming) is None:
+        if step == "next" and ca.read_pair(coming) is None:
             ca.new_authority(self._terms.ca_days, self._now).write(coming)
         if step == "switch":
             self._switch()
         if step == "drop":
             (self._authority / "old.pem").unlink(missing_ok=True)
-        signer = ca.read(current)
+        signer = ca.read_pair(current)
         if signer is None:
             if (self._authority / "ca.pem").exists():
                 raise InputError(
@@ -121,7 +121,7 @@ class Registry:
 
     def _switch(self) -> None:
         """Let the next authority sign; an interrupted call can be repeated."""
-        following = ca.read(self._authority / "next")
+        following = ca.read_pair(self._authority / "next")
         leaving = ca.read_certificate(self._authority / "ca.pem")
         if following is None or leaving is None:
             raise InputError(
@@ -130,13 +130,13 @@ class Registry:
                 "begin with --ca next, and bring trust.pem to all",
             )
         if leaving != following.certificate:
-            ca.write(self._authority / "old.pem", ca.pem(leaving), 0o644)
+            ca.write_atomically(self._authority / "old.pem", ca.to_pem(leaving), 0o644)
         following.write(self._authority / "ca")
         for ending in (".key", ".pem"):
             (self._authority / f"next{ending}").unlink()
 
     def _good(self, name: str, hosts: list[str], signer: x509.Certificate) -> bool:
-        pair = ca.read(self._folder / name)
+        pair = ca.read_pair(self._folder / name)
         if pair is None:
             return False
         found = pair.certificate
@@ -145,7 +145,7 @@ class Registry:
         return (
             ca.is_signed_by(found, signer)
             and found.not_valid_after_utc > soon
-            and list(names) == ca.alternatives(name, hosts)
+            and list(names) == ca.alternative_names(name, hosts)
         )
 
     def _refuse_revoked(self, name: str, signer: x509.Certificate) -> None:
@@ -210,4 +210,4 @@ class Registry:
             ca.read_certificate(self._authority / f"{name}.pem") for name in ("ca", "next", "old")
         )
         trusted = [certificate for certificate in found if certificate is not None]
-        ca.write(self._folder / "trust.pem", b"".join(map(ca.pem, trusted)), 0o644)
+        ca.write_atomically(self._folder / "trust.pem", b"".join(map(ca.to_pem, trusted)), 0o644)

@@ -58,19 +58,19 @@ class Router(Settings):
     @property
     def endpoints(self) -> list[str]:
         """Return its endpoints for clients, in the order in which they try them."""
-        return [_endpoint(protocol, self.hosts[0], self.port) for protocol in self.protocols]
+        return [_format_endpoint(protocol, self.hosts[0], self.port) for protocol in self.protocols]
 
     @property
     def router_endpoint(self) -> str:
         """Return its endpoint for other routers: TLS, so that caps on QUIC apply to vehicles
         only.
         """
-        return _endpoint("tls", self.hosts[0], self.port)
+        return _format_endpoint("tls", self.hosts[0], self.port)
 
     @property
     def listens(self) -> list[str]:
         """Return its listen addresses."""
-        return [_endpoint(protocol, self.listen, self.port) for protocol in self.protocols]
+        return [_format_endpoint(protocol, self.listen, self.port) for protocol in self.protocols]
 
     @property
     def protocols(self) -> list[str]:
@@ -80,7 +80,7 @@ class Router(Settings):
         return ["quic", "tls"] if self.quic else ["tls"]
 
 
-def _endpoint(protocol: str, host: str, port: int) -> str:
+def _format_endpoint(protocol: str, host: str, port: int) -> str:
     return f"{protocol}/[{host}]:{port}" if ":" in host else f"{protocol}/{host}:{port}"
 
 

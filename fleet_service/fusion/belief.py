@@ -66,7 +66,7 @@ def bias_kernel() -> FloatArray:
     return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
 
 
-def _taps() -> Float32Array:
+def _kernel_diagonals() -> Float32Array:
     """Return B by diagonals, (2·REACH + 1, 32), so that the bins are contiguous in memory."""
     kernel = bias_kernel()
     taps = np.zeros((2 * REACH + 1, _BINS), np.float32)
@@ -77,7 +77,7 @@ def _taps() -> Float32Array:
     return taps
 
 
-_TAPS: Final = _taps()
+_TAPS: Final = _kernel_diagonals()
 
 
 @compiled
@@ -104,7 +104,7 @@ def quantiles(belief: FloatArray, levels: tuple[float, ...]) -> FloatArray:
 
 
 @refcount_free_inlined
-def total(p: Bins) -> float:
+def sum_bins(p: Bins) -> float:
     """Sum of 32 numbers, in eight strands: a single one waits for itself."""
     a = p[0]
     b = p[1]
@@ -127,7 +127,7 @@ def total(p: Bins) -> float:
 
 
 @refcount_free_inlined
-def largest(p: Bins) -> float:
+def largest_bin(p: Bins) -> float:
     """Largest of 32 numbers, in eight strands."""
     a = p[0]
     b = p[1]
@@ -150,7 +150,7 @@ def largest(p: Bins) -> float:
 
 
 @refcount_free_inlined
-def unpack(belief: PackedArray, row: int, p: Bins) -> None:
+def unpack_belief(belief: PackedArray, row: int, p: Bins) -> None:
     """p of a belief at rest."""
     whole = np.uint32(0)
     for i in range(_BINS):
@@ -161,17 +161,17 @@ def unpack(belief: PackedArray, row: int, p: Bins) -> None:
 
 
 @refcount_free_inlined
-def pack(p: Bins, belief: PackedArray, row: int) -> None:
+def pack_belief(p: Bins, belief: PackedArray, row: int) -> None:
     """Put a belief at rest; it need not be normalised. Rounding keeps a rising one rising and a
     uniform one uniform.
     """
-    scale = np.float32(FULL) / np.float32(largest(p))
+    scale = np.float32(FULL) / np.float32(largest_bin(p))
     for i in range(_BINS):
         belief[row, i] = np.uint16(np.float32(p[i]) * scale + np.float32(0.5))
 
 
 @refcount_free_inlined
-def mix(p: Bins, change: float, prior: Float32Array) -> None:
+def mix_prior(p: Bins, change: float, prior: Float32Array) -> None:
     """p ← (1 - h)·p + h·prior, in place."""
     h = np.float32(change)
     for i in range(_BINS):
@@ -197,7 +197,7 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
             for i in range(_BINS):
                 p[i] += share * ((padded[i] - padded[i + 1]) + (padded[i + 2] - padded[i + 1]))
     if change_s > 0.0:
-        mix(p, -math.expm1(-change_s / c.CHANGE_S), prior)
+        mix_prior(p, -math.expm1(-change_s / c.CHANGE_S), prior)
 
 
 @refcount_free_inlined
@@ -207,7 +207,7 @@ def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -
     """
     lacking = c.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / c.CHANGE_S)
     if lacking > 0.0:
-        mix(p, lacking, prior)
+        mix_prior(p, lacking, prior)
 
 
 @refcount_free_inlined
@@ -242,13 +242,13 @@ def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> No
         for j in range(_BINS):
             steps = min(steps, evidence[j])
             out[j] = _LIKELIHOOD[steps]
-    scale = np.float32(_BINS) / np.float32(total(out))
+    scale = np.float32(_BINS) / np.float32(sum_bins(out))
     for i in range(_BINS):
         out[i] *= scale
 
 
 @refcount_free_inlined
-def vote(p: Bins, likelihood: Bins, strength: float) -> None:
+def apply_vote(p: Bins, likelihood: Bins, strength: float) -> None:
     """p ← p·(s·L̃ + 1 - s), in place and not normalised."""
     s = np.float32(strength)
     rest = np.float32(1.0 - strength)
@@ -280,7 +280,7 @@ def mean_of(likelihood: Bins) -> float:
 
 
 @refcount_free_inlined
-def describe(likelihood: Bins, mean: float) -> tuple[float, float]:
+def describe_likelihood(likelihood: Bins, mean: float) -> tuple[float, float]:
     """Standard deviation about `mean`, and P(slippery), of a likelihood of mean 1 against the
     uniform prior.
     """

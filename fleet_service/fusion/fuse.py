@@ -13,18 +13,18 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.belief import SLIPPERY_SHARE, unpack
-from fleet_service.fusion.late import LATE_MOST_NS, delayed, fused_at
-from fleet_service.fusion.neighbours import beliefs
+from fleet_service.fusion.belief import SLIPPERY_SHARE, unpack_belief
+from fleet_service.fusion.late import LATE_MOST_NS, delay_observations, fused_at
+from fleet_service.fusion.neighbours import road_beliefs
 from fleet_service.fusion.observations import Observations, SmallArray
 from fleet_service.fusion.shared import KERNELS, UNKNOWN_SHAPE, kernel_of, shape_class, shared_parts
 from fleet_service.fusion.standing import Standing, first_standing
 from fleet_service.fusion.store.cells import Cells
 from fleet_service.fusion.store.records import CLAIMED, HEEDED, NOBODY, NONE, USED, Rows
-from fleet_service.fusion.store.store import Store, distinct
-from fleet_service.fusion.trust import initial_trust, judged, shape_of
+from fleet_service.fusion.store.store import Store, distinct_values
+from fleet_service.fusion.trust import compute_standing, initial_trust, shape_of
 from fleet_service.fusion.weather import Reports, Weather, no_reports, weather_of
-from fleet_service.fusion.window import Arrivals, Votes, absorb, commit
+from fleet_service.fusion.window import Arrivals, Votes, absorb_votes, commit_windows
 from schemas import grid
 from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
 from schemas.runtime.jit import compiled
@@ -163,12 +163,12 @@ class Fusion:
             late_by = before.late_by
         old = late_by > 0
         if old.any():
-            o = delayed(o, late_by, self._weather)
+            o = delay_observations(o, late_by, self._weather)
         left = late & ~old
         vehicle = self.store.vehicles_of(o.vehicle)
         epoch = o.time // c.EPOCH_NS
         touched = [np.zeros(0, np.int64)]
-        for e in distinct(epoch[~left]).tolist():
+        for e in distinct_values(epoch[~left]).tolist():
             self._advance(e)
             rows = np.flatnonzero((epoch == e) & ~left)
             standing = self._standing(e)
@@ -179,7 +179,7 @@ class Fusion:
                 used[rows] = standing.weights(vehicle[rows])
             else:
                 used[rows] = before.weight[rows]
-            arrivals = _arrivals(o, vehicle, used, old)._replace(limited=limited)
+            arrivals = _make_arrivals(o, vehicle, used, old)._replace(limited=limited)
             slots, left_out = self._absorb(
                 o, rows, arrivals, c.WAITING_MOST if before is None else _ANY
             )
@@ -188,7 +188,7 @@ class Fusion:
             left = left | left_out
         used[left] = 0.0
         late_by = np.where(left, 0, late_by)
-        return Updated(late, late_by, used, distinct(np.concatenate(touched)))
+        return Updated(late, late_by, used, distinct_values(np.concatenate(touched)))
 
     def untouched(self, before: int) -> BoolArray:
         """Slots (size,) of which nobody told anything since `before` [ns]; see `drop`."""
@@ -210,7 +210,7 @@ class Fusion:
         if (
             self.checkpoint is not None
         ):  # all that a belief may still ask for is younger than its last visit
-            self.reports = _recent(self.reports, self._oldest())
+            self.reports = _drop_old_reports(self.reports, self._oldest())
         self._weather = weather_of(self.reports)
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
@@ -226,7 +226,7 @@ class Fusion:
         """P(slippery) of each slot's road at its last observation by its own reports alone,
         (k,).
         """
-        return _slippery(
+        return _slippery_probability(
             self.store.state.live, SLIPPERY_WEIGHTS[shape_class(self._shape.reader)], slots
         )
 
@@ -237,7 +237,9 @@ class Fusion:
         return self._read(KERNELS[shape_class(self._shape.alarm)], slots, self.live.time[slots])
 
     def _read(self, kernels: Float32Array, slots: IntArray, now: IntArray) -> FloatArray:
-        return beliefs(self.store.state.live, self.store.table, self._weather, kernels, slots, now)
+        return road_beliefs(
+            self.store.state.live, self.store.table, self._weather, kernels, slots, now
+        )
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
         """Slot of each cell and sector, -1 where nobody was."""
@@ -294,12 +296,12 @@ class Fusion:
             before = self._epoch * c.EPOCH_NS - self._lateness_ns
             store = self.store
             for due in store.due_windows(before):
-                commit(store.state, self._weather, store.peers, store.names, due, before)
+                commit_windows(store.state, self._weather, store.peers, store.names, due, before)
             store.forget(before // NS)
             last = self.standings[-1]
             joined = store.vehicles - len(last.weight)
             weight = np.append(last.weight, np.full(joined, initial_trust(False), np.float32))
-            standing = judged(store.peers, last._replace(weight=weight), self._epoch)
+            standing = compute_standing(store.peers, last._replace(weight=weight), self._epoch)
             self.standings = [
                 self.standings[0],
                 *self.standings[1:][-self._kept_epochs :],
@@ -316,10 +318,10 @@ class Fusion:
         rows = rows[
             np.argsort(o.time[rows], kind="stable")
         ]  # in the order of time nothing has to be computed anew
-        at, keys, share = _votes(o, rows)
+        at, keys, share = _spread_votes(o, rows)
         slots = self.store.slots_for(keys)
         self.store.reserve(len(slots))
-        return slots, absorb(
+        return slots, absorb_votes(
             self.store.state, self._weather, arrivals, Votes(at, slots, share), most
         )
 
@@ -328,7 +330,9 @@ class Fusion:
         return int(times.min(initial=np.iinfo(np.int64).max, where=times > 0))
 
 
-def _arrivals(o: Observations, vehicle: IntArray, weight: Float32Array, old: BoolArray) -> Arrivals:
+def _make_arrivals(
+    o: Observations, vehicle: IntArray, weight: Float32Array, old: BoolArray
+) -> Arrivals:
     return Arrivals(
         time=o.time,
         number=o.vehicle,
@@ -348,10 +352,10 @@ def _arrivals(o: Observations, vehicle: IntArray, weight: Float32Array, old: Boo
 
 def voted_keys(o: Observations) -> IntArray:
     """Return the keys that observations vote on, with repetitions."""
-    return _votes(o, np.arange(len(o.time)))[1]
+    return _spread_votes(o, np.arange(len(o.time)))[1]
 
 
-def _votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
+def _spread_votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
     """Votes of some observations: row, key and share; those of other cells and of a second
     sector too; by time.
     """
@@ -379,17 +383,17 @@ def _votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32
     )
 
 
-def _recent(reports: Reports, oldest: int) -> Reports:
+def _drop_old_reports(reports: Reports, oldest: int) -> Reports:
     """Without those that ended before `oldest` [ns]."""
     return reports.take(reports.time >= oldest - 4 * 3600 * NS)
 
 
 @compiled
-def _slippery(live: Rows, weights: FloatArray, slots: IntArray) -> FloatArray:
+def _slippery_probability(live: Rows, weights: FloatArray, slots: IntArray) -> FloatArray:
     p = np.empty(live.belief.shape[1])
     out = np.empty(len(slots))
     for k in range(len(slots)):
-        unpack(live.belief, slots[k], p)
+        unpack_belief(live.belief, slots[k], p)
         weight = weights[kernel_of(live.cells, slots[k])]
         slippery = 0.0
         whole = 0.0

@@ -76,7 +76,7 @@ def image_of(fusion: Fusion) -> Image:
         "peers": store.peers[: store.vehicles],
         "names": store.names[: store.vehicles],
     }
-    image: Image = {name: {"bytes": _bytes(array)} for name, array in records.items()}
+    image: Image = {name: {"bytes": _record_bytes(array)} for name, array in records.items()}
     image["belief"] = {"bins": live.belief[: store.size].reshape(-1)}
     image["base_belief"] = {"bins": base.belief.reshape(-1)}
     image["free_windows"] = {"row": state.free_windows[: int(state.used[FREE_WINDOWS])]}
@@ -107,17 +107,23 @@ def image_of(fusion: Fusion) -> Image:
 def fusion_of(image: Image, lateness_s: float) -> Fusion:
     """The fusion of an image, with the lateness that it had."""
     fusion = Fusion(lateness_s)
-    records = {name: _records(image[name]["bytes"], kind) for name, kind in _RECORDS.items()}
+    records = {
+        name: _restore_records(image[name]["bytes"], kind) for name, kind in _RECORDS.items()
+    }
     size, vehicles, hour, epoch = image["used"]["more"].tolist()
     state = State(
-        live=Rows(_beliefs(image["belief"]["bins"]), records["cells"], records["reporters"]),
+        live=Rows(
+            _restore_beliefs(image["belief"]["bins"]), records["cells"], records["reporters"]
+        ),
         base=Rows(
-            _beliefs(image["base_belief"]["bins"]), records["base_cells"], records["base_sources"]
+            _restore_beliefs(image["base_belief"]["bins"]),
+            records["base_cells"],
+            records["base_sources"],
         ),
         windows=records["windows"],
-        free_windows=_padded(image["free_windows"]["row"], len(records["windows"])),
+        free_windows=_pad_rows(image["free_windows"]["row"], len(records["windows"])),
         entries=records["entries"],
-        free_entries=_padded(image["free_entries"]["row"], len(records["entries"])),
+        free_entries=_pad_rows(image["free_entries"]["row"], len(records["entries"])),
         pairs=records["pairs"],
         used=image["used"]["count"].copy(),
     )
@@ -134,23 +140,23 @@ def fusion_of(image: Image, lateness_s: float) -> Fusion:
     return fusion
 
 
-def _bytes(records: RecordArray) -> ByteArray:
+def _record_bytes(records: RecordArray) -> ByteArray:
     return records.view(np.uint8) if len(records) else np.zeros(0, np.uint8)
 
 
-def _records(stored: ByteArray, kind: np.dtype[Any]) -> RecordArray:
+def _restore_records(stored: ByteArray, kind: np.dtype[Any]) -> RecordArray:
     out = rows_of_lines(len(stored) // kind.itemsize, kind)
     out[:] = stored.view(kind)
     return out
 
 
-def _beliefs(bins: PackedArray) -> PackedArray:
+def _restore_beliefs(bins: PackedArray) -> PackedArray:
     out = no_beliefs(len(bins) // mugrid.BINS)
     out.reshape(-1)[:] = bins
     return out
 
 
-def _padded(rows: NDArray[Any], places: int) -> NDArray[Any]:
+def _pad_rows(rows: NDArray[Any], places: int) -> NDArray[Any]:
     out = np.zeros(places, np.int32)
     out[: len(rows)] = rows
     return out

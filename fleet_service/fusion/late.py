@@ -21,9 +21,9 @@ from typing import Final
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.belief import PADDED, PRIOR, forget, largest
+from fleet_service.fusion.belief import PADDED, PRIOR, forget, largest_bin
 from fleet_service.fusion.observations import Observations
-from fleet_service.fusion.weather import Weather, aged
+from fleet_service.fusion.weather import Weather, road_time
 from schemas import grid, mugrid
 from schemas.numeric import ByteArray, IntArray
 from schemas.runtime.jit import compiled
@@ -42,7 +42,7 @@ def fused_at(time: IntArray, checkpoint: int) -> IntArray:
     return np.asarray(checkpoint + age // (LATE_MOST_NS // _PLACES_NS) // 1000 * 1000)
 
 
-def delayed(o: Observations, late_by: IntArray, weather: Weather) -> Observations:
+def delay_observations(o: Observations, late_by: IntArray, weather: Weather) -> Observations:
     """The observations, those with `late_by` (n,) [ns] above nought moved on by it."""
     rows = np.flatnonzero(late_by)
     evidence = o.evidence.copy()
@@ -73,9 +73,9 @@ def aged_evidence(
             whole += likelihood[i]
         for i in range(mugrid.BINS):
             likelihood[i] /= whole
-        drift, change, _ = aged(weather, key[n], begin[n], end[n])
+        drift, change, _ = road_time(weather, key[n], begin[n], end[n])
         forget(likelihood, drift, change, PRIOR, padded)
-        most = largest(likelihood)
+        most = largest_bin(likelihood)
         for i in range(mugrid.BINS):
             steps = mugrid.STEPS_PER_NAT * np.log(most / max(likelihood[i], np.float32(1e-30)))
             out[n, i] = np.uint8(min(steps + 0.5, float(_FLOOR)))

@@ -31,7 +31,7 @@ _LESS: Final = 0.5 * c.UTILISED_STD
 _USED_STEP: Final = 0.005
 
 
-def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> Evidence:
+def make_evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> Evidence:
     """Log-likelihood of each visit in steps of 1/16 nat below its maximum, (n, 32), and the values
     as reported.
 
@@ -40,13 +40,13 @@ def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) ->
             NaN where absent.
         with_likelihood: (n,) whether the sender gave a likelihood.
 
-    A likelihood that falls towards the upper end is a value, any other a bound; see `levelled`. A
+    A likelihood that falls towards the upper end is a value, any other a bound; see `level_above_used`. A
     posterior counts as a value where `mu_utilised ≥ 0.6·mu`; otherwise, and where there is no `mu`,
     only "at least mu_utilised" remains. A visit with none of them is flat.
     """
     sent = columns["log_likelihood"]
     steps, reported = as_reported(sent)
-    out = supported(levelled(steps, columns["mu_utilised"]), columns["mu_utilised"])
+    out = bound_by_used(level_above_used(steps, columns["mu_utilised"]), columns["mu_utilised"])
     rest = np.flatnonzero(~with_likelihood)
     if len(rest):
         mu, lower, upper, used = (
@@ -54,13 +54,15 @@ def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) ->
             for n in ("mu", "mu_lower", "mu_upper", "mu_utilised")
         )
         value = used >= c.VALUE_UTILISATION * mu  # False where either is NaN
-        log_likelihood = np.where(value[:, None], posterior(mu, lower, upper), at_least(used))
+        log_likelihood = np.where(
+            value[:, None], interval_likelihood(mu, lower, upper), at_least(used)
+        )
         steps, reported[rest] = as_reported(mugrid.encode_log_likelihood(log_likelihood))
-        out[rest] = supported(levelled(steps, used), used)
+        out[rest] = bound_by_used(level_above_used(steps, used), used)
     return Evidence(out, reported)
 
 
-def supported(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
+def bound_by_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     """Return likelihoods (n, 32) that claim at least as much as the grip used (n,) supports: in
     each bin the more informative of the two.
 
@@ -69,19 +71,19 @@ def supported(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     multiplied.
     """
     out = steps.copy()
-    _support(out, np.asarray(used, np.float64), _bounds())
+    _bound_rows(out, np.asarray(used, np.float64), _levelled_bounds())
     return out
 
 
 @cache
-def _bounds() -> ByteArray:
+def _levelled_bounds() -> ByteArray:
     """Levelled bounds in steps, of uses _USED_STEP apart, as far as one is believed."""
     used = np.arange(0.0, c.UTILISED_MOST + 0.5 * _USED_STEP, _USED_STEP)
-    return levelled(mugrid.encode_log_likelihood(at_least(used)), used)
+    return level_above_used(mugrid.encode_log_likelihood(at_least(used)), used)
 
 
 @compiled
-def _support(steps: ByteArray, used: FloatArray, bounds: ByteArray) -> None:
+def _bound_rows(steps: ByteArray, used: FloatArray, bounds: ByteArray) -> None:
     for n in range(len(steps)):
         if math.isnan(used[n]):
             continue
@@ -94,7 +96,7 @@ def _support(steps: ByteArray, used: FloatArray, bounds: ByteArray) -> None:
             steps[n, i] -= least
 
 
-def levelled(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
+def level_above_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     """Likelihoods (n, 32) that claim no more than the grip used (n,) supports.
 
     A bound is made flat from the bin on that holds `used` less half its own error: a hundred of
@@ -102,12 +104,12 @@ def levelled(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     everything where `used` is NaN.
     """
     out = steps.copy()
-    _level(out, np.asarray(used, np.float64))
+    _level_rows(out, np.asarray(used, np.float64))
     return out
 
 
 @compiled
-def _level(steps: ByteArray, used: FloatArray) -> None:
+def _level_rows(steps: ByteArray, used: FloatArray) -> None:
     for n in range(len(steps)):
         if math.isnan(used[n]) or steps[n, mugrid.BINS - 1] >= c.VALUE_DROP_STEPS:
             continue
@@ -126,16 +128,16 @@ def at_least(used: FloatArray) -> FloatArray:
     return log_distribution((mugrid.CENTRES - known_use) / std)
 
 
-def posterior(mu: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
+def interval_likelihood(mu: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
     """ℓ of a median with 5 % and 95 % bounds: a normal with one standard deviation to each side.
     (n, 32).
     """
-    below = _std(mu - lower)[:, None]
-    above = _std(upper - mu)[:, None]
+    below = _side_std(mu - lower)[:, None]
+    above = _side_std(upper - mu)[:, None]
     distance = mugrid.CENTRES - np.nan_to_num(mu)[:, None]
     return -0.5 * np.square(distance / np.where(distance < 0, below, above))
 
 
-def _std(to_bound: FloatArray) -> FloatArray:
+def _side_std(to_bound: FloatArray) -> FloatArray:
     std = np.nan_to_num(to_bound / Z_95, nan=c.POSTERIOR_STD)
     return np.maximum(std, c.POSTERIOR_STD_LEAST)

@@ -40,12 +40,12 @@ from typing import Final
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.belief import SLIPPERY_SHARE, Bins, forget, unpack
+from fleet_service.fusion.belief import SLIPPERY_SHARE, Bins, forget, unpack_belief
 from fleet_service.fusion.shared import read_road
 from fleet_service.fusion.store.records import AGED, NONE, Rows
-from fleet_service.fusion.store.table import find
+from fleet_service.fusion.store.table import find_row
 from fleet_service.fusion.votes import PADDED, SCRATCH, P
-from fleet_service.fusion.weather import Weather, aged
+from fleet_service.fusion.weather import Weather, road_time
 from schemas import grid, mugrid
 from schemas.numeric import Float32Array, FloatArray, IntArray
 from schemas.runtime.jit import compiled, refcount_free, refcount_free_inlined
@@ -63,7 +63,7 @@ _EAST, _NORTH, _WEST, _SOUTH = range(grid.SECTORS)
 
 
 @refcount_free_inlined
-def stepped(cell: int, heading: int) -> int:
+def next_cell(cell: int, heading: int) -> int:
     """The next cell in a sector's direction; the date line is no border."""
     x = cell & _X
     y = cell & _Y
@@ -79,7 +79,7 @@ def stepped(cell: int, heading: int) -> int:
 
 
 @compiled
-def beliefs(
+def road_beliefs(
     live: Rows,
     table: IntArray,
     weather: Weather,
@@ -96,14 +96,14 @@ def beliefs(
     message = np.empty(_BINS)
     road = np.empty(_BINS)
     for k in range(len(slots)):
-        prior = _aged(live, weather, slots[k], now[k], scratch)
+        prior = _age_belief(live, weather, slots[k], now[k], scratch)
         p[:] = scratch[P, :_BINS]
         read_road(kernels, live.cells, slots[k], p, out[k])
-        slippery = _slippery(out[k])
+        slippery = _slippery_probability(out[k])
         if slippery < c.DECIDED or slippery > 1.0 - c.DECIDED:
             continue
         informative = False
-        unknown = _slippery(weather.prior[prior])
+        unknown = _slippery_probability(weather.prior[prior])
         key = live.cells[slots[k]].key
         cell = key // grid.SECTORS
         sector = key % grid.SECTORS
@@ -118,23 +118,25 @@ def beliefs(
                     if step > 3:
                         break
                     there = (
-                        cell if step == 1 else stepped(cell, (sector + 2 * step - 3) % grid.SECTORS)
+                        cell
+                        if step == 1
+                        else next_cell(cell, (sector + 2 * step - 3) % grid.SECTORS)
                     )
                 else:
-                    there = stepped(there, sector if side == 0 else back)
-                row = find(
+                    there = next_cell(there, sector if side == 0 else back)
+                row = find_row(
                     table, live.cells, there * grid.SECTORS + (back if side == 2 else sector)
                 )
                 if row == NONE or live.cells[row].vehicles == 0:
                     continue
-                kept = _kept(live, row)
+                kept = _stored_slippery(live, row)
                 if kept < _ASKED:
                     if side < 2 and kept < c.NEIGHBOUR_GRIP:
                         break
                     continue
-                _aged(live, weather, row, now[k], scratch)
+                _age_belief(live, weather, row, now[k], scratch)
                 read_road(kernels, live.cells, row, scratch[P], road)
-                slippery = _slippery(road)
+                slippery = _slippery_probability(road)
                 weight = _KEPT[1 if side == 2 else step] * (slippery - unknown) / (1.0 - unknown)
                 if weight > most:
                     most = weight
@@ -150,7 +152,7 @@ def beliefs(
 
 
 @refcount_free_inlined
-def _slippery(road: Bins) -> float:
+def _slippery_probability(road: Bins) -> float:
     whole = 0.0
     for i in range(_BINS):
         whole += SLIPPERY_SHARE[i] * road[i]
@@ -158,7 +160,7 @@ def _slippery(road: Bins) -> float:
 
 
 @refcount_free_inlined
-def _kept(live: Rows, row: int) -> float:
+def _stored_slippery(live: Rows, row: int) -> float:
     """P(slippery) of a belief at rest, which costs a tenth of reading it."""
     whole = 0.0
     slippery = 0.0
@@ -169,13 +171,13 @@ def _kept(live: Rows, row: int) -> float:
 
 
 @refcount_free
-def _aged(live: Rows, weather: Weather, slot: int, now: int, scratch: Bins) -> int:
+def _age_belief(live: Rows, weather: Weather, slot: int, now: int, scratch: Bins) -> int:
     """Age a slot's belief to `now` [ns] into the scratch; return the row of its region's prior."""
     cells = live.cells
     p = scratch[P]
-    unpack(live.belief, slot, p)
+    unpack_belief(live.belief, slot, p)
     seconds = max((now - cells[slot].time) * 1e-9, 0.0) + cells[slot].aged / AGED
-    drift, change, prior = aged(weather, cells[slot].key, now - int(seconds * NS), now)
+    drift, change, prior = road_time(weather, cells[slot].key, now - int(seconds * NS), now)
     if now > cells[slot].time:
         forget(p, drift, change, weather.prior[prior], scratch[PADDED])
     return int(prior)

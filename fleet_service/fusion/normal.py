@@ -17,9 +17,9 @@ _FAR: Final = (
 )  # below, the logarithm's series is better than a part in 10⁶, and its argument may not be held
 
 
-def distribution(x: FloatArray) -> FloatArray:
+def normal_cdf(x: FloatArray) -> FloatArray:
     """Φ(x)."""
-    return _distribution(np.ravel(x)).reshape(x.shape)
+    return _normal_cdf(np.ravel(x)).reshape(x.shape)
 
 
 def log_distribution(x: FloatArray) -> FloatArray:
@@ -28,7 +28,7 @@ def log_distribution(x: FloatArray) -> FloatArray:
 
 
 @compiled
-def _distribution(x: FloatArray) -> FloatArray:
+def _normal_cdf(x: FloatArray) -> FloatArray:
     out = np.empty(len(x))
     for i in range(len(x)):
         out[i] = 0.5 * math.erfc(-x[i] * math.sqrt(0.5))

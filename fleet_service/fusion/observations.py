@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.likelihoods import evidence
+from fleet_service.fusion.likelihoods import make_evidence
 from fleet_service.fusion.shared import manoeuvre_of
 from fleet_service.fusion.space import other_cells
 from schemas import grid
@@ -37,9 +37,9 @@ class Observations:
         cell, sector, second: where; `second` is a sector whose edge is near, or -1.
         vehicle, boot, region, sequence: identity; `vehicle` is a number that stands for the
             vehicle, `sequence` counts rows in the stream of (vehicle, boot, region).
-        evidence: (n, 32) log-likelihood in steps, see `likelihoods.evidence`.
+        evidence: (n, 32) log-likelihood in steps, see `likelihoods.make_evidence`.
         reported: (n, 3) mean, standard deviation and P(slippery) of a value as it was reported, NaN
-            to read them in `evidence`.
+            to read them in `make_evidence`.
         used: (n,) grip used; below EXCITED_SHARE of a value where the sender does not report it.
         manoeuvre: (n,) how it was used, see `shared.manoeuvre_of`.
         limited: (n,) True if a slip controller intervened at so little grip used that only slippery
@@ -82,7 +82,7 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
     """
     _, second = grid.sectors_touched(np.nan_to_num(columns["yaw"]))
     first = columns["sector"].astype(np.int8)
-    steps, reported = evidence(columns, columns["with_likelihood"])
+    steps, reported = make_evidence(columns, columns["with_likelihood"])
     used = np.where(
         np.isnan(columns["mu_utilised"]), UNTOLD_SHARE * reported[:, 0], columns["mu_utilised"]
     )

@@ -34,12 +34,12 @@ def as_reported(steps: NDArray[Any]) -> Evidence:
     """Likelihoods (n, 32) in steps, brought to maximum 0, and the values among them described."""
     out = steps.astype(np.uint8)
     reported = np.full((len(steps), 3), np.nan, np.float32)
-    _describe(out, reported)
+    _describe_rows(out, reported)
     return Evidence(out, reported)
 
 
 @compiled
-def _describe(steps: ByteArray, reported: Float32Array) -> None:
+def _describe_rows(steps: ByteArray, reported: Float32Array) -> None:
     likelihood = np.empty(mugrid.BINS)
     for n in range(len(steps)):
         least = np.uint8(255)

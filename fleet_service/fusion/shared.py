@@ -132,7 +132,7 @@ def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
     return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
 
 
-def _table(slope: float) -> Float32Array:
+def _kernel_table(slope: float) -> Float32Array:
     """Return the kernels transposed, so that the bins of a road are contiguous in memory;
     `kernel_of` finds them, (…, 32, 32).
     """
@@ -146,7 +146,7 @@ def _table(slope: float) -> Float32Array:
 
 
 # By the fleet's shape; handed to kernels, since a global of this size is not kept in their cache.
-KERNELS: Final = tuple(_table(slope) for slope in SHAPES)
+KERNELS: Final = tuple(_kernel_table(slope) for slope in SHAPES)
 
 
 def shape_class(slope: float) -> int:
@@ -221,20 +221,20 @@ def note_value(
         if cells[row].manoeuvres[k] > cells[row].manoeuvres[largest]:
             largest = k
     part = weight / (before / WEIGHT + weight)
-    cells[row].used = _mean(cells[row].used, used * USED, part)
-    cells[row].shared = _mean(cells[row].shared, shared * SHARED, part)
+    cells[row].used = _moving_mean(cells[row].used, used * USED, part)
+    cells[row].shared = _moving_mean(cells[row].shared, shared * SHARED, part)
     kind = int(entries[entry].manoeuvre) if entries[entry].manoeuvre >= 0 else largest
     added = cells[row].manoeuvres[kind] + weight * WEIGHT + 0.5
     cells[row].manoeuvres[kind] = np.uint8(min(max(added, 1.0), _MOST))
 
 
 @refcount_free_inlined
-def _mean(before: int, new: float, part: float) -> np.uint8:
+def _moving_mean(before: int, new: float, part: float) -> np.uint8:
     return np.uint8(min(before + part * (new - before) + 0.5, _MOST))
 
 
 @refcount_free
-def fade(cells: RecordArray, row: int, begin: int, end: int) -> None:
+def fade_weights(cells: RecordArray, row: int, begin: int, end: int) -> None:
     """Let the weights of the manoeuvres, and the votes of those that are not trusted, fade
     between two times [ns].
     """

@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.normal import distribution
+from fleet_service.fusion.normal import normal_cdf
 from schemas import grid
 from schemas.numeric import Float32Array, FloatArray, IntArray
 from schemas.thresholds import EARTH_RADIUS_M
@@ -42,7 +42,7 @@ def other_cells(
     sine = np.sin(np.nan_to_num(yaw))
     steep = np.maximum(np.abs(cosine), np.abs(sine))
     side = _EARTH_M / (1 << grid.CELL_ZOOM) * np.cos(np.radians(np.clip(latitude, -85.0, 85.0)))
-    share = shares(np.nan_to_num(position_std), side / steep)
+    share = cell_shares(np.nan_to_num(position_std), side / steep)
     x, y = grid.deinterleave(cell)
     n = 1 << grid.CELL_ZOOM
     ahead = np.rint(_STEPS * (cosine / steep)[:, None]), np.rint(_STEPS * (-sine / steep)[:, None])
@@ -54,13 +54,18 @@ def other_cells(
     return np.where(good, other, -1), np.where(good, share, 0.0).astype(np.float32)
 
 
-def shares(std: FloatArray, length: FloatArray) -> FloatArray:
+def cell_shares(std: FloatArray, length: FloatArray) -> FloatArray:
     """π of the cells behind and ahead, (n, 2·SPREAD_CELLS), for σ and w (n,)."""
     ratio = (length / np.maximum(std, 1e-6 * length))[:, None]
     return np.asarray(
-        (_g((_STEPS + 1) * ratio) - 2.0 * _g(_STEPS * ratio) + _g((_STEPS - 1) * ratio)) / ratio
+        (
+            _cdf_integral((_STEPS + 1) * ratio)
+            - 2.0 * _cdf_integral(_STEPS * ratio)
+            + _cdf_integral((_STEPS - 1) * ratio)
+        )
+        / ratio
     )
 
 
-def _g(x: FloatArray) -> FloatArray:
-    return np.asarray(x * distribution(x) + np.exp(-0.5 * np.square(x)) / np.sqrt(2.0 * np.pi))
+def _cdf_integral(x: FloatArray) -> FloatArray:
+    return np.asarray(x * normal_cdf(x) + np.exp(-0.5 * np.square(x)) / np.sqrt(2.0 * np.pi))

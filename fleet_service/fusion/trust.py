@@ -41,7 +41,7 @@ _LEAST_VARIANCE: Final = 1e-4  # nobody reads to a hundredth
 
 
 @refcount_free
-def compare(
+def compare_reports(
     reporters: RecordArray,
     row: int,
     peers: RecordArray,
@@ -90,8 +90,12 @@ def compare(
         deviations = abs(mean - here.mean[k]) / spread
         agreement = (c.PEERS_DISAGREE - deviations) / (c.PEERS_DISAGREE - c.PEERS_AGREE)
         agreement = min(max(agreement, 0.0), 1.0)
-        _note(peers, vehicle, other, _rank(names[vehicle].key, names[other].key), agreement)
-        _note(peers, other, vehicle, _rank(names[other].key, names[vehicle].key), agreement)
+        _record_meeting(
+            peers, vehicle, other, _pair_rank(names[vehicle].key, names[other].key), agreement
+        )
+        _record_meeting(
+            peers, other, vehicle, _pair_rank(names[other].key, names[vehicle].key), agreement
+        )
     reporter[place] = vehicle
     reported[place] = now
     here.mean[place] = mean
@@ -156,7 +160,7 @@ def _own_variance(mean: float, std: float) -> float:
 
 
 @refcount_free
-def _rank(vehicle: int, other: int) -> int:
+def _pair_rank(vehicle: int, other: int) -> int:
     """A fixed random number of a pair, by their own numbers and not by the order in which they
     came.
 
@@ -171,7 +175,9 @@ def _rank(vehicle: int, other: int) -> int:
 
 
 @refcount_free
-def _note(peers: RecordArray, vehicle: int, other: int, rank: int, agreement: float) -> None:
+def _record_meeting(
+    peers: RecordArray, vehicle: int, other: int, rank: int, agreement: float
+) -> None:
     this = peers[vehicle]
     place = rank % c.PEERS
     known = this.other[place]
@@ -189,19 +195,19 @@ def _note(peers: RecordArray, vehicle: int, other: int, rank: int, agreement: fl
         this.met[place] *= 0.5
 
 
-def judged(peers: RecordArray, before: Standing, epoch: int) -> Standing:
+def compute_standing(peers: RecordArray, before: Standing, epoch: int) -> Standing:
     """Return the standing of the vehicles (V,) from an epoch on, from their meetings and the
     standing of the vehicles they met, `before`.
 
     In an established service, a vehicle that has met few trusted vehicles is a newcomer.
     """
     weight = np.empty(len(before.weight), np.float32)
-    established = _weigh(peers, before.weight, weight)
+    established = _update_weights(peers, before.weight, weight)
     return Standing(epoch, weight, initial_trust(established), heeded_flags(peers[: len(weight)]))
 
 
 @compiled
-def _weigh(peers: RecordArray, before: Float32Array, out: Float32Array) -> bool:
+def _update_weights(peers: RecordArray, before: Float32Array, out: Float32Array) -> bool:
     """Fill the weights of vehicles (V,), from those `before`; returns whether the service is
     established.
     """
@@ -219,7 +225,7 @@ def _weigh(peers: RecordArray, before: Float32Array, out: Float32Array) -> bool:
                 heard += weight
                 agreed += weight * float(this.agreed[k]) / max(met, 1.0)
         mean = (c.TRUST_PRIOR * c.TRUST_PRIOR_PEERS + agreed) / (c.TRUST_PRIOR_PEERS + heard)
-        known[v], trust = heard >= c.ESTABLISHED_PEERS, _scaled(mean)
+        known[v], trust = heard >= c.ESTABLISHED_PEERS, _scale_trust(mean)
         if known[v]:
             trusted += trust >= c.SOURCE_TRUST
             trust *= max(min(mean, 1.0 - c.CONTAMINATION_LEAST) / (1.0 - c.CONTAMINATION), 1.0)
@@ -263,10 +269,10 @@ def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:
 
 def initial_trust(established: bool) -> float:
     """Weight of a vehicle that was compared with nobody yet."""
-    weight = _scaled(c.TRUST_PRIOR)
+    weight = _scale_trust(c.TRUST_PRIOR)
     return min(weight, c.NEWCOMER) if established else weight
 
 
 @compiled
-def _scaled(mean: float) -> float:
+def _scale_trust(mean: float) -> float:
     return min(max((mean - c.TRUST_NONE) / (c.TRUST_FULL - c.TRUST_NONE), 0.0), 1.0)

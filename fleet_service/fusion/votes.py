@@ -13,19 +13,19 @@ from fleet_service.fusion.belief import (
     REACH,
     VALUE,
     Bins,
+    apply_vote,
     convolve_bias,
-    describe,
+    describe_likelihood,
     ensure_change,
     forget,
     kind_of,
     mean_of,
-    mix,
-    pack,
-    unpack,
-    vote,
+    mix_prior,
+    pack_belief,
+    unpack_belief,
 )
-from fleet_service.fusion.shared import UNKNOWN_SHAPE, fade, note_value
-from fleet_service.fusion.store.pairs import returning
+from fleet_service.fusion.shared import UNKNOWN_SHAPE, fade_weights, note_value
+from fleet_service.fusion.store.pairs import returning_bit
 from fleet_service.fusion.store.records import (
     AGED,
     FINE,
@@ -38,7 +38,7 @@ from fleet_service.fusion.store.records import (
     USED,
     Rows,
 )
-from fleet_service.fusion.weather import Weather, aged
+from fleet_service.fusion.weather import Weather, road_time
 from schemas import mugrid
 from schemas.numeric import Float32Array
 from schemas.runtime.jit import refcount_free, refcount_free_inlined
@@ -83,7 +83,7 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
     entries[entry].mean = mean
     entries[entry].slippery = 0.0 if mean >= _GRIP_MEAN else _NEITHER
     if kind == VALUE:
-        std, slippery = describe(likelihood, mean)
+        std, slippery = describe_likelihood(likelihood, mean)
         entries[entry].std = std
         entries[entry].slippery = slippery
 
@@ -91,20 +91,20 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
 @refcount_free
 def load_likelihood(entries: RecordArray, entry: int, scratch: Bins) -> None:
     """The likelihood of an entry into the scratch again."""
-    _clear(scratch)
+    _clear_padding(scratch)
     this = entries[entry]
     convolve_bias(this.evidence, int(this.kind), scratch[PADDED], scratch[LIKELIHOOD])
 
 
 @refcount_free_inlined
-def _clear(scratch: Bins) -> None:
+def _clear_padding(scratch: Bins) -> None:
     for i in range(REACH):
         scratch[PADDED, i] = 0.0
         scratch[PADDED, SCRATCH - 1 - i] = 0.0
 
 
 @refcount_free_inlined
-def discount(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
+def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
     """Compute how much of a vote is new, from earlier reports of its vehicle here: in the window,
     or before the checkpoint.
 
@@ -124,9 +124,9 @@ def discount(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
         earlier = entries[earlier].before
     if earlier != NONE:
         time = entries[earlier].time // NS
-        mean = _coarse(entries[earlier].last_mean)
-        std = _coarse(entries[earlier].last_std)
-        spent = _coarse(entries[earlier].spent)
+        mean = _from_parts(entries[earlier].last_mean)
+        std = _from_parts(entries[earlier].last_std)
+        spent = _from_parts(entries[earlier].spent)
     else:
         seen = (
             seen
@@ -134,9 +134,9 @@ def discount(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
             or pairs[pair].time[VALUE] >= max(least, 1)
         )
         time = int(pairs[pair].time[kind])
-        mean = _coarse(pairs[pair].mean[kind])
-        std = _coarse(pairs[pair].std)
-        spent = _coarse(pairs[pair].spent[kind])
+        mean = _from_parts(pairs[pair].mean[kind])
+        std = _from_parts(pairs[pair].std)
+        spent = _from_parts(pairs[pair].spent[kind])
     new_mean = entries[entry].mean
     new_std = max(entries[entry].std, np.float32(c.NOVELTY_STD))
     power = np.float32(1.0)
@@ -145,21 +145,21 @@ def discount(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
         spent *= np.float32(1.0 - renewed)
         novelty = 0.0
         if now - time >= c.REVISIT_S:
-            novelty = _novelty(kind, float(mean), float(std), float(new_mean), float(new_std))
+            novelty = _novel_share(kind, float(mean), float(std), float(new_mean), float(new_std))
         power = np.float32(max(renewed, min(novelty, c.VOTES - float(spent))))
         new_mean = mean + power * (new_mean - mean)
         new_std = std + power * (new_std - std)
     else:
         spent = np.float32(0.0)
     entries[entry].power = power
-    entries[entry].last_mean = _fine(new_mean)
-    entries[entry].last_std = _fine(new_std)
-    entries[entry].spent = _fine(spent + power)
+    entries[entry].last_mean = _to_parts(new_mean)
+    entries[entry].last_std = _to_parts(new_std)
+    entries[entry].spent = _to_parts(spent + power)
     entries[entry].fresh = 0 if seen else 1
 
 
 @refcount_free_inlined
-def _fine(number: float | np.floating[Any]) -> np.uint16:
+def _to_parts(number: float | np.floating[Any]) -> np.uint16:
     """A number in parts of 1/FINE."""
     return np.uint16(
         min(max(number * np.float32(FINE) + np.float32(0.5), np.float32(0.0)), np.float32(65535.0))
@@ -167,13 +167,13 @@ def _fine(number: float | np.floating[Any]) -> np.uint16:
 
 
 @refcount_free_inlined
-def _coarse(parts: int) -> np.float32:
+def _from_parts(parts: int) -> np.float32:
     """The number of so many parts."""
     return np.float32(parts) * np.float32(1.0 / FINE)
 
 
 @refcount_free_inlined
-def _novelty(kind: int, mean: float, std: float, new_mean: float, new_std: float) -> float:
+def _novel_share(kind: int, mean: float, std: float, new_mean: float, new_std: float) -> float:
     if kind == BOUND:  # the mean of "at least u" against the uniform prior moves by half of u
         share = 2.0 * (new_mean - mean) / c.NOVELTY_UTILISED
     else:
@@ -203,22 +203,22 @@ def update(
     p = scratch[P]
     seconds = 0.0
     passed = 0.0
-    unpack(belief, row, p)
+    unpack_belief(belief, row, p)
     new = cells[row].time == 0
     if new:
         cells[row].first = time
-        _, _, prior = aged(weather, key, time, time)
+        _, _, prior = road_time(weather, key, time, time)
         if prior:
-            mix(p, 1.0, weather.prior[prior])
+            mix_prior(p, 1.0, weather.prior[prior])
     else:
         passed = (time - cells[row].time) * 1e-9
         seconds = max(passed, 0.0) + cells[row].aged / AGED
-        fade(cells, row, cells[row].time, time)
+        fade_weights(cells, row, cells[row].time, time)
     change = 0.0
     prior = 0
-    cells[row].aged = _aged(seconds)
+    cells[row].aged = _remembered_parts(seconds)
     if seconds >= c.FORGET_S:
-        drift, change, prior = aged(weather, key, time - int(seconds * NS), time)
+        drift, change, prior = road_time(weather, key, time - int(seconds * NS), time)
         forget(p, drift, change, weather.prior[prior], scratch[PADDED])
         cells[row].aged = np.uint16(0)
     weight = float(entries[entry].weight)
@@ -228,16 +228,16 @@ def update(
     if kind == VALUE and not new:
         ensure_change(p, change, min(strength, 1.0), weather.prior[prior])
     if kind == VALUE:
-        vote(
+        apply_vote(
             p,
             scratch[LIKELIHOOD],
             min((1.0 - c.CONTAMINATION) * strength, 1.0 - c.CONTAMINATION_LEAST),
         )
     else:
-        vote(p, scratch[LIKELIHOOD], (1.0 - c.BOUND_CONTAMINATION) * min(strength, 1.0))
-    pack(p, belief, row)
+        apply_vote(p, scratch[LIKELIHOOD], (1.0 - c.BOUND_CONTAMINATION) * min(strength, 1.0))
+    pack_belief(p, belief, row)
     cells[row].time = time
-    _count(cells, row, entries, entry)
+    _count_visit(cells, row, entries, entry)
     if kind == VALUE:
         cells[row].values += np.float32(strength)
         if strength > 0.0:
@@ -250,7 +250,7 @@ def update(
 
 
 @refcount_free_inlined
-def _aged(seconds: float) -> np.uint16:
+def _remembered_parts(seconds: float) -> np.uint16:
     """Time that is not forgotten yet in parts of 1/AGED; it counts below FORGET_S only."""
     return np.uint16(min(seconds, c.FORGET_S) * AGED + 0.5)
 
@@ -309,12 +309,12 @@ def needs_reporters(entries: RecordArray, entry: int) -> bool:
 
 
 @refcount_free_inlined
-def _count(cells: RecordArray, row: int, entries: RecordArray, entry: int) -> None:
+def _count_visit(cells: RecordArray, row: int, entries: RecordArray, entry: int) -> None:
     """Count visits and vehicles; a visit that was probably elsewhere is not counted."""
     if entries[entry].share < c.HERE_SHARE:
         return
     cells[row].visits += np.uint32(1)
-    if entries[entry].fresh and not cells[row].returned & returning(entries[entry].number):
+    if entries[entry].fresh and not cells[row].returned & returning_bit(entries[entry].number):
         cells[row].vehicles += np.uint32(1)
 
 

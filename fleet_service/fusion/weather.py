@@ -85,7 +85,7 @@ class Weather(NamedTuple):
     prior: Float32Array
 
 
-def rates(reports: Reports) -> FloatArray:
+def report_rates(reports: Reports) -> FloatArray:
     """Rates of drift and of change, (n, 2); 1 where nothing is known."""
     road = np.where(
         np.isnan(reports.road_temperature),
@@ -104,7 +104,7 @@ def rates(reports: Reports) -> FloatArray:
     return np.stack([np.where(wet, WET_DRIFT, 1.0), change], axis=1)
 
 
-def priors(reports: Reports) -> Float32Array:
+def report_priors(reports: Reports) -> Float32Array:
     """Priors (n, 32), mixed with the uniform one."""
     given = np.where(np.isnan(reports.prior), mugrid.PRIOR, reports.prior)
     given = given / given.sum(axis=1, keepdims=True)
@@ -119,8 +119,8 @@ def weather_of(reports: Reports) -> Weather:
         np.diff(reports.time[last]) != 0, True
     )
     reports = reports.take(last[keep[: len(last)]])
-    rate = rates(reports)
-    prior = priors(reports)
+    rate = report_rates(reports)
+    prior = report_priors(reports)
     rows: list[tuple[int, float, float, Float32Array]] = [
         (0, 1.0, 1.0, mugrid.PRIOR.astype(np.float32))
     ]
@@ -136,7 +136,7 @@ def weather_of(reports: Reports) -> Weather:
                 rows.append((until, 1.0, 1.0, rows[0][3]))
         starts.append(len(rows))
     time = np.array([row[0] for row in rows])
-    return _clocked(
+    return _accumulate_clock(
         region,
         np.array(starts),
         time,
@@ -145,7 +145,7 @@ def weather_of(reports: Reports) -> Weather:
     )
 
 
-def _clocked(
+def _accumulate_clock(
     region: IntArray, start: IntArray, time: IntArray, rate: FloatArray, prior: list[Float32Array]
 ) -> Weather:
     clock = np.zeros_like(rate)
@@ -166,7 +166,7 @@ _SHIFT: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM) + 2  # from a slot's key
 
 
 @refcount_free
-def aged(weather: Weather, key: int, begin: int, end: int) -> tuple[float, float, int]:
+def road_time(weather: Weather, key: int, begin: int, end: int) -> tuple[float, float, int]:
     """Road time of drift and change between two times [ns], and the row whose prior holds at the
     end; 0 without one.
     """

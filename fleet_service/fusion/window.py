@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion.belief import VALUE, Bins
 from fleet_service.fusion.store.cells import copy_row, copy_sources
-from fleet_service.fusion.store.pairs import commit_pair, link_pair, pair_of, precedes
+from fleet_service.fusion.store.pairs import comes_before, commit_pair, link_pair, pair_of
 from fleet_service.fusion.store.records import (
     FREE_ENTRIES,
     FREE_WINDOWS,
@@ -29,11 +29,11 @@ from fleet_service.fusion.store.records import (
     State,
 )
 from fleet_service.fusion.store.table import AHEAD, first_place
-from fleet_service.fusion.trust import compare, judge_flag
+from fleet_service.fusion.trust import compare_reports, judge_flag
 from fleet_service.fusion.votes import (
     SCRATCH,
     describe_vote,
-    discount,
+    discount_vote,
     load_likelihood,
     needs_reporters,
     update,
@@ -88,7 +88,7 @@ class Marks(NamedTuple):
     stale: Int32Array
 
 
-def absorb(
+def absorb_votes(
     state: State, weather: Weather, arrivals: Arrivals, votes: Votes, most: int
 ) -> BoolArray:
     """Take the votes of a batch into the windows of their slots, and update the beliefs.
@@ -101,13 +101,13 @@ def absorb(
     k = len(votes.row)
     marks = Marks(np.zeros(n, np.bool_), np.zeros(n, np.bool_), np.empty(k, np.int32))
     scratch = np.zeros((3, SCRATCH), np.float32)
-    waiting = _absorb(state, weather, arrivals, votes, most, marks, scratch)
-    _recompute(state, weather, marks.stale[:waiting], scratch)
+    waiting = _absorb_votes(state, weather, arrivals, votes, most, marks, scratch)
+    _recompute_beliefs(state, weather, marks.stale[:waiting], scratch)
     return marks.left_out
 
 
 @refcount_free
-def _absorb(
+def _absorb_votes(
     state: State,
     weather: Weather,
     arrivals: Arrivals,
@@ -124,7 +124,7 @@ def _absorb(
     waiting = 0
     for k in range(len(votes.row)):
         if k % AHEAD == 0:
-            _prefetch(state, arrivals, votes, k, min(k + AHEAD, len(votes.row)))
+            _prefetch_votes(state, arrivals, votes, k, min(k + AHEAD, len(votes.row)))
         row = votes.row[k]
         slot = votes.slot[k]
         if marks.left_out[row]:
@@ -134,7 +134,7 @@ def _absorb(
             marks.left_out[row] = True
             continue
         marks.seen[row] = True
-        entry = _enter(state, arrivals, row)
+        entry = _fill_entry(state, arrivals, row)
         new = entries[entry]
         new.share = votes.share[k]
         describe_vote(entries, entry, arrivals.reported[row], scratch)
@@ -143,7 +143,7 @@ def _absorb(
             window = _open_window(state, slot)
         if cells[slot].reporters == NONE and needs_reporters(entries, entry):
             _open_reporters(state, slot, window)
-        _link(windows, entries, window, entry)
+        _link_entry(windows, entries, window, entry)
         link_pair(entries, pairs, pair, entry)
         if windows[window].stale:
             continue
@@ -152,13 +152,13 @@ def _absorb(
             marks.stale[waiting] = window
             waiting += 1
             continue
-        discount(entries, pairs, entry)
+        discount_vote(entries, pairs, entry)
         update(state.live, slot, cells[slot].reporters, entries, entry, weather, scratch)
     return waiting
 
 
 @refcount_free_inlined
-def _enter(state: State, arrivals: Arrivals, row: int) -> int:
+def _fill_entry(state: State, arrivals: Arrivals, row: int) -> int:
     """Fill a free entry with the data of an observation."""
     state.used[FREE_ENTRIES] -= 1
     entry = int(state.free_entries[state.used[FREE_ENTRIES]])
@@ -180,7 +180,7 @@ def _enter(state: State, arrivals: Arrivals, row: int) -> int:
 
 
 @refcount_free_inlined
-def _prefetch(state: State, arrivals: Arrivals, votes: Votes, begin: int, end: int) -> None:
+def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, begin: int, end: int) -> None:
     """Prefetch all memory that votes `begin` to `end` will touch; last the records whose place is
     known only after another load.
 
@@ -246,7 +246,7 @@ def _open_reporters(state: State, slot: int, window: int) -> None:
 
 
 @refcount_free
-def _recompute(state: State, weather: Weather, stale: Int32Array, scratch: Bins) -> None:
+def _recompute_beliefs(state: State, weather: Weather, stale: Int32Array, scratch: Bins) -> None:
     live = state.live
     windows = state.windows
     entries = state.entries
@@ -258,14 +258,14 @@ def _recompute(state: State, weather: Weather, stale: Int32Array, scratch: Bins)
             copy_sources(state.base.reporters, window, live.reporters, reporters)
         entry = windows[window].head
         while entry != NONE:
-            discount(entries, state.pairs, entry)
+            discount_vote(entries, state.pairs, entry)
             load_likelihood(entries, entry, scratch)
             update(live, slot, reporters, entries, entry, weather, scratch)
             entry = entries[entry].following
         windows[window].stale = 0
 
 
-def commit(
+def commit_windows(
     state: State,
     weather: Weather,
     peers: RecordArray,
@@ -276,7 +276,9 @@ def commit(
     """Let the checkpoint pass to `before` [ns] in the windows (k,), one after the other: older
     entries leave them.
     """
-    _commit(state, weather, peers, names, due_windows, before, np.zeros((3, SCRATCH), np.float32))
+    _commit_windows(
+        state, weather, peers, names, due_windows, before, np.zeros((3, SCRATCH), np.float32)
+    )
 
 
 @refcount_free_inlined
@@ -310,7 +312,7 @@ def _prefetch_due(state: State, due_windows: IntArray, begin: int, end: int) -> 
 
 
 @refcount_free
-def _commit(
+def _commit_windows(
     state: State,
     weather: Weather,
     peers: RecordArray,
@@ -337,16 +339,18 @@ def _commit(
                 judge_flag(live.reporters, live.cells[slot].reporters, peers, entries, entry)
             if entries[entry].kind == VALUE:
                 windows[window].values -= 1
-                compare(live.reporters, live.cells[slot].reporters, peers, names, entries, entry)
+                compare_reports(
+                    live.reporters, live.cells[slot].reporters, peers, names, entries, entry
+                )
             commit_pair(entries, state.pairs, entry)
             state.free_entries[state.used[FREE_ENTRIES]] = entry
             state.used[FREE_ENTRIES] += 1
             entry = int(entries[entry].following)
-        _shorten(state, slot, window, entry)
+        _shorten_window(state, slot, window, entry)
 
 
 @refcount_free_inlined
-def _shorten(state: State, slot: int, window: int, entry: int) -> None:
+def _shorten_window(state: State, slot: int, window: int, entry: int) -> None:
     """A window begins with `entry` now; without one it is given back."""
     windows = state.windows
     windows[window].head = entry
@@ -361,10 +365,10 @@ def _shorten(state: State, slot: int, window: int, entry: int) -> None:
 
 
 @refcount_free_inlined
-def _link(windows: RecordArray, entries: RecordArray, window: int, entry: int) -> None:
+def _link_entry(windows: RecordArray, entries: RecordArray, window: int, entry: int) -> None:
     """Put an entry at its place in time; from the end, where nearly all belong."""
     after = windows[window].tail
-    while after != NONE and precedes(entries, entry, after):
+    while after != NONE and comes_before(entries, entry, after):
         after = entries[after].previous
     following = windows[window].head if after == NONE else entries[after].following
     entries[entry].previous = after

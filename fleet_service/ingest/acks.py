@@ -69,11 +69,11 @@ class Acks:
             streams = [
                 part
                 for stream in sorted(durable.keys() | rejected.keys())
-                for part in _parts(
+                for part in _split_stream(
                     stream,
-                    ranges(durable.get(stream, ())),
+                    consecutive_ranges(durable.get(stream, ())),
                     tuple(rejected.get(stream, ())),
-                    ranges(late.get((vehicle, stream), ())),
+                    consecutive_ranges(late.get((vehicle, stream), ())),
                 )
             ]
             out += [
@@ -85,7 +85,7 @@ class Acks:
         return out
 
 
-def _parts(
+def _split_stream(
     stream: AckedStream,
     durable: tuple[tuple[int, int], ...],
     rejected: tuple[tuple[int, int, str], ...],
@@ -97,7 +97,7 @@ def _parts(
         yield StreamAck(*stream, durable[some], rejected[some], late[some])
 
 
-def ranges(numbers: Iterable[int]) -> tuple[tuple[int, int], ...]:
+def consecutive_ranges(numbers: Iterable[int]) -> tuple[tuple[int, int], ...]:
     """Return runs of consecutive numbers, both ends included; numbers may repeat."""
     ordered = sorted(set(numbers))
     if ordered and ordered[-1] - ordered[0] == len(ordered) - 1:  # as most often

@@ -22,7 +22,7 @@ import zenoh
 from fleet_service.archive.format.layout import DAY_NS, FIRST_TIME, MAP_DAYS, TIME
 from fleet_service.archive.format.segments import Rows, round_to_steps
 from fleet_service.archive.identity import erasures
-from fleet_service.archive.identity.pseudonyms import Pseudonyms, number, texts
+from fleet_service.archive.identity.pseudonyms import Pseudonyms, pseudonym_number, pseudonym_texts
 from fleet_service.archive.identity.vehicle_ids import VehicleIds
 from fleet_service.ingest import validation
 from fleet_service.ingest.acks import Acks
@@ -160,7 +160,7 @@ class BatchIntake:
         self._counts = counts
         self._acks = acks
         self._witnesses = VehicleIds(pseudonyms.folder)
-        self._erased = erasures.read(pseudonyms.folder)
+        self._erased = erasures.read_erasures(pseudonyms.folder)
         self._budget = Bucket(STREAMS_AT_ONCE, STREAMS_PER_HOUR)
         self._pending: set[BatchId] = set()  # accepted, not yet on disk
         self._known: dict[Kind, dict[tuple[str, int, int, int], SequenceTracker]] = {
@@ -266,7 +266,9 @@ class BatchIntake:
             for place in np.flatnonzero(~out).tolist():
                 with suppress(OSError):  # without its month's key it is not let in either
                     pseudonym = self._pseudonyms.of(str(owners[place].name), int(time[place]))
-                    out[place] = int(time[place]) < self._erased.vehicles.get(number(pseudonym), 0)
+                    out[place] = int(time[place]) < self._erased.vehicles.get(
+                        pseudonym_number(pseudonym), 0
+                    )
         return out
 
     def _tell_time(self, owners: Sequence[Parsed], time: IntArray) -> None:
@@ -311,7 +313,7 @@ class BatchIntake:
         hour is over."""
         vehicle, boot, region, _ = name
         try:
-            pseudonym = number(self._pseudonyms.of(vehicle, time))
+            pseudonym = pseudonym_number(self._pseudonyms.of(vehicle, time))
             boot_pseudonym = self._pseudonyms.boot(vehicle, boot, time)
             witness = self._witnesses.id_of(vehicle, self._pseudonyms.month(time), pseudonym)
         except OSError:
@@ -353,7 +355,7 @@ class BatchIntake:
         for place in np.flatnonzero(validation.too_long(rows[TIME[kind]], sizes) & good).tolist():
             good[place] = False
             self._refuse(batches[place][0].vehicle, heads.at(place), validation.TOO_LONG)
-        newest = _newest(rows[FIRST_TIME[kind]], sizes).tolist()
+        newest = _newest_times(rows[FIRST_TIME[kind]], sizes).tolist()
         for place, at in compress(enumerate(newest), good.tolist()):
             stream, seq = batches[place]
             if not stream.accept(
@@ -405,7 +407,7 @@ class BatchIntake:
             self._counts[f"refused.{rule}"] += times
 
 
-def _newest(time: IntArray, sizes: IntArray) -> IntArray:
+def _newest_times(time: IntArray, sizes: IntArray) -> IntArray:
     """Return the newest time of each batch (k,), as the archive stores it, so that a restart
     finds the same.
     """
@@ -434,7 +436,7 @@ def _with_identity(
     """Return rows with the identity of their batches, for the archive."""
     numbers = np.array([stream.key[0] for stream, _ in batches], np.int64)
     identity = {
-        "vehicle": texts(numbers),
+        "vehicle": pseudonym_texts(numbers),
         "witness": np.array([stream.witness for stream, _ in batches], np.int64),
         "estimator": np.array(heads.estimator, np.bytes_),
         "boot": np.array([stream.key[1] for stream, _ in batches], np.int64),

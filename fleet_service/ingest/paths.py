@@ -110,13 +110,19 @@ def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: P
             after -= 1
         excess = 0.0
         if after > 0:
-            excess = _excess(t - anchors[v, after - 1], places[v, after - 1], place[n])
+            excess = _excess_distance(t - anchors[v, after - 1], places[v, after - 1], place[n])
         if after < held:
-            excess = max(excess, _excess(anchors[v, after] - t, places[v, after], place[n]))
+            excess = max(
+                excess, _excess_distance(anchors[v, after] - t, places[v, after], place[n])
+            )
         if 0 < after < held and is_gap[v, after - 1]:
             there = places[v, after - 1]
             back = places[v, after]
-            detour = _metres(there, place[n]) + _metres(place[n], back) - _metres(there, back)
+            detour = (
+                _distance_m(there, place[n])
+                + _distance_m(place[n], back)
+                - _distance_m(there, back)
+            )
             if detour > _DETOUR_M:
                 excess = np.inf
         if after == held and held > 0:
@@ -163,15 +169,15 @@ def _least_needed(anchors: IntArray) -> int:
 
 
 @compiled
-def _excess(apart: int, there: Float32Array, here: FloatArray) -> float:
+def _excess_distance(apart: int, there: Float32Array, here: FloatArray) -> float:
     """Return the distance between two places (2,) [deg] beyond what FASTEST covers in the time
     between them [ns].
     """
-    return max(_metres(there, here) - FASTEST * apart / NS, 0.0)
+    return max(_distance_m(there, here) - FASTEST * apart / NS, 0.0)
 
 
 @compiled
-def _metres(there: Float32Array, here: FloatArray | Float32Array) -> float:
+def _distance_m(there: Float32Array, here: FloatArray | Float32Array) -> float:
     """Return the distance between two places (2,) [deg], the short way around the date line."""
     north = here[0] - there[0]
     east = (here[1] - there[1] + 180.0) % 360.0 - 180.0

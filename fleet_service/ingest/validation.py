@@ -118,9 +118,9 @@ def check_heads(
         wrong_region,
         (heads.boot < 0) | (held < 1) | (held > heads.seq),
         np.array(bad_name, bool),
-        _untimely(time, time, clock),
+        _is_untimely(time, time, clock),
     )
-    return _first(broken), _HEAD_RULES
+    return _first_broken(broken), _HEAD_RULES
 
 
 _HEAD_RULES: Final = (
@@ -136,7 +136,7 @@ _HEAD_RULES: Final = (
 )
 
 
-def _first(broken: Sequence[NDArray[np.bool_]]) -> IntArray:
+def _first_broken(broken: Sequence[NDArray[np.bool_]]) -> IntArray:
     """Return the index of the first broken rule of each, -1 for none."""
     out = np.full(len(broken[0]), -1)
     for index in reversed(range(len(broken))):
@@ -190,7 +190,7 @@ def check_rows(
     )
     broken += [rows for rows, _, _ in extra]
     rules += [Refusal(rule, 0, reason) for _, rule, reason in extra]
-    return _first(broken), tuple(rules)
+    return _first_broken(broken), tuple(rules)
 
 
 ERASED: Final = Refusal(
@@ -257,7 +257,7 @@ def _broken_observation(columns: Columns, clock: Clock) -> list[tuple[NDArray[np
     no_peak = columns["with_likelihood"] & (columns["log_likelihood"].min(axis=1) > 0)
     return [
         (
-            _untimely(enter, leave, clock),
+            _is_untimely(enter, leave, clock),
             "time",
             "leave_time: too old or in the future; set the clock",
         ),
@@ -287,8 +287,10 @@ def _broken_observation(columns: Columns, clock: Clock) -> list[tuple[NDArray[np
 
 def _broken_state(columns: Columns, clock: Clock) -> list[tuple[NDArray[np.bool_], str, str]]:
     time = columns["time"]
-    return [(_untimely(time, time, clock), "time", "time: too old or in the future; set the clock")]
+    return [
+        (_is_untimely(time, time, clock), "time", "time: too old or in the future; set the clock")
+    ]
 
 
-def _untimely(first: IntArray, last: IntArray, clock: Clock) -> NDArray[np.bool_]:
+def _is_untimely(first: IntArray, last: IntArray, clock: Clock) -> NDArray[np.bool_]:
     return (first < clock.horizon) | (last > clock.now + clock.ahead)

@@ -26,7 +26,7 @@ import pyarrow.parquet as pq
 from fleet_service.archive.format.files import SEGMENT, write_table
 from fleet_service.archive.format.layout import DAY_NS, read_epoch, with_term
 from fleet_service.archive.format.load import Damaged, load, skip_damaged
-from fleet_service.archive.format.segments import nanoseconds
+from fleet_service.archive.format.segments import to_nanoseconds
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import VALID_NS, Reports
 from schemas import grid, keys, mugrid, tables, weather
@@ -80,10 +80,10 @@ class WeatherInbox:
         while self._waiting:
             message = self._waiting.popleft()
             try:
-                found.append(_report(message, now))
+                found.append(_decode_report(message, now))
             except InputError:
                 self._counts["refused.weather"] += 1
-        return self._archived(found, now) if found else None
+        return self._archive_reports(found, now) if found else None
 
     def begin(self, path: Path, known: Reports, now: int) -> Reports | None:
         """Archive the reports of a file that may still act and are not `known`; return them for the
@@ -98,10 +98,10 @@ class WeatherInbox:
             acts = max(report.time, self.fusion.next_epoch)
             if report.time > acts - VALID_NS and not {(region, report.time), (region, acts)} & seen:
                 found.append((region, report))
-        return self._archived(found, now) if found else None
+        return self._archive_reports(found, now) if found else None
 
-    def _archived(self, found: list[tuple[int, Report]], now: int) -> Reports | None:
-        table = _table(found, now, self.fusion.next_epoch)
+    def _archive_reports(self, found: list[tuple[int, Report]], now: int) -> Reports | None:
+        table = _reports_table(found, now, self.fusion.next_epoch)
         self._last = max(time.time_ns(), self._last + 1)
         try:
             make_folder(self._folder)
@@ -109,10 +109,10 @@ class WeatherInbox:
         except OSError:  # what is not archived must not act; the next report comes within the hour
             self._counts["weather_failures"] += 1
             return None
-        return _reports(table)
+        return _read_reports(table)
 
 
-def _report(message: WeatherMessage, now: int) -> tuple[int, Report]:
+def _decode_report(message: WeatherMessage, now: int) -> tuple[int, Report]:
     region = keys.parse(message.key).quadint
     report = weather.decode(message.payload, message.encoding)
     if region is None or not now - VALID_NS <= report.time <= now + AHEAD_NS:
@@ -120,7 +120,7 @@ def _report(message: WeatherMessage, now: int) -> tuple[int, Report]:
     return region, report
 
 
-def _table(found: list[tuple[int, Report]], now: int, next_epoch: int) -> pa.Table:
+def _reports_table(found: list[tuple[int, Report]], now: int, next_epoch: int) -> pa.Table:
     found = sorted(found, key=lambda pair: pair[1].time)
     reports = [report for _, report in found]
     columns: dict[str, Any] = {name: [getattr(r, name) for r in reports] for name in weather.RANGES}
@@ -134,13 +134,13 @@ def _table(found: list[tuple[int, Report]], now: int, next_epoch: int) -> pa.Tab
     return table.cast(tables.WEATHER_ARCHIVE, safe=False)
 
 
-def _reports(table: pa.Table) -> Reports:
+def _read_reports(table: pa.Table) -> Reports:
     prior = [
         np.full(mugrid.BINS, np.nan) if row is None else np.array(row)
         for row in table["prior"].to_pylist()
     ]
     air, road, water = (table[name].to_numpy().astype(np.float64) for name in weather.RANGES)
-    acts = nanoseconds(table["acts_from"])
+    acts = to_nanoseconds(table["acts_from"])
     return Reports(
         table["region"].to_numpy(), acts, air, road, water, np.array(prior).reshape(-1, mugrid.BINS)
     )
@@ -163,7 +163,7 @@ def archived_reports(
     """
     for _ in range(_TURNS):
         try:
-            paths = [path for path in files(root) if path.name not in known]
+            paths = [path for path in weather_files(root) if path.name not in known]
             parts = [
                 load(path, tables.WEATHER_ARCHIVE, whole=True, damaged=damaged) for path in paths
             ]
@@ -176,11 +176,11 @@ def archived_reports(
         [tables.WEATHER_ARCHIVE.empty_table(), *(part for part in parts if part is not None)]
     )
     if received_until is not None:
-        table = table.filter(pa.array(nanoseconds(table["received_at"]) <= received_until))
-    return _reports(table)
+        table = table.filter(pa.array(to_nanoseconds(table["received_at"]) <= received_until))
+    return _read_reports(table)
 
 
-def files(root: Path) -> list[Path]:
+def weather_files(root: Path) -> list[Path]:
     """Return the weather files in order of receipt."""
     return sorted((root / FOLDER).glob("*.parquet"), key=lambda path: path.stem[-_DIGITS:])
 
@@ -194,8 +194,8 @@ def join_daily_files(root: Path, damaged: Damaged = skip_damaged) -> int:
     """
     days: dict[int, list[Path]] = {}
     term = read_epoch(root)
-    for path in files(root):
-        days.setdefault(_day(path), []).append(path)
+    for path in weather_files(root):
+        days.setdefault(_written_day(path), []).append(path)
     saved = 0
     for paths in (paths for paths in days.values() if len(paths) > 1):
         found = [(p, load(p, tables.WEATHER_ARCHIVE, whole=True, damaged=damaged)) for p in paths]
@@ -212,21 +212,21 @@ def join_daily_files(root: Path, damaged: Damaged = skip_damaged) -> int:
     return saved
 
 
-def retire(root: Path, until_day: int) -> int:
+def retire_files(root: Path, until_day: int) -> int:
     """Remove files whose reports acted only up to a day since 1970; return their number."""
     removed = 0
-    for path in files(root):
+    for path in weather_files(root):
         table = load(path, tables.WEATHER_ARCHIVE, ["acts_from"])
         if (
             table is not None
-            and int(nanoseconds(table["acts_from"]).max(initial=0)) // DAY_NS <= until_day
+            and int(to_nanoseconds(table["acts_from"]).max(initial=0)) // DAY_NS <= until_day
         ):
             path.unlink()
             removed += 1
     return removed
 
 
-def _day(path: Path) -> int:
+def _written_day(path: Path) -> int:
     """Return the days since 1970 of a file's writing."""
     return int(path.stem[-_DIGITS:]) // DAY_NS
 
@@ -246,10 +246,10 @@ def read_file(path: Path) -> list[tuple[int, Report]]:
         raise InputError(
             "weather", f"cannot read {path}", "give a Parquet file of road weather"
         ) from error
-    return [_row(number, row) for number, row in enumerate(rows)]
+    return [_parse_row(number, row) for number, row in enumerate(rows)]
 
 
-def _row(number: int, row: dict[str, Any]) -> tuple[int, Report]:
+def _parse_row(number: int, row: dict[str, Any]) -> tuple[int, Report]:
     fix = f"give region, time and any of {', '.join(COLUMNS[2:])}"
     if unknown := row.keys() - set(COLUMNS):
         raise InputError("weather", f"{sorted(unknown)[0]} is no column of it", fix)

@@ -128,13 +128,13 @@ class SimulatedReports:
     log_likelihood: FloatArray
 
 
-def shares(rng: Generator, excited: BoolArray, model: ErrorModel = CLEAN) -> FloatArray:
+def used_shares(rng: Generator, excited: BoolArray, model: ErrorModel = CLEAN) -> FloatArray:
     """s of visits: within the model's range where excited, ordinary driving else; same shape."""
     ordinary = rng.uniform(0.05, min(0.5, model.share[1]), excited.shape)
     return np.where(excited, rng.uniform(*model.share, excited.shape), ordinary)
 
 
-def noise(rng: Generator, along: IntArray, tails: float = np.inf) -> FloatArray:
+def reading_noise(rng: Generator, along: IntArray, tails: float = np.inf) -> FloatArray:
     """e of visits that follow each other; `along` (n,) is 0 where a drive begins. Student's with
     `tails` degrees of freedom, of standard deviation one, if these are finite."""
     e = rng.normal(size=len(along))
@@ -145,7 +145,7 @@ def noise(rng: Generator, along: IntArray, tails: float = np.inf) -> FloatArray:
     return np.asarray(heavy * e)
 
 
-def report(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
+def draw_reports(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
     """Reports of visits (n,)."""
     model = errors.model
     who = p.vehicle
@@ -160,7 +160,7 @@ def report(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
     bound = log_ndtr((mugrid.CENTRES - used[:, None]) / BOUND_STD)
     above = np.clip((mugrid.CENTRES - used[:, None]) / (mugrid.UPPER - mugrid.LOWER), 0.0, 1.0)
     sloping = bound + errors.slope[who, None] * above
-    peaked = likelihood(reading, model.stated * relative, model.stated * NOISE_ABSOLUTE)
+    peaked = reading_likelihood(reading, model.stated * relative, model.stated * NOISE_ABSOLUTE)
     std = np.where(p.excited, model.stated * std, np.nan)
     return SimulatedReports(
         np.where(p.excited, reading, np.nan),
@@ -171,7 +171,7 @@ def report(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
     )
 
 
-def likelihood(
+def reading_likelihood(
     reading: FloatArray, relative: FloatArray, absolute: float = NOISE_ABSOLUTE
 ) -> FloatArray:
     """ln p(z | μ) of readings (n,) with relative noise (n,), on the grid (n, 32), up to a
@@ -181,6 +181,8 @@ def likelihood(
     return -0.5 * np.square((reading[:, None] - mugrid.CENTRES) / std) - np.log(std)
 
 
-def overconfident(claim: FloatArray | float, std: float = OVERCONFIDENT_STD) -> FloatArray:
+def overconfident_likelihood(
+    claim: FloatArray | float, std: float = OVERCONFIDENT_STD
+) -> FloatArray:
     """Normal log-likelihoods (n, 32) of one who claims μ (n,) and no doubt."""
     return np.asarray(-0.5 * np.square((mugrid.CENTRES - np.reshape(claim, (-1, 1))) / std))

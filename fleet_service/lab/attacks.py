@@ -1,7 +1,7 @@
 """Attacks on the map: changes that a few attackers cause compared with the honest vehicles alone.
 
-The attackers of `random`, `shifted_pose` and `flood_one_cell` are enrolled vehicles that were
-honest, and so trusted, until the attack begins. `newcomers` are new names. `replayed` goes through
+The attackers of `claim_random`, `shifted_pose` and `flood_one_cell` are enrolled vehicles that were
+honest, and so trusted, until the attack begins. `add_newcomers` are new names. `replay_messages` goes through
 the service's admission: old messages again, other vehicles' messages on an own key, and old visits
 under an own name. A cell is counted if its alert differs from that of the same drive without the
 attack at any minute: dry or wet cells (μ > CLEARLY_DRY) that are raised, icy ones (μ < CLEARLY_ICY)
@@ -24,8 +24,8 @@ from fleet_service.ingest.inbox import Message
 from fleet_service.lab import agent, town
 from fleet_service.lab.agent import Errors, SimulatedReports
 from fleet_service.lab.bars import ATTACKS
-from fleet_service.lab.drive import CELL, watch
-from fleet_service.lab.messages import SentMessage, clock_of, messages, rebadged
+from fleet_service.lab.drive import CELL, watch_drive
+from fleet_service.lab.messages import SentMessage, clock_of, forge_messages, make_messages
 from fleet_service.lab.score import excited_vehicles
 from fleet_service.lab.town import CELLS, LENGTH, Town, Visits
 from schemas.config import ServiceConfig
@@ -55,8 +55,8 @@ class AttackedDrive:
 
 def drive_of(rng: Generator) -> AttackedDrive:
     """The honest part."""
-    place = town.build(rng, MINUTES, 0.0)
-    visits = town.drive(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
+    place = town.draw_town(rng, MINUTES, 0.0)
+    visits = town.drive_fleet(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
     return AttackedDrive(place, visits, excited_vehicles(visits, place, BEGIN, VEHICLES) >= ENOUGH)
 
 
@@ -66,16 +66,16 @@ def measure(seeds: range) -> dict[str, float]:
     for seed in seeds:
         rng = np.random.default_rng([seed, 7])
         drive = drive_of(rng)
-        alone = watch(np.random.default_rng([seed, 8]), drive.visits, MINUTES).alerted
+        alone = watch_drive(np.random.default_rng([seed, 8]), drive.visits, MINUTES).alerted
         for name, attack in VISITS.items():
             visits = attack(rng, drive)
-            attacked = watch(np.random.default_rng([seed, 8]), visits, MINUTES).alerted
-            out[f"fusion.attack.{name}"] += differing(drive, alone, attacked)
-        out["fusion.attack.replayed"] += replayed(rng, drive)
+            attacked = watch_drive(np.random.default_rng([seed, 8]), visits, MINUTES).alerted
+            out[f"fusion.attack.{name}"] += count_differing(drive, alone, attacked)
+        out["fusion.attack.replayed"] += replay_messages(rng, drive)
     return out
 
 
-def differing(drive: AttackedDrive, alone: list[BoolArray], attacked: list[BoolArray]) -> int:
+def count_differing(drive: AttackedDrive, alone: list[BoolArray], attacked: list[BoolArray]) -> int:
     """Cells in which the attack raised or suppressed an alert."""
     raised = np.zeros(CELLS, bool)
     suppressed = np.zeros(CELLS, bool)
@@ -88,24 +88,24 @@ def differing(drive: AttackedDrive, alone: list[BoolArray], attacked: list[BoolA
     )
 
 
-def _attackers(v: Visits, count: int) -> BoolArray:
+def _attacking_rows(v: Visits, count: int) -> BoolArray:
     return (v.vehicle < count) & (v.seconds >= 60.0 * BEGIN)
 
 
-def random(rng: Generator, drive: AttackedDrive) -> Visits:
+def claim_random(rng: Generator, drive: AttackedDrive) -> Visits:
     """Sure values of anything, at every visit."""
     v = drive.visits
     claim = rng.uniform(0.05, 1.2, len(v))
-    return _claiming(v, _attackers(v, ATTACKERS), claim)
+    return _with_claims(v, _attacking_rows(v, ATTACKERS), claim)
 
 
-def _claiming(v: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
+def _with_claims(v: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
     reports = SimulatedReports(
         v.reports.reading,
         v.reports.std,
         np.where(lying, claim, v.reports.used),
         v.reports.manoeuvre,
-        np.where(lying[:, None], agent.overconfident(claim), v.reports.log_likelihood),
+        np.where(lying[:, None], agent.overconfident_likelihood(claim), v.reports.log_likelihood),
     )
     return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, reports)
 
@@ -117,14 +117,14 @@ def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
     return Visits(
         v.seconds,
         v.vehicle,
-        np.where(_attackers(v, ATTACKERS), moved, v.place),
+        np.where(_attacking_rows(v, ATTACKERS), moved, v.place),
         v.mu,
         v.excited,
         v.reports,
     )
 
 
-def victims(drive: AttackedDrive) -> IntArray:
+def victim_cells(drive: AttackedDrive) -> IntArray:
     """The driest and the iciest cell that count."""
     mu = np.where(drive.counted, drive.town.mu[BEGIN], np.nan)
     return np.array([np.nanargmax(mu), np.nanargmin(mu)])
@@ -138,29 +138,35 @@ def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
     seconds = rng.uniform(60.0 * BEGIN, 60.0 * MINUTES, count)
     which = rng.integers(0, 2, count)
     claim = np.where(which == 0, rng.choice([0.1, 0.3], count), rng.choice([0.7, 1.1], count))
-    return _added(
-        drive.visits, seconds, rng.integers(0, FLOODERS, count), victims(drive)[which], claim
+    return _add_visits(
+        drive.visits, seconds, rng.integers(0, FLOODERS, count), victim_cells(drive)[which], claim
     )
 
 
-def newcomers(rng: Generator, drive: AttackedDrive) -> Visits:
+def add_newcomers(rng: Generator, drive: AttackedDrive) -> Visits:
     """Forty new names that each pass once and agree: ice on the road of the driest cell, dry on
     that of the iciest.
     """
-    roads = victims(drive) // LENGTH * LENGTH
+    roads = victim_cells(drive) // LENGTH * LENGTH
     who, which, along = (
         a.ravel() for a in np.meshgrid(np.arange(NAMES), np.arange(2), np.arange(LENGTH))
     )
     seconds: FloatArray = 60.0 * BEGIN + rng.uniform(0.0, 300.0, NAMES)[who] + 20.0 * which + along
     claim: FloatArray = np.where(which == 0, 0.2, 0.85)
-    return _added(drive.visits, seconds, VEHICLES + who, roads[which] + along, claim)
+    return _add_visits(drive.visits, seconds, VEHICLES + who, roads[which] + along, claim)
 
 
-def _added(
+def _add_visits(
     v: Visits, seconds: FloatArray, vehicle: IntArray, place: IntArray, claim: FloatArray
 ) -> Visits:
     std = np.full(len(claim), agent.OVERCONFIDENT_STD)
-    reports = (claim, std, claim, np.zeros(len(claim), np.int64), agent.overconfident(claim))
+    reports = (
+        claim,
+        std,
+        claim,
+        np.zeros(len(claim), np.int64),
+        agent.overconfident_likelihood(claim),
+    )
     joined = (
         np.concatenate([a, b]) for a, b in zip(vars(v.reports).values(), reports, strict=True)
     )
@@ -172,37 +178,37 @@ def _added(
         np.append(v.excited, np.zeros(len(claim), bool)),
         SimulatedReports(*joined),
     )
-    return town.take(both, np.argsort(both.seconds, kind="stable"))
+    return town.select_visits(both, np.argsort(both.seconds, kind="stable"))
 
 
 VISITS: Final[dict[str, Callable[[Generator, AttackedDrive], Visits]]] = {
-    "random": random,
+    "random": claim_random,
     "shifted_pose": shifted_pose,
     "flood_one_cell": flood_one_cell,
-    "newcomers": newcomers,
+    "newcomers": add_newcomers,
 }
 
 
-def replayed(rng: Generator, drive: AttackedDrive) -> int:
+def replay_messages(rng: Generator, drive: AttackedDrive) -> int:
     """Every message of the town's first minutes again, as it was, on other keys, and under
     another name.
     """
-    sent = messages(drive.visits)
+    sent = make_messages(drive.visits)
     at = drive.visits.seconds[[m.last for m in sent]]
     old = np.flatnonzero(at < 60.0 * BEGIN)
     again = rng.choice(old, min(len(old), 600), replace=False)
     forged = [
         m
         for k in again.tolist()
-        for m in (sent[k].message, *rebadged(sent[k].message, VEHICLES + k % NAMES))
+        for m in (sent[k].message, *forge_messages(sent[k].message, VEHICLES + k % NAMES))
     ]
     key = rng.bytes(32)
-    alone = _alerted(sent, at, [], key)
-    attacked = _alerted(sent, at, forged, key)
-    return differing(drive, alone, attacked)
+    alone = _alerts_by_minute(sent, at, [], key)
+    attacked = _alerts_by_minute(sent, at, forged, key)
+    return count_differing(drive, alone, attacked)
 
 
-def _alerted(
+def _alerts_by_minute(
     sent: list[SentMessage], at: FloatArray, forged: list[Message], key: bytes
 ) -> list[BoolArray]:
     """Alerts of each minute; by the `key` vehicles have the same numbers each time, and with

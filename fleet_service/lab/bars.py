@@ -137,7 +137,7 @@ BARS: Final[dict[str, MapBar]] = {
 }
 
 
-def judged(measured: Mapping[str, float]) -> list[Figure]:
+def judge_figures(measured: Mapping[str, float]) -> list[Figure]:
     """Every figure that has a bar, NaN where it was not measured; then those that are only
     shown.
     """

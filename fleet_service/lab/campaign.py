@@ -67,20 +67,22 @@ def run(
     parts = parts_of(seeds, log_line)
     listed = [(name, part) for name, part in parts.items() if only in (None, name)]
     if only in (None, END_TO_END_PART):
-        listed += _ways(drives, folder, seeds)
+        listed += _way_parts(drives, folder, seeds)
     found: dict[str, float] = {}
     for name, part in listed:
         began = time.perf_counter()
         found |= part()
         log_line(f"{name}: {time.perf_counter() - began:.0f} s")
-    judged = [figure for figure in bars.judged(found) if _is_listed(figure.name, only, found)]
+    judged = [
+        figure for figure in bars.judge_figures(found) if _is_listed(figure.name, only, found)
+    ]
     figures.write(
         folder / "figures.json", "fusion" + (" --quick" if quick else ""), list(seeds), judged
     )
     barred = [figure for figure in judged if figure.bar is not None]
-    shown = [figure for figure in judged if figure.bar is None and not _curve(figure.name)]
+    shown = [figure for figure in judged if figure.bar is None and not _is_curve(figure.name)]
     (folder / "figures.md").write_text(f"{figures.markdown(barred)}\n\n{figures.markdown(shown)}\n")
-    for path in plots.draw(judged, folder) if only is None else []:
+    for path in plots.draw_plots(judged, folder) if only is None else []:
         log_line(f"plot {path}")
     return judged
 
@@ -95,21 +97,21 @@ def _is_listed(name: str, only: str | None, found: Mapping[str, float]) -> bool:
 def drives_end_to_end(quick: bool) -> Drives:
     """The end-to-end drives, level and rough, or a few seconds of them."""
     return {
-        world: end_to_end.command(*((4, 3.0) if quick else length), world)
+        world: end_to_end.drive_command(*((4, 3.0) if quick else length), world)
         for world, length in LENGTHS.items()
     }
 
 
-def holds(found: Sequence[Figure]) -> bool:
+def all_hold(found: Sequence[Figure]) -> bool:
     """Return True if every bar holds; a missing figure does not."""
     return all(figure.holds for figure in found if figure.bar is not None)
 
 
-def _curve(name: str) -> bool:
+def _is_curve(name: str) -> bool:
     return "reliability" in name or "share_after" in name
 
 
-def _ways(drives: Drives, folder: Path, seeds: range) -> list[tuple[str, Part]]:
+def _way_parts(drives: Drives, folder: Path, seeds: range) -> list[tuple[str, Part]]:
     ways = {world: drive for world, drive in drives.items() if world in end_to_end.WAYS}
     parts: list[tuple[str, Part]] = [
         (f"end to end, {world.scenario}", partial(end_to_end.measure, drive, folder, world))
@@ -117,22 +119,22 @@ def _ways(drives: Drives, folder: Path, seeds: range) -> list[tuple[str, Part]]:
         if world not in ways
     ]
     rough = [
-        (f"end to end, {len(ways)} rough ways", partial(_rough, ways, folder)),
-        ("towns with the errors of these ways", partial(_resampled, ways, folder, seeds)),
+        (f"end to end, {len(ways)} rough ways", partial(_measure_rough_ways, ways, folder)),
+        ("towns with the errors of these ways", partial(_measure_resampled, ways, folder, seeds)),
     ]
     return [*parts, *rough] if ways else parts
 
 
-def _rough(ways: Drives, folder: Path) -> dict[str, float]:
+def _measure_rough_ways(ways: Drives, folder: Path) -> dict[str, float]:
     found = []
     for world, drive in ways.items():
         drive(folder / world.scenario)
-        found.append(moments.moments(folder / world.scenario))
-    return moments.figures(found, end_to_end.WHOLE_WAY)
+        found.append(moments.ask_moments(folder / world.scenario))
+    return moments.moment_figures(found, end_to_end.WHOLE_WAY)
 
 
-def _resampled(ways: Drives, folder: Path, seeds: range) -> dict[str, float]:
-    visits = resampled.joined([end_to_end.driven_in(folder / world.scenario) for world in ways])
+def _measure_resampled(ways: Drives, folder: Path, seeds: range) -> dict[str, float]:
+    visits = resampled.join_ways([end_to_end.driven_in(folder / world.scenario) for world in ways])
     return models.measure_real(visits, seeds)
 
 
@@ -140,7 +142,7 @@ def parts_of(seeds: range, log_line: LogLine) -> dict[str, Part]:
     """Return the parts that need no simulated vehicle, by their names for `--only`."""
     few = seeds[:EXACT_SEEDS]
     return {
-        "exact": lambda: _exact(few),
+        "exact": lambda: _measure_exact(few),
         "ice": lambda: changes.measure(seeds),
         "fleets": lambda: fleets.measure(seeds, log_line),
         "attacks": lambda: attacks.measure(seeds),
@@ -152,10 +154,10 @@ def parts_of(seeds: range, log_line: LogLine) -> dict[str, Part]:
     }
 
 
-def _exact(seeds: range) -> dict[str, float]:
+def _measure_exact(seeds: range) -> dict[str, float]:
     measures = {
-        "fusion.order.max_difference": exact.order,
-        "fusion.replay.max_difference": exact.replay,
+        "fusion.order.max_difference": exact.order_difference,
+        "fusion.replay.max_difference": exact.replay_difference,
         "fusion.unexcited.upper_shift": exact.upper_shift,
     }
     return {

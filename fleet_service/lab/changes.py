@@ -26,23 +26,23 @@ EXCITEMENT: Final = 0.3  # of a pass over the road
 UNREACHED: Final = 99  # passes, where the drive ended before the map had seen it
 
 
-def changing(rng: Generator, before: float, after: float) -> Town:
+def changing_town(rng: Generator, before: float, after: float) -> Town:
     """A town whose first road is `before` and becomes `after`."""
-    drawn = town.build(rng, MINUTES, 0.0)
+    drawn = town.draw_town(rng, MINUTES, 0.0)
     mu = drawn.mu.copy()
     excitement = drawn.excitement.copy()
     mu[:CHANGE, :LENGTH], mu[CHANGE:, :LENGTH], excitement[:LENGTH] = before, after, EXCITEMENT
     return Town(mu, excitement, drawn.changed, drawn.common, drawn.usual)
 
 
-def delays(rng: Generator, before: float, after: float) -> IntArray:
+def detection_delays(rng: Generator, before: float, after: float) -> IntArray:
     """Excited passes over each cell of the road, (LENGTH,), until the map has seen the change.
 
     Ice is seen when P(μ < .4) > .9; its end, when P(μ < .4) < .1, which ends an alert. A pass is
     one excited visit that the map heard of the cell, whether or not it was the right cell.
     """
-    place = changing(rng, before, after)
-    visits = town.drive(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
+    place = changing_town(rng, before, after)
+    visits = town.drive_fleet(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
     o = observations_of(rows_of(visits), visits.vehicle)
     here = (visits.place < LENGTH) & visits.excited & (visits.seconds >= 60.0 * CHANGE)
     passes = np.zeros(LENGTH, np.int64)
@@ -55,12 +55,12 @@ def delays(rng: Generator, before: float, after: float) -> IntArray:
         if here[part[-1]]:
             cell = visits.place[part[-1]]
             passes[cell] += 1
-            if seen[cell] == UNREACHED and _seen(fusion, int(cell), after < before):
+            if seen[cell] == UNREACHED and _has_seen(fusion, int(cell), after < before):
                 seen[cell] = passes[cell]
     return seen
 
 
-def _seen(fusion: Fusion, cell: int, ice: bool) -> bool:
+def _has_seen(fusion: Fusion, cell: int, ice: bool) -> bool:
     slot = fusion.slots_of(CELL[cell : cell + 1], np.zeros(1, np.int64))[0]
     slippery = float(fusion.believed(np.array([slot]))[0] @ SLIPPERY_SHARE)
     return slippery > RAISE_ABOVE if ice else slippery < CLEAR_BELOW
@@ -74,7 +74,7 @@ def measure(seeds: range) -> dict[str, float]:
     for name, before, after in (("ice_onset", DRY, ICE), ("ice_end", ICE, DRY)):
         found: FloatArray = np.concatenate(
             [
-                delays(np.random.default_rng([seed, 5]), before, after).astype(float)
+                detection_delays(np.random.default_rng([seed, 5]), before, after).astype(float)
                 for seed in seeds
             ]
         )

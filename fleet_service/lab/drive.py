@@ -72,7 +72,7 @@ def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
     }
 
 
-def arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
+def draw_arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
     """When each delivery comes [s] and which visit it brings, in order of arrival: some late,
     some twice.
     """
@@ -87,7 +87,7 @@ def arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
     return at[order], which[order]
 
 
-def novel(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
+def novel_deliveries(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
     """Those deliveries that the service admits: each identity once."""
     streams = SequenceTrackers()
     kept = []
@@ -126,7 +126,7 @@ class AlertWatch:
         self.alerted.append(np.isin(slots, list(self.alerts.slots)) & known)
 
 
-def minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Observations]:
+def split_minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Observations]:
     """The observations that arrive in each minute."""
     for rows in np.split(np.arange(len(at)), np.searchsorted(at, 60.0 * np.arange(1, count + 1)))[
         :count
@@ -134,19 +134,19 @@ def minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Observation
         yield o.take(rows)
 
 
-def watch(
+def watch_drive(
     rng: Generator, v: Visits, count: int, asked: tuple[int, ...] | None = None
 ) -> AlertWatch:
     """Deliver the visits and ask the map after each of `count` minutes, or only those `asked`."""
     rows = rows_of(v)
-    at, which = arrivals(rng, v)
-    kept = novel(rows, v.vehicle, which)
+    at, which = draw_arrivals(rng, v)
+    kept = novel_deliveries(rows, v.vehicle, which)
     at = at[kept]
     which = which[kept]
     fusion = Fusion(LATENESS_S)
     watched = AlertWatch(fusion, Alerts(fusion))
     o = observations_of(rows, v.vehicle).take(which)
-    for minute, part in enumerate(minutes(o, at, count), 1):
+    for minute, part in enumerate(split_minutes(o, at, count), 1):
         if len(part.time):
             updated = fusion.update(part)
             watched.alerts.update(updated.slots)

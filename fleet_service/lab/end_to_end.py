@@ -19,8 +19,8 @@ import pyarrow.parquet as pq
 from fleet_service.fusion import Fusion, Observations, observations_of
 from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.lab.drive import LATENESS_S
-from fleet_service.lab.resampled import DrivenVisits, TrueVisits, driven
-from fleet_service.lab.score import SURE_GRIP, Scores, of_beliefs, safe
+from fleet_service.lab.resampled import DrivenVisits, TrueVisits, attach_truth
+from fleet_service.lab.score import SURE_GRIP, Scores, of_beliefs, safe_share
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.view import LOWER, UPPER, is_measured
 from schemas import grid, mugrid, wire
@@ -55,18 +55,18 @@ HILLS: Final = World(
     "hills-20000", 0.5, f"{WHOLE_WAY}.hills"
 )  # frictions and hills that nobody tuned on
 # Half of the vehicles as real cars are, on ten towns' own frictions and hills: the figures without
-# a further name, see `moments`. All cells of a way share one snow, so that fewer ways say little
+# a further name, see `moments.ask_moments`. All cells of a way share one snow, so that fewer ways say little
 # about P(slippery).
 WAYS: Final = tuple(
     World(f"hills-{seed}", 0.5, f"{WHOLE_WAY}.{seed}", seed) for seed in range(20_001, 20_011)
 )
 
 
-def command(vehicles: int, seconds: float, world: World) -> Drive:
+def drive_command(vehicles: int, seconds: float, world: World) -> Drive:
     """A drive by `python -m deploy.end_to_end`."""
     import sys
 
-    def drive(folder: Path) -> None:
+    def run_drive(folder: Path) -> None:
         options = ["--out", str(folder), "--vehicles", str(vehicles), "--duration", str(seconds)]
         options += [
             "--scenario",
@@ -82,7 +82,7 @@ def command(vehicles: int, seconds: float, world: World) -> Drive:
                 "end-to-end", "the simulated vehicles failed", "see above, or --skip-end-to-end"
             )
 
-    return drive
+    return run_drive
 
 
 def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float]:
@@ -91,23 +91,23 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
     """
     folder = folder / world.prefix.removeprefix("fusion.")
     drive(folder)
-    columns = read(folder / OBSERVATIONS)
+    columns = read_observations(folder / OBSERVATIONS)
     visits = pq.read_table(folder / TRUTH)
     fusion = Fusion(LATENESS_S)
     raised = raised_alerts(fusion, observations_in(columns))
     false, beside = false_ice(raised, visits)
-    slots, truth = joined(fusion, visits)
+    slots, truth = slots_with_truth(fusion, visits)
     several = fusion.live.vehicles[slots] >= SEVERAL
     slots = slots[several]
     truth = truth[several]
     belief = fusion.beliefs(slots, int(fusion.live.time[: fusion.size].max()))
-    scores = of_beliefs(belief, truth, excited(fusion, visits)[slots])
+    scores = of_beliefs(belief, truth, excited_vehicles(fusion, visits)[slots])
     lower, upper = (mugrid.quantiles(belief, q) for q in (LOWER, UPPER))
     with_value = is_measured(lower, upper, fusion.live.values[slots], belief @ SLIPPERY_SHARE)
     pure = with_value & one_surface(fusion, visits)[slots]
-    found = _figures(scores, with_value) | {
-        "rmse.one_surface": mean(scores.error[pure] ** 2) ** 0.5,
-        "safe95": safe(scores),
+    found = _score_figures(scores, with_value) | {
+        "rmse.one_surface": mean_or_nan(scores.error[pure] ** 2) ** 0.5,
+        "safe95": safe_share(scores),
         "observations": float(len(columns["cell"])),
         "alerts": float(len(raised)),
         "false_ice": float(false),
@@ -153,25 +153,25 @@ def false_ice(raised: Sequence[Alert], visits: pa.Table) -> tuple[int, int]:
     return false, beside
 
 
-def _figures(scores: Scores, measured: np.ndarray[Any, Any]) -> dict[str, float]:
+def _score_figures(scores: Scores, measured: np.ndarray[Any, Any]) -> dict[str, float]:
     value = scores.taken(measured)
     return {
-        "coverage90": mean(scores.covered),
-        "rmse": mean(value.error**2) ** 0.5,
-        "coverage90.measured": mean(value.covered),
-        "bias.measured": mean(value.error),
-        "rmse.excited3": mean(value.error[value.vehicles >= 3] ** 2) ** 0.5,
+        "coverage90": mean_or_nan(scores.covered),
+        "rmse": mean_or_nan(value.error**2) ** 0.5,
+        "coverage90.measured": mean_or_nan(value.covered),
+        "bias.measured": mean_or_nan(value.error),
+        "rmse.excited3": mean_or_nan(value.error[value.vehicles >= 3] ** 2) ** 0.5,
         "cells": float(len(scores.error)),
         "cells.measured": float(measured.sum()),
     }
 
 
-def mean(values: np.ndarray[Any, Any]) -> float:
+def mean_or_nan(values: np.ndarray[Any, Any]) -> float:
     """The mean, NaN of nothing: a figure that was not measured holds no bar."""
     return float(values.mean()) if len(values) else float("nan")
 
 
-def read(path: Path) -> dict[str, Any]:
+def read_observations(path: Path) -> dict[str, Any]:
     """Columns of observations as the archive would give them."""
     table = pq.read_table(path)
     out = {}
@@ -191,7 +191,7 @@ def driven_in(folder: Path) -> DrivenVisits:
     _, vehicle = np.unique(truth["vehicle"].to_numpy(zero_copy_only=False), return_inverse=True)
     enter = truth["enter_time"].cast(pa.int64()).to_numpy()
     true = TrueVisits(vehicle, enter, truth["mu"].to_numpy(), truth["utilisation"].to_numpy())
-    return driven(read(folder / OBSERVATIONS), true)
+    return attach_truth(read_observations(folder / OBSERVATIONS), true)
 
 
 def observations_in(columns: dict[str, Any]) -> Observations:
@@ -208,7 +208,7 @@ def observations_in(columns: dict[str, Any]) -> Observations:
     return observations_of(columns | identity, columns["vehicle"])
 
 
-def joined(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatArray]:
+def slots_with_truth(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatArray]:
     """Slots that a vehicle truly visited, and their friction at the last such visit's half
     minute.
     """
@@ -239,7 +239,7 @@ def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np
     return np.asarray(most - least <= SAME)
 
 
-def excited(fusion: Fusion, visits: pa.Table) -> IntArray:
+def excited_vehicles(fusion: Fusion, visits: pa.Table) -> IntArray:
     """Distinct vehicles that used EXCITED_SHARE of the grip in each slot, (slots,)."""
     rows = visits["utilisation"].to_numpy() >= EXCITED_SHARE
     slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))

@@ -16,7 +16,7 @@ from fleet_service.fusion import Fusion, observations_of
 from fleet_service.lab import agent, town
 from fleet_service.lab.agent import Errors, Passes
 from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
-from fleet_service.lab.messages import clock_of, messages
+from fleet_service.lab.messages import clock_of, make_messages
 from fleet_service.lab.town import Visits
 from schemas import mugrid
 from schemas.config import ServiceConfig
@@ -28,7 +28,7 @@ UNEXCITED: Final = (1, 3, 10, 100, 1000)
 PARTS: Final = 60  # portions in which a shuffled drive comes
 
 
-def difference(a: Fusion, b: Fusion) -> float:
+def largest_difference(a: Fusion, b: Fusion) -> float:
     """Largest difference of any probability in any cell of two fusions; 1 where one has a cell
     that the other lacks.
     """
@@ -39,15 +39,17 @@ def difference(a: Fusion, b: Fusion) -> float:
     return float(np.abs(a.beliefs(np.arange(a.size), now) - b.beliefs(there, now)).max())
 
 
-def drive(rng: Generator) -> Visits:
+def drive_town(rng: Generator) -> Visits:
     """Twenty minutes in a town where some vehicles lie, so that weights differ."""
-    visits = town.drive(rng, town.build(rng, MINUTES, 0.3), Errors.draw(rng, VEHICLES), MINUTES)
-    return town.wrong(visits, np.arange(VEHICLES) < VEHICLES // 8, 0.25)
+    visits = town.drive_fleet(
+        rng, town.draw_town(rng, MINUTES, 0.3), Errors.draw(rng, VEHICLES), MINUTES
+    )
+    return town.claim_falsely(visits, np.arange(VEHICLES) < VEHICLES // 8, 0.25)
 
 
-def order(rng: Generator) -> float:
+def order_difference(rng: Generator) -> float:
     """In order of time against any order within the lateness."""
-    visits = drive(rng)
+    visits = drive_town(rng)
     o = observations_of(rows_of(visits), visits.vehicle)
     straight = Fusion(LATENESS_S)
     mixed = Fusion(LATENESS_S)
@@ -56,15 +58,15 @@ def order(rng: Generator) -> float:
     late = sum(
         int(mixed.update(o.take(rows)).late.sum()) for rows in np.array_split(arrival, PARTS)
     )
-    return 1.0 if late else difference(straight, mixed)
+    return 1.0 if late else largest_difference(straight, mixed)
 
 
-def replay(rng: Generator) -> float:
+def replay_difference(rng: Generator) -> float:
     """A service that took messages, some of them late or twice, against one that starts from its
     archive.
     """
-    visits = drive(rng)
-    sent = messages(visits)
+    visits = drive_town(rng)
+    sent = make_messages(visits)
     at = visits.seconds[[m.last for m in sent]] + rng.uniform(0.0, 1.5 * LATENESS_S, len(sent))
     with tempfile.TemporaryDirectory() as folder:
         engine = Engine(ServiceConfig(), Path(folder))
@@ -75,7 +77,7 @@ def replay(rng: Generator) -> float:
         engine.close()
         again = Engine(ServiceConfig(), Path(folder))
         again.close()
-        return difference(engine.state.fusion, again.state.fusion)
+        return largest_difference(engine.state.fusion, again.state.fusion)
 
 
 def upper_shift(rng: Generator) -> float:
@@ -90,12 +92,12 @@ def upper_shift(rng: Generator) -> float:
             seconds: FloatArray = np.sort(rng.random(n)) * 3600.0
             who = rng.integers(0, vehicles, n)
             along = np.zeros(n, np.int64)
-            shares = agent.shares(rng, np.zeros(n, bool))
+            shares = agent.used_shares(rng, np.zeros(n, bool))
             road: FloatArray = np.full(n, mu)
             passes = Passes(
-                who, road, 0.0 * road, shares, agent.noise(rng, along), along, along > 0
+                who, road, 0.0 * road, shares, agent.reading_noise(rng, along), along, along > 0
             )
-            reports = agent.report(rng, Errors.draw(rng, vehicles), passes)
+            reports = agent.draw_reports(rng, Errors.draw(rng, vehicles), passes)
             fusion = Fusion(LATENESS_S)
             fusion.update(
                 observations_of(rows_of(Visits(seconds, who, along, road, along > 0, reports)), who)

@@ -80,10 +80,10 @@ def lower_ends(rng: Generator, known: WeatherSince | None) -> FloatArray:
         nothing,
         excited,
     )
-    reports = agent.report(rng, Errors.draw(rng, CARS), passes)
+    reports = agent.draw_reports(rng, Errors.draw(rng, CARS), passes)
     fusion = Fusion(LATENESS_S)
     if known is not None:
-        fusion.update_weather(_reports(known))
+        fusion.update_weather(_hourly_reports(known))
     fusion.update(
         observations_of(rows_of(Visits(seconds, who, nothing, mu, excited, reports)), who)
     )
@@ -92,7 +92,7 @@ def lower_ends(rng: Generator, known: WeatherSince | None) -> FloatArray:
     return np.array([mugrid.quantiles(fusion.beliefs(slot, moment), 0.05)[0] for moment in at])
 
 
-def _reports(known: WeatherSince) -> Reports:
+def _hourly_reports(known: WeatherSince) -> Reports:
     hours = 1 + np.arange(1 + AFTER_MIN[-1] // 60)
     n = len(hours)
     temperature = np.full(n, known.temperature)
@@ -106,7 +106,7 @@ def _reports(known: WeatherSince) -> Reports:
     )
 
 
-def table(values: Mapping[str, float]) -> str:
+def format_table(values: Mapping[str, float]) -> str:
     """Lower end, and the deceleration [m/s²] that it bears, by weather and time."""
     times = [f"{minutes} min" if minutes < 60 else f"{minutes // 60} h" for minutes in AFTER_MIN]
     lines = [

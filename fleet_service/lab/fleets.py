@@ -12,18 +12,18 @@ import numpy as np
 
 from fleet_service.lab import rules, town
 from fleet_service.lab.agent import Errors
-from fleet_service.lab.drive import watch
+from fleet_service.lab.drive import watch_drive
 from fleet_service.lab.score import (
     LEVELS,
     Scores,
     coverage,
     earlier_visits,
     excited_vehicles,
-    joined,
+    join_scores,
     reliability,
     rmse,
-    safe,
-    snapshots,
+    safe_share,
+    score_snapshots,
 )
 from schemas.numeric import BoolArray
 
@@ -76,20 +76,22 @@ class Found:
     missed_settled: list[BoolArray] = field(default_factory=list)
 
 
-def one(fleet: Fleet, seed: int, found: Found) -> None:
+def drive_seed(fleet: Fleet, seed: int, found: Found) -> None:
     """Drive one seed and record the map's answers."""
     rng = np.random.default_rng([seed, 1])
-    place = town.build(rng, fleet.minutes, CHANGING)
+    place = town.draw_town(rng, fleet.minutes, CHANGING)
     errors = Errors.draw(rng, VEHICLES)
-    visits = town.drive(rng, place, errors, fleet.minutes)
+    visits = town.drive_fleet(rng, place, errors, fleet.minutes)
     if fleet.share:
-        visits = town.wrong(
+        visits = town.claim_falsely(
             visits, np.arange(VEHICLES) < round(fleet.share * VEHICLES), fleet.claim
         )
-    watched = watch(rng, visits, fleet.minutes)
+    watched = watch_drive(rng, visits, fleet.minutes)
     at = tuple(minute for minute in AT if minute > fleet.begin)
-    found.ours.append(snapshots(watched.beliefs, place, visits, at, VEHICLES))
-    for scores, theirs in zip(rules.scores(visits, place, at, VEHICLES), found.theirs, strict=True):
+    found.ours.append(score_snapshots(watched.beliefs, place, visits, at, VEHICLES))
+    for scores, theirs in zip(
+        rules.score_rules(visits, place, at, VEHICLES), found.theirs, strict=True
+    ):
         theirs.append(scores)
     for minute in range(1, fleet.minutes + 1):
         if earlier_visits(visits, 60.0 * minute, VEHICLES).min() < EARLIER:
@@ -112,41 +114,41 @@ def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
     for fleet in FLEETS:
         found = Found()
         for seed in seeds:
-            one(fleet, seed, found)
-        log_line(f"{fleet.name}: {len(joined(found.ours).error)} answers")
-        out |= _figures(fleet, found)
+            drive_seed(fleet, seed, found)
+        log_line(f"{fleet.name}: {len(join_scores(found.ours).error)} answers")
+        out |= _fleet_figures(fleet, found)
     return out
 
 
-def _figures(fleet: Fleet, found: Found) -> dict[str, float]:
-    ours = joined(found.ours)
+def _fleet_figures(fleet: Fleet, found: Found) -> dict[str, float]:
+    ours = join_scores(found.ours)
     out = {}
     name = f"fusion.{fleet.name}"
     out[f"{name}.rmse"], out[f"{name}.coverage90"], out[f"{name}.safe95"] = (
         rmse(ours),
         coverage(ours),
-        safe(ours),
+        safe_share(ours),
     )
     out[f"{name}.interval_score"] = float(ours.interval.mean())
-    out[f"fusion.false_ice.{fleet.name}"] = _share(found.false_ice)
-    out[f"fusion.missed_ice.{fleet.name}"] = _share(found.missed_ice)
-    out[f"fusion.false_ice_settled.{fleet.name}"] = _share(found.false_settled)
-    out[f"fusion.missed_ice_settled.{fleet.name}"] = _share(found.missed_settled)
+    out[f"fusion.false_ice.{fleet.name}"] = _share_of_minutes(found.false_ice)
+    out[f"fusion.missed_ice.{fleet.name}"] = _share_of_minutes(found.missed_ice)
+    out[f"fusion.false_ice_settled.{fleet.name}"] = _share_of_minutes(found.false_settled)
+    out[f"fusion.missed_ice_settled.{fleet.name}"] = _share_of_minutes(found.missed_settled)
     best = np.inf
-    for rule, scores in zip(rules.RULES, map(joined, found.theirs), strict=True):
+    for rule, scores in zip(rules.RULES, map(join_scores, found.theirs), strict=True):
         label = f"rule.{fleet.name}.{rule.replace(' ', '_')}"
         out |= {f"{label}.rmse": rmse(scores), f"{label}.coverage90": coverage(scores)}
         out[f"{label}.interval_score"] = float(scores.interval.mean())
         best = min(best, float(scores.interval.mean()))
     out[f"{name}.vs_best_rule"] = float(ours.interval.mean()) / best
     if fleet.name == FLEETS[0].name:
-        out |= _curves(ours)
+        out |= _reliability_curve(ours)
     if fleet.name == "mis15_dry":
         out["fusion.missed_ice.mis15"] = out[f"fusion.missed_ice.{fleet.name}"]
     return out
 
 
-def _curves(ours: Scores) -> dict[str, float]:
+def _reliability_curve(ours: Scores) -> dict[str, float]:
     """The reliability diagram."""
     return {
         f"fusion.clean.reliability.{level:.2f}": float(share)
@@ -154,5 +156,5 @@ def _curves(ours: Scores) -> dict[str, float]:
     }
 
 
-def _share(minutes: list[BoolArray]) -> float:
+def _share_of_minutes(minutes: list[BoolArray]) -> float:
     return float(np.concatenate(minutes).mean()) if sum(map(len, minutes)) else float("nan")

@@ -35,7 +35,7 @@ def clock_of(seconds: float) -> int:
     return START + int(seconds * NS) + NS
 
 
-def messages(v: Visits) -> list[SentMessage]:
+def make_messages(v: Visits) -> list[SentMessage]:
     """Each vehicle's visits in batches, in order of time per vehicle and region."""
     rows = rows_of(v)
     out = []
@@ -45,12 +45,12 @@ def messages(v: Visits) -> list[SentMessage]:
     for stream in np.split(order, streams):
         for seq, start in enumerate(range(0, len(stream), BATCH_ROWS), 1):
             out.append(
-                _message(v, rows, latitude, longitude, stream[start : start + BATCH_ROWS], seq)
+                _make_message(v, rows, latitude, longitude, stream[start : start + BATCH_ROWS], seq)
             )
     return out
 
 
-def _message(
+def _make_message(
     v: Visits,
     rows: dict[str, np.ndarray],
     latitude: np.ndarray,
@@ -86,7 +86,7 @@ def _message(
     )
 
 
-def rebadged(message: Message, thief: int) -> tuple[Message, Message]:
+def forge_messages(message: Message, thief: int) -> tuple[Message, Message]:
     """Another's message on the thief's own key; and its visits in a batch of the thief's own."""
     batch = decode(message.payload, message.encoding, message.kind)
     name = name_of(thief)

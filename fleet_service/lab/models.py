@@ -17,7 +17,7 @@ import numpy as np
 from fleet_service.lab import resampled, rules, town
 from fleet_service.lab.agent import CLEAN, ErrorModel, Errors
 from fleet_service.lab.bars import COUNTS
-from fleet_service.lab.drive import watch
+from fleet_service.lab.drive import watch_drive
 from fleet_service.lab.resampled import DrivenVisits
 from fleet_service.lab.score import (
     Scores,
@@ -25,10 +25,10 @@ from fleet_service.lab.score import (
     coverage,
     false_grip,
     false_ice,
-    joined,
+    join_scores,
     of_class,
+    score_snapshots,
     slippery_scores,
-    snapshots,
 )
 from schemas.numeric import FloatArray
 
@@ -51,23 +51,23 @@ MODELS: Final[dict[str, ErrorModel]] = {
 }
 
 
-def one(
+def score_town(
     model: ErrorModel, seed: int, ways: DrivenVisits | None = None
 ) -> tuple[Scores, list[Scores]]:
     """Scores of the map, and of the rules, on one town; its reports are drawn from those of
     `ways`, if there are.
     """
     rng = np.random.default_rng([seed, 11])
-    place = town.build(rng, MINUTES, 0.0, model)
+    place = town.draw_town(rng, MINUTES, 0.0, model)
     errors = Errors.draw(rng, VEHICLES, model)
-    visits = town.drive(rng, place, errors, MINUTES, ACQUAINTED)
+    visits = town.drive_fleet(rng, place, errors, MINUTES, ACQUAINTED)
     if ways is not None:
-        visits = resampled.drawn(rng, visits, ways, VEHICLES)
-    watched = watch(rng, visits, MINUTES, AT)
+        visits = resampled.resample_visits(rng, visits, ways, VEHICLES)
+    watched = watch_drive(rng, visits, MINUTES, AT)
     here = np.arange(town.CELLS) >= town.CELLS // 2
     return (
-        snapshots(watched.beliefs, place, visits, AT, VEHICLES, here),
-        rules.scores(visits, place, AT, VEHICLES, here),
+        score_snapshots(watched.beliefs, place, visits, AT, VEHICLES, here),
+        rules.score_rules(visits, place, AT, VEHICLES, here),
     )
 
 
@@ -75,7 +75,7 @@ def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
     """All fleets; `log_line` hears the progress."""
     out: dict[str, float] = {}
     for name, model in MODELS.items():
-        out |= _figures(f"fusion.{name}", [one(model, seed) for seed in seeds])
+        out |= _town_figures(f"fusion.{name}", [score_town(model, seed) for seed in seeds])
         log_line(f"{name}: {len(seeds)} towns")
     return out | {
         "fusion.reliability.ece": max(out[f"fusion.{name}.slippery.ece"] for name in MODELS)
@@ -88,16 +88,16 @@ def measure_real(ways: DrivenVisits, seeds: range) -> dict[str, float]:
     """
     if not ways.excited.any() or ways.excited.all():
         return {}
-    return _figures("fusion.resampled", [one(CLEAN, seed, ways) for seed in seeds])
+    return _town_figures("fusion.resampled", [score_town(CLEAN, seed, ways) for seed in seeds])
 
 
-def _figures(prefix: str, towns: Sequence[tuple[Scores, list[Scores]]]) -> dict[str, float]:
+def _town_figures(prefix: str, towns: Sequence[tuple[Scores, list[Scores]]]) -> dict[str, float]:
     ours, theirs = zip(*towns, strict=True)
-    whole = joined(list(ours))
-    others = [joined(list(of)) for of in zip(*theirs, strict=True)]
+    whole = join_scores(list(ours))
+    others = [join_scores(list(of)) for of in zip(*theirs, strict=True)]
     out = {
         f"{prefix}.coverage90": coverage(whole),
-        f"{prefix}.interval_score": _mean(whole.interval),
+        f"{prefix}.interval_score": _mean_or_nan(whole.interval),
     }
     out |= {f"{prefix}.false_grip": false_grip(whole), f"{prefix}.false_ice": false_ice(whole)}
     out |= {f"{prefix}.slippery.{name}": value for name, value in slippery_scores([whole]).items()}
@@ -106,21 +106,21 @@ def _figures(prefix: str, towns: Sequence[tuple[Scores, list[Scores]]]) -> dict[
     for n in COUNTS:
         here = of_class(whole, n)
         out[f"{prefix}.coverage90.n{n}"] = coverage(here)
-        out[f"{prefix}.rmse.n{n}"] = _root(here.error)
-        out[f"{prefix}.width.n{n}"] = _mean(here.width)
+        out[f"{prefix}.rmse.n{n}"] = _root_mean_square(here.error)
+        out[f"{prefix}.width.n{n}"] = _mean_or_nan(here.width)
         best = min(
-            (_mean(of_class(s, n).interval), label)
+            (_mean_or_nan(of_class(s, n).interval), label)
             for s, label in zip(others, rules.RULES, strict=True)
         )
         out[f"{prefix}.vs_best_rule.n{n}"] = (
-            _mean(here.interval) / best[0] if here.error.size else float("nan")
+            _mean_or_nan(here.interval) / best[0] if here.error.size else float("nan")
         )
     return out
 
 
-def _mean(values: FloatArray) -> float:
+def _mean_or_nan(values: FloatArray) -> float:
     return float(values.mean()) if len(values) else float("nan")
 
 
-def _root(error: FloatArray) -> float:
-    return float(np.sqrt(_mean(error**2)))
+def _root_mean_square(error: FloatArray) -> float:
+    return float(np.sqrt(_mean_or_nan(error**2)))

@@ -27,7 +27,7 @@ from fleet_service.lab.score import (
     by_surface,
     false_grip,
     false_ice,
-    joined,
+    join_scores,
     of_beliefs,
     slippery_scores,
 )
@@ -49,9 +49,9 @@ class AskedWay(NamedTuple):
     measured: BoolArray
 
 
-def moments(folder: Path) -> list[AskedWay]:
+def ask_moments(folder: Path) -> list[AskedWay]:
     """Return the map's answers about a way at each of MOMENTS that the way reaches."""
-    o = end_to_end.observations_in(end_to_end.read(folder / OBSERVATIONS))
+    o = end_to_end.observations_in(end_to_end.read_observations(folder / OBSERVATIONS))
     visits = pq.read_table(folder / TRUTH)
     begin = int(o.time.min())
     left = visits["leave_time"].cast(pa.int64())
@@ -66,13 +66,13 @@ def moments(folder: Path) -> list[AskedWay]:
         end_to_end.raised_alerts(fusion, o.take(rows))
         past = visits.filter(pc.less_equal(left, pa.scalar(until)))
         taken = until
-        slots, truth = end_to_end.joined(fusion, past)
+        slots, truth = end_to_end.slots_with_truth(fusion, past)
         several = fusion.live.vehicles[slots] >= SEVERAL
         slots = slots[several]
         truth = truth[several]
         belief = fusion.beliefs(slots, until)
         lower, upper = (mugrid.quantiles(belief, q) for q in (LOWER, UPPER))
-        scores = of_beliefs(belief, truth, end_to_end.excited(fusion, past)[slots])
+        scores = of_beliefs(belief, truth, end_to_end.excited_vehicles(fusion, past)[slots])
         out.append(
             AskedWay(
                 scores,
@@ -82,7 +82,7 @@ def moments(folder: Path) -> list[AskedWay]:
     return out
 
 
-def figures(ways: Sequence[Sequence[AskedWay]], prefix: str) -> dict[str, float]:
+def moment_figures(ways: Sequence[Sequence[AskedWay]], prefix: str) -> dict[str, float]:
     """Return the figures of ways (≥ 10 for a judgement): of each moment the mean, the worst and the
     spread over them.
 
@@ -94,19 +94,19 @@ def figures(ways: Sequence[Sequence[AskedWay]], prefix: str) -> dict[str, float]
         name = f"after{seconds / 60.0:.0f}"
         now = [way[k] for way in ways]
         known = [moment.scores.taken(moment.measured) for moment in now]
-        rmse = np.array([float(end_to_end.mean(s.error**2) ** 0.5) for s in known])
-        cover = np.array([end_to_end.mean(s.covered) for s in known])
-        every = joined([moment.scores for moment in now])
+        rmse = np.array([float(end_to_end.mean_or_nan(s.error**2) ** 0.5) for s in known])
+        cover = np.array([end_to_end.mean_or_nan(s.covered) for s in known])
+        every = join_scores([moment.scores for moment in now])
         out |= {f"{prefix}.rmse.{name}": rmse.mean(), f"{prefix}.rmse.{name}.worst": rmse.max()}
         out |= {
             f"{prefix}.rmse.{name}.spread": rmse.std(),
             f"{prefix}.coverage90.measured.{name}": cover.mean(),
         }
-        out |= {f"{prefix}.coverage90.measured.{name}.worst": _farthest(cover)}
-        out |= {f"{prefix}.false_grip.{name}": false_grip(joined(known))}
-        out |= {f"{prefix}.false_ice.{name}": false_ice(joined(known))}
-        out |= {f"{prefix}.crps.{name}": end_to_end.mean(every.crps)}
-        out |= {f"{prefix}.interval_score.{name}": end_to_end.mean(every.interval)}
+        out |= {f"{prefix}.coverage90.measured.{name}.worst": _farthest_coverage(cover)}
+        out |= {f"{prefix}.false_grip.{name}": false_grip(join_scores(known))}
+        out |= {f"{prefix}.false_ice.{name}": false_ice(join_scores(known))}
+        out |= {f"{prefix}.crps.{name}": end_to_end.mean_or_nan(every.crps)}
+        out |= {f"{prefix}.interval_score.{name}": end_to_end.mean_or_nan(every.interval)}
         out |= {
             f"{prefix}.slippery.{of}.{name}": value
             for of, value in slippery_scores([every]).items()
@@ -114,11 +114,11 @@ def figures(ways: Sequence[Sequence[AskedWay]], prefix: str) -> dict[str, float]
     last = [way[-1].scores for way in ways]
     out |= {
         f"{prefix}.coverage90.{surface}": share
-        for surface, share in by_surface(joined(last)).items()
+        for surface, share in by_surface(join_scores(last)).items()
     }
     out |= {f"{prefix}.slippery.{of}": value for of, value in slippery_scores(last).items()}
-    return out | {f"{prefix}.crps": end_to_end.mean(joined(last).crps)}
+    return out | {f"{prefix}.crps": end_to_end.mean_or_nan(join_scores(last).crps)}
 
 
-def _farthest(cover: FloatArray) -> float:
+def _farthest_coverage(cover: FloatArray) -> float:
     return float(cover[np.argmax(np.abs(cover - MIDDLE))])

@@ -18,7 +18,7 @@ from schemas.runtime.palette import ESTIMATORS
 SIZE = (5.5, 4.2)
 
 
-def draw(
+def draw_plots(
     found: Sequence[Figure], folder: Path, forms: Sequence[str] = ("png", "svg", "pdf")
 ) -> list[Path]:
     """Write the four plots into `folder`, in each form.
@@ -33,10 +33,10 @@ def draw(
     values = {figure.name: figure.value for figure in found}
     paths = []
     for name, plot in (
-        ("reliability", _reliability),
-        ("rmse", _rmse),
-        ("delay", _delay),
-        ("misbehaving", _misbehaving),
+        ("reliability", _draw_reliability),
+        ("rmse", _draw_rmse),
+        ("delay", _draw_delay),
+        ("misbehaving", _draw_misbehaving),
     ):
         canvas = Canvas(figsize=SIZE, layout="constrained")
         axes = canvas.subplots()
@@ -47,7 +47,7 @@ def draw(
     return paths
 
 
-def _family(values: Mapping[str, float], prefix: str) -> tuple[list[float], list[float]]:
+def _values_below(values: Mapping[str, float], prefix: str) -> tuple[list[float], list[float]]:
     pairs = sorted(
         (float(name.removeprefix(prefix)), v)
         for name, v in values.items()
@@ -56,9 +56,9 @@ def _family(values: Mapping[str, float], prefix: str) -> tuple[list[float], list
     return [x for x, _ in pairs], [y for _, y in pairs]
 
 
-def _reliability(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401 matplotlib has no types here
+def _draw_reliability(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401 matplotlib has no types here
     axes.plot([0, 1], [0, 1], color="0.7")
-    axes.plot(*_family(values, "fusion.clean.reliability."), marker="o", markersize=3)
+    axes.plot(*_values_below(values, "fusion.clean.reliability."), marker="o", markersize=3)
     axes.set(
         title="Reliability, honest fleet",
         xlabel="said: P(μ ≤ x)",
@@ -66,7 +66,7 @@ def _reliability(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN40
     )
 
 
-def _rmse(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
+def _draw_rmse(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
     axes.plot(
         COUNTS,
         [values.get(f"fusion.clean.rmse.n{n}", float("nan")) for n in COUNTS],
@@ -83,13 +83,16 @@ def _rmse(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
     )
 
 
-def _delay(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
+def _draw_delay(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
     for name, label in (
         ("ice_onset", "ice comes: P(μ < .4) > .9"),
         ("ice_end", "ice goes: alert cleared"),
     ):
         axes.plot(
-            *_family(values, f"fusion.{name}.share_after."), marker="o", markersize=3, label=label
+            *_values_below(values, f"fusion.{name}.share_after."),
+            marker="o",
+            markersize=3,
+            label=label,
         )
     axes.set(
         title="Detection delay", xlabel="excited passes", ylabel="share of cells", ylim=(0, 1.02)
@@ -97,7 +100,7 @@ def _delay(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
     axes.legend()
 
 
-def _misbehaving(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
+def _draw_misbehaving(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
     shares = {"clean": 0.0, "mis05": 5.0, "mis15": 15.0, "mis30_colluding": 30.0}
     axes.plot(
         shares.values(),

@@ -57,8 +57,8 @@ class DrivenVisits(NamedTuple):
     reports: SimulatedReports
 
 
-def driven(observations: dict[str, Any], truth: TrueVisits) -> DrivenVisits:
-    """Return observations of a way, columns as `end_to_end.read` gives them, with the truth at the
+def attach_truth(observations: dict[str, Any], truth: TrueVisits) -> DrivenVisits:
+    """Return observations of a way, columns as `end_to_end.read_observations` gives them, with the truth at the
     middle of each.
     """
     vehicle = observations["vehicle"].astype(np.int64)
@@ -83,7 +83,7 @@ def driven(observations: dict[str, Any], truth: TrueVisits) -> DrivenVisits:
     return DrivenVisits(vehicle, truth.mu[row], truth.share[row] >= EXCITED_SHARE, reports)
 
 
-def joined(ways: Sequence[DrivenVisits]) -> DrivenVisits:
+def join_ways(ways: Sequence[DrivenVisits]) -> DrivenVisits:
     """Visits of several ways, whose vehicles are different ones."""
     begins = np.cumsum([0, *(int(way.vehicle.max()) + 1 for way in ways)])
     columns = zip(*(vars(way.reports).values() for way in ways), strict=True)
@@ -95,7 +95,7 @@ def joined(ways: Sequence[DrivenVisits]) -> DrivenVisits:
     )
 
 
-def drawn(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles: int) -> Visits:
+def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles: int) -> Visits:
     """The town's visits with reports of `ways`; each of its `vehicles` is one of theirs, if
     there are so many.
     """
@@ -107,14 +107,16 @@ def drawn(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles: int) -> 
         alike = alike[np.argsort(ways.mu[alike], kind="stable")]
         for vehicle in range(vehicles):
             wanted = np.flatnonzero((visits.vehicle == vehicle) & (visits.excited == excited))
-            own = _near(rng, visits.mu[wanted], ways.mu, alike[ways.vehicle[alike] == who[vehicle]])
-            others = _near(rng, visits.mu[wanted], ways.mu, alike)
+            own = _nearest_friction(
+                rng, visits.mu[wanted], ways.mu, alike[ways.vehicle[alike] == who[vehicle]]
+            )
+            others = _nearest_friction(rng, visits.mu[wanted], ways.mu, alike)
             far = (own < 0) | (np.abs(np.log(visits.mu[wanted] / ways.mu[own])) > FARTHEST)
             row[wanted] = np.where(far, others, own)
-    return replace(visits, reports=_scaled(ways.reports, row, visits.mu / ways.mu[row]))
+    return replace(visits, reports=_scale_reports(ways.reports, row, visits.mu / ways.mu[row]))
 
 
-def _near(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntArray) -> IntArray:
+def _nearest_friction(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntArray) -> IntArray:
     """For each friction one of the NEAREST of `rows`, which are in its order; -1 where there are
     none.
     """
@@ -124,7 +126,7 @@ def _near(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntArray) -> Int
     return np.asarray(rows[first + rng.integers(0, min(NEAREST, len(rows)), len(mu))])
 
 
-def _scaled(reports: SimulatedReports, row: IntArray, by: FloatArray) -> SimulatedReports:
+def _scale_reports(reports: SimulatedReports, row: IntArray, by: FloatArray) -> SimulatedReports:
     """Rows of reports, on roads with `by` times the grip."""
     width = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
     place = np.clip(

@@ -23,7 +23,7 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.lab.score import Scores, excited_vehicles, joined, of_intervals
+from fleet_service.lab.score import Scores, excited_vehicles, join_scores, of_intervals
 from fleet_service.lab.town import CELLS, Town, Visits
 from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
@@ -52,7 +52,7 @@ _NEWEST, _ALL, _ONE, _INTERSECTION, _FEDERATED = range(_KALMAN)
 
 
 @compiled
-def posteriors(
+def vehicle_posteriors(
     vehicle: IntArray, reading: FloatArray, std: FloatArray, vehicles: int
 ) -> FloatArray:
     """(m, P) that each visit's vehicle sends, (n, 2): its filter's, which goes back to the prior
@@ -75,7 +75,7 @@ def posteriors(
 
 
 @compiled
-def fuse(
+def fuse_by_rules(
     place: IntArray,
     seconds: FloatArray,
     sent: FloatArray,
@@ -123,7 +123,7 @@ def fuse(
     return out
 
 
-def medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
+def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
     """Median of the vehicles' last readings within MEDIAN_MIN, and its standard deviation,
     (cells,) each.
     """
@@ -141,20 +141,20 @@ def medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
     return mean, std
 
 
-def scores(
+def score_rules(
     v: Visits, town: Town, at: tuple[int, ...], vehicles: int, where: BoolArray | bool = True
 ) -> list[Scores]:
     """Scores of each of RULES at some minutes, for the cells `where` an excited vehicle was."""
-    sent = posteriors(v.vehicle, v.reports.reading, v.reports.std, vehicles)
+    sent = vehicle_posteriors(v.vehicle, v.reports.reading, v.reports.std, vehicles)
     asked = 60.0 * np.array(at, float)
-    found = fuse(v.place, v.seconds, sent, v.reports.reading, v.reports.std, asked, CELLS)
+    found = fuse_by_rules(v.place, v.seconds, sent, v.reports.reading, v.reports.std, asked, CELLS)
     out: list[list[Scores]] = [[] for _ in RULES]
     for k, minute in enumerate(at):
         n = excited_vehicles(v, town, minute, vehicles)
         of_rules = [
             (found[k, rule, :, 0], np.sqrt(found[k, rule, :, 1])) for rule in range(_KALMAN)
         ]
-        for (mean, std), per_rule in zip([*of_rules, medians(v, minute)], out, strict=True):
+        for (mean, std), per_rule in zip([*of_rules, recent_medians(v, minute)], out, strict=True):
             half = Z_95 * std
             lower, mid, upper = (
                 np.clip(mean + sign * half, mugrid.LOWER, mugrid.UPPER) for sign in (-1.0, 0.0, 1.0)
@@ -162,4 +162,4 @@ def scores(
             nothing = np.full(CELLS, np.nan)
             answers = of_intervals(lower, mid, upper, town.mu[minute], n, nothing, nothing)
             per_rule.append(answers.taken((n >= 1) & where))
-    return [joined(per_rule) for per_rule in out]
+    return [join_scores(per_rule) for per_rule in out]

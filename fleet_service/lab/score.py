@@ -49,7 +49,7 @@ class Scores:
         return Scores(*(column[rows] for column in vars(self).values()))
 
 
-def joined(scores: list[Scores]) -> Scores:
+def join_scores(scores: list[Scores]) -> Scores:
     """All answers of several runs."""
     return Scores(
         *(
@@ -135,7 +135,7 @@ def crps_of(belief: FloatArray, truth: FloatArray) -> FloatArray:
     return np.asarray(np.trapezoid(gap, fine, axis=1))
 
 
-def snapshots(
+def score_snapshots(
     beliefs: Mapping[int, FloatArray],
     town: Town,
     v: Visits,
@@ -149,7 +149,7 @@ def snapshots(
         n = excited_vehicles(v, town, minute, vehicles)
         truth = town.mu[minute]
         out.append(of_beliefs(beliefs[minute], truth, n).taken((n >= 1) & where))
-    return joined(out)
+    return join_scores(out)
 
 
 def rmse(s: Scores) -> float:
@@ -163,7 +163,7 @@ def coverage(s: Scores) -> float:
     return float(s.covered.mean()) if len(s.covered) else float("nan")
 
 
-def safe(s: Scores) -> float:
+def safe_share(s: Scores) -> float:
     """Share of the truths above the lower end, on which the deceleration that is called safe at
     95 % rests.
     """
@@ -212,11 +212,11 @@ def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
     certain = np.clip(np.where(slippery, given, 1.0 - given), 1e-6, 1.0)
     found = calibration(scores)
     return {
-        "brier": _mean(np.square(given - slippery)),
-        "log": _mean(-np.log(certain)),
+        "brier": _mean_or_nan(np.square(given - slippery)),
+        "log": _mean_or_nan(-np.log(certain)),
         "ece": float(np.sum(found[:, 0] * np.abs(found[:, 1] - found[:, 2])) / max(len(given), 1)),
-        "missed": _mean(given[slippery] < MISSED),
-        "grip_raised": _mean(given[truth > SURE_GRIP] > RAISED),
+        "missed": _mean_or_nan(given[slippery] < MISSED),
+        "grip_raised": _mean_or_nan(given[truth > SURE_GRIP] > RAISED),
     }
 
 
@@ -224,17 +224,17 @@ def false_grip(s: Scores) -> float:
     """Return the share of truths below the interval: road that is more slippery than the map
     vouches for.
     """
-    return _mean(s.rank < ALPHA / 2.0)
+    return _mean_or_nan(s.rank < ALPHA / 2.0)
 
 
 def false_ice(s: Scores) -> float:
     """Return the share of truths above the interval: road with more grip than the map thinks
     possible.
     """
-    return _mean(s.rank > 1.0 - ALPHA / 2.0)
+    return _mean_or_nan(s.rank > 1.0 - ALPHA / 2.0)
 
 
-def _mean(values: FloatArray | BoolArray) -> float:
+def _mean_or_nan(values: FloatArray | BoolArray) -> float:
     return float(values.mean()) if len(values) else float("nan")
 
 

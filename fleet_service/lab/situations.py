@@ -40,7 +40,7 @@ WINTER: Final = agent.CLEAN._replace(share=(0.25, 0.35), low=0.65, tyres=-0.05, 
 VALUED: Final = 0.3  # of such passes look like values: a tenth to a third with common tyres
 
 
-def bounded(used: float, path: str) -> float:
+def bound_excess(used: float, path: str) -> float:
     """Lower end less `used`, or than the prior's, after BOUNDED vehicles that used so much, by
     one path of the wire.
     """
@@ -71,14 +71,16 @@ def bounded(used: float, path: str) -> float:
     for k in range(n):
         one = {name: column[k : k + 1] for name, column in columns.items()}
         fusion.update(
-            _received(Batch(Kind.OBSERVATION, "car-1", 1, 0, 1, 1, one), k, as_json="json" in path)
+            _decode_batch(
+                Batch(Kind.OBSERVATION, "car-1", 1, 0, 1, 1, one), k, as_json="json" in path
+            )
         )
     slot = fusion.slots_of(CELL[:1], np.zeros(1, np.int64))
     lower = float(mugrid.quantiles(fusion.beliefs(slot, int(fusion.live.time[slot[0]])), 0.05)[0])
     return lower - max(used, float(mugrid.quantiles(mugrid.PRIOR, 0.05)))
 
 
-def _received(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
+def _decode_batch(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
     """A batch as the service reads it from its bytes."""
     payload = wire.encode(batch)
     encoding = wire.ENCODING[Kind.OBSERVATION]
@@ -100,16 +102,16 @@ def _received(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
 def lower_excess() -> float:
     """The worst of all grips used and paths."""
     paths = ("protobuf posterior", "json posterior", "protobuf likelihood", "json likelihood")
-    return max(bounded(used, path) for used in USED for path in paths)
+    return max(bound_excess(used, path) for used in USED for path in paths)
 
 
 def backlog_fused(rng: Generator) -> float:
     """Share of an hour's rows that are fused when they come after an outage, while another
     vehicle drives on.
     """
-    place = town.build(rng, 60, 0.0)
+    place = town.draw_town(rng, 60, 0.0)
     errors = Errors.draw(rng, BACKLOG + 1)
-    visits = town.drive(rng, place, errors, 60)
+    visits = town.drive_fleet(rng, place, errors, 60)
     o = observations_of(rows_of(visits), visits.vehicle)
     live = o.vehicle == BACKLOG
     fusion = Fusion(LATENESS_S)
@@ -134,17 +136,17 @@ def safe_excess(rng: Generator) -> float:
     mu: FloatArray = np.where(icy, ICE, DRY)
     nothing = np.zeros(n, np.int64)
     passes = Passes(who, mu, np.zeros(n), share, rng.normal(size=n), nothing, ~icy)
-    reports = agent.report(rng, Errors.draw(rng, 40), passes)
+    reports = agent.draw_reports(rng, Errors.draw(rng, 40), passes)
     visits = Visits(seconds, who, nothing, mu, ~icy, reports)
     fusion = Fusion(LATENESS_S)
-    fusion.update_weather(_weather(FREEZING_C))
+    fusion.update_weather(_make_weather(FREEZING_C))
     fusion.update(observations_of(rows_of(visits), who))
     slot = fusion.slots_of(CELL[:1], np.zeros(1, np.int64))
     lower = mugrid.quantiles(fusion.beliefs(slot, START + int((HOUR_S + 1800.0) * NS)), 0.05)
     return GRAVITY * (float(lower[0]) - ICE)
 
 
-def _weather(temperature: float) -> Reports:
+def _make_weather(temperature: float) -> Reports:
     nothing = np.full((1, mugrid.BINS), np.nan)
     region = grid.region_of(CELL[:1])
     value: FloatArray = np.array([temperature])
@@ -171,7 +173,12 @@ def false_alert(rng: Generator) -> bool:
     passes = Passes(who, mu, common, share, rng.normal(size=n), turning, valued)
     seconds = np.asarray(20.0 * who, np.float64)
     visits = Visits(
-        seconds, who, 0 * who, mu, valued, agent.report(rng, Errors.draw(rng, n, WINTER), passes)
+        seconds,
+        who,
+        0 * who,
+        mu,
+        valued,
+        agent.draw_reports(rng, Errors.draw(rng, n, WINTER), passes),
     )
     o = observations_of(rows_of(visits), who)
     fusion = Fusion(LATENESS_S)

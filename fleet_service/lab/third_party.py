@@ -34,7 +34,7 @@ from fleet_service.lab import agent
 from fleet_service.lab.agent import SimulatedReports
 from fleet_service.lab.bars import EXCITED as CHANGE_EXCITED
 from fleet_service.lab.drive import LATENESS_S, rows_of
-from fleet_service.lab.score import Scores, coverage, joined, of_beliefs
+from fleet_service.lab.score import Scores, coverage, join_scores, of_beliefs
 from fleet_service.lab.town import CELL_M, FIX_STD_M, LENGTH, START, Visits, cell_numbers
 from fleet_service.serve.alerts import Alerts
 from schemas import mugrid
@@ -76,7 +76,7 @@ class ForeignDrive(NamedTuple):
     cells: IntArray
 
 
-def report(
+def make_reports(
     rng: Generator, gain: FloatArray, vehicle: IntArray, mu: FloatArray, excited: BoolArray
 ) -> SimulatedReports:
     """Return the reports of visits (n,) by vehicles with gain errors `gain` (V,)."""
@@ -86,7 +86,7 @@ def report(
     reading = seen * (1.0 + NOISE * rng.normal(size=n))
     used = share * seen
     bound = log_ndtr((mugrid.CENTRES - used[:, None]) / agent.BOUND_STD)
-    value = agent.likelihood(np.maximum(reading, mugrid.LOWER), np.full(n, NOISE), 0.0)
+    value = agent.reading_likelihood(np.maximum(reading, mugrid.LOWER), np.full(n, NOISE), 0.0)
     std = np.where(excited, NOISE * reading, np.nan)
     return SimulatedReports(
         np.where(excited, reading, np.nan),
@@ -97,7 +97,7 @@ def report(
     )
 
 
-def observe(drive: ForeignDrive) -> Observations:
+def make_observations(drive: ForeignDrive) -> Observations:
     """Return the drive's visits as the service takes them: without a single optional column."""
     rows = rows_of(drive.visits, drive.cells)
     rows["used_longitudinal"] = rows["used_lateral"] = np.full(
@@ -123,13 +123,13 @@ def drive_honest(rng: Generator, gain_std: float) -> tuple[ForeignDrive, FloatAr
     seconds = rng.uniform(0.0, 60.0 * MINUTES, n)
     vehicle = rng.integers(0, VEHICLES, n)
     excited = rng.random(n) < HARD_VISITS
-    reports = report(rng, gain_std * rng.normal(size=VEHICLES), vehicle, mu[place], excited)
+    reports = make_reports(rng, gain_std * rng.normal(size=VEHICLES), vehicle, mu[place], excited)
     order = np.argsort(seconds, kind="stable")
     visits = Visits(seconds, vehicle, place_fixes(rng, place), mu[place], excited, reports)
-    return ForeignDrive(take(visits, order), cell_numbers(CELLS)), mu
+    return ForeignDrive(select_visits(visits, order), cell_numbers(CELLS)), mu
 
 
-def take(v: Visits, rows: IntArray) -> Visits:
+def select_visits(v: Visits, rows: IntArray) -> Visits:
     """Return some of the visits."""
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
     return Visits(
@@ -144,7 +144,7 @@ def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, In
     drive, mu = drive_honest(rng, gain_std)
     fusion = Fusion(LATENESS_S)
     alerts = Alerts(fusion)
-    o = observe(drive)
+    o = make_observations(drive)
     for rows in split_by(drive.visits.seconds, STEP_S):
         alerts.update(fusion.update(o.take(rows)).slots)
     now = START + 60 * MINUTES * NS
@@ -164,7 +164,7 @@ def split_by(seconds: FloatArray, step: float) -> list[IntArray]:
 def measure_honest(name: str, gain_std: float, seeds: range) -> dict[str, float]:
     """Return coverage, false grip, false ice, error and alerts of an honest fleet over `seeds`."""
     found = [score_honest(np.random.default_rng([seed, 23]), gain_std) for seed in seeds]
-    scores = joined([one[0] for one in found])
+    scores = join_scores([one[0] for one in found])
     alerted = np.concatenate([one[1] for one in found])
     icy = scores.truth < ICE
     dry = scores.truth > 0.45
@@ -205,7 +205,9 @@ def drive_change(rng: Generator, excitement: float) -> ForeignDrive:
     )
     vehicle = rng.integers(0, VEHICLES, n)
     excited = rng.random(n) < excitement
-    reports = report(rng, GAINS["third_party"] * rng.normal(size=VEHICLES), vehicle, mu, excited)
+    reports = make_reports(
+        rng, GAINS["third_party"] * rng.normal(size=VEHICLES), vehicle, mu, excited
+    )
     roads = cell_numbers(CHANGE_CELLS * CHANGE_STRETCH + CELLS)
     cells = np.concatenate(
         [
@@ -224,7 +226,7 @@ def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]
     """
     drive = drive_change(rng, excitement)
     v = drive.visits
-    o = observe(drive)
+    o = make_observations(drive)
     fusion = Fusion(LATENESS_S)
     alerts = Alerts(fusion)
     raised = np.full(CHANGE_CELLS, NEVER)
@@ -279,12 +281,12 @@ def count_cold(rng: Generator) -> int:
     mu: FloatArray = np.full(n, WHITE)
     sure = np.ones(n, bool)
     along = np.zeros(n, np.int64)
-    share = agent.shares(rng, sure)
+    share = agent.used_shares(rng, sure)
     manoeuvre = rng.integers(0, MANOEUVRES, n)
     passes = agent.Passes(
         who, mu, agent.COMMON * rng.normal() + 0.0 * mu, share, rng.normal(size=n), manoeuvre, sure
     )
-    reports = agent.report(rng, agent.Errors.draw(rng, n), passes)
+    reports = agent.draw_reports(rng, agent.Errors.draw(rng, n), passes)
     seconds = np.asarray(COLD_GAP_S * who, np.float64)
     o = observations_of(rows_of(Visits(seconds, who, along, mu, sure, reports)), who)
     fusion = Fusion(LATENESS_S)

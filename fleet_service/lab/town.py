@@ -77,13 +77,13 @@ class Town:
         )
 
 
-def build(rng: Generator, minutes: int, changing: float, model: ErrorModel = CLEAN) -> Town:
+def draw_town(rng: Generator, minutes: int, changing: float, model: ErrorModel = CLEAN) -> Town:
     """Draw a town. `changing` is the share of roads that get another surface at some minute."""
     names = list(SURFACES.values())
     share = [s[2] for s in SURFACES.values()]
     stretches = CELLS // STRETCH
 
-    def surface() -> FloatArray:
+    def draw_surface() -> FloatArray:
         drawn = rng.choice(len(names), stretches, p=share)
         mean, spread = (np.array([n[k] for n in names])[drawn] for k in (0, 1))
         return np.repeat(mean + spread * rng.normal(size=stretches), STRETCH)
@@ -93,8 +93,8 @@ def build(rng: Generator, minutes: int, changing: float, model: ErrorModel = CLE
         * np.sqrt(1 / 60)
         * np.vstack([np.zeros(stretches), rng.normal(size=(minutes, stretches))])
     )
-    before = surface()
-    after = surface()
+    before = draw_surface()
+    after = draw_surface()
     change = np.where(
         rng.random(ROADS) < changing, rng.uniform(0.2, 0.8, ROADS) * minutes, np.inf
     ).repeat(LENGTH)
@@ -128,7 +128,7 @@ class Visits:
         return len(self.seconds)
 
 
-def drive(
+def drive_fleet(
     rng: Generator, town: Town, errors: Errors, minutes: float, acquainted: float = 0.0
 ) -> Visits:
     """Let a fleet drive: each vehicle passes a whole road every minute on average, at random times.
@@ -155,10 +155,10 @@ def drive(
         town.usual[place],
         rng.integers(0, MANOEUVRES, len(place)),
     )
-    shares = agent.shares(rng, excited, model)
-    noise = agent.noise(rng, along, model.tails)
+    shares = agent.used_shares(rng, excited, model)
+    noise = agent.reading_noise(rng, along, model.tails)
     common = town.common[place, manoeuvre]
-    reports = agent.report(
+    reports = agent.draw_reports(
         rng, errors, Passes(vehicle, mu, common, shares, noise, manoeuvre, excited)
     )
     offset = rng.uniform(0.0, CELL_M, len(place)) + FIX_STD_M * rng.normal(size=len(place))
@@ -166,10 +166,10 @@ def drive(
     reported_place = np.where(reported_at // LENGTH == place // LENGTH, reported_at, place)
     order = np.argsort(seconds, kind="stable")
     visits = Visits(seconds, vehicle, reported_place, mu, excited, reports)
-    return take(visits, order)
+    return select_visits(visits, order)
 
 
-def take(v: Visits, rows: IntArray | BoolArray) -> Visits:
+def select_visits(v: Visits, rows: IntArray | BoolArray) -> Visits:
     """Some of the visits."""
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
     return Visits(
@@ -177,7 +177,7 @@ def take(v: Visits, rows: IntArray | BoolArray) -> Visits:
     )
 
 
-def wrong(v: Visits, liars: BoolArray, claim: float) -> Visits:
+def claim_falsely(v: Visits, liars: BoolArray, claim: float) -> Visits:
     """The visits with those of `liars` (V,) claiming `claim`, sure, at every visit."""
     lying = liars[v.vehicle]
     readings = np.where(lying, claim, v.reports.reading)
@@ -186,6 +186,6 @@ def wrong(v: Visits, liars: BoolArray, claim: float) -> Visits:
         np.where(lying, agent.OVERCONFIDENT_STD, v.reports.std),
         np.where(lying, claim, v.reports.used),
         v.reports.manoeuvre,
-        np.where(lying[:, None], agent.overconfident(claim), v.reports.log_likelihood),
+        np.where(lying[:, None], agent.overconfident_likelihood(claim), v.reports.log_likelihood),
     )
     return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, reports)

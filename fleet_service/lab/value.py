@@ -67,7 +67,7 @@ class Readings(NamedTuple):
     median: BoolArray
 
 
-def drive(rng: Generator, place: Town, cars: float, demand: float) -> TownTraffic:
+def drive_cars(rng: Generator, place: Town, cars: float, demand: float) -> TownTraffic:
     """Let `cars` an hour pass each road; drivers use `demand` times the grip that the place
     demands.
     """
@@ -88,19 +88,19 @@ def drive(rng: Generator, place: Town, cars: float, demand: float) -> TownTraffi
         rng.random(len(mu)) < agent.CLEAN.alike, place.usual[cell], rng.integers(0, 4, len(mu))
     )
     common = place.common[cell, manoeuvre]
-    reports = agent.report(
+    reports = agent.draw_reports(
         rng,
         Errors.draw(rng, VEHICLES),
-        Passes(vehicle, mu, common, share, agent.noise(rng, along), manoeuvre, excited),
+        Passes(vehicle, mu, common, share, agent.reading_noise(rng, along), manoeuvre, excited),
     )
     order = np.argsort(seconds, kind="stable")
     return TownTraffic(
-        town.take(Visits(seconds, vehicle, cell, mu, excited, reports), order),
+        town.select_visits(Visits(seconds, vehicle, cell, mu, excited, reports), order),
         (share >= 1.0)[order],
     )
 
 
-def observe(traffic: TownTraffic) -> Observations:
+def make_observations(traffic: TownTraffic) -> Observations:
     """Return the visits as the service takes them, with the flags of the slip controllers."""
     rows = rows_of(traffic.visits)
     rows["abs_active"] = traffic.limited.astype(np.int8)
@@ -128,9 +128,9 @@ def slippery_median(traffic: TownTraffic, seconds: float) -> BoolArray:
     return out
 
 
-def watch(place: Town, traffic: TownTraffic) -> Readings:
+def read_map(place: Town, traffic: TownTraffic) -> Readings:
     """Fuse the visits minute by minute and read the map every STEP minutes from BEGIN on."""
-    o = observe(traffic)
+    o = make_observations(traffic)
     fusion = Fusion(LATENESS_S)
     alerts = Alerts(fusion)
     read: list[tuple[FloatArray | BoolArray, ...]] = []
@@ -188,8 +188,8 @@ def measure_rate(cars: int, seeds: range, demand: float = 1.0) -> dict[str, floa
     towns = []
     for seed in seeds:
         rng = np.random.default_rng([seed, 37])
-        place = town.build(rng, MINUTES, CHANGING)
-        towns.append((place, watch(place, drive(rng, place, cars, demand))))
+        place = town.draw_town(rng, MINUTES, CHANGING)
+        towns.append((place, read_map(place, drive_cars(rng, place, cars, demand))))
     truth, width, slippery = (np.concatenate([of[k] for _, of in towns]) for k in range(3))
     out = {f"known.r{cars}": float((width < NARROW).mean())}
     out[f"slippery.grip_raised.r{cars}"] = float((slippery[truth > SURE_GRIP] > RAISED).mean())

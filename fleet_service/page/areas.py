@@ -40,10 +40,10 @@ def found_in(world: MapMirror, named: Sequence[tuple[str, float, float]]) -> lis
         box = [float(west.min()), float(south.min()), float(east.max()), float(north.max())]
         latitude = (box[1] + box[3]) / 2
         longitude = (box[0] + box[2]) / 2
-        alerts = sum(_inside(box, one["longitude"], one["latitude"]) for one in standing)
+        alerts = sum(_is_inside(box, one["longitude"], one["latitude"]) for one in standing)
         found.append(
             {
-                "name": _name(latitude, longitude, named),
+                "name": _nearest_name(latitude, longitude, named),
                 "box": box,
                 "latitude": latitude,
                 "longitude": longitude,
@@ -54,11 +54,13 @@ def found_in(world: MapMirror, named: Sequence[tuple[str, float, float]]) -> lis
     return sorted(found, key=lambda one: (-one["alerts"], -one["cells"]))[:MOST]
 
 
-def _inside(box: Sequence[float], longitude: float, latitude: float) -> bool:
+def _is_inside(box: Sequence[float], longitude: float, latitude: float) -> bool:
     return box[0] <= longitude <= box[2] and box[1] <= latitude <= box[3]
 
 
-def _name(latitude: float, longitude: float, named: Sequence[tuple[str, float, float]]) -> str:
+def _nearest_name(
+    latitude: float, longitude: float, named: Sequence[tuple[str, float, float]]
+) -> str:
     scale = METRES_PER_DEGREE * math.cos(math.radians(latitude))
     far = [
         (math.hypot((x - longitude) * scale, (y - latitude) * METRES_PER_DEGREE), name)

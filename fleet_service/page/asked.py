@@ -19,36 +19,36 @@ _OF_FEATURES: Final = ("bbox", "datetime", "limit", "after", "f")
 WORLD: Final = (-180.0, -90.0, 180.0, 90.0)
 
 
-def moment(request: Request) -> int | None:
+def parse_moment(request: Request) -> int | None:
     """Return `at` [s since 1970]; None for now."""
-    return _number(request, "at", 0, 1 << 33) if "at" in request.query_params else None
+    return _parse_number(request, "at", 0, 1 << 33) if "at" in request.query_params else None
 
 
-def level(request: Request) -> int:
+def parse_level(request: Request) -> int:
     """Return the zoom of the places, 14 to 21."""
     return (
-        _number(request, "level", LEAST_LEVEL, CELL_LEVEL)
+        _parse_number(request, "level", LEAST_LEVEL, CELL_LEVEL)
         if "level" in request.query_params
         else CELL_LEVEL
     )
 
 
-def tiles(request: Request) -> list[int]:
+def parse_tiles(request: Request) -> list[int]:
     """Return z14 quadints, at most some hundred."""
     words = request.query_params.get("tiles", "").split(",")
     if len(words) > MOST_TILES:
         raise InputError("tiles", f"are {len(words)}", f"ask for {MOST_TILES} at once")
-    return [_whole("tiles", word, 0, 4**grid.TILE_ZOOM - 1) for word in words if word]
+    return [_parse_whole("tiles", word, 0, 4**grid.TILE_ZOOM - 1) for word in words if word]
 
 
-def view(request: Request) -> View:
+def parse_view(request: Request) -> View:
     """Return the part of the map that a watcher looks at."""
     text = request.query_params.get("bbox")
     box = WORLD if text is None else query.parse({"bbox": text}).bbox or WORLD
-    return View(box, level(request))
+    return View(box, parse_level(request))
 
 
-def features(request: Request, now: int) -> FeatureQuestion:
+def parse_features(request: Request, now: int) -> FeatureQuestion:
     """Return a query for features, now [ns].
 
     Raises:
@@ -58,28 +58,28 @@ def features(request: Request, now: int) -> FeatureQuestion:
     if unknown := [name for name in given if name not in _OF_FEATURES]:
         raise InputError(unknown[0][:40], "is no parameter", f"use {', '.join(_OF_FEATURES)}")
     box = query.parse({"bbox": given["bbox"]}).bbox if "bbox" in given else None
-    since, at = _interval(given.get("datetime", "../.."), now)
-    limit = _whole("limit", given["limit"], 1, 1 << 31) if "limit" in given else FEW
-    after = feature(given["after"]) if "after" in given else -1
+    since, at = _parse_interval(given.get("datetime", "../.."), now)
+    limit = _parse_whole("limit", given["limit"], 1, 1 << 31) if "limit" in given else FEW
+    after = parse_feature_id(given["after"]) if "after" in given else -1
     return FeatureQuestion(box, since, at, min(limit, MOST), after)
 
 
-def feature(text: str) -> int:
+def parse_feature_id(text: str) -> int:
     """Return the place (cell · 4 + sector) of a feature's id."""
     cell, _, sector = text.partition("-")
-    found = _whole("feature", cell, 0, 4**grid.CELL_ZOOM - 1) * grid.SECTORS
-    return found + _whole("feature", sector, 0, grid.SECTORS - 1)
+    found = _parse_whole("feature", cell, 0, 4**grid.CELL_ZOOM - 1) * grid.SECTORS
+    return found + _parse_whole("feature", sector, 0, grid.SECTORS - 1)
 
 
-def _interval(text: str, now: int) -> tuple[int, int | None]:
+def _parse_interval(text: str, now: int) -> tuple[int, int | None]:
     """Return the begin [ns] of the selected observations, and the moment [ns] of the map (None for
     now).
 
     RFC 3339: an instant, or an interval of which one side may be open (`..` or nothing).
     """
     first, is_interval, last = text.partition("/")
-    begin = _instant(first)
-    end = _instant(last if is_interval else first)
+    begin = _parse_instant(first)
+    end = _parse_instant(last if is_interval else first)
     if begin is None and end is None and not is_interval:
         raise InputError(
             "datetime",
@@ -91,7 +91,7 @@ def _interval(text: str, now: int) -> tuple[int, int | None]:
     return (begin or 0) if is_interval else 0, None if end is None or end >= now else end
 
 
-def _instant(text: str) -> int | None:
+def _parse_instant(text: str) -> int | None:
     if text in ("", ".."):
         return None
     try:
@@ -103,24 +103,24 @@ def _instant(text: str) -> int | None:
     return None if found is None else nanoseconds(found)
 
 
-def place(request: Request) -> tuple[int, int]:
+def parse_place(request: Request) -> tuple[int, int]:
     """Return cell and sector."""
-    cell = _whole("cell", request.path_params["cell"], 0, 4**grid.CELL_ZOOM - 1)
-    return cell, _whole("sector", request.path_params["sector"], 0, grid.SECTORS - 1)
+    cell = _parse_whole("cell", request.path_params["cell"], 0, 4**grid.CELL_ZOOM - 1)
+    return cell, _parse_whole("sector", request.path_params["sector"], 0, grid.SECTORS - 1)
 
 
-def route(request: Request) -> tuple[list[tuple[float, float]], str]:
+def parse_route(request: Request) -> tuple[list[tuple[float, float]], str]:
     """Return the points (longitude, latitude) of a route, and their text."""
     text = request.query_params.get("points", "")
     found = query.parse({"route": text}).route
     return list(found or ()), text
 
 
-def _number(request: Request, name: str, least: int, most: int) -> int:
-    return _whole(name, request.query_params[name], least, most)
+def _parse_number(request: Request, name: str, least: int, most: int) -> int:
+    return _parse_whole(name, request.query_params[name], least, most)
 
 
-def _whole(name: str, text: str, least: int, most: int) -> int:
+def _parse_whole(name: str, text: str, least: int, most: int) -> int:
     reading: Callable[[str], int] = int
     try:
         found = reading(text)

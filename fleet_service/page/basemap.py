@@ -60,7 +60,7 @@ class TileFile:
     def __init__(self, path: Path) -> None:
         self._lock = threading.Lock()
         if not path.is_file():
-            raise _refused(f"{path} is not there")
+            raise _base_map_error(f"{path} is not there")
         try:
             self._table = sqlite3.connect(
                 f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False
@@ -72,10 +72,10 @@ class TileFile:
                 "select min(zoom_level), max(zoom_level) from tiles"
             ).fetchone()
         except sqlite3.Error as error:
-            raise _refused(f"{path} cannot be read ({error})") from error
+            raise _base_map_error(f"{path} cannot be read ({error})") from error
         form = str(self.metadata.get("format"))
         if form not in KINDS or least is None:
-            raise _refused(
+            raise _base_map_error(
                 f"{path} holds {form} tiles" if least is not None else f"{path} holds no tile"
             )
         self.kind = KINDS[form]
@@ -148,11 +148,11 @@ def base_map(text: str, attribution: str | None = None) -> BaseMap:
         mark in text for mark in " ;,'\""
     )
     if not whole or not text.startswith(("http://", "https://", "/")):
-        raise _refused(f"{text[:60]!r} is no address of tiles")
+        raise _base_map_error(f"{text[:60]!r} is no address of tiles")
     return BaseMap(text, attribution=attribution or "")
 
 
-def _refused(problem: str) -> InputError:
+def _base_map_error(problem: str) -> InputError:
     return InputError(
         "base_map",
         problem,

@@ -67,42 +67,42 @@ class FeatureQuestion(NamedTuple):
     after: int = -1
 
 
-def identity(cell: int, sector: int) -> str:
+def feature_id(cell: int, sector: int) -> str:
     """Return the id of a feature."""
     return f"{cell}-{sector}"
 
 
-def _link(href: str, rel: str, kind: str, title: str) -> dict[str, str]:
+def _make_link(href: str, rel: str, kind: str, title: str) -> dict[str, str]:
     return {"href": href, "rel": rel, "type": kind, "title": title}
 
 
-def landing(base: str) -> dict[str, Any]:
+def landing_document(base: str) -> dict[str, Any]:
     """Return the landing page; `base` is the address without a final slash."""
     return {
         "title": "GripMap",
         "description": ABOUT,
         "links": [
-            _link(f"{base}/?f=json", "self", JSON, "this document"),
-            _link(f"{base}/", "alternate", "text/html", "the live page"),
-            _link(f"{base}/api", "service-desc", OPENAPI, "the definition of this interface"),
-            _link(f"{base}/conformance", "conformance", JSON, "what it conforms to"),
-            _link(f"{base}/collections", "data", JSON, "the collections"),
+            _make_link(f"{base}/?f=json", "self", JSON, "this document"),
+            _make_link(f"{base}/", "alternate", "text/html", "the live page"),
+            _make_link(f"{base}/api", "service-desc", OPENAPI, "the definition of this interface"),
+            _make_link(f"{base}/conformance", "conformance", JSON, "what it conforms to"),
+            _make_link(f"{base}/collections", "data", JSON, "the collections"),
         ],
     }
 
 
-def conformance() -> dict[str, Any]:
+def conformance_document() -> dict[str, Any]:
     """Return the conformance classes."""
     return {"conformsTo": list(CONFORMANCE)}
 
 
-def collections(base: str, extent: Box | None) -> dict[str, Any]:
+def collections_document(base: str, extent: Box | None) -> dict[str, Any]:
     """Return the list of collections, which has one entry."""
-    links = [_link(f"{base}/collections", "self", JSON, "this document")]
-    return {"links": links, "collections": [collection(base, extent)]}
+    links = [_make_link(f"{base}/collections", "self", JSON, "this document")]
+    return {"links": links, "collections": [collection_document(base, extent)]}
 
 
-def collection(base: str, extent: Box | None) -> dict[str, Any]:
+def collection_document(base: str, extent: Box | None) -> dict[str, Any]:
     """Return the collection; `extent` is the box of all cells, if there are any."""
     own = f"{base}/collections/{COLLECTION}"
     found: dict[str, Any] = {
@@ -112,9 +112,9 @@ def collection(base: str, extent: Box | None) -> dict[str, Any]:
         "itemType": "feature",
         "crs": [CRS84],
         "links": [
-            _link(own, "self", JSON, "this document"),
-            _link(f"{own}/items", "items", GEOJSON, "the features"),
-            _link(f"{own}/schema", "describedby", SCHEMA_JSON, "the columns"),
+            _make_link(own, "self", JSON, "this document"),
+            _make_link(f"{own}/items", "items", GEOJSON, "the features"),
+            _make_link(f"{own}/schema", "describedby", SCHEMA_JSON, "the columns"),
         ],
     }
     if extent is not None:
@@ -122,7 +122,7 @@ def collection(base: str, extent: Box | None) -> dict[str, Any]:
     return found
 
 
-def schema(base: str) -> dict[str, Any]:
+def feature_schema(base: str) -> dict[str, Any]:
     """Return the JSON Schema of a feature for GDAL, so that a reader that first sees only bounds
     knows `mu` is a number."""
     columns = {
@@ -141,17 +141,17 @@ def schema(base: str) -> dict[str, Any]:
     }
 
 
-def api(base: str) -> dict[str, Any]:
+def api_definition(base: str) -> dict[str, Any]:
     """Return the definition of the interface, OpenAPI 3.0."""
 
-    def route(summary: str, *parameters: dict[str, Any]) -> dict[str, Any]:
+    def describe_route(summary: str, *parameters: dict[str, Any]) -> dict[str, Any]:
         answers = {
             "200": {"description": "the document"},
             "400": {"description": "what was wrong, and how to mend it"},
         }
         return {"get": {"summary": summary, "parameters": list(parameters), "responses": answers}}
 
-    def parameter(name: str, where: str, about: str, **form: object) -> dict[str, Any]:
+    def describe_parameter(name: str, where: str, about: str, **form: object) -> dict[str, Any]:
         return {
             "name": name,
             "in": where,
@@ -161,7 +161,7 @@ def api(base: str) -> dict[str, Any]:
         }
 
     asked = (
-        parameter(
+        describe_parameter(
             "bbox",
             "query",
             "west, south, east, north [deg]",
@@ -171,26 +171,28 @@ def api(base: str) -> dict[str, Any]:
             maxItems=4,
         )
         | {"style": "form", "explode": False},
-        parameter("datetime", "query", "instant or interval, RFC 3339", type="string"),
-        parameter(
+        describe_parameter("datetime", "query", "instant or interval, RFC 3339", type="string"),
+        describe_parameter(
             "limit", "query", "of one answer", type="integer", minimum=1, maximum=MOST, default=FEW
         ),
-        parameter("after", "query", "id after which to go on; links say it", type="string"),
+        describe_parameter(
+            "after", "query", "id after which to go on; links say it", type="string"
+        ),
     )
-    one = parameter("featureId", "path", "CELL-SECTOR", type="string")
+    one = describe_parameter("featureId", "path", "CELL-SECTOR", type="string")
     own = f"/collections/{COLLECTION}"
     return {
         "openapi": "3.0.3",
         "info": {"title": TITLE, "version": "1.0.0", "description": ABOUT},
         "servers": [{"url": base}],
         "paths": {
-            "/": route("what there is"),
-            "/conformance": route("what it conforms to"),
-            "/collections": route("the collections"),
-            own: route("the collection"),
-            f"{own}/schema": route("the columns"),
-            f"{own}/items": route("features", *asked),
-            f"{own}/items/{{featureId}}": route("one feature", one),
+            "/": describe_route("what there is"),
+            "/conformance": describe_route("what it conforms to"),
+            "/collections": describe_route("the collections"),
+            own: describe_route("the collection"),
+            f"{own}/schema": describe_route("the columns"),
+            f"{own}/items": describe_route("features", *asked),
+            f"{own}/items/{{featureId}}": describe_route("one feature", one),
         },
     }
 
@@ -208,9 +210,9 @@ def page_of(
         stamp: time of the data, ISO 8601.
     """
     found = list(features)
-    links = [_link(address, "self", GEOJSON, "this document")]
+    links = [_make_link(address, "self", GEOJSON, "this document")]
     if more:
-        links.append(_link(following, "next", GEOJSON, "what follows"))
+        links.append(_make_link(following, "next", GEOJSON, "what follows"))
     return {
         "type": "FeatureCollection",
         "timeStamp": stamp,
@@ -227,7 +229,7 @@ def with_identity(features: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]
         properties = {name: value for name, value in feature["properties"].items() if name in names}
         yield {
             **feature,
-            "id": identity(properties["cell"], properties["sector"]),
+            "id": feature_id(properties["cell"], properties["sector"]),
             "properties": properties,
         }
 

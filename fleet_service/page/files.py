@@ -40,7 +40,7 @@ class Files:
             if name.endswith(".js")
         }
         plain[SCRIPT] = bundle_modules(modules, "main").encode()
-        self._files = {name: _packed(name, text) for name, text in plain.items()}
+        self._files = {name: _pack_file(name, text) for name, text in plain.items()}
 
     def texts(self, accepted: str) -> str:
         """Return the name of the text table in the browser's first available language; English
@@ -70,7 +70,7 @@ class Files:
         )
 
 
-def _packed(name: str, plain: bytes) -> _File:
+def _pack_file(name: str, plain: bytes) -> _File:
     kind = mimetypes.guess_type(name)[0] or "application/octet-stream"
     tag = f'"{hashlib.sha256(plain).hexdigest()[:16]}"'
     return _File(plain, gzip.compress(plain, LEVEL, mtime=0), kind, tag)

@@ -46,7 +46,7 @@ class ServiceHealth:
                 text = answer.read(MOST_BYTES).decode("utf-8", "replace")
         except (OSError, ValueError):
             return {"address": address, "answers": False}
-        found = values(text)
+        found = parse_metrics(text)
         rows = found.get("rows", {}).get("observation", 0.0)
         now = time.monotonic()
         before = self._before.get(address)
@@ -77,7 +77,7 @@ class ServiceHealth:
         }
 
 
-def values(text: str) -> dict[str, dict[str, float]]:
+def parse_metrics(text: str) -> dict[str, dict[str, float]]:
     """Return the values of an OpenMetrics text by name and label; "" is the label of a single
     value.
     """

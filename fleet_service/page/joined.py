@@ -43,18 +43,18 @@ def bundle_modules(modules: Mapping[str, str], main: str) -> str:
         for names, module in found:
             wanted[module] |= {one.split(" as ")[0] for one in names.split(", ")}
     return "".join(
-        _plain(modules[name])
+        _strip_imports(modules[name])
         if name == main
-        else _called(name, _plain(modules[name]), sorted(wanted[name]))
+        else _wrap_module(name, _strip_imports(modules[name]), sorted(wanted[name]))
         for name in TopologicalSorter(needs).static_order()
     )
 
 
-def _called(name: str, body: str, exported: list[str]) -> str:
+def _wrap_module(name: str, body: str, exported: list[str]) -> str:
     return f"const from_{name} = (() => {{\n{body}return {{ {', '.join(exported)} }};\n}})();\n"
 
 
-def _plain(text: str) -> str:
+def _strip_imports(text: str) -> str:
     """Return a module's text without imports and exports."""
     text = _IMPORT.sub(
         lambda m: f"const {{ {m[1].replace(' as ', ': ')} }} = from_{m[2]};", _EXPORT.sub("", text)

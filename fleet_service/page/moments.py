@@ -106,7 +106,7 @@ class Moments:
     def _files(self) -> dict[int, Path]:
         if self._root is None:
             return {}
-        folders = layout.days(self._root, snapshots.TABLE)
+        folders = layout.day_folders(self._root, snapshots.TABLE)
         return {
             snapshots.time_of(path) // NS: path
             for folder in folders

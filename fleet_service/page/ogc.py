@@ -56,33 +56,39 @@ class FeatureRoutes:
 
     async def landing(self, request: Request) -> Response:
         """Return the landing page for programs."""
-        return JSONResponse(features.landing(_base(request)), headers={"Vary": "Accept"})
+        return JSONResponse(
+            features.landing_document(_base_address(request)), headers={"Vary": "Accept"}
+        )
 
     async def conformance(self, _: Request) -> Response:
         """Return the conformance classes."""
-        return JSONResponse(features.conformance())
+        return JSONResponse(features.conformance_document())
 
     async def collections(self, request: Request) -> Response:
         """Return the list with the one collection."""
-        return JSONResponse(features.collections(_base(request), self._extent()))
+        return JSONResponse(features.collections_document(_base_address(request), self._extent()))
 
     async def collection(self, request: Request) -> Response:
         """Return the collection."""
-        return JSONResponse(features.collection(_base(request), self._extent()))
+        return JSONResponse(features.collection_document(_base_address(request), self._extent()))
 
     async def schema(self, request: Request) -> Response:
         """Return its columns."""
-        return JSONResponse(features.schema(_base(request)), media_type=features.SCHEMA_JSON)
+        return JSONResponse(
+            features.feature_schema(_base_address(request)), media_type=features.SCHEMA_JSON
+        )
 
     async def api(self, request: Request) -> Response:
         """Return the interface definition."""
-        return JSONResponse(features.api(_base(request)), media_type=features.OPENAPI)
+        return JSONResponse(
+            features.api_definition(_base_address(request)), media_type=features.OPENAPI
+        )
 
     async def items(self, request: Request) -> Response:
         """Return features ordered by place, from `after` on; `next` continues there, whatever
         changes meanwhile.
         """
-        question = asked.features(request, time.time_ns())
+        question = asked.parse_features(request, time.time_ns())
         if not self._reader.is_served:
             message = "no service answers for the map; that is no empty map\n"
             return PlainTextResponse(message, 503, headers={"Retry-After": "10"})
@@ -99,10 +105,10 @@ class FeatureRoutes:
         table = self._cells(question)
         more = table.num_rows > question.limit
         table = table.slice(0, question.limit)
-        address = f"{_base(request)}{_OWN}/items"
+        address = f"{_base_address(request)}{_OWN}/items"
         last = ""
         if table.num_rows:
-            last = features.identity(table["cell"][-1].as_py(), table["sector"][-1].as_py())
+            last = features.feature_id(table["cell"][-1].as_py(), table["sector"][-1].as_py())
         given = {name: value for name, value in request.query_params.items() if name != "after"}
         stamp = (
             datetime.fromtimestamp((question.at or time.time_ns()) / NS, UTC)
@@ -110,7 +116,7 @@ class FeatureRoutes:
             .replace("+00:00", "Z")
         )
         answer = features.page_of(
-            features.with_identity(extract.features(geo.with_cells(table))),
+            features.with_identity(extract.geojson_features(geo.with_cells(table))),
             more,
             str(request.url),
             f"{address}?{urlencode(given | {'after': last})}",
@@ -120,17 +126,21 @@ class FeatureRoutes:
 
     async def item(self, request: Request) -> Response:
         """Return one feature as it is now."""
-        place = asked.feature(request.path_params["feature"])
+        place = asked.parse_feature_id(request.path_params["feature"])
         table = await run_in_threadpool(
-            self._cells, FeatureQuestion(_box(place), after=place - 1, limit=1)
+            self._cells, FeatureQuestion(_place_box(place), after=place - 1, limit=1)
         )
         cell, sector = divmod(place, grid.SECTORS)
         table = table.filter(
             (pa.compute.field("cell") == cell) & (pa.compute.field("sector") == sector)
         )
-        for found in features.with_identity(extract.features(geo.with_cells(table))):
+        for found in features.with_identity(extract.geojson_features(geo.with_cells(table))):
             links = [
-                {"href": f"{_base(request)}{_OWN}", "rel": "collection", "type": features.JSON}
+                {
+                    "href": f"{_base_address(request)}{_OWN}",
+                    "rel": "collection",
+                    "type": features.JSON,
+                }
             ]
             return JSONResponse({**found, "links": links}, media_type=GEOJSON)
         return PlainTextResponse("nobody was there: nothing is known\n", 404)
@@ -186,10 +196,10 @@ def wants_json(request: Request) -> bool:
     return "json" in accepted and "text/html" not in accepted
 
 
-def _base(request: Request) -> str:
+def _base_address(request: Request) -> str:
     return str(request.base_url).rstrip("/")
 
 
-def _box(place: int) -> features.Box:
+def _place_box(place: int) -> features.Box:
     west, south, east, north = (float(side) for side in grid.bounds(place // grid.SECTORS))
     return west, south, east, north

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 from schemas.errors import InputError
 
 
-def cells(path: Path | None) -> dict[str, list[Any]] | None:
+def read_overlay(path: Path | None) -> dict[str, list[Any]] | None:
     """Return cell (as text), sector and mean mu of each place; None if there is no file yet.
 
     Raises:

@@ -32,7 +32,7 @@ class RecentMoments:
         moment = int(now)
         last = next(reversed(self._kept), None)
         if not tiles or (
-            last is not None and (moment < last + STEP_S or _same(self._kept[last], tiles))
+            last is not None and (moment < last + STEP_S or _is_same(self._kept[last], tiles))
         ):
             return
         self._kept[moment] = dict(tiles)
@@ -52,5 +52,5 @@ class RecentMoments:
         return self._kept.get(moment)
 
 
-def _same(before: Mapping[int, Records], tiles: Mapping[int, Records]) -> bool:
+def _is_same(before: Mapping[int, Records], tiles: Mapping[int, Records]) -> bool:
     return before.keys() == tiles.keys() and all(before[tile] is tiles[tile] for tile in tiles)

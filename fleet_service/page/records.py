@@ -88,10 +88,10 @@ def of_table(table: pa.Table) -> Records:
     found = np.zeros(table.num_rows, RECORD)
     found["last"] = np.clip(table["last_time"].cast(pa.int64()).to_numpy() // NS, 0, 2**32 - 1)
     found["place"] = (table["cell"].to_numpy() & 0x3FFF) * grid.SECTORS + table["sector"].to_numpy()
-    found["mu"] = _steps(np.rint, table["mu"], MU_STEPS)
-    found["lower"] = _steps(np.floor, table["mu_lower"], MU_STEPS)
-    found["upper"] = _steps(np.ceil, table["mu_upper"], MU_STEPS)
-    found["slippery"] = _steps(np.ceil, table["p_slippery"], SHARE_STEPS)
+    found["mu"] = _to_steps(np.rint, table["mu"], MU_STEPS)
+    found["lower"] = _to_steps(np.floor, table["mu_lower"], MU_STEPS)
+    found["upper"] = _to_steps(np.ceil, table["mu_upper"], MU_STEPS)
+    found["slippery"] = _to_steps(np.ceil, table["p_slippery"], SHARE_STEPS)
     basis = table["basis"].to_numpy()
     found["basis"] = np.select(
         [basis == "measured", basis == "borrowed"], [MEASURED, BORROWED], BOUND
@@ -103,7 +103,7 @@ def of_table(table: pa.Table) -> Records:
     return found[np.argsort(found["place"], kind="stable")]
 
 
-def _steps(
+def _to_steps(
     rounding: Callable[[FloatArray], FloatArray], column: pa.ChunkedArray[Any], steps: int
 ) -> NDArray[np.uint8]:
     value = column.to_numpy().astype(np.float64)

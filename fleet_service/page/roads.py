@@ -71,7 +71,7 @@ def read_roads(path: Path) -> RoadMap:
         features = json.loads(path.read_bytes())["features"]
         found = RoadMap([], [])
         for feature in features:
-            _add(found, feature["geometry"], feature.get("properties") or {})
+            _add_feature(found, feature["geometry"], feature.get("properties") or {})
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
         problem = f"{path} cannot be read ({str(error)[:80]})"
         raise InputError(
@@ -84,7 +84,7 @@ def read_roads(path: Path) -> RoadMap:
     return found
 
 
-def _add(found: RoadMap, geometry: dict[str, Any], about: dict[str, Any]) -> None:
+def _add_feature(found: RoadMap, geometry: dict[str, Any], about: dict[str, Any]) -> None:
     kind = geometry["type"]
     points = geometry["coordinates"]
     name = str(about.get("name") or "")
@@ -112,12 +112,12 @@ def learned_lines(cell: IntArray, sector: IntArray) -> list[Line]:
     for heading in range(grid.SECTORS):
         own = np.unique(cell[sector == heading])
         columns, rows = (part.astype(np.int64).tolist() for part in grid.deinterleave(own))
-        chains = _chains(list(zip(columns, rows, strict=True)), heading)
+        chains = _chain_cells(list(zip(columns, rows, strict=True)), heading)
         found.extend(Line("", _smooth_chain(np.array(chain, np.float64)), 1) for chain in chains)
     return found[:MOST_LINES]
 
 
-def _chains(cells: list[tuple[int, int]], heading: int) -> Iterable[list[tuple[int, int]]]:
+def _chain_cells(cells: list[tuple[int, int]], heading: int) -> Iterable[list[tuple[int, int]]]:
     """Yield chains of cells in the order of travel: each cell goes on to the nearest one ahead
     that has no other.
     """

@@ -25,7 +25,7 @@ SIGHTS_M: Final = (50, 100)
 Points = Sequence[tuple[float, float]]
 
 
-def profile(points: Points, table: pa.Table) -> dict[str, Any]:
+def grip_profile(points: Points, table: pa.Table) -> dict[str, Any]:
     """Return the stretches along a route of (longitude, latitude) [deg], with the cells that a
     service returned.
 
@@ -37,7 +37,7 @@ def profile(points: Points, table: pa.Table) -> dict[str, Any]:
     Raises:
         InputError: the route is too long or not valid.
     """
-    longitude, latitude, along, sector = _samples(points)
+    longitude, latitude, along, sector = _sample_route(points)
     keys = grid.cell_of(latitude, longitude) * grid.SECTORS + sector
     known = {
         int(cell) * grid.SECTORS + int(heading): row
@@ -65,7 +65,7 @@ def profile(points: Points, table: pa.Table) -> dict[str, Any]:
             "latitude": float(latitude[middle]),
         }
         stretches.append(
-            place | (_described(cells[rows[first]]) if rows[first] >= 0 else {"basis": UNKNOWN})
+            place | (_describe_cell(cells[rows[first]]) if rows[first] >= 0 else {"basis": UNKNOWN})
         )
         share[stretches[-1]["basis"]] += float(along[last] - along[first]) / length
     measured = [k for k, one in enumerate(stretches) if one["basis"] == "measured"]
@@ -80,7 +80,7 @@ def safe_speeds(mu_lower: float) -> dict[str, float]:
     return {str(sight): float(stopping_speed(mu_lower, sight)) for sight in SIGHTS_M}
 
 
-def _described(cell: dict[str, Any]) -> dict[str, Any]:
+def _describe_cell(cell: dict[str, Any]) -> dict[str, Any]:
     measured = cell["basis"] == "measured"
     names = ("cell", "sector", "basis", "mu_lower", "mu_upper", "p_slippery", "vehicles", "age_s")
     return {name: cell[name] for name in names} | {
@@ -90,7 +90,7 @@ def _described(cell: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _samples(points: Points) -> tuple[Any, Any, Any, Any]:
+def _sample_route(points: Points) -> tuple[Any, Any, Any, Any]:
     """Return longitude and latitude [deg], metres along and heading sector of each step of the
     route.
     """

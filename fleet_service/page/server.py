@@ -75,15 +75,15 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
     Raises:
         InputError: the port is in use.
     """
-    listening = _listen(settings.host, settings.port)
+    listening = _open_socket(settings.host, settings.port)
     world = MapMirror()
     reader = Reader(settings.connection, world)
 
-    def state() -> dict[str, Any]:
+    def reader_state() -> dict[str, Any]:
         away = [region for region in reader.regions() if not region["served"]]
         return {"router": reader.is_connected, "served": reader.is_served, "away": away}
 
-    watchers = Watchers(world, state, settings.most)
+    watchers = Watchers(world, reader_state, settings.most)
     sources = web.Sources(
         world,
         reader,
@@ -102,7 +102,7 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
         async with web.push_changes(watchers):
             yield
 
-    app = web.application(sources, hosts, lifespan)
+    app = web.make_application(sources, hosts, lifespan)
     listener = threading.Thread(target=reader.run, args=(stop,), name="reader", daemon=True)
     listener.start()
     if settings.datex is not None:
@@ -113,7 +113,7 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
             daemon=True,
         ).start()
     try:
-        asyncio.run(_serve(app, listening, stop, watchers, say))
+        asyncio.run(_serve_app(app, listening, stop, watchers, say))
     finally:
         stop.set()
         listener.join(LEAVE_S)
@@ -135,7 +135,7 @@ def update_publication(
             log.warning("%s", error)
 
 
-async def _serve(
+async def _serve_app(
     app: ASGIApp,
     listening: socket.socket,
     stop: threading.Event,
@@ -175,7 +175,7 @@ class _Server(uvicorn.Server):
         yield
 
 
-def _listen(host: str, port: int) -> socket.socket:
+def _open_socket(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     found = socket.socket(family, socket.SOCK_STREAM)
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -50,30 +50,37 @@ class TileShape(NamedTuple):
 def encode_tile(layers: Mapping[str, Iterable[TileShape]]) -> bytes:
     """Return a tile of these layers; a layer without shapes is left out."""
     return b"".join(
-        _field(3, _layer(name, list(shapes))) for name, shapes in layers.items() if shapes
+        _bytes_field(3, _encode_layer(name, list(shapes)))
+        for name, shapes in layers.items()
+        if shapes
     )
 
 
-def _layer(name: str, shapes: list[TileShape]) -> bytes:
+def _encode_layer(name: str, shapes: list[TileShape]) -> bytes:
     keys: dict[str, int] = {}
     values: dict[str | int, int] = {}
-    found = [_number(15, 2), _field(1, name.encode())]
+    found = [_number_field(15, 2), _bytes_field(1, name.encode())]
     for shape in shapes:
         tags = b"".join(
-            _varint(keys.setdefault(key, len(keys)))
-            + _varint(values.setdefault(value, len(values)))
+            _encode_varint(keys.setdefault(key, len(keys)))
+            + _encode_varint(values.setdefault(value, len(values)))
             for key, value in shape.tags.items()
         )
-        body = _field(2, tags) + _number(3, shape.kind) + _field(4, _commands(shape))
-        found.append(_field(2, body))
-    found += [_field(3, key.encode()) for key in keys]
+        body = (
+            _bytes_field(2, tags)
+            + _number_field(3, shape.kind)
+            + _bytes_field(4, _encode_geometry(shape))
+        )
+        found.append(_bytes_field(2, body))
+    found += [_bytes_field(3, key.encode()) for key in keys]
     found += [
-        _field(4, _field(1, v.encode()) if isinstance(v, str) else _number(5, v)) for v in values
+        _bytes_field(4, _bytes_field(1, v.encode()) if isinstance(v, str) else _number_field(5, v))
+        for v in values
     ]
-    return b"".join([*found, _number(5, EXTENT)])
+    return b"".join([*found, _number_field(5, EXTENT)])
 
 
-def _commands(shape: TileShape) -> bytes:
+def _encode_geometry(shape: TileShape) -> bytes:
     out = []
     x = 0
     y = 0
@@ -81,21 +88,21 @@ def _commands(shape: TileShape) -> bytes:
     def move_to(points: Sequence[tuple[int, int]]) -> None:
         nonlocal x, y
         for px, py in points:
-            out.append(_varint(_zigzag(px - x)) + _varint(_zigzag(py - y)))
+            out.append(_encode_varint(_zigzag(px - x)) + _encode_varint(_zigzag(py - y)))
             x = px
             y = py
 
     for part in shape.parts:
         if shape.kind == POINT:
-            out.append(_varint(_MOVE | len(part) << 3))
+            out.append(_encode_varint(_MOVE | len(part) << 3))
             move_to(part)
             continue
-        out.append(_varint(_MOVE | 1 << 3))
+        out.append(_encode_varint(_MOVE | 1 << 3))
         move_to(part[:1])
-        out.append(_varint(_DRAW | (len(part) - 1) << 3))
+        out.append(_encode_varint(_DRAW | (len(part) - 1) << 3))
         move_to(part[1:])
         if shape.kind == POLYGON:
-            out.append(_varint(_CLOSE | 1 << 3))
+            out.append(_encode_varint(_CLOSE | 1 << 3))
     return b"".join(out)
 
 
@@ -103,7 +110,7 @@ def _zigzag(value: int) -> int:
     return value << 1 if value >= 0 else (-value << 1) - 1
 
 
-def _varint(value: int) -> bytes:
+def _encode_varint(value: int) -> bytes:
     out = bytearray()
     while value > 127:
         out.append(value & 127 | 128)
@@ -112,12 +119,12 @@ def _varint(value: int) -> bytes:
     return bytes(out)
 
 
-def _number(field: int, value: int) -> bytes:
-    return _varint(field << 3) + _varint(value)
+def _number_field(field: int, value: int) -> bytes:
+    return _encode_varint(field << 3) + _encode_varint(value)
 
 
-def _field(number: int, body: bytes) -> bytes:
-    return _varint(number << 3 | 2) + _varint(len(body)) + body
+def _bytes_field(number: int, body: bytes) -> bytes:
+    return _encode_varint(number << 3 | 2) + _encode_varint(len(body)) + body
 
 
 def unpack_tile(tile: bytes) -> bytes | None:
@@ -179,11 +186,11 @@ class PmtilesFile:
             return None
 
     def _find_tile(self, zoom: int, x: int, y: int) -> bytes | None:
-        wanted = _hilbert(zoom, x, y)
+        wanted = _hilbert_number(zoom, x, y)
         offset = self._root
         size = self._root_size
         for _ in range(4):
-            entry = _entry(self._part(offset, size), wanted)
+            entry = _find_entry(self._part(offset, size), wanted)
             if entry is None:
                 return None
             start, size, run = entry
@@ -205,11 +212,11 @@ class PmtilesFile:
             return file.read(size)
 
 
-def _entry(directory: bytes, wanted: int) -> tuple[int, int, int] | None:
+def _find_entry(directory: bytes, wanted: int) -> tuple[int, int, int] | None:
     """Return offset, size and run of the last entry at or before a tile's number; a run of 0 is
     a leaf directory.
     """
-    numbers = _varints(directory)
+    numbers = _decode_varints(directory)
     count = next(numbers)
     ids = []
     at = 0
@@ -228,7 +235,7 @@ def _entry(directory: bytes, wanted: int) -> tuple[int, int, int] | None:
     return offsets[place], sizes[place], runs[place]
 
 
-def _varints(data: bytes) -> Iterator[int]:
+def _decode_varints(data: bytes) -> Iterator[int]:
     value = shift = 0
     for byte in data:
         value |= (byte & 127) << shift
@@ -239,7 +246,7 @@ def _varints(data: bytes) -> Iterator[int]:
             value = shift = 0
 
 
-def _hilbert(zoom: int, x: int, y: int) -> int:
+def _hilbert_number(zoom: int, x: int, y: int) -> int:
     """Return the number of a tile: those of all smaller zooms, then the place on the Hilbert
     curve.
     """

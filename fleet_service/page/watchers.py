@@ -79,8 +79,8 @@ class Watchers:
             self._make_place(client)
         watcher = _OpenPage(view, asyncio.Queue(WAITING), client)
         self._watchers[watcher.queue] = watcher
-        watcher.queue.put_nowait(_event("alerts", self._world.standing()))
-        watcher.queue.put_nowait(_event("beat", self._beat()))
+        watcher.queue.put_nowait(_encode_event("alerts", self._world.standing()))
+        watcher.queue.put_nowait(_encode_event("beat", self._beat()))
         return self._events(watcher)
 
     def _make_place(self, client: str) -> None:
@@ -107,10 +107,10 @@ class Watchers:
             if changes := self._world.changes():
                 self.push(changes)
             if self._world.alerts_changed():
-                self._tell(_event("alerts", self._world.standing()))
+                self._tell(_encode_event("alerts", self._world.standing()))
             if time.monotonic() - beaten >= BEAT_S:
                 beaten = time.monotonic()
-                self._tell(_event("beat", self._beat()))
+                self._tell(_encode_event("beat", self._beat()))
 
     def close(self) -> None:
         """End all streams."""
@@ -126,17 +126,19 @@ class Watchers:
         for watcher in list(self._watchers.values()):
             found = []
             for block in changes:
-                if grid.touches(watcher.view.box, _area(block.tile)):
+                if grid.touches(watcher.view.box, _tile_box(block.tile)):
                     place = (block.tile, watcher.view.level)
                     if place not in lines:
                         lines[place] = (
-                            b"data: " + base64.b64encode(self._made(block, place[1])) + b"\n"
+                            b"data: "
+                            + base64.b64encode(self._encode_block(block, place[1]))
+                            + b"\n"
                         )
                     found.append(lines[place])
             if found:
                 self._put(watcher, b"event: tiles\n" + b"".join(found) + b"\n")
 
-    def _made(self, block: TileBlock, level: int) -> bytes:
+    def _encode_block(self, block: TileBlock, level: int) -> bytes:
         return block.encoded() if level == CELL_LEVEL else self._world.encoded(block.tile, level)
 
     def _tell(self, event: bytes) -> None:
@@ -153,10 +155,10 @@ class Watchers:
             watcher.queue.put_nowait(_RELOAD if event is not None else None)
 
 
-def _area(tile: int) -> Box:
+def _tile_box(tile: int) -> Box:
     west, south, east, north = box_of(tile)
     return west, south, east, north
 
 
-def _event(name: str, value: object) -> bytes:
+def _encode_event(name: str, value: object) -> bytes:
     return f"event: {name}\ndata: {json.dumps(value)}\n\n".encode()

@@ -52,7 +52,7 @@ class Sources(NamedTuple):
     roads: RoadMap | None = None
 
 
-def application(
+def make_application(
     sources: Sources, hosts: Iterable[str], lifespan: Callable[[Starlette], Any]
 ) -> ASGIApp:
     """Return the web application, with compression and the headers of every answer.
@@ -174,7 +174,7 @@ class Routes:
 
     async def tiles(self, request: Request) -> Response:
         """Return the tiles with cells, now or `at` a moment."""
-        at = asked.moment(request)
+        at = asked.parse_moment(request)
         found = (
             self._of.world.tiles()
             if at is None
@@ -186,20 +186,20 @@ class Routes:
         """Return blocks of `tiles` at a `level`, now or `at` a moment; with `borrowed`, borrowed
         cells too.
         """
-        wanted = asked.tiles(request)
-        level = asked.level(request)
-        at = asked.moment(request)
+        wanted = asked.parse_tiles(request)
+        level = asked.parse_level(request)
+        at = asked.parse_moment(request)
         if at is not None:
             made = await run_in_threadpool(
                 lambda: [self._of.moments.encoded(at, tile, level) for tile in wanted]
             )
         elif "borrowed" in request.query_params:
-            made = await run_in_threadpool(lambda: [self._borrowed(tile) for tile in wanted])
+            made = await run_in_threadpool(lambda: [self._borrowed_cells(tile) for tile in wanted])
         else:
             made = [self._of.world.encoded(tile, level) for tile in wanted]
         return Response(b"".join(made), media_type=BLOCKS, headers={"Cache-Control": "no-store"})
 
-    def _borrowed(self, tile: int) -> bytes:
+    def _borrowed_cells(self, tile: int) -> bytes:
         version = self._of.world.version(
             tile
         )  # a page passes over what is older than what it holds
@@ -215,7 +215,7 @@ class Routes:
         """Stream the changes in `bbox` at a `level`, from now on."""
         try:
             stream = self._of.watchers.enter(
-                asked.view(request), request.client.host if request.client else ""
+                asked.parse_view(request), request.client.host if request.client else ""
             )
         except TooManyWatchersError:
             return PlainTextResponse("too many watch already\n", 503, headers={"Retry-After": "10"})
@@ -224,7 +224,7 @@ class Routes:
 
     async def cell(self, request: Request) -> Response:
         """Return one cell and heading as the service knows it now."""
-        cell, sector = asked.place(request)
+        cell, sector = asked.parse_place(request)
         return JSONResponse(await run_in_threadpool(self._cell, cell, sector))
 
     def _cell(self, cell: int, sector: int) -> dict[str, Any] | None:
@@ -241,7 +241,7 @@ class Routes:
     async def history(self, request: Request) -> Response:
         """Return the belief about a cell at the stored moments."""
         return JSONResponse(
-            await run_in_threadpool(self._of.moments.history, *asked.place(request))
+            await run_in_threadpool(self._of.moments.history, *asked.parse_place(request))
         )
 
     async def times(self, _: Request) -> Response:
@@ -250,7 +250,7 @@ class Routes:
 
     async def route(self, request: Request) -> Response:
         """Return the grip along `points`."""
-        points, text = asked.route(request)
+        points, text = asked.parse_route(request)
         return JSONResponse(await run_in_threadpool(self._profile, points, text))
 
     def _profile(self, points: list[tuple[float, float]], text: str) -> dict[str, Any]:
@@ -261,7 +261,7 @@ class Routes:
         replies = [
             table for _, table in self._of.reader.ask(f"{keys.ROOT}/map/**", {"route": text})
         ]
-        return route.profile(
+        return route.grip_profile(
             points, pa.concat_tables(replies) if replies else MAP_SCHEMA.empty_table()
         )
 
@@ -297,7 +297,7 @@ class Routes:
 
     async def overlay(self, _: Request) -> Response:
         """Return the overlay map, or null."""
-        return JSONResponse(await run_in_threadpool(overlay.cells, self._of.overlay))
+        return JSONResponse(await run_in_threadpool(overlay.read_overlay, self._of.overlay))
 
 
 def with_errors(
@@ -305,13 +305,13 @@ def with_errors(
 ) -> Callable[[Request], Awaitable[Response]]:
     """Wrap a handler so that a bad request gets an answer with the problem and the fix."""
 
-    async def wrapped(request: Request) -> Response:
+    async def answer_or_refuse(request: Request) -> Response:
         try:
             return await answer(request)
         except (InputError, WireError) as error:
             return PlainTextResponse(f"{error}\n", 400)
 
-    return wrapped
+    return answer_or_refuse
 
 
 class Guarded:
@@ -320,7 +320,7 @@ class Guarded:
     def __init__(self, app: ASGIApp, hosts: frozenset[str], base_map: str | None) -> None:
         self._app = app
         self._hosts = hosts
-        pictures = f"'self' data: {origin(base_map or '')}".rstrip()
+        pictures = f"'self' data: {origin_of(base_map or '')}".rstrip()
         policy = (
             f"default-src 'none'; script-src 'self'; style-src 'self'; img-src {pictures}; "
             "connect-src 'self'; "
@@ -337,21 +337,21 @@ class Guarded:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Forward a request and add the headers."""
 
-        async def sent(message: Message) -> None:
+        async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 message["headers"] = [*message["headers"], *self._headers]
             await send(message)
 
-        if scope["type"] == "http" and self._hosts and _host(scope) not in self._hosts:
+        if scope["type"] == "http" and self._hosts and _host_name(scope) not in self._hosts:
             refusal = PlainTextResponse(
                 "this page is not served under that name; see --name\n", 421
             )
-            await refusal(scope, receive, sent)
+            await refusal(scope, receive, send_with_headers)
         else:
-            await self._app(scope, receive, sent)
+            await self._app(scope, receive, send_with_headers)
 
 
-def _host(scope: Scope) -> str:
+def _host_name(scope: Scope) -> str:
     named = next(
         (value.decode("latin-1") for name, value in scope["headers"] if name == b"host"), ""
     )
@@ -360,7 +360,7 @@ def _host(scope: Scope) -> str:
     return ""
 
 
-def origin(address: str) -> str:
+def origin_of(address: str) -> str:
     """Return scheme, host and port of an address; empty for this host."""
     parts = urlsplit(address)
     return f"{parts.scheme}://{parts.netloc}" if parts.netloc else ""

@@ -51,7 +51,7 @@ class Taken(NamedTuple):
     weather: tuple[str, ...] = ()
 
 
-def save(root: Path, taken: Taken) -> Path:
+def save_checkpoint(root: Path, taken: Taken) -> Path:
     """Store a checkpoint, and keep the one before it.
 
     Raises:
@@ -68,7 +68,7 @@ def save(root: Path, taken: Taken) -> Path:
             with pa.ipc.new_file(file, table.schema.with_metadata(metadata)) as writer:
                 writer.write_table(table.replace_schema_metadata(metadata))
     content = {
-        "files": {file.name: digest(file) for file in sorted(draft.iterdir())},
+        "files": {file.name: file_digest(file) for file in sorted(draft.iterdir())},
         "weather": list(taken.weather),
     }
     with open_durably(draft / _MANIFEST, named=False) as file:
@@ -78,17 +78,17 @@ def save(root: Path, taken: Taken) -> Path:
     draft.rename(path)
     sync_directory(folder)
     sync_directory(root)
-    for old in _folders(root)[:-KEPT]:
+    for old in _checkpoint_folders(root)[:-KEPT]:
         shutil.rmtree(old, ignore_errors=True)
     return path
 
 
-def newest(root: Path) -> list[Path]:
+def list_checkpoints(root: Path) -> list[Path]:
     """Return the checkpoints, newest first."""
-    return _folders(root)[::-1]
+    return _checkpoint_folders(root)[::-1]
 
 
-def load(path: Path) -> Taken:
+def load_checkpoint(path: Path) -> Taken:
     """Return a checkpoint after verification.
 
     Raises:
@@ -100,11 +100,15 @@ def load(path: Path) -> Taken:
         content: dict[str, Any] = manifest["content"]
         right = manifest["digest"] == _digest_of(content)
     except (ValueError, KeyError, TypeError, FileNotFoundError) as error:
-        raise _refused(path, "has no manifest that can be read") from error
-    if not right or any(digest(path / name) != wanted for name, wanted in content["files"].items()):
-        raise _refused(path, "is damaged")
-    if _tries(path) >= TRIES:
-        raise _refused(path, f"was begun from {TRIES} times by a service that died at once")
+        raise _checkpoint_error(path, "has no manifest that can be read") from error
+    if not right or any(
+        file_digest(path / name) != wanted for name, wanted in content["files"].items()
+    ):
+        raise _checkpoint_error(path, "is damaged")
+    if _count_tries(path) >= TRIES:
+        raise _checkpoint_error(
+            path, f"was begun from {TRIES} times by a service that died at once"
+        )
     tables = {}
     for name in content["files"]:
         with pa.memory_map(str(path / name)) as source:
@@ -113,19 +117,19 @@ def load(path: Path) -> Taken:
     return Taken(tables, Cut(int(epoch), int(number)), tuple(content["weather"]))
 
 
-def begin(path: Path) -> None:
+def mark_begun(path: Path) -> None:
     """Record that a service begins from a checkpoint; `mark_survived` removes the record."""
     with suppress(OSError):  # a full disk does not keep a service from its start
-        (path / _TRIED).write_text(str(_tries(path) + 1))
+        (path / _TRIED).write_text(str(_count_tries(path) + 1))
 
 
 def mark_survived(root: Path) -> None:
     """Record that the service runs well with its checkpoint."""
-    for path in _folders(root):
+    for path in _checkpoint_folders(root):
         (path / _TRIED).unlink(missing_ok=True)
 
 
-def digest(path: Path) -> str:
+def file_digest(path: Path) -> str:
     """Return the hash of a file; that of nothing if it does not exist."""
     state = blake2b(digest_size=16)
     with suppress(FileNotFoundError), path.open("rb") as file:
@@ -134,7 +138,7 @@ def digest(path: Path) -> str:
     return state.hexdigest()
 
 
-def _tries(path: Path) -> int:
+def _count_tries(path: Path) -> int:
     try:
         return int((path / _TRIED).read_text())
     except (OSError, ValueError):
@@ -145,11 +149,11 @@ def _digest_of(content: Sequence[Any] | dict[str, Any]) -> str:
     return blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
-def _refused(path: Path, problem: str) -> InputError:
+def _checkpoint_error(path: Path, problem: str) -> InputError:
     return InputError(
         "checkpoint", f"{path.name} {problem}", "the one before it, or the log, is taken instead"
     )
 
 
-def _folders(root: Path) -> list[Path]:
+def _checkpoint_folders(root: Path) -> list[Path]:
     return sorted(path for path in (root / CHECKPOINTS).glob("[0-9]*") if path.is_dir())

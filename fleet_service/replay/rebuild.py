@@ -20,7 +20,7 @@ from fleet_service.archive.format import layout, reading, segments
 from fleet_service.archive.format.load import Damaged, skip_damaged
 from fleet_service.archive.format.row_filter import ValueRange, filter_table, matching_row_groups
 from fleet_service.archive.identity import vehicle_ids
-from fleet_service.archive.identity.pseudonyms import number
+from fleet_service.archive.identity.pseudonyms import pseudonym_number
 from fleet_service.fusion import Fusion, Observations, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.fuse import Before
@@ -93,11 +93,13 @@ def restore_streams(
             boot, region, seq, first_held = (
                 table[name].to_numpy() for name in (*IDENTITY[1:], "first_held")
             )
-            time = segments.nanoseconds(table[first])
-            streams.restore(kind, numbers(table["vehicle"]), boot, region, seq, first_held, time)
+            time = segments.to_nanoseconds(table[first])
+            streams.restore(
+                kind, pseudonym_numbers(table["vehicle"]), boot, region, seq, first_held, time
+            )
 
 
-def numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
+def pseudonym_numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
     """Return pseudonyms (n,) as numbers."""
     chunked = (
         pseudonyms if isinstance(pseudonyms, pa.ChunkedArray) else pa.chunked_array([pseudonyms])
@@ -105,7 +107,9 @@ def numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
     coded = chunked.combine_chunks().dictionary_encode()
     if not len(coded):
         return np.zeros(0, np.int64)
-    each = np.array([number(pseudonym) for pseudonym in coded.dictionary.to_pylist()], np.int64)
+    each = np.array(
+        [pseudonym_number(pseudonym) for pseudonym in coded.dictionary.to_pylist()], np.int64
+    )
     return np.asarray(each[coded.indices.to_numpy()])
 
 
@@ -153,7 +157,7 @@ class Since(NamedTuple):
 Heard = Callable[[Observations], AbstractContextManager[None]]
 
 
-def nobody(_: Observations) -> AbstractContextManager[None]:
+def ignore_observations(_: Observations) -> AbstractContextManager[None]:
     """Ignore observations."""
     return nullcontext()
 
@@ -194,7 +198,7 @@ def past_fusion(
     fusion = fusion_with_weather(root, lateness_s, until)
     begin = Begin(until // layout.DAY_NS - layout.MAP_DAYS)
     wanted = Since(begin, until=until, box=box, most=most)
-    heard = nobody if listener is None else listener(fusion)
+    heard = ignore_observations if listener is None else listener(fusion)
     for _ in replay(root, fusion, wanted, heard=heard):
         pass  # the alerts of then are history
     return fusion
@@ -207,7 +211,9 @@ def first_day(root: Path) -> int | None:
     Older batches are not sent again (ServiceConfig.oldest_s), and they do not show in the map.
     """
     found = [
-        layout.day_of(folder) for kind in Kind for folder in layout.days(root, layout.TABLES[kind])
+        layout.day_of(folder)
+        for kind in Kind
+        for folder in layout.day_folders(root, layout.TABLES[kind])
     ]
     return max(found) - layout.MAP_DAYS if found else None
 
@@ -217,7 +223,7 @@ def replay(
     fusion: Fusion,
     since: Since = Since(),  # noqa: B008 immutable
     damaged: Damaged = skip_damaged,
-    heard: Heard = nobody,
+    heard: Heard = ignore_observations,
 ) -> Iterator[Updated]:
     """Replay the archive into `fusion` in order of time, with the weights that were used; yield
     once per epoch.
@@ -241,7 +247,7 @@ def replay(
     waiting: list[
         tuple[Observations, Before]
     ] = []  # late rows that were fused after the end of their table
-    known = vehicle_ids.read(root / "keys")
+    known = vehicle_ids.read_numbers(root / "keys")
     for table in in_order(reading.Listing(root, Kind.OBSERVATION, wanted, damaged), since.most):
         rows = segments.rows_of(table)
         if since.known is not None:
@@ -250,8 +256,8 @@ def replay(
             new = ~since.known.accepted(Kind.OBSERVATION, distinct)[index.reshape(-1)]
             rows = {name: column[new] for name, column in rows.items()}
         o = observations_of(rows, vehicle_ids.numbers_of(known, rows["vehicle"]))
-        before = _before(rows)
-        end = int(segments.nanoseconds(table["leave_time"]).max(initial=0)) // EPOCH_NS
+        before = _recorded_result(rows)
+        end = int(segments.to_nanoseconds(table["leave_time"]).max(initial=0)) // EPOCH_NS
         o, before = _join_parts([*waiting, (o, before)])
         epoch = (o.time + before.late_by) // EPOCH_NS
         waiting = [_select_rows(o, before, epoch > end)]
@@ -260,7 +266,7 @@ def replay(
         yield from _fuse_epochs(fusion, *waiting[0], heard)
 
 
-def _before(rows: segments.Rows) -> Before:
+def _recorded_result(rows: segments.Rows) -> Before:
     """Return lateness and weight of rows as they were used at the first fusion."""
     return Before(rows["late"].astype(bool), rows["late_by"], rows["weight"])
 
@@ -314,13 +320,17 @@ def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.T
     Raises:
         InputError: there are more than `most` rows.
     """
-    for held in _parts(listing, most) if most is not None else _ahead(_parts(listing, most)):
+    for held in (
+        _split_parts(listing, most)
+        if most is not None
+        else _prefetch_parts(_split_parts(listing, most))
+    ):
         yield from held.chunks()
         pa.default_memory_pool().release_unused()  # before the next is used
         trim_memory()
 
 
-def _ahead(parts: Iterator[_Held]) -> Iterator[_Held]:
+def _prefetch_parts(parts: Iterator[_Held]) -> Iterator[_Held]:
     """Yield the same parts, each made in a thread while the one before is used: reading is a third
     of a start's time."""
     with ThreadPoolExecutor(1, "reads ahead") as thread:
@@ -330,7 +340,7 @@ def _ahead(parts: Iterator[_Held]) -> Iterator[_Held]:
             yield part
 
 
-def _parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
+def _split_parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
     """Yield the rows of a listing in parts of about PART_ROWS."""
     name = layout.TIME[listing.kind]
     fresh = [table for table in listing.inbox() if table.num_rows]
@@ -339,7 +349,7 @@ def _parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
     inbox_days = (
         np.zeros(0, np.int64)
         if inbox is None
-        else segments.nanoseconds(inbox[name]) // layout.DAY_NS
+        else segments.to_nanoseconds(inbox[name]) // layout.DAY_NS
     )
     files: dict[int, list[Path]] = {day: [] for day in np.unique(inbox_days).tolist()}
     for path in listing.files:
@@ -349,14 +359,14 @@ def _parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
         mine = None if inbox is None else inbox.slice(begin, end - begin)
         rows = end - begin + sum(_rows_of(path) for path in files[day])
         for low, high in pairwise(
-            _borders(day * layout.DAY_NS, (day + 1) * layout.DAY_NS, rows, PART_ROWS)
+            _time_borders(day * layout.DAY_NS, (day + 1) * layout.DAY_NS, rows, PART_ROWS)
         ):
             within = (
                 [ValueRange(name, low // US_STEP, high // US_STEP - 1)]
                 if high - low < layout.DAY_NS
                 else []
             )
-            borders = _borders(low, high, rows * (high - low) // layout.DAY_NS, CHUNK_ROWS)
+            borders = _time_borders(low, high, rows * (high - low) // layout.DAY_NS, CHUNK_ROWS)
             held = _Held(name, borders)
             if mine is not None:
                 held.take(filter_table(mine, within))
@@ -389,7 +399,7 @@ class _Held:
 
     def take(self, table: pa.Table) -> None:
         """Add rows to those that `keep` or `forget` decides on."""
-        time = segments.nanoseconds(table[self._name])
+        time = segments.to_nanoseconds(table[self._name])
         order = np.argsort(time, kind="stable")
         table = _with_numbers(table).take(order)
         places = np.searchsorted(time[order], self._borders).tolist()
@@ -419,7 +429,7 @@ class _Held:
                 yield pa.concat_tables([pa.ipc.open_stream(one).read_all() for one in packed])
 
 
-def _borders(low: int, high: int, rows: int, most: int) -> list[int]:
+def _time_borders(low: int, high: int, rows: int, most: int) -> list[int]:
     """Return times from `low` to `high` [ns], between epochs, with about `most` rows between two if
     rows are even in time."""
     epochs = (high - low) // EPOCH_NS
@@ -430,7 +440,7 @@ def _borders(low: int, high: int, rows: int, most: int) -> list[int]:
 def _with_numbers(table: pa.Table) -> pa.Table:
     """Return a table with numbers for pseudonyms, which takes less than half the memory."""
     at = table.column_names.index("vehicle")
-    return table.set_column(at, "vehicle", pa.array(numbers(table["vehicle"])))
+    return table.set_column(at, "vehicle", pa.array(pseudonym_numbers(table["vehicle"])))
 
 
 def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
@@ -442,7 +452,7 @@ def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
     """
     last = until // layout.DAY_NS + 1
     found = (
-        sum(path.stat().st_size for path in segments.paths(root, Kind.OBSERVATION))
+        sum(path.stat().st_size for path in segments.list_segments(root, Kind.OBSERVATION))
         // SEGMENT_ROW_BYTES
     )
     for path in layout.compacted_files(root, Kind.OBSERVATION, last - layout.MAP_DAYS - 1, last):

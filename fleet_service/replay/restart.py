@@ -52,9 +52,9 @@ def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()
     that the service stored with those of `image_of`.
     """
     refused = 0
-    for path in checkpoints.newest(root):
+    for path in checkpoints.list_checkpoints(root):
         try:
-            taken = checkpoints.load(path)
+            taken = checkpoints.load_checkpoint(path)
             tables = dict(taken.tables)
             standing = [Alert(**row) for row in tables.pop(ALERTS).to_pylist()]
             above = tables.pop(ABOVE)["seq"].to_numpy()
@@ -72,7 +72,7 @@ def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()
             log.warning("checkpoint %s is not begun from: %s", path.name, error)
             refused += 1
             continue
-        checkpoints.begin(path)
+        checkpoints.mark_begun(path)
         return Restart(
             fusion, streams, standing, taken.cut, frozenset(taken.weather), refused, others
         )

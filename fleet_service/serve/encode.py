@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import SLIPPERY_SHARE, quantiles
-from fleet_service.serve.view import LOWER, UPPER, CellView, is_measured, view
+from fleet_service.serve.view import LOWER, UPPER, CellView, is_measured, view_cells
 from schemas import grid, tables
 from schemas.numeric import IntArray
 from schemas.query import Format
@@ -61,16 +61,16 @@ def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
 
 def cell_table(fusion: Fusion, slots: IntArray, now: int) -> pa.Table:
     """Return the cells of `slots` as believed at `now` [ns], in the schema of the map."""
-    return pa.Table.from_batches([batch_of(view(fusion, slots, now), now)])
+    return pa.Table.from_batches([batch_of(view_cells(fusion, slots, now), now)])
 
 
-def encode(cells: pa.RecordBatch, form: Format, tile: int) -> bytes:
+def encode_tile(cells: pa.RecordBatch, form: Format, tile: int) -> bytes:
     """Return the cells of a tile in one of the three forms."""
     if form is Format.ARROW:
         return arrow_stream(cells)
-    rows = _plain(cells)
+    rows = _json_rows(cells)
     if form is Format.JSON:
-        return f'{{"tile": "{grid.quadkey(tile, grid.TILE_ZOOM)}", "cells": [{_joined(rows)}]}}'.encode()
+        return f'{{"tile": "{grid.quadkey(tile, grid.TILE_ZOOM)}", "cells": [{_encode_rows(rows)}]}}'.encode()
     outlines = np.stack(
         grid.outline(cells["cell"].to_numpy(), cells["sector"].to_numpy()), axis=-1
     ).tolist()
@@ -82,10 +82,10 @@ def encode(cells: pa.RecordBatch, form: Format, tile: int) -> bytes:
         }
         for ring, cell in zip(outlines, rows, strict=True)
     )
-    return f'{{"type": "FeatureCollection", "features": [{_joined(features)}]}}'.encode()
+    return f'{{"type": "FeatureCollection", "features": [{_encode_rows(features)}]}}'.encode()
 
 
-def _joined(rows: Iterable[dict[str, Any]]) -> str:
+def _encode_rows(rows: Iterable[dict[str, Any]]) -> str:
     """Encode rows as JSON one by one; a single call for thousands would hold the interpreter
     lock too long.
     """
@@ -97,7 +97,7 @@ def arrow_stream(cells: pa.RecordBatch) -> bytes:
     return b"".join([_SCHEMA, cells.serialize(), _END])
 
 
-def _plain(table: pa.RecordBatch) -> list[dict[str, Any]]:
+def _json_rows(table: pa.RecordBatch) -> list[dict[str, Any]]:
     """Return rows with times as ISO 8601 text and single-precision numbers without surplus
     digits.
     """

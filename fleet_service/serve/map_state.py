@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import Fusion
-from fleet_service.fusion.store.store import distinct
+from fleet_service.fusion.store.store import distinct_values
 from schemas import grid
 from schemas.numeric import IntArray
 
@@ -36,7 +36,7 @@ class MapState:
         """Record cells that were updated."""
         self._index()
         self.change += 1
-        tiles = distinct(tile_of(self.fusion, slots)).tolist()
+        tiles = distinct_values(tile_of(self.fusion, slots)).tolist()
         self._dirty.update(tiles)
         self._changed.update(dict.fromkeys(tiles, self.change))
 

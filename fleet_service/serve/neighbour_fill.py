@@ -25,7 +25,7 @@ REACH: Final = 10  # cells, some 130 m
 KEPT: Final = 0.8
 
 
-def impute(
+def impute_cells(
     fusion: Fusion, tile: int, known: IntArray, route: IntArray | None, now: int
 ) -> CellView:
     """Return the cells of a tile that are not `known` next to those of its cells that are, same
@@ -50,7 +50,7 @@ def impute(
     share = np.full(len(keys), 1.0 - PRIOR_SHARE)
     if route is not None:
         ahead = np.isin(keys, route)
-        along = _along(fusion, route, tile, known)
+        along = _route_gaps(fusion, route, tile, known)
         keys, visited, share = (
             np.concatenate([a[ahead], b])
             for a, b in zip((keys, visited, share), along, strict=True)
@@ -81,7 +81,7 @@ def impute(
     )
 
 
-def _along(
+def _route_gaps(
     fusion: Fusion, route: IntArray, tile: int, known: IntArray
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Return unknown keys of a route in a tile, the slots of the nearest visited ones before and

@@ -27,7 +27,7 @@ from fleet_service.fusion.belief import SLIPPERY_SHARE, quantiles
 from fleet_service.fusion.fuse import voted_keys
 from fleet_service.fusion.store.records import CELL, NONE
 from fleet_service.serve.map_state import tile_of
-from fleet_service.serve.view import CellView, coarsen, view
+from fleet_service.serve.view import CellView, coarsen_cells, view_cells
 from fleet_service.serve.visitors import Visitors, bit_of
 from schemas import grid, mugrid
 from schemas.numeric import IntArray
@@ -109,7 +109,7 @@ class PublicCells:
             worse |= quantiles(published, (0.5,))[0] - quantiles(current, (0.5,))[0] >= LESS_MU
             self._release(np.unique(slots[waiting[worse]]))
         with self.as_published(slots):
-            return coarsen(view(self._fusion, slots, now))
+            return coarsen_cells(view_cells(self._fusion, slots, now))
 
     @contextmanager
     def as_published(self, slots: IntArray) -> Iterator[None]:

@@ -8,17 +8,17 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.serve.encode import encode
-from fleet_service.serve.neighbour_fill import impute
+from fleet_service.serve.encode import encode_tile
+from fleet_service.serve.neighbour_fill import impute_cells
 from fleet_service.serve.tile_cache import ShownTile, TileCache, used_once
-from fleet_service.serve.view import joined
+from fleet_service.serve.view import join_views
 from schemas import grid
 from schemas.numeric import BoolArray, IntArray
 from schemas.query import Format, MapQuery
 from schemas.regions import keys_along
 
 
-def answer(
+def answer_query(
     cache: TileCache,
     query: MapQuery,
     wanted: Callable[[int], bool],
@@ -38,13 +38,13 @@ def answer(
         InputError: the route is too long.
     """
     route = keys_along(query.route) if query.route else None
-    for tile in _tiles(cache, query, route, only):
+    for tile in _select_tiles(cache, query, route, only):
         if wanted(tile):
             if route is None and query.basis is None:
                 shown = cache.shown(tile, now)
             else:
                 shown = _view_tile(cache, tile, query, route, now)
-            payload = _encode_tile(shown, _rows(shown, query), query.format, tile)
+            payload = _encode_tile(shown, _select_rows(shown, query), query.format, tile)
             if payload is not None:
                 yield tile, payload
 
@@ -59,14 +59,18 @@ class AnswerSize(NamedTuple):
 def size_asked(
     cache: TileCache, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None
 ) -> AnswerSize:
-    """Return the size of all tiles that an answer reads; arguments and errors as for `answer`."""
+    """Return the size of all tiles that an answer reads; arguments and errors as for `answer_query`."""
     route = keys_along(query.route) if query.route else None
-    tiles = [tile for tile in _tiles(cache, query, route, only) if only is not None or wanted(tile)]
+    tiles = [
+        tile
+        for tile in _select_tiles(cache, query, route, only)
+        if only is not None or wanted(tile)
+    ]
     with cache.guard:
         return AnswerSize(sum(cache.state.count(tile) for tile in tiles), len(tiles))
 
 
-def _tiles(
+def _select_tiles(
     cache: TileCache, query: MapQuery, route: IntArray | None, only: int | None
 ) -> list[int]:
     """Select the tiles that may contain something."""
@@ -102,12 +106,12 @@ def _view_tile(
                 known = np.union1d(slots, along[along >= 0])
             known = cache.public(known, now)
             with cache.as_published(known):
-                borrowed = impute(fusion, tile, known, route, now)
-            cells = joined(cells, cache.coarse(borrowed))
+                borrowed = impute_cells(fusion, tile, known, route, now)
+            cells = join_views(cells, cache.coarse(borrowed))
     return used_once(cells, now)
 
 
-def _rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
+def _select_rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
     """Select the cells with enough vehicles that touch the box.
 
     Usually that is a complete tile, or a contiguous part of it. Every step that releases the
@@ -145,4 +149,4 @@ def _encode_tile(
         cells = shown.cells.slice(rows.start, count)
     else:
         cells = shown.cells.filter(pa.array(rows))
-    return encode(cells, form, tile) if cells.num_rows else None
+    return encode_tile(cells, form, tile) if cells.num_rows else None

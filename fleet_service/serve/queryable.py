@@ -145,7 +145,7 @@ class MapQueryable:
                 {name: value for name, value in pairs if not name.startswith("_")}
             )  # Zenoh's own
             if wanted.at is None:
-                asked = self._answering.size(wanted, *_wanted(request))
+                asked = self._answering.size(wanted, *_key_filter(request))
                 cost = asked.cells * COST[wanted.format]
                 if cost > MOST:
                     fix = (
@@ -223,9 +223,9 @@ class MapQueryable:
     def _goes_on(self, heavy: _QueuedQuery) -> bool:
         """Answer with one more tile; return True if there may be others."""
         request = heavy.request
-        with self._answered(request) as answered:
+        with self._reply_to(request) as answered:
             if heavy.tiles is None:
-                heavy.tiles = iter(self._answering.answer(heavy.wanted, *_wanted(request)))
+                heavy.tiles = iter(self._answering.answer(heavy.wanted, *_key_filter(request)))
             for tile, payload in heavy.tiles:
                 request.reply(keys.map_key(tile), payload, encoding=heavy.wanted.format.encoding)
                 answered.whole = False
@@ -239,12 +239,12 @@ class MapQueryable:
             self._past.release()
 
     def _reply(self, request: zenoh.Query, wanted: MapQuery) -> None:
-        with self._answered(request):
-            for tile, payload in self._answering.answer(wanted, *_wanted(request)):
+        with self._reply_to(request):
+            for tile, payload in self._answering.answer(wanted, *_key_filter(request)):
                 request.reply(keys.map_key(tile), payload, encoding=wanted.format.encoding)
 
     @contextmanager
-    def _answered(self, request: zenoh.Query) -> Iterator[_Answered]:
+    def _reply_to(self, request: zenoh.Query) -> Iterator[_Answered]:
         """Reply to a request and close it unless more follows; a failure becomes an error reply."""
         answered = _Answered()
         try:
@@ -277,18 +277,18 @@ class MapQueryable:
             request.reply_err(str(error), encoding=TEXT)
 
 
-def _wanted(request: zenoh.Query) -> tuple[Callable[[int], bool], int | None]:
+def _key_filter(request: zenoh.Query) -> tuple[Callable[[int], bool], int | None]:
     """Return a predicate for tiles whose key matches the query's, and the only such tile if the
     query's key names it."""
     expression = request.key_expr
-    only = _tile(str(expression))
+    only = _tile_of_key(str(expression))
     return (
         lambda tile: tile == only or expression.intersects(zenoh.KeyExpr(keys.map_key(tile)))
     ), only
 
 
 @lru_cache(1 << 12)
-def _tile(expression: str) -> int | None:
+def _tile_of_key(expression: str) -> int | None:
     """Return the tile that a key names; None if it names none or several."""
     try:
         return keys.parse(expression).quadint

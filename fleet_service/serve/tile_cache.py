@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fleet_service.serve.encode import arrow_stream, batch_of
 from fleet_service.serve.map_state import MapState
 from fleet_service.serve.public_cells import PublicCells
-from fleet_service.serve.view import CellView, coarsen, view
+from fleet_service.serve.view import CellView, coarsen_cells, view_cells
 from schemas import grid
 from schemas.numeric import IntArray
 from schemas.thresholds import NS
@@ -107,14 +107,14 @@ class TileCache:
         payload = arrow_stream(batch_of(cells, now))
         batch = pa.ipc.open_stream(payload).read_next_batch()
         columns = selected_by(batch)
-        made = ShownTile(batch, columns, payload, *_common(columns), now, change)
+        made = ShownTile(batch, columns, payload, *_common_bounds(columns), now, change)
         self._keep(tile, made)
         return made
 
     def seen(self, slots: IntArray, now: int) -> CellView:
         """Return the cells of public slots as readers see them."""
         if self._public is None:
-            return view(self.state.fusion, slots, now)
+            return view_cells(self.state.fusion, slots, now)
         return self._public.view(slots, now)
 
     def as_published(self, slots: IntArray) -> AbstractContextManager[None]:
@@ -123,7 +123,7 @@ class TileCache:
 
     def coarse(self, cells: CellView) -> CellView:
         """Return cells with times and counts as readers see them."""
-        return cells if self._public is None else coarsen(cells)
+        return cells if self._public is None else coarsen_cells(cells)
 
     def public(self, slots: IntArray, now: int) -> IntArray:
         """Return the slots that are public at `now` [ns]."""
@@ -153,7 +153,9 @@ def used_once(cells: CellView, now: int) -> ShownTile:
     return ShownTile(batch, selected_by(batch))
 
 
-def _common(columns: Mapping[str, NDArray[Any]]) -> tuple[int, tuple[float, float, float, float]]:
+def _common_bounds(
+    columns: Mapping[str, NDArray[Any]],
+) -> tuple[int, tuple[float, float, float, float]]:
     if not len(columns["vehicles"]):
         return 0, NOTHING
     west = float(columns["west"].max())

@@ -51,7 +51,7 @@ class CellView(NamedTuple):
     imputed: BoolArray
 
 
-def view(fusion: Fusion, slots: IntArray, now: int) -> CellView:
+def view_cells(fusion: Fusion, slots: IntArray, now: int) -> CellView:
     """Return the cells of `slots` as believed at `now` [ns]; copies, so that the fusion may
     continue.
     """
@@ -70,7 +70,7 @@ def view(fusion: Fusion, slots: IntArray, now: int) -> CellView:
     )
 
 
-def coarsen(cells: CellView) -> CellView:
+def coarsen_cells(cells: CellView) -> CellView:
     """Return the cells as readers see them with privacy on: no single passage shows in a time or
     a count.
     """
@@ -87,7 +87,7 @@ def coarse_counts(counts: IntArray) -> IntArray:
     return COUNT_STEPS[np.maximum(np.searchsorted(COUNT_STEPS, counts, "right") - 1, 0)]
 
 
-def joined(*views: CellView) -> CellView:
+def join_views(*views: CellView) -> CellView:
     """Return views joined into one."""
     return CellView(*(np.concatenate(columns) for columns in zip(*views, strict=True)))
 

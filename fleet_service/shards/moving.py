@@ -78,7 +78,7 @@ def hand_over(
         InputError: the region has no service, the standby does not wait, or it did not take over.
     """
     with tokens.track_tokens(session) as there:
-        service = _server(there, region)
+        service = _find_server(there, region)
         if service is None:
             raise InputError("region", f"nobody serves {region}", "see `fleet-service watch`")
         if service == to:
@@ -86,7 +86,7 @@ def hand_over(
         say(f"{service} hands over {_request_handover(session, service, to)}")
         end = time.monotonic() + MOVED_S
         absent_since = 0.0
-        while (now := _server(there, region)) != to:
+        while (now := _find_server(there, region)) != to:
             absent_since = absent_since or (time.monotonic() if now is None else 0.0)
             if time.monotonic() > end or now not in (None, service):
                 raise InputError(
@@ -98,7 +98,7 @@ def hand_over(
         return HandoverResult(service, time.monotonic() - (absent_since or time.monotonic()))
 
 
-def _server(there: tokens.PresenceTracker, region: str) -> str | None:
+def _find_server(there: tokens.PresenceTracker, region: str) -> str | None:
     return next(
         (token.service for token in there.active if regions.covers(token.region, region)), None
     )

@@ -46,7 +46,7 @@ def claim_regions(
         InputError: another service has one of the regions.
     """
     mine = frozenset(ServiceToken(region, name, secrets.token_hex(4)) for region in regions)
-    with _standing(_claimed(session, mine, stop, former)):
+    with _hold_tokens(_claim_regions(session, mine, stop, former)):
         yield mine
 
 
@@ -54,12 +54,12 @@ def claim_regions(
 def announce_regions(session: zenoh.Session, mine: frozenset[ServiceToken]) -> Iterator[None]:
     """Announce that regions are served while the block runs. The queryables must answer before and
     after the block: an empty answer of a served region means that nothing is known there."""
-    with _standing(_declared(session, mine, SERVES)):
+    with _hold_tokens(_declare_tokens(session, mine, SERVES)):
         yield
 
 
 @contextmanager
-def _standing(held: list[zenoh.LivelinessToken]) -> Iterator[None]:
+def _hold_tokens(held: list[zenoh.LivelinessToken]) -> Iterator[None]:
     try:
         yield
     finally:
@@ -89,7 +89,7 @@ def rival_tokens(
     return sorted(one for one in others if any(overlap(one.region, own.region) for own in mine))
 
 
-def _claimed(
+def _claim_regions(
     session: zenoh.Session,
     mine: frozenset[ServiceToken],
     stop: threading.Event,
@@ -109,7 +109,7 @@ def _claimed(
         if others:
             problem = f"{others[0].region} is served by {others[0].service} already"
             raise InputError("regions", problem, "stop that service, or give each its own regions")
-        held = _declared(session, mine, CLAIMS)
+        held = _declare_tokens(session, mine, CLAIMS)
         if not others_there():
             return held
         for token in held:  # both began at once: the one that comes back first has it
@@ -120,7 +120,7 @@ def _claimed(
     )
 
 
-def _declared(
+def _declare_tokens(
     session: zenoh.Session, mine: frozenset[ServiceToken], root: str
 ) -> list[zenoh.LivelinessToken]:
     return [session.liveliness().declare_token(token.key_under(root)) for token in sorted(mine)]
@@ -144,7 +144,7 @@ def standby_signs(
     with (
         session,
         tokens.track_tokens(session) as there,
-        _standing(_declared(session, waits, WAITS)),
+        _hold_tokens(_declare_tokens(session, waits, WAITS)),
     ):
         yield (
             lambda: bool(list(session.info.routers_zid())),

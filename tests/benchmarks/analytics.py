@@ -81,7 +81,9 @@ def write_stations(folder: Path) -> Path:
         "time": (np.tile(hours, 5) * 3600 + START_NS // 10**9).astype("datetime64[s]"),
         "latitude": 57.6 + 0.1 * place,
         "longitude": 11.9 + 0.1 * place,
-        "temperature": np.tile(5.0 - 8.0 * synthetic.night(np.asarray(hours * 3600.0, float)), 5)
+        "temperature": np.tile(
+            5.0 - 8.0 * synthetic.night_factor(np.asarray(hours * 3600.0, float)), 5
+        )
         + 0.1 * place,
     }
     path = folder / "stations.csv"
@@ -92,8 +94,8 @@ def write_stations(folder: Path) -> Path:
 def measure_archive(root: Path, rows: int) -> list[Figure]:
     """Rows per second of compaction, bytes of an observation."""
     print_progress(f"writing {rows:,} observations")
-    synthetic.write(root, SyntheticFleet(rows, DAYS))
-    inbox = size_of(segments.paths(root, Kind.OBSERVATION))
+    synthetic.write_archive(root, SyntheticFleet(rows, DAYS))
+    inbox = size_of(segments.list_segments(root, Kind.OBSERVATION))
     began = time.process_time()
     done = compact(root)
     spent = time.process_time() - began
@@ -131,7 +133,9 @@ def measure_questions(root: Path, readings: Path) -> list[Figure]:
             Figure(f"analytics.{name}_cpu_s", busy, "s of CPU"),
         ]
     t = QueryEngine("duckdb", root, PART).observations()
-    cells = np.unique(next(reading.read(root, Kind.OBSERVATION, ["cell"]))["cell"].to_numpy())
+    cells = np.unique(
+        next(reading.read_tables(root, Kind.OBSERVATION, ["cell"]))["cell"].to_numpy()
+    )
     chosen = np.random.default_rng(SEED).choice(cells, CELLS_ASKED)
     columns = ("time", "vehicle", "mu", "mu_lower", "mu_upper", "mu_utilised")
 
@@ -144,9 +148,9 @@ def measure_questions(root: Path, readings: Path) -> list[Figure]:
 
 def write_small_archive(root: Path) -> dict[int, pa.Table]:
     """A small archive with snapshots; returns them by time."""
-    synthetic.write(root, SMALL, 4000)
+    synthetic.write_archive(root, SMALL, 4000)
     compact(root)
-    rollup.complete(root)
+    rollup.complete_parts(root)
     maps = {}
     for hour in (12, 24, 36):
         now = START_NS + hour * 3600 * 10**9
@@ -155,7 +159,7 @@ def write_small_archive(root: Path) -> dict[int, pa.Table]:
             pass
         slots = np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)
         maps[now] = cell_table(fusion, slots, now)
-        snapshots.write(root, maps[now], now)
+        snapshots.write_snapshot(root, maps[now], now)
     return maps
 
 
@@ -164,7 +168,7 @@ def measure_agreement(root: Path, readings: Path) -> list[Figure]:
     differently.
     """
     invalid = sum(bool(_find_refusals(path)) for path in _geo_files(root))
-    expected = sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["seq"]))
+    expected = sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["seq"]))
     readers = READERS | ({"spark": by_spark} if find_spec("pyspark") else {})
     failed = sum(not _can_read(reader, root, expected) for reader in readers.values())
     print_progress(f"readers: {', '.join(readers)}")
@@ -207,7 +211,8 @@ def _count_differences(root: Path, readings: Path) -> int:
     count = 0
     roads = root.parent / "roads.parquet"
     pq.write_table(
-        roads_along(next(reading.read(root, Kind.OBSERVATION, ["cell"]))["cell"].to_numpy()), roads
+        roads_along(next(reading.read_tables(root, Kind.OBSERVATION, ["cell"]))["cell"].to_numpy()),
+        roads,
     )
     for question in QUESTIONS.values():
         if question.name == "replay":  # asks no engine

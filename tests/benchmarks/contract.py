@@ -45,8 +45,8 @@ def parquet_bytes() -> list[Figure]:
     """Bytes per observation of an archive, as its service writes it and compacted."""
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
-        synthetic.write(root, WORLD)
-        inbox = size_of(segments.paths(root, Kind.OBSERVATION))
+        synthetic.write_archive(root, WORLD)
+        inbox = size_of(segments.list_segments(root, Kind.OBSERVATION))
         rows = compact(root).rows
         compacted = size_of((root / "observations").rglob("*.parquet"))
     return [

@@ -36,9 +36,11 @@ def measure_past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
     """Milliseconds of `at=` for a box of a thousand cells; largest change of a probability by a
     restart.
     """
-    synthetic.write(root, WORLD)
+    synthetic.write_archive(root, WORLD)
     compact(root)
-    synthetic.write(root, SyntheticFleet(20_000, 1, seed=1))  # rows that are not compacted yet
+    synthetic.write_archive(
+        root, SyntheticFleet(20_000, 1, seed=1)
+    )  # rows that are not compacted yet
     with closing(Engine(ServiceConfig(), root)) as engine:
         before = _read_beliefs(engine)
     with closing(Engine(ServiceConfig(), root)) as engine:

@@ -44,7 +44,9 @@ def state() -> list[Figure]:
         folder = Path(name)
         root = folder / "archive"
         fusion, _ = fill_fusion(CELLS, 3, SPAN_S)
-        checkpoints.save(root, Taken(image_of(fusion, [], SequenceTrackers()), Cut(0, 0)))
+        checkpoints.save_checkpoint(
+            root, Taken(image_of(fusion, [], SequenceTrackers()), Cut(0, 0))
+        )
         del fusion
         with closing(Engine(ServiceConfig(), root)) as engine:
             took, held = checkpoint_s(engine, root, make_messages(SINCE, 10, now), now)
@@ -91,7 +93,7 @@ def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> t
     began = time.perf_counter()
     taken = engine.checkpoint(threading.Event())
     assert taken is not None
-    checkpoints.save(root, taken)
+    checkpoints.save_checkpoint(root, taken)
     took = time.perf_counter() - began
     busy = len(turns)
     saved.set()

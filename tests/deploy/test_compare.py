@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 
 from deploy.demo import compare, page, picture
-from deploy.demo.story import report
+from deploy.demo.story import report_figures
 from schemas.runtime.figures import Figure
 from schemas.wire import Alert
 from tests.browser import open_page
@@ -127,8 +127,8 @@ def test_picture_and_page_are_written_and_no_value_can_end_the_script(tmp_path: 
     hostile = replace(
         found, cells=found.cells.set_column(basis, "basis", [["</script><!--<script>", "measured"]])
     )
-    picture.draw(found, tmp_path / "map.png")
-    page.write(hostile, [Figure("demo.map.rmse", 0.09, "", 0.12)], tmp_path / "map.html")
+    picture.draw_maps(found, tmp_path / "map.png")
+    page.write_page(hostile, [Figure("demo.map.rmse", 0.09, "", 0.12)], tmp_path / "map.html")
     assert (tmp_path / "map.png").stat().st_size > 10_000
     text = (tmp_path / "map.html").read_text()
     assert text.count("</script>") == 1
@@ -149,7 +149,7 @@ def test_demo_page_opens_in_a_browser_with_both_maps_and_figures(tmp_path: Path)
     )
     basis = found.cells.schema.get_field_index("basis")
     found = replace(found, cells=found.cells.set_column(basis, "basis", [["bound", "measured"]]))
-    page.write(found, [Figure("demo.map.rmse", 0.09, "", 0.12)], tmp_path / "map.html")
+    page.write_page(found, [Figure("demo.map.rmse", 0.09, "", 0.12)], tmp_path / "map.html")
     with open_page(tmp_path / "map.html") as shown:
         assert shown.errors == []
         assert shown.drawn_count == 4
@@ -192,16 +192,16 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
         "demo.passes.unwarned": 0,
     }
     assert not any(one.holds for one in nobody.figures())
-    assert compare.works(nobody.figures()), "few passes are no failure of the demo"
+    assert compare.demo_works(nobody.figures()), "few passes are no failure of the demo"
     found = compare.MapComparison(make_tile([7, 8], 0.1, 0.3), np.array([0.2, 0.2]))
-    told = report(tmp_path, found, [Figure("demo.map.rmse", 0.09, "", 0.12)], grip, 1)
+    told = report_figures(tmp_path, found, [Figure("demo.map.rmse", 0.09, "", 0.12)], grip, 1)
     assert grip.line() in capsys.readouterr().out
     shares = {figure.name: figure.value for figure in told}
     assert (shares["demo.lost_grip.warned"], shares["demo.lost_grip.unwarned"]) == (0.5, 1.0)
     assert [row["name"] for row in json.loads((tmp_path / "figures.json").read_text())[1:]] == list(
         shares
     )
-    picture.draw(found, tmp_path / "without.png")
+    picture.draw_maps(found, tmp_path / "without.png")
     assert (tmp_path / "map.png").read_bytes() != (tmp_path / "without.png").read_bytes()
 
 
@@ -220,4 +220,4 @@ def test_a_demo_fails_by_what_breaks_a_promise(name: str, value: float, works: b
     among = Figure(name, value, "", 0)
     if name == compare.COVERAGE:
         among = Figure(name, value, "", (0.8, compare.WIDEST), "within")
-    assert compare.works([Figure("demo.vehicles", 36, "", 30, "more"), among]) == works
+    assert compare.demo_works([Figure("demo.vehicles", 36, "", 30, "more"), among]) == works

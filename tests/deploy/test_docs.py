@@ -29,7 +29,7 @@ def test_the_examples_of_the_reference_run_in_their_order(
     drive = ["simulate", "slalom", "--duration", "2", "--out", str(tmp_path / "drive.parquet")]
     assert edge_agent.cli.main([*drive, "--vehicle-out", str(tmp_path / "drive.json")]) == 0
     world = synthetic.SyntheticFleet(rows=6000, days=1, vehicles=20, roads=4, length=30, icy=2)
-    synthetic.write(tmp_path / "archive", world, 2000)
+    synthetic.write_archive(tmp_path / "archive", world, 2000)
     compact(tmp_path / "archive")
     monkeypatch.chdir(tmp_path)
     capsys.readouterr()

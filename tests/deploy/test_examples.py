@@ -89,7 +89,7 @@ def test_a_car_is_warned_of_what_three_others_found(tmp_path: Path, capsys: Outp
 
 def test_the_archive_is_the_same_in_pandas_and_duckdb(tmp_path: Path, capsys: Output) -> None:
     world = synthetic.SyntheticFleet(rows=6000, days=1, vehicles=20, roads=4, length=30, icy=2)
-    synthetic.write(tmp_path / "archive", world, 2000)
+    synthetic.write_archive(tmp_path / "archive", world, 2000)
     compact(tmp_path / "archive")
     archive_questions.main(tmp_path / "archive", tmp_path / "out")
     said = capsys.readouterr().out

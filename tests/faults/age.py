@@ -102,7 +102,9 @@ def _measure_smaller(site: Site, millions: float) -> tuple[dict[str, float], dic
 def _measure_archive(root: Path) -> tuple[dict[str, float], dict[str, float]]:
     """Measure a start from a checkpoint, and a query about the past."""
     _measure_process("checkpoint", root)
-    synthetic.write(root, SyntheticFleet(SINCE, 1, vehicles=50, seed=int(time.time())), SEGMENT)
+    synthetic.write_archive(
+        root, SyntheticFleet(SINCE, 1, vehicles=50, seed=int(time.time())), SEGMENT
+    )
     return _measure_process("ready", root), _measure_process("past", root, _encode_past_query(root))
 
 
@@ -112,7 +114,7 @@ def _ensure_archive(site: Site, root: Path, observations: int) -> Path:
     if said.exists() and said.read_text() == str(observations):
         return root
     shutil.rmtree(root, ignore_errors=True)
-    synthetic.write(root, SyntheticFleet(observations, DAYS, vehicles=1000), SEGMENT)
+    synthetic.write_archive(root, SyntheticFleet(observations, DAYS, vehicles=1000), SEGMENT)
     _write_states(root, 2 * observations)
     site.say("written; being compacted")
     words = ["compact", "--archive", str(root), "--round-rows", "1000000"]
@@ -145,7 +147,7 @@ def _write_states(root: Path, rows: int) -> None:
     writer = Writer(root, "shard-1")
     rng = np.random.default_rng(1)
     at = 0
-    model = next(synthetic.chunks(SyntheticFleet(SEGMENT, 1, vehicles=1000), 24))
+    model = next(synthetic.make_chunks(SyntheticFleet(SEGMENT, 1, vehicles=1000), 24))
     while at < rows:
         n = min(SEGMENT, rows - at)
         part = {name: column[:n].copy() for name, column in model.items()}

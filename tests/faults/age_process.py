@@ -67,7 +67,7 @@ def _write_checkpoint(engine: Engine, root: Path) -> None:
         engine.settlement.flush()
         thread.join(0.1)
     assert taken[0] is not None
-    checkpoints.save(root, taken[0])
+    checkpoints.save_checkpoint(root, taken[0])
 
 
 if __name__ == "__main__":

@@ -60,12 +60,12 @@ def issue_certificate(
     ground: Ground, name: str, folder: Path, *, days_ago: float = 0.0, days: float = 5.0
 ) -> dict[str, Any]:
     """TLS entries with a certificate that the fleet's own authority issued at some time."""
-    authority = ca.read(ground.folder / "authority" / "ca")
+    authority = ca.read_pair(ground.folder / "authority" / "ca")
     assert authority is not None
     folder.mkdir(exist_ok=True)
-    ca.issue(authority, name, [], days, datetime.now(UTC) - timedelta(days=days_ago)).write(
-        folder / "it"
-    )
+    ca.issue_certificate(
+        authority, name, [], days, datetime.now(UTC) - timedelta(days=days_ago)
+    ).write(folder / "it")
     return {
         "connect_certificate": str(folder / "it.pem"),
         "connect_private_key": str(folder / "it.key"),

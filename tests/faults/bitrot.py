@@ -112,7 +112,9 @@ def _read_rows(root: Path, kind: Kind, told: list[Path]) -> list[tuple[str, int,
     columns = ("vehicle", "seq", "row")
     return sorted(
         row
-        for table in reading.read(root, kind, columns, damaged=lambda path, _: told.append(path))
+        for table in reading.read_tables(
+            root, kind, columns, damaged=lambda path, _: told.append(path)
+        )
         for row in zip(*(table[name].to_pylist() for name in columns), strict=True)
     )
 

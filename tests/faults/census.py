@@ -117,7 +117,7 @@ def _count_archived(
     """Distinct rows of every archived batch, by starts (vehicle, boot); rows that are there
     again; all rows.
     """
-    tables = list(reading.read(archive, Kind.OBSERVATION, ROW))
+    tables = list(reading.read_tables(archive, Kind.OBSERVATION, ROW))
     if not tables:
         return {}, 0, 0
     whole = pa.concat_tables(tables)

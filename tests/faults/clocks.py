@@ -179,7 +179,7 @@ def _count_rows(root: Path) -> Counter[tuple[int, int]]:
     """Return how often each batch's row is in the archive; a vehicle has another pseudonym in
     another month.
     """
-    tables = list(reading.read(root, Kind.OBSERVATION, ["boot", "seq"]))
+    tables = list(reading.read_tables(root, Kind.OBSERVATION, ["boot", "seq"]))
     table = pa.concat_tables(tables)
     return Counter(
         zip(table["boot"].to_numpy().tolist(), table["seq"].to_numpy().tolist(), strict=True)

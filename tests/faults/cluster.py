@@ -169,7 +169,7 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
 
 def rows_of(root: Path) -> int:
     """Rows of an archive."""
-    return sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["row"]))
+    return sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["row"]))
 
 
 def _make_figures(failovers: int, happened: list[Failover], census: list[Census]) -> list[Figure]:

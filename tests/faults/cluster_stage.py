@@ -52,7 +52,7 @@ def write_town_archive(root: Path) -> str:
     """An archive with the map of a town, as of today; returns a box of it."""
     writer = Writer(root, "shard-0")
     since = time.time_ns() - START_NS - DAY_S * NS - 60 * NS
-    for rows in synthetic.chunks(WORLD):
+    for rows in synthetic.make_chunks(WORLD):
         place = [float(rows[name][0]) for name in ("longitude", "latitude")]
         moved = {name: rows[name] + since for name in ("enter_time", "leave_time", "received_at")}
         writer.write(Kind.OBSERVATION, rows | moved)
@@ -353,7 +353,8 @@ class Machines:
         last = max(path.name for path in (former.root / CHECKPOINTS).glob("*-*"))
         until(lambda: any(path.name > last for path in mine.glob("*-*")), PATIENCE_S)
         both = [
-            checkpoints.load(checkpoints.newest(host.root)[0]) for host in (former, self.serving)
+            checkpoints.load_checkpoint(checkpoints.list_checkpoints(host.root)[0])
+            for host in (former, self.serving)
         ]
         for part in parts:
             part.send_signal(signal.SIGCONT)

@@ -72,7 +72,7 @@ class Reading:
     def _read_rows(self) -> None:
         while not self._stop.is_set():
             owed = self._writing.acknowledged
-            whole = reading.read(self._root, Kind.OBSERVATION, ["seq", "row"])
+            whole = reading.read_tables(self._root, Kind.OBSERVATION, ["seq", "row"])
             self.incomplete += not is_complete(whole, owed)
             self.incomplete += not is_complete(read_compacted(self._root), 0)
             self.reads += 2

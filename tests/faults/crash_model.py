@@ -139,7 +139,7 @@ class History(Lives[Batch]):
             restore_streams(root, streams)
         found: list[str] = []
         for kind in Kind:
-            tables = list(reading.read(root, kind, ["seq", "row"]))
+            tables = list(reading.read_tables(root, kind, ["seq", "row"]))
             rows = Counter(
                 pair
                 for t in tables

@@ -26,8 +26,8 @@ from fleet_service.app.engine import Engine
 from fleet_service.app.state import ServiceState, load_state
 from fleet_service.archive.format import layout, reading, snapshots
 from fleet_service.archive.format.load import load
-from fleet_service.archive.format.segments import nanoseconds
-from fleet_service.archive.identity.pseudonyms import Pseudonyms, number
+from fleet_service.archive.format.segments import to_nanoseconds
+from fleet_service.archive.identity.pseudonyms import Pseudonyms, pseudonym_number
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.archive.maintenance.retention import (
     LEAST_DAYS,
@@ -185,8 +185,8 @@ class ServiceHistory(Lives[Sent]):
                 stop.set()
         taken = coming.result()
         if taken is not None:
-            checkpoints.save(root, taken)
-            snapshots.write(root, engine.queries.whole_map(self._now), self._now)
+            checkpoints.save_checkpoint(root, taken)
+            snapshots.write_snapshot(root, engine.queries.whole_map(self._now), self._now)
 
     def _make_batch(self) -> Sent:
         vehicle = self.random.choice(VEHICLES)
@@ -239,21 +239,23 @@ class ServiceHistory(Lives[Sent]):
         self.retired = max(self.retired, (today - date(1970, 1, 1)).days - LEAST_DAYS - 1)
         with suppress(InputError):
             retire_rows(root, LEAST_DAYS, today)
-            weather.retire(root, self._now // layout.DAY_NS - LEAST_DAYS - 1)
+            weather.retire_files(root, self._now // layout.DAY_NS - LEAST_DAYS - 1)
 
     def _find_problems(self, root: Path, last: bool) -> list[str]:
         rows: Counter[int] = Counter()
         with suppress(FileNotFoundError):
-            for table in reading.read(root, Kind.OBSERVATION, ["leave_time"]):
-                rows.update(nanoseconds(table["leave_time"]).tolist())
+            for table in reading.read_tables(root, Kind.OBSERVATION, ["leave_time"]):
+                rows.update(to_nanoseconds(table["leave_time"]).tolist())
         found = [f"{time} is there {count} times" for time, count in rows.items() if count > 1]
         found += self._find_lost(rows, last) + self._came_back(root, rows)
-        reports = (load(path, tables.WEATHER_ARCHIVE, ["time"]) for path in weather.files(root))
+        reports = (
+            load(path, tables.WEATHER_ARCHIVE, ["time"]) for path in weather.weather_files(root)
+        )
         there = {
             time
             for table in reports
             if table is not None
-            for time in nanoseconds(table["time"]).tolist()
+            for time in to_nanoseconds(table["time"]).tolist()
         }
         found += [
             f"the weather of {time} is lost"
@@ -318,7 +320,7 @@ class ServiceHistory(Lives[Sent]):
                 continue
             first = one.rows[0]
             name = (
-                number(pseudonyms.of(one.vehicle, first)),
+                pseudonym_number(pseudonyms.of(one.vehicle, first)),
                 pseudonyms.boot(one.vehicle, _compute_boot(one.vehicle), first),
             )
             names = np.array([[*name, REGION, one.seq]], np.int64)

@@ -195,7 +195,7 @@ def _until_done(engine: Engine) -> int:
 
 
 def _count_rows(root: Path) -> int:
-    return sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["seq"]))
+    return sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["seq"]))
 
 
 def _room_made(engine: Engine, folder: Path) -> int:

@@ -128,7 +128,7 @@ def _make_figure(site: Site, name: str, value: float, quick: float) -> Figure:
 
 def begin_with_old_rows(archive: Path) -> None:
     """An archive of old rows, which no service reads again: it has a day of today, too."""
-    synthetic.write(archive, OLD, OLD.rows // 4)
+    synthetic.write_archive(archive, OLD, OLD.rows // 4)
     compact(archive)
     (archive / layout.TABLES[Kind.OBSERVATION] / f"date={datetime.now(UTC).date()}").mkdir(
         exist_ok=True

@@ -19,7 +19,7 @@ import numpy as np
 
 from fleet_service.app.engine import Engine
 from fleet_service.archive.format import load, reading, segments
-from fleet_service.archive.identity.pseudonyms import Pseudonyms, number
+from fleet_service.archive.identity.pseudonyms import Pseudonyms, pseudonym_number
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay.rebuild import restore_streams
@@ -69,7 +69,7 @@ def _write_archive(root: Path) -> tuple[list[Batch], Path]:
         for first in range(0, len(batches), BATCHES):
             engine.intake.ingest(_make_messages(batches[first : first + BATCHES]), time.time_ns())
             engine.settlement.flush()
-    return batches, segments.paths(root, Kind.OBSERVATION)[-1]
+    return batches, segments.list_segments(root, Kind.OBSERVATION)[-1]
 
 
 def _make_damages(whole: bytes, rng: np.random.Generator, stride: int) -> Iterator[bytes]:
@@ -86,7 +86,7 @@ def _make_messages(batches: Sequence[Batch]) -> list[Message]:
 
 
 def _read_rows(root: Path) -> list[tuple[int, int, float]]:
-    tables = reading.read(root, Kind.OBSERVATION, ["seq", "row", "mu"])
+    tables = reading.read_tables(root, Kind.OBSERVATION, ["seq", "row", "mu"])
     return [
         row
         for table in tables
@@ -110,7 +110,7 @@ def _count_lost(root: Path, batches: Sequence[Batch]) -> int:
     pseudonyms = Pseudonyms(root / "keys")
     first = batches[0]
     at = int(batches[0].columns["enter_time"][0])
-    vehicle = number(pseudonyms.of("sim-001", at))
+    vehicle = pseudonym_number(pseudonyms.of("sim-001", at))
     boot = pseudonyms.boot("sim-001", first.boot, at)
     assert (vehicle, boot, Kind.OBSERVATION, first.region) in streams
     stream = streams[vehicle, boot, Kind.OBSERVATION, first.region]

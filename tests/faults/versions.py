@@ -75,4 +75,4 @@ def _find_difference(root: Path, made: dict[str, Any]) -> float:
 
 
 def _count_rows(root: Path, kind: Kind) -> int:
-    return sum(table.num_rows for table in reading.read(root, kind, ["seq"]))
+    return sum(table.num_rows for table in reading.read_tables(root, kind, ["seq"]))

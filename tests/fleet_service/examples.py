@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion import Fusion, Observations
 from fleet_service.fusion.belief import SLIPPERY_SHARE
-from fleet_service.fusion.likelihoods import evidence
+from fleet_service.fusion.likelihoods import make_evidence
 from schemas import grid, keys, mugrid, wire
 from schemas.numeric import FloatArray
 from schemas.wire import Batch, Kind
@@ -75,7 +75,9 @@ def posterior_evidence(mu: float, lower: float, upper: float, used: float) -> Fl
         zip(names, (np.array([v]) for v in (mu, lower, upper, used)), strict=True)
     )
     columns["log_likelihood"] = np.zeros((1, mugrid.BINS), np.uint8)
-    return np.asarray(mugrid.decode_log_likelihood(evidence(columns, np.array([False])).steps)[0])
+    return np.asarray(
+        mugrid.decode_log_likelihood(make_evidence(columns, np.array([False])).steps)[0]
+    )
 
 
 def belief(fusion: Fusion, cell: int = CELL, sector: int = 0, now: int | None = None) -> FloatArray:

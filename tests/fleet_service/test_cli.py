@@ -179,7 +179,7 @@ def test_run_and_watch_as_processes_from_start_to_signal(
         said = run.stdout.read()
         assert "status: 4 observations" in said
     kept = pa.concat_tables(
-        reading.read(tmp_path / "archive", Kind.OBSERVATION, ["boot", "seq", "row"])
+        reading.read_tables(tmp_path / "archive", Kind.OBSERVATION, ["boot", "seq", "row"])
     )
     assert kept.num_rows == 4
     modes = {path: path.stat().st_mode for path in (tmp_path / "archive").rglob("*")}

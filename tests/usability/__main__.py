@@ -59,7 +59,7 @@ class House:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.archive = folder / "archive"
-        synthetic.write(self.archive, WORLD, 2000)
+        synthetic.write_archive(self.archive, WORLD, 2000)
         compact(self.archive)
         mistakes.prepare_files(folder)
 

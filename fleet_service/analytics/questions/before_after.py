@@ -16,7 +16,7 @@ import ibis
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.analytics.engines import QueryEngine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, has_value
 from fleet_service.analytics.options import Options
 from schemas.errors import InputError
 from schemas.thresholds import NS, Z_95
@@ -26,7 +26,7 @@ def expression(t: Table, at_s: int) -> Table:
     """Return one row: cells, vehicles, values, means of both periods, difference and its
     standard deviation.
     """
-    t = t.filter(value(t))
+    t = t.filter(has_value(t))
     t = t.select("cell", "sector", "vehicle", after=t.time >= at_s, y=t.mu.cast("float64"))
     place = ["cell", "sector"]
     cells = t.group_by(place).aggregate(

@@ -11,7 +11,7 @@ from typing import Final
 
 import pyarrow as pa
 
-from fleet_service.analytics.engines import QueryEngine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, has_value
 from fleet_service.analytics.options import Options
 
 HORIZON_S: Final = 6 * 3600
@@ -20,7 +20,7 @@ _HOUR_S: Final = 3600
 
 def expression(t: Table, maps: Table) -> Table:
     """Return one row per basis and hours between snapshot and value."""
-    t = t.filter(value(t)).select(
+    t = t.filter(has_value(t)).select(
         "cell",
         "sector",
         "time",

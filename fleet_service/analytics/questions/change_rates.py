@@ -27,7 +27,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from scipy.optimize import minimize
 
-from fleet_service.analytics.engines import QueryEngine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, has_value
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions.weather import nearest_readings
 from fleet_service.fusion.constants import CHANGE_S
@@ -58,7 +58,7 @@ def expression(t: Table) -> Table:
     Args:
         t: observations with `temperature` of the air [°C], null if unknown.
     """
-    t = t.filter(value(t))
+    t = t.filter(has_value(t))
     w = ibis.window(group_by=["cell", "sector"], order_by=["time", "vehicle", "boot", "seq", "row"])
     t = t.mutate(slippery=(t.mu < SLIPPERY_MU).cast("int64"))
     t = t.mutate(
@@ -116,7 +116,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
         for one in names:
             part = counted.filter(pc.equal(counted[column], pa.scalar(one)))
             if (pc.sum(part["pairs"]).as_py() or 0) >= LEAST_PAIRS:
-                rows.append({"by": by, "class": _named(one), **_fit_class(part)})
+                rows.append({"by": by, "class": _band_name(one), **_fit_class(part)})
     return pa.Table.from_pylist(rows, schema=SCHEMA)
 
 
@@ -137,7 +137,7 @@ _FIELDS: Final[list[tuple[str, pa.DataType]]] = [
 SCHEMA: Final = pa.schema(_FIELDS)
 
 
-def _named(one: str | int) -> str:
+def _band_name(one: str | int) -> str:
     return one if isinstance(one, str) else f"{one * HOURS:02}-{(one + 1) * HOURS:02}"
 
 
@@ -169,10 +169,10 @@ def _fit_class(counted: pa.Table) -> dict[str, float | int | None]:
         "hours_between": seconds / 3600,
         "unlike": int(unlike),
         "share_slippery": slippery / max(2.0 * pairs, 1.0),
-        "rate_per_hour": _known(3600 * rate),
-        "rate_lower": _known(3600 * lower),
-        "rate_upper": _known(3600 * upper),
-        "misread": _known(misread),
+        "rate_per_hour": _finite_or_none(3600 * rate),
+        "rate_lower": _finite_or_none(3600 * lower),
+        "rate_upper": _finite_or_none(3600 * upper),
+        "misread": _finite_or_none(misread),
         "assumed_per_hour": 3600 / CHANGE_S,
     }
 
@@ -217,5 +217,5 @@ def _logit(share: float) -> float:
     return float(np.log(share / (1.0 - share)))
 
 
-def _known(number: float) -> float | None:
+def _finite_or_none(number: float) -> float | None:
     return float(number) if np.isfinite(number) else None

@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 from scipy.stats import t as student
 
-from fleet_service.analytics.engines import QueryEngine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, has_value
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.roads.join import read_roads
 from schemas.errors import InputError
@@ -63,7 +63,7 @@ def expression(t: Table, places: Table) -> Table:
         t: observations.
         places: `cell`, `sector`, `link`, `direction`, `piece`.
     """
-    t = t.filter(value(t)).mutate(slot=(t.time / SLOT_S).floor().cast("int64"))
+    t = t.filter(has_value(t)).mutate(slot=(t.time / SLOT_S).floor().cast("int64"))
     std = (t.mu_upper.cast("float64") - t.mu_lower.cast("float64")) / INTERVAL_STD
     t = t.mutate(y=t.mu.cast("float64"), variance=std * std)
     rows = t.inner_join(
@@ -97,11 +97,11 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
     places = roads.select(["cell", "sector", "link", "direction", "piece"])
     found = engine.answer(expression(t, ibis.memtable(places)))
     span = engine.answer(t.aggregate(begin=t.time.min(), end=t.time.max())).to_pylist()[0]
-    seen = engine.answer(t.filter(value(t)).select("cell", "sector").distinct())
-    return _judged(found, roads, seen, (span["begin"], span["end"]), options)
+    seen = engine.answer(t.filter(has_value(t)).select("cell", "sector").distinct())
+    return _link_rows(found, roads, seen, (span["begin"], span["end"]), options)
 
 
-def slots(found: pa.Table) -> dict[str, FloatArray]:
+def slot_intervals(found: pa.Table) -> dict[str, FloatArray]:
     """Return mean and 90 % interval per slot from those of its vehicles, as columns with the slot's
     first row.
 
@@ -121,7 +121,7 @@ def slots(found: pa.Table) -> dict[str, FloatArray]:
     return {"first": first, "mu": mean, "lower": mean - error, "upper": mean + error, "vehicles": n}
 
 
-def breach(
+def longest_breach(
     slot: IntArray,
     lower: FloatArray,
     mu: FloatArray,
@@ -141,11 +141,11 @@ def breach(
     """
     begins = np.maximum(slot * SLOT_S, span[0])
     closes = np.minimum((slot + 1) * SLOT_S, span[1])
-    first, after = _runs(mu < level)
+    first, after = _find_runs(mu < level)
     ends = np.where(after < len(slot), begins[np.minimum(after, len(slot) - 1)], closes[after - 1])
     lasted = ends - begins[first]
     far = np.append(False, np.diff(begins) > GAP_S)
-    sure, over = _runs(upper < level, far)
+    sure, over = _find_runs(upper < level, far)
     surely = closes[over - 1] - begins[sure]
     is_kept = lower >= level
     unsure = np.append(begins[is_kept], span[1]) - np.append(span[0], closes[is_kept])
@@ -153,7 +153,7 @@ def breach(
     return int(lasted.max(initial=0)), int(surely.max(initial=0)), int(unsure.max(initial=0)), begin
 
 
-def _runs(is_below: BoolArray, far: BoolArray | None = None) -> tuple[IntArray, IntArray]:
+def _find_runs(is_below: BoolArray, far: BoolArray | None = None) -> tuple[IntArray, IntArray]:
     """Return the first positions of runs of true values, and the positions after their last; a run
     ends where the next slot is far."""
     number = np.cumsum(~is_below if far is None else ~is_below | far)
@@ -170,7 +170,7 @@ class _Measured(NamedTuple):
     values: list[int]
 
 
-def _judged(
+def _link_rows(
     found: pa.Table, roads: pa.Table, seen: pa.Table, span: tuple[int, int], options: Options
 ) -> pa.Table:
     level = options.level or 0.0
@@ -189,7 +189,7 @@ def _judged(
     ]
     number = {key: k for k, key in enumerate(sorted(set(names)))}
     found = found.append_column("key", pa.array([number[key] for key in names], pa.int64()))
-    each = slots(found)
+    each = slot_intervals(found)
     keys = sorted(number)
     links: dict[tuple[str, str], _Measured] = {}
     for (link, direction, _, _), row in zip(names, rows, strict=True):
@@ -204,7 +204,7 @@ def _judged(
         for of_piece in own.pieces.values():
             slot = np.array([keys[k][3] for k in of_piece], np.int64)
             lower, mu, upper = (each[name][of_piece] for name in ("lower", "mu", "upper"))
-            found_breaches.append(breach(slot, lower, mu, upper, level, span))
+            found_breaches.append(longest_breach(slot, lower, mu, upper, level, span))
         by_mean, begin = max((one[0], one[3]) for one in found_breaches)
         least, most = (max(one[k] for one in found_breaches) for k in (1, 2))
         worst = min(

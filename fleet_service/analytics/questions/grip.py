@@ -10,7 +10,7 @@ import ibis
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.analytics.engines import QueryEngine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, has_value
 from fleet_service.analytics.options import Options
 
 PERCENTILES: Final = {"mu_p10": 0.1, "mu_p50": 0.5, "mu_p90": 0.9}
@@ -19,7 +19,7 @@ PERCENTILES: Final = {"mu_p10": 0.1, "mu_p50": 0.5, "mu_p90": 0.9}
 def expression(t: Table) -> Table:
     """Return one row per day, cell and sector. Without a value there are no percentiles: mu is at
     least `utilised_max`."""
-    reported = ibis.ifelse(value(t), t.mu.cast("float64"), ibis.null("float64"))
+    reported = ibis.ifelse(has_value(t), t.mu.cast("float64"), ibis.null("float64"))
     t = t.select(
         "day",
         "cell",
@@ -44,12 +44,12 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Return the rows of `expression`; report the coverage of the network (every cell and sector
     seen in these days) per day."""
     found = engine.answer(expression(engine.observations()))
-    for line in coverage(found):
+    for line in coverage_lines(found):
         options.report(line)
     return found
 
 
-def coverage(found: pa.Table) -> list[str]:
+def coverage_lines(found: pa.Table) -> list[str]:
     """Return a line per day: shares of the network with a value, with a bound only, without a
     visit.
     """

@@ -46,7 +46,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
             rows += len(updated.late)
             if rows // REPORT_ROWS > (rows - len(updated.late)) // REPORT_ROWS:
                 options.report(f"{rows:,} observations replayed, {fusion.size:,} cells")
-        return _frame(engine, fusion, at)
+        return _map_frame(engine, fusion, at)
     step = int(options.step_s * NS)
     due = None
     frames = []
@@ -57,25 +57,25 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
             continue
         now = int(fusion.live.time[updated.slots].max())
         if due is None:
-            due = _begin(engine, int(fusion.live.time[updated.slots].min()), step)
+            due = _frames_begin(engine, int(fusion.live.time[updated.slots].min()), step)
         while due + step <= now:
             due += step
-            frames.append(_frame(engine, fusion, due))
+            frames.append(_map_frame(engine, fusion, due))
             options.report(
                 f"frame {np.datetime64(due, 'ns').astype('datetime64[s]')}: {frames[-1].num_rows} "
                 "cells"
             )
-    return pa.concat_tables([*frames, _frame(engine, fusion, engine.part.until)])
+    return pa.concat_tables([*frames, _map_frame(engine, fusion, engine.part.until)])
 
 
-def _begin(engine: QueryEngine, first: int, step: int) -> int:
+def _frames_begin(engine: QueryEngine, first: int, step: int) -> int:
     """Return the begin of the frames [ns]: that of the part, or just before the first row if the
     part begins earlier.
 
     Raises:
         InputError: there would be too many frames.
     """
-    days = layout.days(engine.root, layout.TABLES[Kind.OBSERVATION])
+    days = layout.day_folders(engine.root, layout.TABLES[Kind.OBSERVATION])
     last = (max(map(layout.day_of, days), default=first // layout.DAY_NS) + 1) * layout.DAY_NS
     begin = max(engine.part.since, first - first % step)
     frames = (min(engine.part.until, max(last, first)) - begin) // step
@@ -89,7 +89,7 @@ def _begin(engine: QueryEngine, first: int, step: int) -> int:
     return begin
 
 
-def _frame(engine: QueryEngine, fusion: Fusion, at: int) -> pa.Table:
+def _map_frame(engine: QueryEngine, fusion: Fusion, at: int) -> pa.Table:
     table = visited_cells(fusion, at, engine.part.bbox)
     frame = pa.array(np.full(table.num_rows, at // tables.US_STEP)).cast(tables.US)
     return table.append_column("frame", frame)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ibis
 import pyarrow as pa
 
-from fleet_service.analytics.engines import QueryEngine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, has_value
 from fleet_service.analytics.options import Options
 from schemas.thresholds import SLIPPERY_MU
 
@@ -19,7 +19,9 @@ def expression(t: Table, least_vehicles: int) -> Table:
     """Return one row per spell; if it `lasts` at the end of the data, `end` is null and
     `duration_s` a minimum.
     """
-    t = t.filter(value(t)).select("cell", "sector", "time", "vehicle", "boot", "seq", "row", "mu")
+    t = t.filter(has_value(t)).select(
+        "cell", "sector", "time", "vehicle", "boot", "seq", "row", "mu"
+    )
     place = ["cell", "sector"]
     order = ["time", "vehicle", "boot", "seq", "row"]
     t = t.mutate(slippery=(t.mu < SLIPPERY_MU).cast("int64"))

@@ -7,7 +7,7 @@ from __future__ import annotations
 import ibis
 import pyarrow as pa
 
-from fleet_service.analytics.engines import QueryEngine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, has_value
 from fleet_service.analytics.options import Options
 
 HOUR_S = 3600
@@ -19,7 +19,7 @@ def expression(t: Table) -> Table:
     `bias` is the mean of (own mean - mean of the others) over cells and hours, `bias_std` its
     standard error, `z` the size of their ratio.
     """
-    reported = value(t)
+    reported = has_value(t)
     mine = t.group_by("vehicle").aggregate(
         observations=t.count(),
         late=t.late.sum(),

@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
-from fleet_service.analytics.engines import QueryEngine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, has_value
 from fleet_service.analytics.options import Options
 from schemas.errors import InputError
 from schemas.thresholds import SLIPPERY_MU
@@ -29,8 +29,8 @@ def nearest_readings(t: Table, path: Path) -> Table:
     Raises:
         InputError: the table of stations cannot be used.
     """
-    stations, readings = read(path)
-    return _joined(t, ibis.memtable(stations), ibis.memtable(readings))
+    stations, readings = read_stations(path)
+    return _join_stations(t, ibis.memtable(stations), ibis.memtable(readings))
 
 
 def expression(t: Table, stations: Table, readings: Table) -> Table:
@@ -42,7 +42,7 @@ def expression(t: Table, stations: Table, readings: Table) -> Table:
         stations: `station`, `latitude`, `longitude`.
         readings: `station`, `hour`, `temperature` [°C].
     """
-    t = _joined(t.filter(value(t)), stations, readings)
+    t = _join_stations(t.filter(has_value(t)), stations, readings)
     t = t.mutate(y=t.mu.cast("float64"), band=(t.temperature / BAND).floor() * BAND)
     return t.group_by(temperature=t.band).aggregate(
         values=t.count(),
@@ -54,7 +54,7 @@ def expression(t: Table, stations: Table, readings: Table) -> Table:
     )
 
 
-def _joined(t: Table, stations: Table, readings: Table) -> Table:
+def _join_stations(t: Table, stations: Table, readings: Table) -> Table:
     t = t.mutate(region=t.cell >> _BITS, hour=(t.time / _HOUR_S).floor().cast("int64"))
     regions = t.group_by("region").aggregate(lat=t.latitude.mean(), lon=t.longitude.mean())
     pairs = regions.cross_join(stations)
@@ -84,13 +84,13 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
             "no table of readings",
             f"give a CSV or Parquet file with {', '.join(NEEDED)}",
         )
-    stations, readings = read(options.stations)
+    stations, readings = read_stations(options.stations)
     return engine.answer(
         expression(engine.observations(), ibis.memtable(stations), ibis.memtable(readings))
     )
 
 
-def read(path: Path) -> tuple[pa.Table, pa.Table]:
+def read_stations(path: Path) -> tuple[pa.Table, pa.Table]:
     """Return stations, and mean readings per station and hour.
 
     Raises:

@@ -12,7 +12,7 @@ import pyarrow as pa
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from fleet_service.analytics.engines import QueryEngine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, has_value
 from fleet_service.analytics.options import Options
 from schemas import grid
 from schemas.numeric import FloatArray, IntArray
@@ -24,7 +24,7 @@ SHARE: Final = 0.1
 
 def expression(t: Table, least_vehicles: int) -> Table:
     """Return cells and sectors with at least SHARE slippery values from enough vehicles."""
-    reported = value(t)
+    reported = has_value(t)
     cells = t.group_by(["cell", "sector"]).aggregate(
         observations=t.count(),
         values=reported.sum(),
@@ -46,26 +46,26 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
     slippery values.
     """
     cells = engine.answer(expression(engine.observations(), options.least_vehicles))
-    return stretches(cells)
+    return join_stretches(cells)
 
 
-def stretches(cells: pa.Table) -> pa.Table:
+def join_stretches(cells: pa.Table) -> pa.Table:
     """Return cells of one sector that touch as one row each; `members` are the cells, the box
     surrounds them.
     """
     column = {name: cells[name].to_numpy() for name in cells.schema.names}
-    label = _touching(column["cell"], column["sector"].astype(np.int64))
+    label = _label_components(column["cell"], column["sector"].astype(np.int64))
     count = int(label.max(initial=-1)) + 1
 
-    def total(values: Any) -> FloatArray:  # noqa: ANN401 columns of several types
+    def sum_by_stretch(values: Any) -> FloatArray:  # noqa: ANN401 columns of several types
         return np.asarray(np.bincount(label, values, minlength=count), np.float64)
 
-    west, south, east, north = _boxes(column["cell"], label, count)
+    west, south, east, north = _bounding_boxes(column["cell"], label, count)
     metres = np.cos(np.radians((south + north) / 2)) * METRES_PER_DEGREE
     length = np.hypot((east - west) * metres, (north - south) * METRES_PER_DEGREE)
-    values = total(column["values"])
-    slippery = total(column["slippery"])
-    lower = wilson(slippery, values)
+    values = sum_by_stretch(column["values"])
+    slippery = sum_by_stretch(column["slippery"])
+    lower = wilson_lower(slippery, values)
     first = np.full(count, np.iinfo(np.int64).max)
     np.minimum.at(first, label, column["cell"])
     sector = np.zeros(count, np.int8)
@@ -75,22 +75,22 @@ def stretches(cells: pa.Table) -> pa.Table:
         "sector": sector,
         "cells": np.bincount(label, minlength=count),
         "length_m": length,
-        "exposure": total(column["observations"]).astype(np.int64),
+        "exposure": sum_by_stretch(column["observations"]).astype(np.int64),
         "values": values.astype(np.int64),
         "share_slippery": slippery / np.maximum(values, 1),
         "share_lower": lower,
-        "mu": total(column["mu_sum"]) / np.maximum(slippery, 1),
+        "mu": sum_by_stretch(column["mu_sum"]) / np.maximum(slippery, 1),
         "score": lower * length,
         "west": west,
         "south": south,
         "east": east,
         "north": north,
-        "members": _members(column["cell"], label, count),
+        "members": _stretch_cells(column["cell"], label, count),
     }
     return pa.table(found).sort_by([("score", "descending"), ("cell", "ascending")])
 
 
-def wilson(hits: FloatArray, of: FloatArray) -> FloatArray:
+def wilson_lower(hits: FloatArray, of: FloatArray) -> FloatArray:
     """Return the lower 95 % bound of a share (Wilson 1927), (n,)."""
     n = np.maximum(of, 1.0)
     p = hits / n
@@ -98,7 +98,7 @@ def wilson(hits: FloatArray, of: FloatArray) -> FloatArray:
     return np.asarray((p + Z_95**2 / (2 * n) - spread) / (1 + Z_95**2 / n))
 
 
-def _touching(cell: IntArray, sector: IntArray) -> IntArray:
+def _label_components(cell: IntArray, sector: IntArray) -> IntArray:
     """Return the component number of each cell, among cells of its sector that touch, (n,)."""
     key = cell * grid.SECTORS + sector
     order = np.argsort(key)
@@ -114,7 +114,7 @@ def _touching(cell: IntArray, sector: IntArray) -> IntArray:
     return np.asarray(connected_components(edges, directed=False)[1], np.int64)
 
 
-def _members(cell: IntArray, label: IntArray, count: int) -> pa.Array[Any]:
+def _stretch_cells(cell: IntArray, label: IntArray, count: int) -> pa.Array[Any]:
     """Return the cells of each stretch, so that a bent road is drawn as a road and not as a box."""
     order = np.lexsort((cell, label))
     ends = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=count))])
@@ -123,7 +123,7 @@ def _members(cell: IntArray, label: IntArray, count: int) -> pa.Array[Any]:
     )
 
 
-def _boxes(cell: IntArray, label: IntArray, count: int) -> tuple[FloatArray, ...]:
+def _bounding_boxes(cell: IntArray, label: IntArray, count: int) -> tuple[FloatArray, ...]:
     out = []
     for side, least in zip(grid.bounds(cell), (True, True, False, False), strict=True):
         extreme = np.full(count, np.inf if least else -np.inf)

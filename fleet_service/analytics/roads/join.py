@@ -62,23 +62,25 @@ class _Marks(NamedTuple):
 def join_roads(network: RoadNetwork) -> pa.Table:
     """Return one row per cell and sector on a link; the reference "Columns of the ten questions"
     explains the columns."""
-    lengths, marks = _marks(network.links)
-    tree = cKDTree(_conformal(marks.latitude, marks.longitude))
+    lengths, marks = _link_marks(network.links)
+    tree = cKDTree(_to_mercator(marks.latitude, marks.longitude))
     scale = np.cos(np.radians(marks.latitude))
     reach = REACH_M / scale.min()
     side = scale.mean() * METRES_PER_DEGREE * 360.0 / 2**grid.CELL_ZOOM
-    cells = _near(marks, float(side))
+    cells = _nearby_cells(marks, float(side))
     service = np.array([SERVICE_M if link.kind == "service" else 0.0 for link in network.links])
-    start, end = (np.unique(_ends(network.links), axis=0, return_inverse=True)[1].reshape(-1, 2)).T
+    start, end = (
+        np.unique(_end_points(network.links), axis=0, return_inverse=True)[1].reshape(-1, 2)
+    ).T
     parts = []
     for first in range(0, len(cells), PIECE):
         piece = cells[first : first + PIECE]
-        pairs = cKDTree(_conformal(*grid.centre(piece))).sparse_distance_matrix(
+        pairs = cKDTree(_to_mercator(*grid.centre(piece))).sparse_distance_matrix(
             tree, reach, output_type="ndarray"
         )
         metres = pairs["v"] * scale[pairs["j"]]
         for axis in range(grid.SECTORS):
-            turn = _apart(marks.yaw[pairs["j"]], axis * np.pi / 2.0)
+            turn = _angle_between(marks.yaw[pairs["j"]], axis * np.pi / 2.0)
             fits = (turn <= MOST_TURN) & (metres <= REACH_M)
             row = pairs["i"][fits]
             mark = pairs["j"][fits]
@@ -152,7 +154,7 @@ def read_roads(path: Path) -> pa.Table:
         ) from error
 
 
-def _marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
+def _link_marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
     """Return the lengths [m] of the links, and their marks."""
     lengths = np.empty(len(links))
     parts = []
@@ -180,7 +182,7 @@ def _marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
     return lengths, _Marks._make(np.concatenate(column) for column in zip(*parts, strict=True))
 
 
-def _near(marks: _Marks, side: float) -> IntArray:
+def _nearby_cells(marks: _Marks, side: float) -> IntArray:
     """Return cells that may lie on a link: those within REACH_M of a mark, and some beyond."""
     x, y = grid.deinterleave(np.unique(grid.cell_of(marks.latitude, marks.longitude)))
     wide = int(np.ceil(REACH_M / side))
@@ -198,7 +200,7 @@ def _first_of(order: IntArray, *groups: IntArray) -> IntArray:
     return order[new]
 
 
-def _ends(links: list[DirectedLink]) -> FloatArray:
+def _end_points(links: list[DirectedLink]) -> FloatArray:
     """Return the first and last points of the links in turn, (2 n, 2) [deg], to a tenth of a
     metre.
     """
@@ -206,7 +208,7 @@ def _ends(links: list[DirectedLink]) -> FloatArray:
     return np.asarray(np.round(np.array(ends), 6), np.float64)
 
 
-def _conformal(latitude: FloatArray, longitude: FloatArray) -> FloatArray:
+def _to_mercator(latitude: FloatArray, longitude: FloatArray) -> FloatArray:
     """Return points in Mercator's plane (n, 2) [m]: a metre is 1 / cos(latitude) of it in all
     directions.
     """
@@ -215,5 +217,5 @@ def _conformal(latitude: FloatArray, longitude: FloatArray) -> FloatArray:
     return np.asarray(radius * np.column_stack([np.radians(longitude), y]))
 
 
-def _apart(yaw: FloatArray, axis: float) -> FloatArray:
+def _angle_between(yaw: FloatArray, axis: float) -> FloatArray:
     return np.asarray(np.abs((yaw - axis + np.pi) % (2.0 * np.pi) - np.pi))

@@ -83,9 +83,9 @@ def read_network(path: Path, identity: str = "id", name: str = "name") -> RoadNe
         )
     source = {"extract": path.name, "sha256": sha256(path.read_bytes()).hexdigest()}
     if path.name.endswith(EXTRACT):
-        links, about = _openstreetmap(path)
+        links, about = _read_openstreetmap(path)
     elif path.name.endswith(LINES):
-        links = _lines(path, identity, name)
+        links = _read_lines(path, identity, name)
         about = {}
     else:
         known = ", ".join((*EXTRACT, *LINES))
@@ -99,7 +99,7 @@ def read_network(path: Path, identity: str = "id", name: str = "name") -> RoadNe
     return RoadNetwork(links, source | about)
 
 
-def _openstreetmap(path: Path) -> tuple[list[DirectedLink], dict[str, str]]:
+def _read_openstreetmap(path: Path) -> tuple[list[DirectedLink], dict[str, str]]:
     try:
         import osmium
     except ImportError as error:
@@ -125,14 +125,14 @@ def _openstreetmap(path: Path) -> tuple[list[DirectedLink], dict[str, str]]:
                 "motorway"
             )
             oneway = tags.get("oneway", "yes" if by_rule else "no")
-            links += _directions(str(way.id), name, kind, oneway, points)
+            links += _driven_directions(str(way.id), name, kind, oneway, points)
     except (RuntimeError, ValueError, OSError) as error:
         problem = f"{path.name} cannot be read ({str(error).splitlines()[0][:100]})"
         raise InputError("extract", problem, "name a whole extract") from error
     return links, {"date": date, "licence": "ODbL 1.0, © OpenStreetMap contributors"}
 
 
-def _lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
+def _read_lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
     try:
         import geopandas
     except ImportError as error:
@@ -168,11 +168,11 @@ def _lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
                 "extract", f"{path.name} has points that are no degrees", "give the file its CRS"
             )
         called, kind, oneway = (str(about.get(column) or "") for column in (name, "kind", "oneway"))
-        links += _directions(str(about[identity]), called, kind, oneway, points)
+        links += _driven_directions(str(about[identity]), called, kind, oneway, points)
     return links
 
 
-def _directions(
+def _driven_directions(
     identity: str, name: str, kind: str, oneway: str, points: FloatArray
 ) -> list[DirectedLink]:
     """Return the directions in which a line may be driven."""

@@ -40,16 +40,16 @@ class Extract(NamedTuple):
     bbox: Box | None = None
 
 
-def observations(root: Path, part: Extract) -> pa.Table:
+def read_observations(root: Path, part: Extract) -> pa.Table:
     """Return rows of observations, inbox included, as points."""
-    where = [_within("leave_time", part)]
+    where = [_time_filter("leave_time", part)]
     if part.bbox is not None:
         west, south, east, north = part.bbox
         where.append(ValueRange("longitude", west, math.nextafter(east, -math.inf)))
         where.append(ValueRange("latitude", south, math.nextafter(north, -math.inf)))
     days = (part.since // layout.DAY_NS, part.until // layout.DAY_NS)
     found = [
-        *reading.read(root, Kind.OBSERVATION, where=where, days=days),
+        *reading.read_tables(root, Kind.OBSERVATION, where=where, days=days),
         tables.OBSERVATION_ARCHIVE.empty_table(),
     ]
     table = pa.concat_tables(found).sort_by([("cell", "ascending"), ("leave_time", "ascending")])
@@ -59,11 +59,11 @@ def observations(root: Path, part: Extract) -> pa.Table:
 
 def snapshot_time(root: Path, part: Extract) -> int:
     """Return the time of the last snapshot of the map before `until` [ns]."""
-    return snapshots.time_of(_snapshot(root, part))
+    return snapshots.time_of(_find_snapshot(root, part))
 
 
-def _snapshot(root: Path, part: Extract) -> Path:
-    path = snapshots.newest(root, part.until)
+def _find_snapshot(root: Path, part: Extract) -> Path:
+    path = snapshots.newest_snapshot(root, part.until)
     if path is None:
         raise InputError("to", "there is no snapshot of the map so early", "give a later time")
     return path
@@ -76,14 +76,14 @@ def with_vehicles(table: pa.Table, vehicles: int) -> pa.Table:
 
 def map_then(root: Path, part: Extract) -> pa.Table:
     """Return the last snapshot of the map before `until`."""
-    path = _snapshot(root, part)
+    path = _find_snapshot(root, part)
     table = load(path, tables.MAP_ARCHIVE)
     if table is None:
         raise InputError("to", f"the snapshot {path} is damaged", "give an earlier time")
     table = mask_unmeasured(
         table, ("mu",), np.array(table["basis"].to_pylist(), str) != "bound"
     )  # files before 1.2 say one
-    return geo.with_cells(_inside(table, part.bbox))
+    return geo.with_cells(_cells_in_box(table, part.bbox))
 
 
 def mask_unmeasured(table: pa.Table, names: Sequence[str], known: BoolArray) -> pa.Table:
@@ -101,8 +101,10 @@ def mask_unmeasured(table: pa.Table, names: Sequence[str], known: BoolArray) -> 
 
 def cell_hours(root: Path, part: Extract) -> pa.Table:
     """Return parts of the roll-up with the polygons of their cells."""
-    where = [_within("hour", part)]
-    days = layout.days(root, rollup.TABLE, part.since // layout.DAY_NS, part.until // layout.DAY_NS)
+    where = [_time_filter("hour", part)]
+    days = layout.day_folders(
+        root, rollup.TABLE, part.since // layout.DAY_NS, part.until // layout.DAY_NS
+    )
     paths = sorted(path for folder in days for path in folder.glob("*/*.parquet"))
     loaded = (load(path, tables.CELL_HOUR_SCHEMA, where=where) for path in paths)
     found = [table for table in loaded if table is not None]
@@ -110,25 +112,25 @@ def cell_hours(root: Path, part: Extract) -> pa.Table:
     measured = np.nan_to_num(table["value_count"].to_numpy()) > 0  # null before 1.2
     table = mask_unmeasured(table, _OF_MU, measured)
     return geo.with_cells(
-        _inside(table, part.bbox).sort_by([("cell", "ascending"), ("hour", "ascending")])
+        _cells_in_box(table, part.bbox).sort_by([("cell", "ascending"), ("hour", "ascending")])
     )
 
 
 WHAT: Final[dict[str, Callable[[Path, Extract], pa.Table]]] = {
     "map": map_then,
-    "observations": observations,
+    "observations": read_observations,
     "rollup": cell_hours,
 }
 
 
-def _within(column: str, part: Extract) -> ValueRange:
+def _time_filter(column: str, part: Extract) -> ValueRange:
     """Return the filter for rows from the first time on and before the second."""
     return ValueRange(
         column, -(-part.since // tables.US_STEP), -(-part.until // tables.US_STEP) - 1
     )
 
 
-def _inside(table: pa.Table, bbox: Box | None) -> pa.Table:
+def _cells_in_box(table: pa.Table, bbox: Box | None) -> pa.Table:
     """Return the cells that touch a box."""
     if bbox is None:
         return table
@@ -151,23 +153,25 @@ def write(table: pa.Table, path: Path) -> None:
         writer(table, path)
 
 
-def features(table: pa.Table) -> Iterator[dict[str, Any]]:
+def geojson_features(table: pa.Table) -> Iterator[dict[str, Any]]:
     """Yield the rows of a GeoParquet table as GeoJSON features; binary and nested columns are
     omitted.
     """
-    flat = _flat(table)
+    flat = _drop_nested(table)
     for geometry, *values in zip(
-        geo.shapes(table), *(_texts(flat, name) for name in flat.schema.names), strict=True
+        geo.geojson_shapes(table),
+        *(_json_values(flat, name) for name in flat.schema.names),
+        strict=True,
     ):
         properties = dict(zip(flat.schema.names, values, strict=True))
         yield {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-def _geojson(table: pa.Table, path: Path) -> None:
+def _write_geojson(table: pa.Table, path: Path) -> None:
     with open_durably(path) as raw:
         file = io.TextIOWrapper(raw, encoding="utf-8")
         file.write('{"type": "FeatureCollection", "features": [\n')
-        for place, feature in enumerate(features(table)):
+        for place, feature in enumerate(geojson_features(table)):
             file.write((",\n" if place else "") + json.dumps(feature, allow_nan=False))
         file.write("\n]}\n")
         file.detach()  # flushes it; `open_durably` closes it
@@ -178,7 +182,7 @@ def iso_text(us: int) -> str:
     return str(np.datetime_as_string(np.datetime64(us, "us"), "ms", "UTC"))
 
 
-def _texts(table: pa.Table, name: str) -> list[Any]:
+def _json_values(table: pa.Table, name: str) -> list[Any]:
     """Return values for JSON: times as ISO 8601 text, no NaN, no digits beyond single precision."""
     column = table[name]
     if pa.types.is_timestamp(column.type):
@@ -192,24 +196,24 @@ def _texts(table: pa.Table, name: str) -> list[Any]:
     return column.to_pylist()
 
 
-def _flat(table: pa.Table) -> pa.Table:
+def _drop_nested(table: pa.Table) -> pa.Table:
     plain = [
         f.name for f in table.schema if not (pa.types.is_nested(f.type) or "binary" in str(f.type))
     ]
     return table.select(plain)
 
 
-def _csv(table: pa.Table, path: Path) -> None:
+def _write_csv(table: pa.Table, path: Path) -> None:
     with open_durably(path) as file:
-        flat = _flat(table)
+        flat = _drop_nested(table)
         for place, name in enumerate(flat.schema.names):
             if pa.types.is_timestamp(flat.schema.field(name).type):
-                flat = flat.set_column(place, name, pa.array(_texts(flat, name), pa.string()))
+                flat = flat.set_column(place, name, pa.array(_json_values(flat, name), pa.string()))
         pacsv.write_csv(flat, file)
 
 
 _WRITERS: Final[dict[str, Callable[[pa.Table, Path], None]]] = {
     ".parquet": lambda table, path: write_table(table, path, MAP),
-    ".geojson": _geojson,
-    ".csv": _csv,
+    ".geojson": _write_geojson,
+    ".csv": _write_csv,
 }

@@ -43,12 +43,12 @@ def copy_new_files(root: Path, uri: str, again: Collection[Path] = ()) -> int:
     for path in sorted(path for folder in FOLDERS for path in (root / folder).rglob("*.parquet")):
         target = f"{base}/{path.relative_to(root).as_posix()}"
         if path in again or sizes.get(target) != path.stat().st_size:
-            _copy(path, there, target)
+            _copy_file(path, there, target)
             count += 1
     return count
 
 
-def _copy(path: Path, there: fs.FileSystem, target: str) -> None:
+def _copy_file(path: Path, there: fs.FileSystem, target: str) -> None:
     folder, _, name = target.rpartition("/")
     there.create_dir(folder, recursive=True)
     draft = f"{folder}/.{name}.tmp"

@@ -99,7 +99,7 @@ def write_table(
         pq.ParquetWriter(file, table.schema, **options) as writer,
     ):
         writer.write_table(table, ROW_GROUP)
-        writer.add_key_value_metadata(version.footer(table.schema, footer))
+        writer.add_key_value_metadata(version.make_footer(table.schema, footer))
 
 
 def put_in_place(
@@ -141,7 +141,7 @@ def lock_archive(root: Path) -> BinaryIO:
     try:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise _unusable(root, error) from error
+        raise _folder_error(root, error) from error
     return lock_file(
         root / "lock", f"{root} belongs to a running service", "stop it, or give another folder"
     )
@@ -166,7 +166,7 @@ def lock_file(path: Path, problem: str, fix: str) -> BinaryIO:
     try:
         file = path.open("ab")
     except OSError as error:
-        raise _unusable(path.parent, error) from error
+        raise _folder_error(path.parent, error) from error
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
@@ -175,7 +175,7 @@ def lock_file(path: Path, problem: str, fix: str) -> BinaryIO:
     return file
 
 
-def _unusable(root: Path, error: OSError) -> InputError:
+def _folder_error(root: Path, error: OSError) -> InputError:
     return InputError(
         "archive", f"cannot use {root} ({error.strerror})", "give a folder you may write to"
     )

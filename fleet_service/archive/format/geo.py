@@ -37,8 +37,10 @@ def with_cells(table: pa.Table) -> pa.Table:
     If it has a `sector` too, a row's polygon is its quarter of the cell (grid.outline), so that no
     row hides another.
     """
-    x, y = _outlines(table, table["cell"].to_numpy())
-    return _marked(table, _binary(_polygons(x, y)), "Polygon", _extremes(x, y))
+    x, y = _cell_outlines(table, table["cell"].to_numpy())
+    return _add_geo_metadata(
+        table, _binary_array(_wkb_polygons(x, y)), "Polygon", _bounding_sides(x, y)
+    )
 
 
 def with_stretches(table: pa.Table, cells: Pieces) -> pa.Table:
@@ -49,9 +51,9 @@ def with_stretches(table: pa.Table, cells: Pieces) -> pa.Table:
     """
     count = np.array([len(own) for own in cells], np.int64)
     first = np.concatenate([[0], np.cumsum(count)])
-    x, y = _outlines(table, np.array([cell for own in cells for cell in own], np.int64), count)
-    boxes = _polygons(x, y)
-    sides = _extremes(x, y)
+    x, y = _cell_outlines(table, np.array([cell for own in cells for cell in own], np.int64), count)
+    boxes = _wkb_polygons(x, y)
+    sides = _bounding_sides(x, y)
     head = struct.Struct("<BII")
     wkb = [
         head.pack(_LITTLE_ENDIAN, _TYPE_MULTIPOLYGON, n) + boxes[begin : begin + n].tobytes()
@@ -62,7 +64,7 @@ def with_stretches(table: pa.Table, cells: Pieces) -> pa.Table:
         f.reduceat(side, first[:-1]) if len(count) else side
         for f, side in zip(extreme, sides, strict=True)
     )
-    return _marked(table, pa.array(wkb, pa.binary()), "MultiPolygon", whole)
+    return _add_geo_metadata(table, pa.array(wkb, pa.binary()), "MultiPolygon", whole)
 
 
 def with_points(table: pa.Table, longitude: FloatArray, latitude: FloatArray) -> pa.Table:
@@ -70,10 +72,12 @@ def with_points(table: pa.Table, longitude: FloatArray, latitude: FloatArray) ->
     wkb = np.zeros(len(longitude), _POINT)
     wkb["order"], wkb["type"] = _LITTLE_ENDIAN, _TYPE_POINT
     wkb["xy"] = np.stack([longitude, latitude], axis=1)
-    return _marked(table, _binary(wkb), "Point", (longitude, latitude, longitude, latitude))
+    return _add_geo_metadata(
+        table, _binary_array(wkb), "Point", (longitude, latitude, longitude, latitude)
+    )
 
 
-def shapes(table: pa.Table) -> Iterator[dict[str, Any]]:
+def geojson_shapes(table: pa.Table) -> Iterator[dict[str, Any]]:
     """Yield the geometries of a GeoParquet table as GeoJSON."""
     written: list[Any] = table[GEOMETRY].to_pylist()
     for wkb in written:
@@ -83,25 +87,27 @@ def shapes(table: pa.Table) -> Iterator[dict[str, Any]]:
         if kind == _TYPE_POINT:
             yield {"type": "Point", "coordinates": np.frombuffer(wkb, "<f8", 2, 5).tolist()}
         elif kind == _TYPE_POLYGON:
-            yield {"type": "Polygon", "coordinates": _rings(wkb, 1, 0)[0]}
+            yield {"type": "Polygon", "coordinates": _read_rings(wkb, 1, 0)[0]}
         else:
-            yield {"type": "MultiPolygon", "coordinates": _rings(wkb, count, 9)}
+            yield {"type": "MultiPolygon", "coordinates": _read_rings(wkb, count, 9)}
 
 
-def _rings(wkb: bytes, count: int, begin: int) -> list[Any]:
+def _read_rings(wkb: bytes, count: int, begin: int) -> list[Any]:
     """Return the rings of `count` polygons with one ring and equally many corners, from a byte
     on.
     """
     corners = struct.unpack_from("<I", wkb, begin + _RING.itemsize - 4)[0] if count else 0
-    rings: list[Any] = np.frombuffer(wkb, _ring(corners), count, begin)["xy"][:, None].tolist()
+    rings: list[Any] = np.frombuffer(wkb, _ring_dtype(corners), count, begin)["xy"][
+        :, None
+    ].tolist()
     return rings
 
 
-def _ring(corners: int) -> np.dtype[Any]:
+def _ring_dtype(corners: int) -> np.dtype[Any]:
     return np.dtype([*_RING.descr, ("xy", "<f8", (corners, 2))])
 
 
-def _outlines(
+def _cell_outlines(
     table: pa.Table, cells: IntArray, count: IntArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Return the corners (n, k) of cells, or of the sector of their row; `count` is the number
@@ -113,15 +119,15 @@ def _outlines(
     return grid.outline(cells, sector if count is None else np.repeat(sector, count))
 
 
-def _extremes(
+def _bounding_sides(
     x: FloatArray, y: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     return x.min(axis=1), y.min(axis=1), x.max(axis=1), y.max(axis=1)
 
 
-def _polygons(x: FloatArray, y: FloatArray) -> np.ndarray[Any, Any]:
+def _wkb_polygons(x: FloatArray, y: FloatArray) -> np.ndarray[Any, Any]:
     """Return polygons of the corners x, y (n, k), each as a closed ring."""
-    wkb = np.zeros(len(x), _ring(x.shape[1] + 1))
+    wkb = np.zeros(len(x), _ring_dtype(x.shape[1] + 1))
     wkb["order"], wkb["type"], wkb["rings"], wkb["points"] = (
         _LITTLE_ENDIAN,
         _TYPE_POLYGON,
@@ -133,13 +139,13 @@ def _polygons(x: FloatArray, y: FloatArray) -> np.ndarray[Any, Any]:
     return wkb
 
 
-def _binary(wkb: np.ndarray[Any, Any]) -> pa.Array[Any]:
+def _binary_array(wkb: np.ndarray[Any, Any]) -> pa.Array[Any]:
     offsets: IntArray = np.arange(len(wkb) + 1, dtype=np.int64) * wkb.dtype.itemsize
     buffers = [None, pa.py_buffer(offsets.astype(np.int32).tobytes()), pa.py_buffer(wkb.tobytes())]
     return pa.Array.from_buffers(pa.binary(), len(wkb), buffers)
 
 
-def _marked(
+def _add_geo_metadata(
     table: pa.Table, geometry: pa.Array[Any], kind: str, sides: tuple[FloatArray, ...]
 ) -> pa.Table:
     box = pa.StructArray.from_arrays([pa.array(side) for side in sides], names=list(SIDES))
@@ -156,12 +162,12 @@ def _marked(
         column["bbox"] = [*least, *most]
     geo = {"version": "1.1.0", "primary_column": GEOMETRY, "columns": {GEOMETRY: column}}
     marked = table.append_column(
-        _field(GEOMETRY, geometry, "WKB, longitude and latitude (OGC:CRS84)"), geometry
+        _degree_field(GEOMETRY, geometry, "WKB, longitude and latitude (OGC:CRS84)"), geometry
     )
-    marked = marked.append_column(_field(BBOX, box, "of the geometry, deg"), box)
+    marked = marked.append_column(_degree_field(BBOX, box, "of the geometry, deg"), box)
     metadata: dict[Any, Any] = {**(table.schema.metadata or {}), GEO: json.dumps(geo).encode()}
     return marked.replace_schema_metadata(metadata)
 
 
-def _field(name: str, column: pa.Array[Any], meaning: str) -> pa.Field[Any]:
+def _degree_field(name: str, column: pa.Array[Any], meaning: str) -> pa.Field[Any]:
     return pa.field(name, column.type, nullable=False, metadata={"unit": "deg", "meaning": meaning})

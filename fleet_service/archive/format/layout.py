@@ -126,11 +126,11 @@ def compacted_files(
     root: Path, kind: Kind, since_day: int | None = None, until_day: int | None = None
 ) -> Iterator[Path]:
     """Yield the compacted files of a kind by date, zone and age; both days are included."""
-    for folder in days(root, TABLES[kind], since_day, until_day):
+    for folder in day_folders(root, TABLES[kind], since_day, until_day):
         yield from sorted(folder.glob("zone=*/*.parquet"))
 
 
-def days(
+def day_folders(
     root: Path, table: str, since_day: int | None = None, until_day: int | None = None
 ) -> list[Path]:
     """Return the folders of a table's days in order."""
@@ -175,7 +175,7 @@ def term_of(name: str) -> int | None:
     return None if found is None else int(found["term"] or found["epoch"])
 
 
-def age(name: str) -> tuple[int, int, str]:
+def age_key(name: str) -> tuple[int, int, str]:
     """Return a sort key of segments, and of files with their rows, from old to new: epoch,
     number, shard.
     """

@@ -19,7 +19,13 @@ import pyarrow.parquet as pq
 
 from fleet_service.archive.format.row_filter import Where, filter_table, matching_row_groups
 from fleet_service.archive.format.segments import is_value
-from fleet_service.archive.format.version import DamagedError, Version, entries_of, is_newer, judge
+from fleet_service.archive.format.version import (
+    DamagedError,
+    Version,
+    check_version,
+    entries_of,
+    is_newer,
+)
 from schemas import tables
 from schemas.errors import InputError
 
@@ -104,13 +110,13 @@ def load(
     """
     known = schema if columns is None else pa.schema([schema.field(name) for name in columns])
 
-    def read(file: pq.ParquetFile) -> pa.Table:
+    def read_rows(file: pq.ParquetFile) -> pa.Table:
         names = None if whole else [name for name in known.names if name in file.schema_arrow.names]
         if where is not None and file.metadata.num_row_groups > 1:
-            return _some(file, names, where)
+            return _read_row_groups(file, names, where)
         return file.read(names)  # for small files half of read_table
 
-    found = _content(path, read, damaged)
+    found = _read_verified(path, read_rows, damaged)
     if found is None:
         return None
     table = conform_columns(found.table, schema if whole else known)
@@ -136,34 +142,34 @@ def load_groups(
     """
     known = pa.schema([schema.field(name) for name in columns])
 
-    def read(file: pq.ParquetFile) -> pa.Table:
+    def read_matching(file: pq.ParquetFile) -> pa.Table:
         names = [name for name in columns if name in file.schema_arrow.names]
         own = [one for one in where if one.column in names]
         looked = list({one.column: None for one in own})
         for group in matching_row_groups(file.metadata, where):
             if own and not any(
-                filter_table(part, own).num_rows for part in _batches(file, group, looked)
+                filter_table(part, own).num_rows for part in _read_batches(file, group, looked)
             ):
                 continue
             parts = [
                 filter_table(conform_columns(part, known), where)
-                for part in _batches(file, group, names)
+                for part in _read_batches(file, group, names)
             ]
             if parts:  # none, of a file whose only vehicle was forgotten
                 take(pa.concat_tables(parts))
         return file.schema_arrow.empty_table().select(names)
 
-    return _content(path, read, damaged, BUFFER_BYTES) is not None
+    return _read_verified(path, read_matching, damaged, BUFFER_BYTES) is not None
 
 
-def _batches(file: pq.ParquetFile, group: int, names: list[str]) -> Iterator[pa.Table]:
+def _read_batches(file: pq.ParquetFile, group: int, names: list[str]) -> Iterator[pa.Table]:
     for batch in file.iter_batches(BATCH_ROWS, [group], names, use_threads=False):
         table = pa.Table.from_batches([batch])
         table.validate(full=True)
         yield table
 
 
-def _some(file: pq.ParquetFile, names: list[str] | None, where: Where) -> pa.Table:
+def _read_row_groups(file: pq.ParquetFile, names: list[str] | None, where: Where) -> pa.Table:
     """Return the row groups that may match, one after the other, filtered."""
     own = file.schema_arrow
     known = [one for one in where if one.column in own.names]
@@ -178,16 +184,16 @@ def _some(file: pq.ParquetFile, names: list[str] | None, where: Where) -> pa.Tab
     )
 
 
-def content(path: Path, damaged: Damaged = skip_damaged) -> Content | None:
+def read_content(path: Path, damaged: Damaged = skip_damaged) -> Content | None:
     """Return everything in a file, unknown columns included; None if it is damaged.
 
     Raises:
         as `load`.
     """
-    return _content(path, lambda file: file.read(), damaged)
+    return _read_verified(path, lambda file: file.read(), damaged)
 
 
-def _content(
+def _read_verified(
     path: Path, read: Callable[[pq.ParquetFile], pa.Table], damaged: Damaged, buffer_bytes: int = 0
 ) -> Content | None:
     try:
@@ -198,12 +204,12 @@ def _content(
             if is_newer(
                 entries
             ):  # before it is read: it may be written in a way that is not known here
-                judge(path, file.schema_arrow, entries)
+                check_version(path, file.schema_arrow, entries)
             table = read(file)
             whole = (
                 table.num_columns == file.metadata.num_columns
             )  # then its schema is at hand, in a third of the time
-            version = judge(path, table.schema if whole else file.schema_arrow, entries)
+            version = check_version(path, table.schema if whole else file.schema_arrow, entries)
         table.validate(full=True)
         return Content(table, version, entries)
     except MemoryError:
@@ -223,10 +229,10 @@ def conform_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
     """
     if table.schema.names == schema.names and table.schema.types == schema.types:
         return table
-    return pa.Table.from_arrays([_column(table, f) for f in schema], schema=schema)
+    return pa.Table.from_arrays([_convert_column(table, f) for f in schema], schema=schema)
 
 
-def _column(table: pa.Table, wanted: pa.Field[Any]) -> pa.ChunkedArray[Any]:
+def _convert_column(table: pa.Table, wanted: pa.Field[Any]) -> pa.ChunkedArray[Any]:
     if wanted.name not in table.column_names:
         if wanted.name in NEEDED:
             raise InputError(

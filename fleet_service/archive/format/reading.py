@@ -22,7 +22,7 @@ from fleet_service.archive.format import layout, segments
 from fleet_service.archive.format.layout import Partition
 from fleet_service.archive.format.load import Damaged, load, load_groups, skip_damaged
 from fleet_service.archive.format.row_filter import Where
-from fleet_service.archive.format.version import DamagedError, entries_of, judge
+from fleet_service.archive.format.version import DamagedError, check_version, entries_of
 from schemas import grid
 from schemas.numeric import BoolArray
 from schemas.wire import Kind
@@ -53,10 +53,10 @@ class Wanted(NamedTuple):
         """Return True if a segment, or a file named by its newest segment, was written after the
         position.
         """
-        return self.after is None or layout.age(path.name)[:2] > self.after
+        return self.after is None or layout.age_key(path.name)[:2] > self.after
 
 
-def read(
+def read_tables(
     root: Path,
     kind: Kind,
     columns: Sequence[str] | None = None,
@@ -84,7 +84,7 @@ def read(
 def read_wanted(
     root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged
 ) -> Iterator[pa.Table]:
-    """Yield tables like `read`, for a selection."""
+    """Yield tables like `read_tables`, for a selection."""
     listing = Listing(root, kind, wanted, damaged)
     yield from listing.inbox()
     for path in listing.files:
@@ -98,7 +98,7 @@ class Listing:
     later.
 
     Args:
-        as of `read`.
+        as of `read_tables`.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Listing:
         self._schema = segments.SCHEMAS[kind]
         self._names = list(wanted.columns) if wanted.columns is not None else self._schema.names
         needed = list(dict.fromkeys([*self._names, layout.TIME[kind], "cell"]))
-        self._fresh = _inbox(root, kind, wanted._replace(columns=needed), damaged)
+        self._fresh = _read_inbox(root, kind, wanted._replace(columns=needed), damaged)
         files = list(layout.compacted_files(root, kind, *wanted.days))
         self._done = compacted_partitions(files, {path.name for path, _ in self._fresh})
         self.files = [path for path in files_near(files, wanted.box) if wanted.newer(path)]
@@ -152,12 +152,14 @@ def files_near(files: Sequence[Path], box: tuple[float, float, float, float] | N
     return [path for path, taken in zip(files, touching.tolist(), strict=True) if taken]
 
 
-def _inbox(root: Path, kind: Kind, wanted: Wanted, damaged: Damaged) -> list[tuple[Path, pa.Table]]:
+def _read_inbox(
+    root: Path, kind: Kind, wanted: Wanted, damaged: Damaged
+) -> list[tuple[Path, pa.Table]]:
     for _ in range(_TURNS):
         try:
-            paths = [path for path in segments.paths(root, kind) if wanted.newer(path)]
+            paths = [path for path in segments.list_segments(root, kind) if wanted.newer(path)]
             if wanted.until is not None:
-                paths = [path for path in paths if layout.age(path.name)[:2] <= wanted.until]
+                paths = [path for path in paths if layout.age_key(path.name)[:2] <= wanted.until]
             schema = segments.SCHEMAS[kind]
             loaded = [
                 (
@@ -180,9 +182,9 @@ def compacted_partitions(files: Iterable[Path], names: set[str]) -> dict[str, se
     done: dict[str, set[Partition]] = {}
     if not names:
         return done
-    oldest = min(map(layout.age, names))
+    oldest = min(map(layout.age_key, names))
     for path in files:
-        if layout.age(path.name) >= oldest:
+        if layout.age_key(path.name) >= oldest:
             for name in names & sources_of(path):
                 done.setdefault(name, set()).add(layout.partition_of(path))
     return done
@@ -193,7 +195,7 @@ def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Tabl
     if not done or not table.num_rows:
         return table
     day, zone = layout.partitions_of(
-        segments.nanoseconds(table[layout.TIME[kind]]), table["cell"].to_numpy()
+        segments.to_nanoseconds(table[layout.TIME[kind]]), table["cell"].to_numpy()
     )
     taken: BoolArray = np.zeros(table.num_rows, bool)
     for partition in done:
@@ -210,7 +212,7 @@ def sources_of(path: Path) -> set[str]:
     """
     try:
         footer = pq.read_metadata(path)
-        judge(path, footer.schema.to_arrow_schema(), entries_of(footer.metadata))
+        check_version(path, footer.schema.to_arrow_schema(), entries_of(footer.metadata))
         runs = json.loads((footer.metadata or {}).get(SOURCES, b"[]"))
     except (FileNotFoundError, pa.ArrowInvalid, DamagedError):
         return set()

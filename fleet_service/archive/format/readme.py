@@ -55,24 +55,27 @@ _TABLES: Final[tuple[tuple[str, tuple[Field, ...]], ...]] = (
 )
 
 
-def text() -> str:
+def page_text() -> str:
     """Return the page."""
     parts = [_HEAD]
     for name, fields in _TABLES:
         parts.append(f"\n## `{name}`\n\n| column | type | unit | meaning |\n|---|---|---|---|\n")
-        parts += [f"| `{f.name}` | {f.type} | {_cell(f.unit)} | {_meaning(f)} |\n" for f in fields]
+        parts += [
+            f"| `{f.name}` | {f.type} | {_escape_cell(f.unit)} | {_field_meaning(f)} |\n"
+            for f in fields
+        ]
     return "".join(parts)
 
 
-def _meaning(f: Field) -> str:
-    return _cell(f.meaning) + (f"; multiples of {f.step:g}" if f.step else "")
+def _field_meaning(f: Field) -> str:
+    return _escape_cell(f.meaning) + (f"; multiples of {f.step:g}" if f.step else "")
 
 
-def _cell(value: str) -> str:
+def _escape_cell(value: str) -> str:
     return value.replace("|", "\\|")
 
 
-def keep(root: Path) -> None:
+def write_if_outdated(root: Path) -> None:
     """Write the page into an archive if it is missing or outdated. A foreign page of that name
     stays.
 
@@ -80,7 +83,7 @@ def keep(root: Path) -> None:
         OSError: it cannot be written.
     """
     path = root / NAME
-    page = text().encode()
+    page = page_text().encode()
     there = path.read_bytes() if path.exists() else b""  # bytes: power loss may have left any
     if there != page and (
         not there.strip(b"\0") or there.startswith(_HEAD.splitlines()[0].encode())

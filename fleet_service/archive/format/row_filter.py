@@ -50,11 +50,11 @@ def matching_row_groups(footer: pq.FileMetaData, where: Where) -> list[int]:
     return [
         group
         for group in range(footer.num_row_groups)
-        if all(_may(footer.row_group(group).column(at).statistics, one) for at, one in known)
+        if all(_may_match(footer.row_group(group).column(at).statistics, one) for at, one in known)
     ]
 
 
-def _may(statistics: Any, wanted: ValueRange) -> bool:  # noqa: ANN401 pyarrow's has no name
+def _may_match(statistics: Any, wanted: ValueRange) -> bool:  # noqa: ANN401 pyarrow's has no name
     if statistics is None or not statistics.has_min_max:
         return True
     least, most = (bound.encode() if isinstance(bound, str) else bound for bound in wanted[1:])

@@ -36,14 +36,16 @@ NEARLY: Final = 1e-6  # far below the steps of both, so that rounding decides no
 Rows = dict[str, NDArray[Any]]
 
 
-def folder(root: Path, kind: Kind) -> Path:
+def segment_folder(root: Path, kind: Kind) -> Path:
     """Return the folder of a kind's segments."""
     return root / _FOLDERS[kind]
 
 
-def paths(root: Path, kind: Kind) -> list[Path]:
+def list_segments(root: Path, kind: Kind) -> list[Path]:
     """Return the segments of a kind, oldest first within a shard."""
-    return sorted(folder(root, kind).glob("*.parquet"), key=lambda path: layout.age(path.name))
+    return sorted(
+        segment_folder(root, kind).glob("*.parquet"), key=lambda path: layout.age_key(path.name)
+    )
 
 
 class Writer:
@@ -59,7 +61,7 @@ class Writer:
         self._root = root
         self._shard = shard
         self._seq = 0
-        folders = [folder(root, kind) for kind in SCHEMAS]
+        folders = [segment_folder(root, kind) for kind in SCHEMAS]
         for inbox in folders:
             inbox.mkdir(parents=True, exist_ok=True)
             for draft in inbox.glob(
@@ -78,9 +80,9 @@ class Writer:
         named = [
             path
             for kind in SCHEMAS
-            for path in (*paths(root, kind), *layout.compacted_files(root, kind))
+            for path in (*list_segments(root, kind), *layout.compacted_files(root, kind))
         ]
-        used = [layout.age(path.name)[0] for path in named]
+        used = [layout.age_key(path.name)[0] for path in named]
         self._epoch = max([epoch or int(time.time()), *(one + 1 for one in used)])
 
     @property
@@ -97,7 +99,7 @@ class Writer:
             OSError: it could not be written; no draft is left.
         """
         self._seq += 1
-        path = folder(self._root, kind) / layout.segment_name(
+        path = segment_folder(self._root, kind) / layout.segment_name(
             f"{self._shard}-{self._epoch:010d}", self._seq
         )
         write_table(table_of(kind, rows), path, SEGMENT, named=False)
@@ -128,17 +130,19 @@ def round_to_steps(rows: Rows) -> Rows:
     }
 
 
-def nanoseconds(times: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
+def to_nanoseconds(times: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
     """Return the times of a stored table in ns, (n,)."""
     return np.asarray(times.cast(tables.NS).cast(pa.int64()))
 
 
 def table_of(kind: Kind, rows: Rows) -> pa.Table:
     """Return columns as an Arrow table of the archive's schema."""
-    return pa.Table.from_arrays([_column(f, rows) for f in SCHEMAS[kind]], schema=SCHEMAS[kind])
+    return pa.Table.from_arrays(
+        [_make_column(f, rows) for f in SCHEMAS[kind]], schema=SCHEMAS[kind]
+    )
 
 
-def _column(f: pa.Field[Any], rows: Rows) -> pa.Array[Any]:
+def _make_column(f: pa.Field[Any], rows: Rows) -> pa.Array[Any]:
     values = (
         is_value(rows["mu"], rows["mu_utilised"]) if f.name == tables.VALUE.name else rows[f.name]
     )
@@ -168,9 +172,9 @@ def rows_of(table: pa.Table) -> Rows:
         column = table.column(f.name).combine_chunks()
         if f.type == tables.LIKELIHOOD:
             rows["with_likelihood"] = np.asarray(column.is_valid())
-            rows[f.name] = _likelihoods(column)
+            rows[f.name] = _read_likelihoods(column)
         elif f.type == tables.US:
-            rows[f.name] = nanoseconds(column)
+            rows[f.name] = to_nanoseconds(column)
         else:
             rows[f.name] = _without_null(f, column).to_numpy(zero_copy_only=False)
     return rows
@@ -186,7 +190,7 @@ def _without_null(f: pa.Field[Any], column: pa.Array[Any]) -> pa.Array[Any]:
     return filled
 
 
-def _likelihoods(column: pa.Array[Any]) -> NDArray[np.uint8]:
+def _read_likelihoods(column: pa.Array[Any]) -> NDArray[np.uint8]:
     """Return fixed-size binary as (n, 32); rows without one are flat."""
     filled: pa.Array[Any] = column.fill_null(bytes(mugrid.BINS))
     data = np.frombuffer((filled.buffers()[1] or pa.py_buffer(b"")).to_pybytes(), np.uint8).reshape(

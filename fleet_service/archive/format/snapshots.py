@@ -22,7 +22,7 @@ TABLE: Final = "map"
 _NAME: Final = "%Y%m%dT%H%M%SZ"
 
 
-def write(root: Path, table: pa.Table, now: int) -> Path:
+def write_snapshot(root: Path, table: pa.Table, now: int) -> Path:
     """Store the map of a moment [ns]; `table` has the schema of the map.
 
     Raises:
@@ -49,9 +49,9 @@ def time_of(path: Path) -> int:
     return int(datetime.strptime(path.stem, _NAME).replace(tzinfo=UTC).timestamp()) * NS
 
 
-def newest(root: Path, until: int) -> Path | None:
+def newest_snapshot(root: Path, until: int) -> Path | None:
     """Return the last snapshot taken up to a moment [ns]."""
-    for folder in reversed(layout.days(root, TABLE, until_day=until // layout.DAY_NS)):
+    for folder in reversed(layout.day_folders(root, TABLE, until_day=until // layout.DAY_NS)):
         for path in sorted(folder.glob("*.parquet"), reverse=True):
             if time_of(path) <= until:
                 return path

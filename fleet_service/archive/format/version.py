@@ -59,13 +59,13 @@ class DamagedError(Exception):
     """The content of the file differs from the content that was written."""
 
 
-def footer(schema: pa.Schema, entries: Mapping[str, str] | None = None) -> dict[str, str]:
+def make_footer(schema: pa.Schema, entries: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return key-value pairs for the footer of a file: `entries`, a version if they have none,
     and the digest.
     """
     own = {KEY: str(VERSION), **(entries or {})}
     own = {key: value for key, value in own.items() if key != DIGEST}
-    return own | {DIGEST: digest(schema, own)}
+    return own | {DIGEST: schema_digest(schema, own)}
 
 
 def entries_of(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
@@ -80,11 +80,11 @@ def entries_of(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
 
 
 def is_newer(entries: Mapping[str, str]) -> bool:
-    """Return True if a file states a newer major version; a quick check, `judge` decides."""
+    """Return True if a file states a newer major version; a quick check, `check_version` decides."""
     return entries.get(KEY, "0").partition(".")[0] > str(VERSION.major)
 
 
-def judge(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
+def check_version(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
     """Return the version of a file with these columns and key-value pairs.
 
     Raises:
@@ -92,11 +92,11 @@ def judge(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
         InputError: it is of a newer major version, or states no valid version.
     """
     if KEY not in entries and DIGEST not in entries:
-        if digest(schema, {}) not in FIRST:
+        if schema_digest(schema, {}) not in FIRST:
             raise DamagedError(f"columns are not those of version {OLDEST}, and it says no other")
         return OLDEST
     others = {key: value for key, value in entries.items() if key != DIGEST}
-    if entries.get(DIGEST) != digest(schema, others):
+    if entries.get(DIGEST) != schema_digest(schema, others):
         raise DamagedError("columns are not those that were written")
     found = parse_version(entries[KEY])
     if found.major > VERSION.major:
@@ -124,28 +124,28 @@ def parse_version(text: str) -> Version:
     return Version(int(major), int(minor))
 
 
-def digest(schema: pa.Schema, entries: Mapping[str, str]) -> str:
+def schema_digest(schema: pa.Schema, entries: Mapping[str, str]) -> str:
     """Return the hash (16 hexadecimal digits) of names and types of columns, and of key-value
     pairs.
     """
-    state = _columns(tuple(schema.names), tuple(schema.types)).copy()
+    state = _hash_columns(tuple(schema.names), tuple(schema.types)).copy()
     for key in sorted(entries):
         state.update(f"\n{key}={entries[key]}".encode())
     return state.hexdigest()
 
 
 @lru_cache(64)
-def _columns(names: tuple[str, ...], types: tuple[pa.DataType, ...]) -> blake2b:
-    lines = (f"{name} {_type(kind)}" for name, kind in zip(names, types, strict=True))
+def _hash_columns(names: tuple[str, ...], types: tuple[pa.DataType, ...]) -> blake2b:
+    lines = (f"{name} {_type_name(kind)}" for name, kind in zip(names, types, strict=True))
     return blake2b("\n".join(lines).encode(), digest_size=8)
 
 
-def _type(kind: pa.DataType) -> str:
+def _type_name(kind: pa.DataType) -> str:
     """Return the name of a type; that of a list's values differs between versions of Arrow and
     is omitted.
     """
     if pa.types.is_list(kind):
-        return f"list<{_type(kind.value_type)}>"
+        return f"list<{_type_name(kind.value_type)}>"
     if pa.types.is_struct(kind):
-        return f"struct<{', '.join(f'{f.name} {_type(f.type)}' for f in kind)}>"
+        return f"struct<{', '.join(f'{f.name} {_type_name(f.type)}' for f in kind)}>"
     return str(kind)

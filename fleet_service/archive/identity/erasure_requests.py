@@ -84,7 +84,7 @@ def open_requests(root: Path) -> list[Path]:
     )
 
 
-def read(question: Path) -> Erasure:
+def read_request(question: Path) -> Erasure:
     """Return the content of a request.
 
     Raises:
@@ -99,7 +99,7 @@ def read(question: Path) -> Erasure:
         raise InputError("request", f"{question.name} is none", "ask again") from error
 
 
-def settle(question: Path, outcome: dict[str, Any] | InputError) -> None:
+def answer_request(question: Path, outcome: dict[str, Any] | InputError) -> None:
     """Answer a request and remove it.
 
     Raises:

@@ -21,7 +21,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fleet_service.archive.format.layout import DAY_NS
-from fleet_service.archive.identity.pseudonyms import number
+from fleet_service.archive.identity.pseudonyms import pseudonym_number
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, IntArray
 from schemas.runtime.durable import sync_directory
@@ -92,7 +92,7 @@ class ErasedData(NamedTuple):
     vehicles: dict[int, int]
 
 
-def read(folder: Path) -> ErasedData:
+def read_erasures(folder: Path) -> ErasedData:
     """Return the erased data recorded in the folder of the keys."""
     months = list[Span]()
     vehicles = dict[int, int]()
@@ -105,7 +105,9 @@ def read(folder: Path) -> ErasedData:
         if pseudonym is None:
             months.append(Span(span_of(month).begin, until))
         else:
-            vehicles[number(pseudonym)] = max(until, vehicles.get(number(pseudonym), 0))
+            vehicles[pseudonym_number(pseudonym)] = max(
+                until, vehicles.get(pseudonym_number(pseudonym), 0)
+            )
     return ErasedData(months, vehicles)
 
 

@@ -27,13 +27,13 @@ _DAY_NS: Final = 86_400_000_000_000
 
 
 @lru_cache(1 << 16)
-def number(pseudonym: str) -> int:
+def pseudonym_number(pseudonym: str) -> int:
     """Return a pseudonym as a signed 64-bit number."""
     return int.from_bytes(bytes.fromhex(pseudonym), signed=True)
 
 
-def texts(numbers: IntArray) -> NDArray[np.bytes_]:
-    """Return the pseudonyms (n,) of numbers; the inverse of `number`."""
+def pseudonym_texts(numbers: IntArray) -> NDArray[np.bytes_]:
+    """Return the pseudonyms (n,) of numbers; the inverse of `pseudonym_number`."""
     return np.frombuffer(numbers.astype(">i8").tobytes().hex().encode(), f"S{2 * _DIGEST_BYTES}")
 
 
@@ -99,14 +99,14 @@ def load_or_create_key(path: Path) -> bytes:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with open_durably(path, 0o600) as file:
             key = secrets.token_bytes(KEY_BYTES)
-            file.write(key + _check(key))
+            file.write(key + _key_digest(key))
         sync_directory(
             path.parent.parent
         )  # else power loss forgets the key, and acknowledged batches with it
-    return _checked(path)
+    return _read_key(path)
 
 
-def _checked(path: Path) -> bytes:
+def _read_key(path: Path) -> bytes:
     """Return a verified key; keys of a former version have no digest.
 
     Raises:
@@ -116,10 +116,10 @@ def _checked(path: Path) -> bytes:
     data = path.read_bytes()
     key = data[:KEY_BYTES]
     check = data[KEY_BYTES:]
-    if len(key) < KEY_BYTES or (check and check != _check(key)):
+    if len(key) < KEY_BYTES or (check and check != _key_digest(key)):
         raise OSError(errno.EIO, "the key is damaged; bring it back from a copy", str(path))
     return key
 
 
-def _check(key: bytes) -> bytes:
+def _key_digest(key: bytes) -> bytes:
     return blake2b(key, digest_size=_DIGEST_BYTES).digest()

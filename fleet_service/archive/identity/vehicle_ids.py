@@ -60,7 +60,7 @@ class VehicleIds:
         """
         number = self.number_of(vehicle)
         if self._known is None:
-            self._known = set(read(self._folder))
+            self._known = set(read_numbers(self._folder))
         if pseudonym not in self._known:
             path = self._folder / f"{layout.with_term(month, self._term)}{ENDING}"
             path.touch(_SECRET)
@@ -69,7 +69,7 @@ class VehicleIds:
                 file.seek(
                     file.seek(0, os.SEEK_END) // _LINE * _LINE
                 )  # over what a full disk left of a line
-                if file.write(_line(pseudonym, number)) != _LINE:
+                if file.write(_encode_line(pseudonym, number)) != _LINE:
                     raise OSError(errno.ENOSPC, "no room for a line", str(path))
             self._known.add(pseudonym)
         return number
@@ -100,12 +100,12 @@ class VehicleIds:
             self._unsynced.discard(path)
 
 
-def read(folder: Path) -> dict[int, int]:
+def read_numbers(folder: Path) -> dict[int, int]:
     """Return the numbers by pseudonym of all months, without damaged lines."""
     return {
         pseudonym: number
-        for path in _files(folder)
-        for pseudonym, number in _whole(path.read_bytes())
+        for path in _month_files(folder)
+        for pseudonym, number in _undamaged_lines(path.read_bytes())
     }
 
 
@@ -116,9 +116,9 @@ def remove_damaged_lines(folder: Path) -> int:
         OSError: a file cannot be read.
     """
     damaged = 0
-    for path in _files(folder):
+    for path in _month_files(folder):
         data = path.read_bytes()
-        good = b"".join(_line(*both) for both in _whole(data))
+        good = b"".join(_encode_line(*both) for both in _undamaged_lines(data))
         if len(good) < len(data):
             damaged += -(-(len(data) - len(good)) // _LINE)
             with suppress(OSError), open_durably(path, _SECRET) as file:
@@ -126,21 +126,21 @@ def remove_damaged_lines(folder: Path) -> int:
     return damaged
 
 
-def _files(folder: Path) -> list[Path]:
+def _month_files(folder: Path) -> list[Path]:
     """Return the files of all months."""
     return [path for path in sorted(folder.glob(f"*{ENDING}")) if _MONTH.fullmatch(path.stem)]
 
 
-def _whole(data: bytes) -> Iterator[tuple[int, int]]:
+def _undamaged_lines(data: bytes) -> Iterator[tuple[int, int]]:
     """Yield pseudonym and number of every undamaged line."""
     for at in range(0, len(data) - _LINE + 1, _LINE):
         pseudonym, number = (int.from_bytes(data[at + k : at + k + 8], signed=True) for k in (0, 8))
-        if data[at : at + _LINE] == _line(pseudonym, number):
+        if data[at : at + _LINE] == _encode_line(pseudonym, number):
             yield pseudonym, number
 
 
 def numbers_of(known: Mapping[int, int], pseudonyms: IntArray) -> IntArray:
-    """Return the numbers of pseudonyms (n,) by the result of `read`; an unknown pseudonym is its
+    """Return the numbers of pseudonyms (n,) by the result of `read_numbers`; an unknown pseudonym is its
     own number.
     """
     if not known or not len(pseudonyms):
@@ -149,9 +149,9 @@ def numbers_of(known: Mapping[int, int], pseudonyms: IntArray) -> IntArray:
     return np.asarray(np.array([known.get(one, one) for one in distinct.tolist()], np.int64)[index])
 
 
-def forget(folder: Path, month: str, pseudonym: int | None = None) -> None:
+def forget_vehicles(folder: Path, month: str, pseudonym: int | None = None) -> None:
     """Remove one vehicle's line of a month, or all of them."""
-    for path in _files(folder):
+    for path in _month_files(folder):
         if path.name.partition(".")[0] != month:
             continue
         if pseudonym is None:
@@ -167,6 +167,6 @@ def forget(folder: Path, month: str, pseudonym: int | None = None) -> None:
             )
 
 
-def _line(pseudonym: int, number: int) -> bytes:
+def _encode_line(pseudonym: int, number: int) -> bytes:
     both = pseudonym.to_bytes(8, signed=True) + number.to_bytes(8, signed=True)
     return both + blake2b(both, digest_size=8).digest()

@@ -24,7 +24,7 @@ import pyarrow as pa
 
 from fleet_service.archive.format import layout, reading, readme, segments
 from fleet_service.archive.format.files import COMPACTED, lock_file, sync_tree, write_table
-from fleet_service.archive.format.load import conform_columns, content, set_aside
+from fleet_service.archive.format.load import conform_columns, read_content, set_aside
 from fleet_service.archive.format.version import KEY, VERSION
 from schemas.runtime.durable import sync_directory
 from schemas.wire import Kind
@@ -81,10 +81,12 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
     """
     total = CompactionResult(0, 0, 0)
     with hold_compaction_lock(root):
-        readme.keep(root)
+        readme.write_if_outdated(root)
         term = layout.read_epoch(root)
         for kind in Kind:
-            waiting = sorted(segments.paths(root, kind), key=lambda path: layout.age(path.name))
+            waiting = sorted(
+                segments.list_segments(root, kind), key=lambda path: layout.age_key(path.name)
+            )
             done = reading.compacted_partitions(
                 layout.compacted_files(root, kind), {path.name for path in waiting}
             )
@@ -100,7 +102,7 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
                 },
             )
             rest = _Rest(root, kind, iter(waiting), done, term)
-            while (moved := _round(rest, round_rows)).segments:
+            while (moved := _compact_round(rest, round_rows)).segments:
                 total = CompactionResult(*map(sum, zip(total, moved, strict=True)))
     return total
 
@@ -117,7 +119,7 @@ class _Rest(NamedTuple):
     term: int
 
 
-def _round(rest: _Rest, most: int) -> CompactionResult:
+def _compact_round(rest: _Rest, most: int) -> CompactionResult:
     """Move the next segments: about `most` rows, or at least one segment."""
     sources: list[Path] = []
     tables: list[pa.Table] = []
@@ -126,7 +128,7 @@ def _round(rest: _Rest, most: int) -> CompactionResult:
         sum(table.num_rows for table in tables) < most
         and (path := next(rest.segments, None)) is not None
     ):
-        found = content(path, set_aside)
+        found = read_content(path, set_aside)
         if found is not None:
             sources.append(path)
             newest = max(newest, found.version)
@@ -136,14 +138,14 @@ def _round(rest: _Rest, most: int) -> CompactionResult:
     if not sources:
         return CompactionResult(0, 0, 0)
     table = join_versions(tables, segments.SCHEMAS[rest.kind])
-    named = json.dumps(runs(path.name for path in sources))
+    named = json.dumps(consecutive_runs(path.name for path in sources))
     footer = {KEY: str(newest), reading.SOURCES.decode(): named}
-    files = _place(
+    files = _place_files(
         rest.root, rest.kind, layout.compacted_name(sources[-1].name, rest.term), table, footer
     )
     for path in sources:
         path.unlink()
-    sync_directory(segments.folder(rest.root, rest.kind))
+    sync_directory(segments.segment_folder(rest.root, rest.kind))
     return CompactionResult(table.num_rows, len(sources), files)
 
 
@@ -158,7 +160,9 @@ def join_versions(tables: list[pa.Table], known: pa.Schema) -> pa.Table:
     return pa.concat_tables([conform_columns(table, schema) for table in tables])
 
 
-def _place(root: Path, kind: Kind, name: str, table: pa.Table, footer: Mapping[str, str]) -> int:
+def _place_files(
+    root: Path, kind: Kind, name: str, table: pa.Table, footer: Mapping[str, str]
+) -> int:
     """Write the files of a round and rename them into place; return their number."""
     drafts: list[tuple[Path, Path]] = []
     for partition, part in split_by_partition(table, kind):
@@ -173,14 +177,14 @@ def _place(root: Path, kind: Kind, name: str, table: pa.Table, footer: Mapping[s
     return len(drafts)
 
 
-def runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
+def consecutive_runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
     """Return names of segments, in order of age, as runs of consecutive numbers: SHARD-EPOCH,
     first, last.
     """
     out: list[tuple[str, int, int]] = []
     for name in names:
         prefix = Path(name).stem.rpartition("-")[0]
-        n = layout.age(name)[1]
+        n = layout.age_key(name)[1]
         if out and out[-1][0] == prefix and out[-1][2] == n - 1:
             out[-1] = (prefix, out[-1][1], n)
         else:
@@ -193,7 +197,7 @@ def split_by_partition(table: pa.Table, kind: Kind) -> Iterator[tuple[layout.Par
     if not table.num_rows:
         return
     table = table.combine_chunks()
-    time = segments.nanoseconds(table[layout.TIME[kind]])
+    time = segments.to_nanoseconds(table[layout.TIME[kind]])
     cell = table["cell"].to_numpy()
     day, zone = layout.partitions_of(time, cell)
     order = np.lexsort((time, cell, day))  # the zone is the cell's leading digits

@@ -73,12 +73,12 @@ def register(root: Path, place: Place) -> RegistrationResult:
     """
     total = RegistrationResult(0, 0, 0)
     with hold_compaction_lock(root):  # nobody removes or rewrites files meanwhile
-        _remember(root, place)
-        with _said(place):
-            catalog = _catalog(place)
+        _record_registration(root, place)
+        with _one_line_errors(place):
+            catalog = _open_catalog(place)
             catalog.create_namespace_if_not_exists(place.namespace)
             for kind in Kind:
-                done = _brought_up(_table(catalog, place, kind), root, place, kind)
+                done = _brought_up(_open_table(catalog, place, kind), root, place, kind)
                 total = RegistrationResult(*map(sum, zip(total, done, strict=True)))
     return total
 
@@ -93,13 +93,17 @@ def unregister(root: Path, paths: Sequence[Path]) -> None:
     place = place_of(root)
     if place is None or not paths:
         return
-    names = {_name(root, place, path) for path in paths}
-    with _said(place):
-        catalog = _catalog(place)
+    names = {_file_url(root, place, path) for path in paths}
+    with _one_line_errors(place):
+        catalog = _open_catalog(place)
         for kind in Kind:
             if catalog.table_exists((place.namespace, layout.TABLES[kind])):
                 table = catalog.load_table((place.namespace, layout.TABLES[kind]))
-                _commit(table, [file for name, file in _held(table).items() if name in names], [])
+                _commit_files(
+                    table,
+                    [file for name, file in _files_by_name(table).items() if name in names],
+                    [],
+                )
 
 
 def place_of(root: Path) -> Place | None:
@@ -120,7 +124,7 @@ def place_of(root: Path) -> Place | None:
         ) from error
 
 
-def _remember(root: Path, place: Place) -> None:
+def _record_registration(root: Path, place: Place) -> None:
     """Record the registration before it happens, so that no registered file is removed
     unnoticed.
     """
@@ -142,7 +146,7 @@ def _remember(root: Path, place: Place) -> None:
             file.write(json.dumps(place._asdict()).encode())
 
 
-def _catalog(place: Place) -> Catalog:
+def _open_catalog(place: Place) -> Catalog:
     try:
         from pyiceberg.catalog import load_catalog
     except ImportError as error:
@@ -159,31 +163,37 @@ def _catalog(place: Place) -> Catalog:
     return load_catalog("gripmap", **catalog_properties)  # by this name others find the tables
 
 
-def _table(catalog: Catalog, place: Place, kind: Kind) -> Table:
+def _open_table(catalog: Catalog, place: Place, kind: Kind) -> Table:
     """Return the table of a kind with all columns known today."""
     from pyiceberg.transforms import DayTransform
 
     name = (place.namespace, layout.TABLES[kind])
     schema = SCHEMAS[kind]
     if not catalog.table_exists(name):
-        new = catalog.create_table_transaction(name, schema=_plain(schema), properties=PROPERTIES)
+        new = catalog.create_table_transaction(
+            name, schema=_plain_schema(schema), properties=PROPERTIES
+        )
         with new, new.update_spec() as spec:  # a compacted file holds one date
             spec.add_field(layout.TIME[kind], DayTransform(), "date")
     table = catalog.load_table(name)
     if set(schema.names) - {field.name for field in table.schema().fields}:
         with table.update_schema() as update:
-            update.union_by_name(_plain(schema))
+            update.union_by_name(_plain_schema(schema))
     return table
 
 
-def _plain(schema: pa.Schema) -> pa.Schema:
+def _plain_schema(schema: pa.Schema) -> pa.Schema:
     return pa.schema([field.with_nullable(True).remove_metadata() for field in schema])
 
 
 def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> RegistrationResult:
     """Remove missing and changed files from a table and add new ones, in one commit."""
-    there = {_name(root, place, path): path for path in layout.compacted_files(root, kind)}
-    mine = {name: file for name, file in _held(table).items() if name.startswith(_folder(place))}
+    there = {_file_url(root, place, path): path for path in layout.compacted_files(root, kind)}
+    mine = {
+        name: file
+        for name, file in _files_by_name(table).items()
+        if name.startswith(_folder_url(place))
+    }
     # one that was rewritten elsewhere is known by its size
     stale = [
         n
@@ -191,14 +201,14 @@ def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registrat
         if n not in there or there[n].stat().st_size != file.file_size_in_bytes
     ]
     missing = sorted((there.keys() - mine.keys()) | (there.keys() & set(stale)))
-    _commit(table, [mine[name] for name in stale], missing)
-    now = _held(table.refresh())
+    _commit_files(table, [mine[name] for name in stale], missing)
+    now = _files_by_name(table.refresh())
     return RegistrationResult(
         len(missing), len(stale), sum(f.record_count for n, f in now.items() if n in there)
     )
 
 
-def _commit(table: Table, removed: list[Any], added: list[str]) -> None:
+def _commit_files(table: Table, removed: list[Any], added: list[str]) -> None:
     """Change a table atomically."""
     if not removed and not added:
         return
@@ -208,24 +218,24 @@ def _commit(table: Table, removed: list[Any], added: list[str]) -> None:
                 for file in removed:
                     without.delete_data_file(file)
         if added:
-            change.add_files(added, check_duplicate_files=False)  # `_held` has looked
+            change.add_files(added, check_duplicate_files=False)  # `_files_by_name` has looked
 
 
-def _held(table: Table) -> dict[str, Any]:
+def _files_by_name(table: Table) -> dict[str, Any]:
     """Return the files that a table names, by name."""
     return {task.file.file_path: task.file for task in table.scan().plan_files()}
 
 
-def _folder(place: Place) -> str:
+def _folder_url(place: Place) -> str:
     return place.at.rstrip("/") + "/"
 
 
-def _name(root: Path, place: Place, path: Path) -> str:
-    return _folder(place) + str(path.relative_to(root))
+def _file_url(root: Path, place: Place, path: Path) -> str:
+    return _folder_url(place) + str(path.relative_to(root))
 
 
 @contextmanager
-def _said(place: Place) -> Iterator[None]:
+def _one_line_errors(place: Place) -> Iterator[None]:
     """Turn errors of the catalogue into one line."""
     try:
         yield

@@ -21,12 +21,12 @@ import pyarrow.compute as pc
 from fleet_service.archive.format import layout, reading, snapshots
 from fleet_service.archive.format.files import COMPACTED, MAP, lock_archive, put_in_place
 from fleet_service.archive.format.layout import TABLES
-from fleet_service.archive.format.load import BAD, content, load
+from fleet_service.archive.format.load import BAD, load, read_content
 from fleet_service.archive.format.row_filter import ValueRange, Where
-from fleet_service.archive.format.segments import SCHEMAS, nanoseconds
+from fleet_service.archive.format.segments import SCHEMAS, to_nanoseconds
 from fleet_service.archive.format.version import KEY
 from fleet_service.archive.identity import erasures, vehicle_ids
-from fleet_service.archive.identity.pseudonyms import Pseudonyms, number
+from fleet_service.archive.identity.pseudonyms import Pseudonyms, pseudonym_number
 from fleet_service.archive.maintenance import iceberg, rollup
 from fleet_service.archive.maintenance.compaction import compact, hold_compaction_lock
 from schemas.errors import InputError
@@ -57,7 +57,7 @@ def retire_rows(root: Path, raw_days: int, today: date) -> RetirementResult:
     """
     files = 0
     with hold_compaction_lock(root):
-        rollup.complete(root, until_day=_last_to_go(raw_days, today))
+        rollup.complete_parts(root, until_day=_last_to_go(raw_days, today))
         folders = due_folders(root, raw_days, today)
         iceberg.unregister(root, [path for folder in folders for path in folder.glob("*/*")])
         for folder in folders:
@@ -78,7 +78,7 @@ def due_folders(root: Path, raw_days: int, today: date) -> list[Path]:
         InputError: too few days.
     """
     last = _last_to_go(raw_days, today)
-    return [day for kind in Kind for day in layout.days(root, TABLES[kind], until_day=last)]
+    return [day for kind in Kind for day in layout.day_folders(root, TABLES[kind], until_day=last)]
 
 
 def _last_to_go(raw_days: int, today: date) -> int:
@@ -101,7 +101,9 @@ def forget_period(root: Path, month: str) -> None:
     with lock_archive(root):
         key_of(root, month)
         begin, until = erasures.span_of(month)
-        destroy_key(root, month, _newest(root, (begin // layout.DAY_NS, None), until=until))
+        destroy_key(
+            root, month, _newest_first_time(root, (begin // layout.DAY_NS, None), until=until)
+        )
 
 
 def destroy_key(root: Path, month: str, newest: int) -> None:
@@ -115,20 +117,22 @@ def destroy_key(root: Path, month: str, newest: int) -> None:
     """
     key = key_of(root, month)
     erasures.record_erasure(key.parent, month, newest)
-    vehicle_ids.forget(key.parent, month)
+    vehicle_ids.forget_vehicles(key.parent, month)
     key.unlink()
     sync_directory(key.parent)
 
 
-def _newest(
+def _newest_first_time(
     root: Path, days: tuple[int, int | None], where: Where = (), until: float = math.inf
 ) -> int:
     """Return the newest first time of a record of these days [ns], -1 if there is none; one not
     before `until` is enough."""
     newest = -1
     for kind, name in layout.FIRST_TIME.items():
-        for table in reading.read(root, kind, [name, *(one.column for one in where)], where, days):
-            newest = max(newest, int(nanoseconds(table[name]).max(initial=-1)))
+        for table in reading.read_tables(
+            root, kind, [name, *(one.column for one in where)], where, days
+        ):
+            newest = max(newest, int(to_nanoseconds(table[name]).max(initial=-1)))
             if newest >= until:
                 return newest
     return newest
@@ -171,9 +175,13 @@ def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]
     """
     key_of(root, month)
     compact(root)
-    begin, end = _days(month)
-    pseudonym = _pseudonym(root, vehicle, month)
-    if (newest := _newest(root, (begin, end), [ValueRange("vehicle", pseudonym, pseudonym)])) >= 0:
+    begin, end = _days_of_month(month)
+    pseudonym = _pseudonym_of(root, vehicle, month)
+    if (
+        newest := _newest_first_time(
+            root, (begin, end), [ValueRange("vehicle", pseudonym, pseudonym)]
+        )
+    ) >= 0:
         erasures.record_erasure(root / _KEYS, month, newest, pseudonym)
     rows = 0
     files = [*root.rglob(f"*{BAD}")]
@@ -186,15 +194,15 @@ def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]
             theirs = [
                 path
                 for path in layout.compacted_files(root, kind, begin, end)
-                if _names(kind, path, pseudonym)
+                if _may_hold_vehicle(kind, path, pseudonym)
             ]
             iceberg.unregister(root, theirs)
             for path in theirs:
-                if len(removed := _without(root, kind, path, pseudonym)):
+                if len(removed := _remove_vehicle(root, kind, path, pseudonym)):
                     rows = rows + len(removed)
                     cells = cells.union(removed)
                     files += [path, rollup.part_of(path)] if kind is Kind.OBSERVATION else [path]
-        for folder in layout.days(root, snapshots.TABLE, begin, end):
+        for folder in layout.day_folders(root, snapshots.TABLE, begin, end):
             files += [
                 path
                 for path in sorted(folder.glob("*.parquet"))
@@ -209,10 +217,12 @@ def forget_witness(root: Path, vehicle: str, month: str) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    vehicle_ids.forget(root / _KEYS, month, number(_pseudonym(root, vehicle, month)))
+    vehicle_ids.forget_vehicles(
+        root / _KEYS, month, pseudonym_number(_pseudonym_of(root, vehicle, month))
+    )
 
 
-def _pseudonym(root: Path, vehicle: str, month: str) -> str:
+def _pseudonym_of(root: Path, vehicle: str, month: str) -> str:
     return Pseudonyms(root / _KEYS).of(vehicle, erasures.span_of(month).begin)
 
 
@@ -220,7 +230,7 @@ def _thin_snapshot(root: Path, path: Path, cells: set[int]) -> bool:
     """Remove lines of these cells with fewer than ANONYMOUS vehicles from a snapshot; return
     True if there were any.
     """
-    found = content(path, _refuse_damaged)
+    found = read_content(path, _refuse_damaged)
     if found is None or not cells:
         return False
     lines = np.isin(found.table["cell"].to_numpy(), sorted(cells)) & (
@@ -241,12 +251,12 @@ def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
         OSError: a file cannot be read.
     """
     key_of(root, month)
-    pseudonym = _pseudonym(root, vehicle, month)
+    pseudonym = _pseudonym_of(root, vehicle, month)
     where = [ValueRange("vehicle", pseudonym, pseudonym)]
     return sum(
         table.num_rows
         for kind in Kind
-        for table in reading.read(root, kind, ["vehicle"], where, _days(month))
+        for table in reading.read_tables(root, kind, ["vehicle"], where, _days_of_month(month))
     )
 
 
@@ -261,15 +271,15 @@ def drop_checkpoints(root: Path) -> None:
         sync_directory(root)
 
 
-def _names(kind: Kind, path: Path, pseudonym: str) -> bool:
+def _may_hold_vehicle(kind: Kind, path: Path, pseudonym: str) -> bool:
     """Return True if a file may hold rows of a vehicle."""
     found = load(path, SCHEMAS[kind], ["vehicle"], damaged=_refuse_damaged)
     return found is not None and pseudonym in pc.unique(found["vehicle"]).to_pylist()
 
 
-def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[int]:
+def _remove_vehicle(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[int]:
     """Remove the rows of a vehicle from a file; return their cells."""
-    found = content(path, _refuse_damaged)
+    found = read_content(path, _refuse_damaged)
     if found is None or pseudonym not in pc.unique(found.table["vehicle"]).to_pylist():
         return []
     theirs = pc.equal(found.table["vehicle"], pa.scalar(pseudonym))
@@ -307,7 +317,7 @@ def key_of(root: Path, month: str) -> Path:
     return path
 
 
-def _days(month: str) -> tuple[int, int]:
+def _days_of_month(month: str) -> tuple[int, int]:
     """Return the days of a month and the one after it: a batch has the pseudonym of its first
     record and may end a day later."""
     begin, until = erasures.span_of(month)

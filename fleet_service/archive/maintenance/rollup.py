@@ -53,7 +53,7 @@ def part_of(path: Path, below: Path | None = None) -> Path:
     return root / TABLE / path.parents[1].name / path.parent.name / path.name
 
 
-def complete(root: Path, until_day: int | None = None) -> int:
+def complete_parts(root: Path, until_day: int | None = None) -> int:
     """Compute missing parts; return their number.
 
     Raises:
@@ -101,17 +101,17 @@ def roll_up(table: pa.Table) -> pa.Table:
     starts = np.flatnonzero(new | (np.diff(rows["sector"], prepend=-1) != 0))
     if not len(starts):
         return tables.CELL_HOUR_SCHEMA.empty_table()
-    columns = _statistics(rows, starts)
+    columns = _cell_statistics(rows, starts)
     columns |= {
         "cell": rows["cell"][starts],
         "sector": rows["sector"][starts],
         "hour": hour[starts] * (HOUR_NS // 1000),
     }
-    arrays = [_array(columns[f.name], f.type) for f in tables.CELL_HOUR_SCHEMA]
+    arrays = [_make_array(columns[f.name], f.type) for f in tables.CELL_HOUR_SCHEMA]
     return pa.Table.from_arrays(arrays, schema=tables.CELL_HOUR_SCHEMA)
 
 
-def _statistics(rows: segments.Rows, starts: IntArray) -> dict[str, Any]:
+def _cell_statistics(rows: segments.Rows, starts: IntArray) -> dict[str, Any]:
     n = len(rows["cell"])
     group = np.repeat(np.arange(len(starts)), np.diff(starts, append=n))
     with_mu = ~np.isnan(rows["mu"])
@@ -145,7 +145,7 @@ def _statistics(rows: segments.Rows, starts: IntArray) -> dict[str, Any]:
     }
 
 
-def _array(values: Any, kind: pa.DataType) -> pa.Array[Any]:  # noqa: ANN401 columns of many types
+def _make_array(values: Any, kind: pa.DataType) -> pa.Array[Any]:  # noqa: ANN401 columns of many types
     if pa.types.is_list(kind):
         offsets = np.arange(len(values) + 1, dtype=np.int32) * mugrid.BINS
         buffers = [None, pa.py_buffer(offsets.tobytes())]

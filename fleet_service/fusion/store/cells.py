@@ -24,7 +24,7 @@ from schemas.runtime.records import RecordArray
 
 
 class Cells(NamedTuple):
-    """Stored state of each slot: `belief` (n, 32) in 16 bits, see `belief.unpack`, and the columns
+    """Stored state of each slot: `belief` (n, 32) in 16 bits, see `belief.unpack_belief`, and the columns
     (n,) of `records.CellRecord`; `untrusted` is (n, 2), `manoeuvres` (n, 4).
     """
 

@@ -18,7 +18,7 @@ _FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its
 
 
 @refcount_free_inlined
-def precedes(entries: RecordArray, a: int, b: int) -> bool:
+def comes_before(entries: RecordArray, a: int, b: int) -> bool:
     """Return True if entry `a` comes before `b`: by time, then by identity."""
     if entries[a].time != entries[b].time:
         return bool(entries[a].time < entries[b].time)
@@ -51,7 +51,7 @@ def link_pair(entries: RecordArray, pairs: RecordArray, pair: int, entry: int) -
     entries[entry].pair = pair
     before = int(pairs[pair].last)
     after = NONE
-    while before != NONE and precedes(entries, entry, before):
+    while before != NONE and comes_before(entries, entry, before):
         before, after = int(entries[before].before), before
     entries[entry].before = before
     entries[entry].after = after
@@ -83,7 +83,7 @@ def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 
 
 @refcount_free_inlined
-def _stays(pairs: RecordArray, place: int, least: int) -> bool:
+def _must_stay(pairs: RecordArray, place: int, least: int) -> bool:
     """Return True if a pair reported since `least` [s], or waits in the window."""
     pair = pairs[place]
     return bool(pair.last != NONE or pair.time[0] >= least or pair.time[1] >= least)
@@ -94,7 +94,7 @@ def count_staying(pairs: RecordArray, least: int) -> int:
     """Count the pairs that reported since `least` [s]."""
     count = 0
     for place in range(len(pairs)):
-        count += pairs[place].slot != NONE and _stays(pairs, place, least)
+        count += pairs[place].slot != NONE and _must_stay(pairs, place, least)
     return count
 
 
@@ -113,7 +113,7 @@ def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: 
         for place in range(begin, end):
             if old[place].slot == NONE:
                 continue
-            if not _stays(old, place, least):
+            if not _must_stay(old, place, least):
                 dropped[count] = place
                 count += 1
                 continue
@@ -127,7 +127,7 @@ def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: 
 
 
 @refcount_free_inlined
-def returning(number: int) -> np.uint64:
+def returning_bit(number: int) -> np.uint64:
     """The bit of `Cells.returned` that a vehicle has."""
     return np.uint64(1) << ((np.uint64(number) * _FIBONACCI) >> np.uint64(58))
 
@@ -137,7 +137,7 @@ def mark_returned(state: State, slots: IntArray, numbers: IntArray) -> None:
     """Mark in cells (k,) that vehicles (k,) were there, though their reports are forgotten."""
     for k in range(len(slots)):
         slot = slots[k]
-        bit = returning(numbers[k])
+        bit = returning_bit(numbers[k])
         state.live.cells[slot].returned |= bit
         window = state.live.cells[slot].window
         if window != NONE:

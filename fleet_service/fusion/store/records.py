@@ -44,7 +44,7 @@ UInt16Array = NDArray[np.uint16]
 
 
 class CellRecord:
-    """A slot: one visited cell and sector. Its belief is a row of its own, see `belief.unpack`.
+    """A slot: one visited cell and sector. Its belief is a row of its own, see `belief.unpack_belief`.
 
     Attributes:
         key: cell · 4 + sector.
@@ -103,7 +103,7 @@ class EntryRecord:
         mean, std, slippery: of the vote.
         number, boot, sequence: order entries of equal times: the vehicle's number, its start, the
             row in its stream.
-        evidence: likelihood in steps, see `likelihoods.evidence`.
+        evidence: likelihood in steps, see `likelihoods.make_evidence`.
         used, shared: grip used, and the error that its value shares with others, in parts of 1/USED
             and 1/SHARED.
         manoeuvre: see `shared`.

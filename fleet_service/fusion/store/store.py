@@ -33,8 +33,8 @@ from fleet_service.fusion.store.table import (
     LEAST,
     PAIRS_MOST,
     ROWS_MOST,
+    assign_rows,
     is_full,
-    numbered,
     places_for,
     rows_of,
     slots_for,
@@ -113,7 +113,7 @@ class Store:
         of; so their order may not depend on who came first. All else is done in the order of
         memory.
         """
-        plain, valued = due(self.state.windows, before)
+        plain, valued = find_due_windows(self.state.windows, before)
         return plain, valued[
             np.argsort(self.state.live.cells["key"][self.state.windows["slot"][valued]])
         ]
@@ -133,13 +133,15 @@ class Store:
         new = np.flatnonzero(slots == NONE)
         if not len(new):
             return slots
-        most = self.size + len(distinct(keys[new]))
+        most = self.size + len(distinct_values(keys[new]))
         if is_full(most, len(self._slots), ROWS_MOST):
             self._slots = table_of(self.state.live.cells, self.size, most)
         if most > len(self.state.live.cells):
             live = self.state.live
             rows = max(most, 2 * len(self.state.live.cells))
-            live = live._replace(belief=_longer(live.belief, rows), cells=_longer(live.cells, rows))
+            live = live._replace(
+                belief=_grow_rows(live.belief, rows), cells=_grow_rows(live.cells, rows)
+            )
             self.state = self.state._replace(live=live)
         slots[new], self.size = slots_for(self._slots, self.state.live, keys[new], self.size)
         return slots
@@ -153,16 +155,16 @@ class Store:
         index = self.known(vehicle)
         if not len(index) or index.min() != NONE:
             return index
-        most = self.vehicles + len(distinct(vehicle[index == NONE]))
+        most = self.vehicles + len(distinct_values(vehicle[index == NONE]))
         if is_full(most, len(self._known), ROWS_MOST):
             self._known = table_of(self.names, self.vehicles, most)
         if most > len(self.names):
             rows = max(most, 2 * len(self.names))
-            self.names = _longer(self.names, rows)
+            self.names = _grow_rows(self.names, rows)
             peers = no_peers(rows)
             peers[: len(self.peers)] = self.peers
             self.peers = peers
-        index, self.vehicles = numbered(self._known, self.names, vehicle, self.vehicles)
+        index, self.vehicles = assign_rows(self._known, self.names, vehicle, self.vehicles)
         return index
 
     def reserve(self, rows: int) -> None:
@@ -176,33 +178,33 @@ class Store:
         if used[REPORTERS_USED] + rows > len(live.reporters):
             most = max(int(used[REPORTERS_USED]) + rows, 2 * len(live.reporters))
             self.state = self.state._replace(
-                live=live._replace(reporters=_longer(live.reporters, most))
+                live=live._replace(reporters=_grow_rows(live.reporters, most))
             )
         if is_full(int(used[PAIRS]) + rows, len(self.state.pairs), PAIRS_MOST):
             self._rebuild_pairs(0, int(used[PAIRS]) + rows)
 
     def _more_entries(self, most: int) -> None:
-        entries = _longer(self.state.entries, max(2 * len(self.state.entries), most))
-        free = _restacked(self.state.free_entries, self.state.used, FREE_ENTRIES, len(entries))
+        entries = _grow_rows(self.state.entries, max(2 * len(self.state.entries), most))
+        free = _free_rows(self.state.free_entries, self.state.used, FREE_ENTRIES, len(entries))
         self.state = self.state._replace(entries=entries, free_entries=free)
 
     def _more_windows(self, most: int) -> None:
         old = self.state
         rows = max(2 * len(self.state.windows), most)
-        windows = _longer(old.windows, rows)
+        windows = _grow_rows(old.windows, rows)
         windows["slot"][len(old.windows) :] = NONE
         base = Rows(
-            _longer(old.base.belief, rows),
-            _longer(old.base.cells, rows),
-            _longer(old.base.reporters, rows),
+            _grow_rows(old.base.belief, rows),
+            _grow_rows(old.base.cells, rows),
+            _grow_rows(old.base.reporters, rows),
         )
-        free = _restacked(old.free_windows, old.used, FREE_WINDOWS, rows)
+        free = _free_rows(old.free_windows, old.used, FREE_WINDOWS, rows)
         self.state = old._replace(windows=windows, base=base, free_windows=free)
 
     def forget(self, checkpoint_s: int) -> None:
         """Drop old records once per hour of the checkpoint: reports of vehicles from FORGOTTEN_S
-        before it (`votes.discount`), and reporters and sources from an hour before it
-        (`trust.compare`, `Fusion.sources`).
+        before it (`votes.discount_vote`), and reporters and sources from an hour before it
+        (`trust.compare_reports`, `Fusion.sources`).
         """
         hour = checkpoint_s - checkpoint_s % _HOUR
         if hour != self.hour:
@@ -269,7 +271,7 @@ class Store:
 
 
 @compiled
-def due(windows: RecordArray, before: int) -> tuple[IntArray, IntArray]:
+def find_due_windows(windows: RecordArray, before: int) -> tuple[IntArray, IntArray]:
     """Windows with entries before `before` [ns]: those without a value, and those with one."""
     plain = np.empty(len(windows), np.int64)
     valued = np.empty(len(windows), np.int64)
@@ -293,7 +295,7 @@ def no_peers(vehicles: int) -> RecordArray:
     return peers
 
 
-def distinct(values: IntArray) -> IntArray:
+def distinct_values(values: IntArray) -> IntArray:
     """Each value once, ascending; by sorting, which for numbers of this kind is several times
     faster than a set.
     """
@@ -312,13 +314,13 @@ def _no_pairs(places: int) -> RecordArray:
 Array = TypeVar("Array", bound=NDArray[Any])
 
 
-def _longer(old: Array, rows: int) -> Array:
+def _grow_rows(old: Array, rows: int) -> Array:
     new = rows_of_lines(rows, old.dtype, *old.shape[1:])
     new[: len(old)] = old
     return new  # type: ignore[return-value] # of the very type of `old`
 
 
-def _restacked(old: Int32Array, used: IntArray, which: int, rows: int) -> Int32Array:
+def _free_rows(old: Int32Array, used: IntArray, which: int, rows: int) -> Int32Array:
     """Free rows of a grown pool: those of the old one, and the new ones; counted in
     `used[which]`.
     """

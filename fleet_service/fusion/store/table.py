@@ -30,7 +30,7 @@ AHEAD: Final = 128
 
 
 @refcount_free_inlined
-def _mixed(key: int | np.int64) -> np.uint64:
+def _hash_key(key: int | np.int64) -> np.uint64:
     """Hash of a key: mixing steps of the splitmix64 generator, so that every bit of it moves
     all.
     """
@@ -41,40 +41,40 @@ def _mixed(key: int | np.int64) -> np.uint64:
 
 
 @refcount_free_inlined
-def _first(mixed: np.uint64, places: int) -> int:
+def _first_place(mixed: np.uint64, places: int) -> int:
     """Where a key is sought first."""
     return int(np.int64(((mixed >> np.uint64(32)) * np.uint64(places)) >> np.uint64(32)))
 
 
 @refcount_free_inlined
-def _row(held: int) -> int:
+def _row_at(held: int) -> int:
     """Row that a place holds; NONE in a free one."""
     return int(np.int32(held & _LOWER))
 
 
 @refcount_free_inlined
-def _held(mixed: np.uint64, row: int) -> int:
+def _place_content(mixed: np.uint64, row: int) -> int:
     """Return the content of a place for a key and its row; never NONE."""
     return int((np.int64(mixed & np.uint64(_TAG)) << 32) | row)
 
 
 @refcount_free_inlined
-def locate(table: IntArray, rows: RecordArray, key: int) -> int:
+def locate_key(table: IntArray, rows: RecordArray, key: int) -> int:
     """Place of the row with `key`, or the free place where it belongs."""
-    mixed = _mixed(key)
-    place = _first(mixed, len(table))
+    mixed = _hash_key(key)
+    place = _first_place(mixed, len(table))
     tag = np.int64(mixed & np.uint64(_TAG))
     while table[place] != NONE and (
-        (table[place] >> 32) != tag or rows[_row(table[place])].key != key
+        (table[place] >> 32) != tag or rows[_row_at(table[place])].key != key
     ):
         place = place + 1 if place + 1 < len(table) else 0
     return place
 
 
 @refcount_free_inlined
-def find(table: IntArray, rows: RecordArray, key: int) -> int:
+def find_row(table: IntArray, rows: RecordArray, key: int) -> int:
     """Row of a key; NONE where it is unknown."""
-    return _row(table[locate(table, rows, key)])
+    return _row_at(table[locate_key(table, rows, key)])
 
 
 @compiled
@@ -84,12 +84,12 @@ def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
     for group in range(0, len(wanted), AHEAD):
         end = min(group + AHEAD, len(wanted))
         for i in range(group, end):
-            out[i] = _first(_mixed(wanted[i]), len(table))
+            out[i] = _first_place(_hash_key(wanted[i]), len(table))
             prefetch(table, out[i], 0)
         for i in range(group, end):
-            prefetch(rows, _row(table[out[i]]), 0)
+            prefetch(rows, _row_at(table[out[i]]), 0)
         for i in range(group, end):
-            out[i] = find(table, rows, wanted[i])
+            out[i] = find_row(table, rows, wanted[i])
     return out
 
 
@@ -100,17 +100,17 @@ def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int) -> tuple
     """
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
-        place = locate(table, live.cells, wanted[i])
+        place = locate_key(table, live.cells, wanted[i])
         if table[place] == NONE:
-            table[place] = _held(_mixed(wanted[i]), used)
+            table[place] = _place_content(_hash_key(wanted[i]), used)
             begin_slot(live, used, wanted[i])
             used += 1
-        out[i] = _row(table[place])
+        out[i] = _row_at(table[place])
     return out, used
 
 
 @compiled
-def numbered(
+def assign_rows(
     table: IntArray, rows: RecordArray, wanted: IntArray, used: int
 ) -> tuple[IntArray, int]:
     """Row of each key, (n,), and how many are used then; an unknown key is written to the next
@@ -118,26 +118,28 @@ def numbered(
     """
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
-        place = locate(table, rows, wanted[i])
+        place = locate_key(table, rows, wanted[i])
         if table[place] == NONE:
-            table[place] = _held(_mixed(wanted[i]), used)
+            table[place] = _place_content(_hash_key(wanted[i]), used)
             rows[used].key = wanted[i]
             used += 1
-        out[i] = _row(table[place])
+        out[i] = _row_at(table[place])
     return out, used
 
 
 @compiled
-def fill(table: IntArray, rows: RecordArray, used: int) -> None:
+def fill_table(table: IntArray, rows: RecordArray, used: int) -> None:
     """Enter the first `used` rows into an empty table."""
     for row in range(used):
-        table[locate(table, rows, rows[row].key)] = _held(_mixed(rows[row].key), row)
+        table[locate_key(table, rows, rows[row].key)] = _place_content(
+            _hash_key(rows[row].key), row
+        )
 
 
 @refcount_free_inlined
 def first_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
     """Where a pair is sought first."""
-    return _first(_mixed((np.int64(slot) << np.int64(32)) | np.int64(vehicle)), len(pairs))
+    return _first_place(_hash_key((np.int64(slot) << np.int64(32)) | np.int64(vehicle)), len(pairs))
 
 
 @refcount_free_inlined
@@ -156,7 +158,7 @@ def pair_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
 def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
     """A table with room for `entries` that holds the first `used` rows."""
     table = np.full(places_for(entries, ROWS_MOST), NONE, np.int64)
-    fill(table, rows, used)
+    fill_table(table, rows, used)
     return table
 
 

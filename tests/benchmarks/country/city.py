@@ -7,7 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from deploy.end_to_end import RATE_HZ, write
+from deploy.end_to_end import RATE_HZ, write_drive
 from edge_agent.lab.simulation import SimulatedFleet
 from fleet_service.lab.end_to_end import World, measure
 from schemas.runtime.figures import Figure
@@ -27,7 +27,7 @@ def simulate_city(sumo: Sumo, folder: Path, seed: int) -> list[Figure]:
     def drive_fleet(into: Path) -> None:
         into.mkdir(exist_ok=True)
         streets = make_streets(simulate_drives(sumo, VEHICLES, SECONDS, seed), seed)
-        write(SimulatedFleet(streets, VEHICLES, seed, RATE_HZ, rough=ROUGH), SECONDS, into)
+        write_drive(SimulatedFleet(streets, VEHICLES, seed, RATE_HZ, rough=ROUGH), SECONDS, into)
 
     found = measure(drive_fleet, folder, World("helsinki", ROUGH, PREFIX, seed))
     cells = f"of {found[f'{PREFIX}.cells']:.0f} cells with two vehicles or more"

@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from fleet_service.lab.end_to_end import OBSERVATIONS, read
+from fleet_service.lab.end_to_end import OBSERVATIONS, read_observations
 from schemas import grid, keys, wire
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import NS
@@ -68,7 +68,7 @@ class Country:
     """
 
     def __init__(self, folder: Path, seed: int, vehicles: int = VEHICLES) -> None:
-        columns = read(folder / OBSERVATIONS)
+        columns = read_observations(folder / OBSERVATIONS)
         x, y = grid.deinterleave(columns["cell"])
         corner = np.array([x.min(), y.min()]) // _CELLS * _CELLS
         assert max(np.ptp(x), np.ptp(y)) < 6 * _CELLS, (

@@ -32,7 +32,7 @@ def fill(root: Path, world: SyntheticFleet) -> None:
     step = 360.0 / (1 << grid.CELL_ZOOM)
     shift = BORDER - synthetic.LONGITUDE - world.length // 2 * step
     writer = segments.Writer(root, "shard-0")
-    for number, rows in enumerate(synthetic.chunks(world)):
+    for number, rows in enumerate(synthetic.make_chunks(world)):
         far = np.where(rows["boot"] % 4 == 0, FAR, 0.0)
         rows["longitude"] = rows["longitude"] + shift - far
         rows["cell"] = grid.cell_of(rows["latitude"], rows["longitude"])
@@ -40,7 +40,7 @@ def fill(root: Path, world: SyntheticFleet) -> None:
         writer.write(Kind.OBSERVATION, segments.round_to_steps(rows))
         if number % 2:
             compact(root)
-    rollup.complete(root)
+    rollup.complete_parts(root)
 
 
 def rebuilt_map(out: Path) -> pa.Table:

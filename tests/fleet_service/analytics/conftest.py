@@ -43,15 +43,15 @@ def find_visited(fusion: Fusion) -> IntArray:
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Compacted, with a snapshot of the map every twelve hours."""
     root = tmp_path_factory.mktemp("analytics") / "archive"
-    synthetic.write(root, WORLD, 4000)
+    synthetic.write_archive(root, WORLD, 4000)
     compact(root)
-    rollup.complete(root)
+    rollup.complete_parts(root)
     for hour in range(12, 48, 12):
         now = START_NS + hour * HOUR_NS
         fusion = Fusion(120.0)
         for _ in replay(root, fusion, Since(until=now)):
             pass
-        snapshots.write(root, cell_table(fusion, find_visited(fusion), now), now)
+        snapshots.write_snapshot(root, cell_table(fusion, find_visited(fusion), now), now)
     return root
 
 
@@ -59,7 +59,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def rows(archive: Path) -> pd.DataFrame:
     """All rows; `time` in whole seconds, `value`: whether mu was told, as the contract says it."""
     frame = (
-        pa.concat_tables(reading.read(archive, Kind.OBSERVATION))
+        pa.concat_tables(reading.read_tables(archive, Kind.OBSERVATION))
         .drop_columns(["log_likelihood"])
         .to_pandas()
     )
@@ -73,7 +73,7 @@ def rows(archive: Path) -> pd.DataFrame:
 def stations(archive: Path) -> Path:
     """Hourly readings of two stations."""
     hours = np.arange(WORLD.days * 24)
-    inland = 5.0 - 8.0 * synthetic.night(np.asarray(hours * 3600.0, float))
+    inland = 5.0 - 8.0 * synthetic.night_factor(np.asarray(hours * 3600.0, float))
     columns: dict[str, Any] = {
         "station": np.repeat(["inland", "coast"], len(hours)),
         "time": (np.tile(hours, 2) * 3600 + START_NS // 10**9).astype("datetime64[s]"),

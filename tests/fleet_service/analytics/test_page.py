@@ -137,7 +137,7 @@ def test_frames_seconds_apart_are_frames_of_their_own() -> None:
         "mu": [0.2, 0.5, 0.9],
         "p_slippery": [1.0, 0.5, 0.0],
     }
-    text = output.page(pa.table({**columns, "frame": frame}), QUESTIONS["replay"])
+    text = output.make_page(pa.table({**columns, "frame": frame}), QUESTIONS["replay"])
     assert '"frames": ["1970-01-01 00:00:00", "1970-01-01 00:00:10", "1970-01-01 00:00:20"]' in text
     assert '"frame": [0, 1, 2]' in text
 
@@ -149,7 +149,7 @@ def test_a_stretch_is_drawn_as_its_road_and_a_spell_that_lasts_is_marked(tmp_pat
     worst = pa.table(
         {"cell": [bent[0]], "sector": [0], "mu": [0.2], "score": [1.0], "members": [bent]}
     )
-    (tmp_path / "worst.html").write_text(output.page(worst, QUESTIONS["worst"]))
+    (tmp_path / "worst.html").write_text(output.make_page(worst, QUESTIONS["worst"]))
     with open_page(tmp_path / "worst.html") as found:
         assert found.drawn_count == len(bent)
     spells = pa.table(
@@ -161,7 +161,7 @@ def test_a_stretch_is_drawn_as_its_road_and_a_spell_that_lasts_is_marked(tmp_pat
             "lasts": [False, True],
         }
     )
-    (tmp_path / "spells.html").write_text(output.page(spells, QUESTIONS["spells"]))
+    (tmp_path / "spells.html").write_text(output.make_page(spells, QUESTIONS["spells"]))
     with open_page(tmp_path / "spells.html") as found:
         assert found.page.locator("#lasting").is_visible()
         assert not found.page.locator("#unknown").is_visible()

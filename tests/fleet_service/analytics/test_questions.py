@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_service.analytics import synthetic
-from fleet_service.analytics.questions.worst import stretches, wilson
+from fleet_service.analytics.questions.worst import join_stretches, wilson_lower
 from fleet_service.analytics.synthetic import START_NS
 from fleet_service.archive.export.extract import Extract
 from fleet_service.fusion import Fusion
@@ -83,7 +83,7 @@ def test_touching_cells_of_one_sector_are_one_stretch() -> None:
             "witnesses": [2] * 5,
         }
     )
-    found = stretches(table)
+    found = join_stretches(table)
     assert sorted(found["cells"].to_numpy().tolist()) == [1, 1, 3]
     row = found.to_pylist()[found["cells"].to_pylist().index(3)]
     assert (row["exposure"], row["values"], row["share_slippery"], row["mu"]) == (
@@ -92,13 +92,13 @@ def test_touching_cells_of_one_sector_are_one_stretch() -> None:
         pytest.approx(10 / 12),
         0.25,
     )
-    assert stretches(table.slice(0, 0)).num_rows == 0
+    assert join_stretches(table.slice(0, 0)).num_rows == 0
 
 
 def test_the_bound_of_a_share_is_wilson_s() -> None:
     z = Z_95
     for hits, of in ((3, 10), (10, 10), (0, 5)):
-        lower = wilson(np.array([hits]), np.array([of]))[0]
+        lower = wilson_lower(np.array([hits]), np.array([of]))[0]
         assert (hits / of - lower) ** 2 == pytest.approx(z**2 * lower * (1 - lower) / of, abs=1e-12)
 
 
@@ -236,7 +236,7 @@ def test_weather_takes_the_nearest_station_s_reading_of_the_hour(
 ) -> None:
     found = asked("weather", stations=stations).to_pandas().set_index("temperature").sort_index()
     told = rows[rows["value"]]
-    temperature = 5.0 - 8.0 * synthetic.night(
+    temperature = 5.0 - 8.0 * synthetic.night_factor(
         ((told["time"] - START_NS // 10**9) // 3600 * 3600).to_numpy(float)
     )
     groups = told.groupby(np.floor(temperature / 2) * 2)["mu"]

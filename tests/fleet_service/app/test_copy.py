@@ -78,20 +78,20 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
         take(engine, first)
         assert len(engine.settlement.flush()) == VEHICLES
         if with_checkpoint:
-            checkpoints.save(root, engine._image())
+            checkpoints.save_checkpoint(root, engine._image())
             assert engine.copy is not None
             engine.copy.sync()
         take(engine, second)
         engine.settlement.flush()
         assert engine.alerts.count > 0
-        rows = sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["row"]))
+        rows = sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["row"]))
     without = ServiceConfig()
     with closing(Engine(without, root)) as engine:
         expected = read_image(engine)
     with closing(Engine(config, new)) as engine:
         assert list_copied_files(new).keys() == list_copied_files(root).keys()
         missing = rows - sum(
-            table.num_rows for table in reading.read(new, Kind.OBSERVATION, ["row"])
+            table.num_rows for table in reading.read_tables(new, Kind.OBSERVATION, ["row"])
         )
         assert (rows, missing) == (3 * len(first + second), 0)  # cluster.empty_disk.rows_missing
         assert engine.alerts.count > 0
@@ -103,8 +103,8 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
         assert (
             len(engine.settlement.flush()) == VEHICLES
         )  # they are acknowledged again, and nothing is written
-        assert len(segments.paths(new, Kind.OBSERVATION)) == len(
-            segments.paths(root, Kind.OBSERVATION)
+        assert len(segments.list_segments(new, Kind.OBSERVATION)) == len(
+            segments.list_segments(root, Kind.OBSERVATION)
         )
 
 

@@ -56,7 +56,7 @@ def sent_by(vehicle: str, seq: int) -> Batch:
 
 
 def pseudonyms_of(root: Path) -> list[str]:
-    tables = reading.read(root, Kind.OBSERVATION, ["vehicle", "seq", "row"])
+    tables = reading.read_tables(root, Kind.OBSERVATION, ["vehicle", "seq", "row"])
     return sorted(map(str, pa.concat_tables(tables)["vehicle"].to_pylist()))
 
 
@@ -127,7 +127,7 @@ def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
         number.to_bytes(8, "big", signed=True),
     )
     assert [path for path in files if any(one in path.read_bytes() for one in told)] == []
-    assert checkpoints.newest(root), "what the service began from anew"
+    assert checkpoints.list_checkpoints(root), "what the service began from anew"
     drop_checkpoints(root)
     with closing(Engine(ServiceConfig(), root)) as engine:
         assert engine.state.fusion.live.visits[: engine.state.fusion.size].tolist() == list(

@@ -99,7 +99,9 @@ def test_upkeep_that_has_died_is_known_and_told() -> None:
 def test_a_copy_of_a_days_folder_is_none_of_the_archive(tmp_path: Path) -> None:
     for name in ("date=2026-01-31 (copy)", "date=2026-01-31", "date=2026-99-99"):
         (tmp_path / "observations" / name).mkdir(parents=True)
-    assert [path.name for path in layout.days(tmp_path, "observations")] == ["date=2026-01-31"]
+    assert [path.name for path in layout.day_folders(tmp_path, "observations")] == [
+        "date=2026-01-31"
+    ]
 
 
 def test_a_checkpoint_without_good_segments_does_not_block_other_jobs(

@@ -96,6 +96,6 @@ def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
 def list_archived(folder: Path) -> list[tuple[int, int, int]]:
     """Boot, seq and row of everything in the segments."""
     table = pa.concat_tables(
-        reading.read(folder / "archive", Kind.OBSERVATION, ["boot", "seq", "row"])
+        reading.read_tables(folder / "archive", Kind.OBSERVATION, ["boot", "seq", "row"])
     )
     return list(zip(*(table[name].to_pylist() for name in ("boot", "seq", "row")), strict=True))

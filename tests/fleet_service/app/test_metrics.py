@@ -75,7 +75,7 @@ def test_damaged_files_are_counted_by_a_job_not_by_metrics_readers(tmp_path: Pat
     def count_damaged() -> object:
         found = {
             metric.name: metric.values
-            for metric in metrics.metrics(engine, pulse, config, tmp_path)
+            for metric in metrics.collect_metrics(engine, pulse, config, tmp_path)
         }
         return found["damaged_files"][""]
 

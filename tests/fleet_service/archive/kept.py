@@ -167,9 +167,9 @@ def make(root: Path) -> dict[str, Any]:
                 engine.settlement.flush()
             if turn == ROUNDS // 2 - 1:
                 compact(root)
-                rollup.complete(root)
-                snapshots.write(root, engine.queries.whole_map(now_of(turn)), now_of(turn))
-                checkpoints.save(root, take_checkpoint(engine))
+                rollup.complete_parts(root)
+                snapshots.write_snapshot(root, engine.queries.whole_map(now_of(turn)), now_of(turn))
+                checkpoints.save_checkpoint(root, take_checkpoint(engine))
         rows = {str(kind): engine.counts[kind] for kind in Kind}
         return map_of(engine, now_of(ROUNDS)) | {
             "alerts": engine.alerts.count,

@@ -66,6 +66,6 @@ def identities(root: Path, kind: Kind) -> list[tuple[int, int]]:
     """(boot, seq) of all rows that a reader sees, sorted."""
     return sorted(
         (row["boot"], row["seq"])
-        for table in reading.read(root, kind, ["boot", "seq"])
+        for table in reading.read_tables(root, kind, ["boot", "seq"])
         for row in table.to_pylist()
     )

@@ -18,7 +18,7 @@ import pytest
 from fleet_service.app.engine import Engine
 from fleet_service.archive.format import reading, segments
 from fleet_service.archive.format.files import lock_archive
-from fleet_service.archive.identity.pseudonyms import Pseudonyms, number, texts
+from fleet_service.archive.identity.pseudonyms import Pseudonyms, pseudonym_number, pseudonym_texts
 from fleet_service.ingest.inbox import Message
 from schemas import tables, wire
 from schemas.config import ServiceConfig
@@ -90,7 +90,10 @@ def test_nothing_is_acknowledged_while_the_disk_fails_and_all_after(
     shutil.move(tmp_path / "gone", tmp_path / "inbox")
     assert read_settled(engine.settlement.flush()) == {"sim-001": [(1, 2)]}
     assert (
-        sum(pq.read_table(path).num_rows for path in segments.paths(tmp_path, Kind.OBSERVATION))
+        sum(
+            pq.read_table(path).num_rows
+            for path in segments.list_segments(tmp_path, Kind.OBSERVATION)
+        )
         == 4
     )
 
@@ -109,7 +112,7 @@ def test_a_damaged_segment_is_set_aside_and_the_others_are_read(
         engine.intake.ingest([make_message("sim-001", seq)], time.time_ns())
         engine.settlement.flush()
     engine.close()
-    damaged = segments.paths(tmp_path, Kind.OBSERVATION)[1]
+    damaged = segments.list_segments(tmp_path, Kind.OBSERVATION)[1]
     damaged.write_bytes(damaged.read_bytes()[:-20])
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         assert again.state.fusion.live.visits[0] == 4
@@ -126,14 +129,16 @@ def test_a_changed_byte_is_noticed_wherever_it_is(
     engine.intake.ingest([make_message("sim-001", 1)], time.time_ns())
     engine.settlement.flush()
     engine.close()
-    (segment,) = segments.paths(tmp_path, Kind.OBSERVATION)
+    (segment,) = segments.list_segments(tmp_path, Kind.OBSERVATION)
     content = bytearray(segment.read_bytes())
     content[int(place * len(content))] ^= 0x55
-    before = next(reading.read(tmp_path, Kind.OBSERVATION)).to_pylist()
+    before = next(reading.read_tables(tmp_path, Kind.OBSERVATION)).to_pylist()
     segment.write_bytes(content)
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         held = [
-            row for table in reading.read(tmp_path, Kind.OBSERVATION) for row in table.to_pylist()
+            row
+            for table in reading.read_tables(tmp_path, Kind.OBSERVATION)
+            for row in table.to_pylist()
         ]
         assert repr(held) == repr(before) or not held
         assert again.counts["files_set_aside"] == (not held)
@@ -155,7 +160,7 @@ def test_unsynced_names_are_synced_before_any_acknowledgement(
         assert engine.counts["segment_failures"] == 1
     engine.intake.ingest([make_message("sim-001", 2)], time.time_ns())
     assert read_settled(engine.settlement.flush()) == {"sim-001": [(1, 2)]}
-    assert sum(table.num_rows for table in reading.read(tmp_path, Kind.OBSERVATION)) == 4
+    assert sum(table.num_rows for table in reading.read_tables(tmp_path, Kind.OBSERVATION)) == 4
 
 
 def test_what_a_died_service_had_half_written_is_removed(engine: Engine, tmp_path: Path) -> None:
@@ -172,7 +177,7 @@ def test_no_segment_name_is_used_twice(tmp_path: Path) -> None:
         engine.intake.ingest([make_message("sim-001", seq)], time.time_ns())
         engine.settlement.flush()
         engine.close()
-    assert len(segments.paths(tmp_path, Kind.OBSERVATION)) == 3
+    assert len(segments.list_segments(tmp_path, Kind.OBSERVATION)) == 3
 
 
 def test_rows_read_back_are_the_rows_written(engine: Engine, tmp_path: Path) -> None:
@@ -180,7 +185,7 @@ def test_rows_read_back_are_the_rows_written(engine: Engine, tmp_path: Path) -> 
         [make_message("sim-001", 1), make_message("sim-002", 1, told=False)], time.time_ns()
     )
     engine.settlement.flush()
-    (table,) = reading.read(tmp_path, Kind.OBSERVATION)
+    (table,) = reading.read_tables(tmp_path, Kind.OBSERVATION)
     rows = segments.rows_of(table)
     assert rows["with_likelihood"].tolist() == [True, True, False, False]
     assert not rows["log_likelihood"][2:].any()
@@ -202,15 +207,15 @@ def test_other_tools_read_the_segments(engine: Engine, tmp_path: Path) -> None:
             "read_parquet(?)"
         )
         assert db.execute(query, [pattern]).fetchone() == (4, 2, 2, pytest.approx(0.7, abs=1e-3))
-    (path,) = segments.paths(tmp_path, Kind.OBSERVATION)
+    (path,) = segments.list_segments(tmp_path, Kind.OBSERVATION)
     assert list(pd.read_parquet(path).columns) == tables.OBSERVATION_ARCHIVE.names
 
 
 def test_a_pseudonym_is_its_number_and_its_number_is_the_pseudonym(tmp_path: Path) -> None:
     names = [Pseudonyms(tmp_path).of(f"sim-{k:03}", 0) for k in range(50)]
-    numbers = np.array([number(name) for name in names])
+    numbers = np.array([pseudonym_number(name) for name in names])
     assert (numbers < 0).any(), "numbers of either sign are shown"
-    assert texts(numbers).astype(str).tolist() == names
+    assert pseudonym_texts(numbers).astype(str).tolist() == names
 
 
 def test_pseudonym_holds_for_its_month_across_restarts_not_beyond(tmp_path: Path) -> None:
@@ -221,7 +226,7 @@ def test_pseudonym_holds_for_its_month_across_restarts_not_beyond(tmp_path: Path
     assert again.of("sim-001", now) == name
     assert first.of("sim-002", now) != name
     assert first.of("sim-001", now - 2 * MONTH) != name
-    assert -(2**63) <= number(name) < 2**63
+    assert -(2**63) <= pseudonym_number(name) < 2**63
 
 
 def test_keys_are_for_the_service_alone_and_a_destroyed_one_forgets(tmp_path: Path) -> None:
@@ -240,7 +245,7 @@ def test_late_observation_is_archived_and_fused_as_old_news(engine: Engine, tmp_
     engine.intake.ingest([Message(Kind.OBSERVATION, key("sim-002"), wire.encode(old), "")], now)
     assert read_settled(engine.settlement.flush()) == {"sim-001": [(1, 1)], "sim-002": [(1, 1)]}
     assert engine.counts["late"] == 1
-    (table,) = reading.read(tmp_path, Kind.OBSERVATION)
+    (table,) = reading.read_tables(tmp_path, Kind.OBSERVATION)
     assert sorted(zip(table["late"].to_pylist(), table["weight"].to_pylist(), strict=True)) == [
         (False, 0.75),
         (False, 0.75),

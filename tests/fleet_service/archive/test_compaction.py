@@ -51,12 +51,16 @@ def test_compacted_rows_are_the_rows_of_the_inbox(tmp_path: Path) -> None:
         ("boot", "ascending"),
         ("seq", "ascending"),
     ]
-    before = {kind: pa.concat_tables(reading.read(tmp_path, kind)).sort_by(by) for kind in Kind}
+    before = {
+        kind: pa.concat_tables(reading.read_tables(tmp_path, kind)).sort_by(by) for kind in Kind
+    }
     done = compact(tmp_path)
     assert done == (2 * SEGMENTS * ROWS, 2 * SEGMENTS, 2 * 2 * 2)
     for kind in Kind:
-        assert not segments.paths(tmp_path, kind)
-        assert pa.concat_tables(reading.read(tmp_path, kind)).sort_by(by).equals(before[kind])
+        assert not segments.list_segments(tmp_path, kind)
+        assert (
+            pa.concat_tables(reading.read_tables(tmp_path, kind)).sort_by(by).equals(before[kind])
+        )
     assert compact(tmp_path) == (0, 0, 0)
 
 
@@ -81,7 +85,7 @@ def test_files_lie_by_date_and_zone_and_are_sorted_by_cell_and_time(tmp_path: Pa
         table = file.read()
         order = list(zip(table["cell"].to_pylist(), table["leave_time"].to_pylist(), strict=True))
         assert order == sorted(order)
-        time = segments.nanoseconds(table["leave_time"])
+        time = segments.to_nanoseconds(table["leave_time"])
         day, zone = (
             np.unique(values).tolist()
             for values in layout.partitions_of(time, table["cell"].to_numpy())
@@ -154,7 +158,7 @@ def test_what_it_left_half_done_is_not_done_twice(tmp_path: Path) -> None:
         patch.setattr(Path, "unlink", lambda *_: (_ for _ in ()).throw(DiedError))
         with pytest.raises(DiedError):
             compact(tmp_path)
-    assert len(segments.paths(tmp_path, Kind.OBSERVATION)) == 2
+    assert len(segments.list_segments(tmp_path, Kind.OBSERVATION)) == 2
     assert (
         compact(tmp_path).rows == 2 * ROWS
     )  # of states; the observations are only removed from the inbox
@@ -220,7 +224,7 @@ def test_only_one_compacts_at_a_time(tmp_path: Path) -> None:
 
 def test_a_damaged_segment_is_set_aside_and_the_rest_compacted(tmp_path: Path) -> None:
     fill(tmp_path, 3, ROWS)
-    damaged = segments.paths(tmp_path, Kind.OBSERVATION)[1]
+    damaged = segments.list_segments(tmp_path, Kind.OBSERVATION)[1]
     damaged.write_bytes(damaged.read_bytes()[:-30])
     compact(tmp_path)
     assert [path.name for path in (tmp_path / "inbox").glob("*.bad")] == [damaged.name + ".bad"]

@@ -49,11 +49,11 @@ def failures(path: Path) -> list[str]:
 
 def test_a_snapshot_is_geoparquet_that_an_independent_validator_accepts(tmp_path: Path) -> None:
     table = a_map()
-    path = snapshots.write(tmp_path, table, START)
+    path = snapshots.write_snapshot(tmp_path, table, START)
     assert path == tmp_path / "map/date=2023-11-14/20231114T221320Z.parquet"
     assert failures(path) == []
-    assert snapshots.newest(tmp_path, START) == path
-    assert snapshots.newest(tmp_path, START - 10**9) is None
+    assert snapshots.newest_snapshot(tmp_path, START) == path
+    assert snapshots.newest_snapshot(tmp_path, START - 10**9) is None
     assert snapshots.time_of(path) == START
     kept = pq.read_table(path, partitioning=None)
     assert kept.schema.names == [*tables.MAP_ARCHIVE.names, "geometry", "bbox"]
@@ -62,7 +62,7 @@ def test_a_snapshot_is_geoparquet_that_an_independent_validator_accepts(tmp_path
 
 
 def test_geopandas_reads_the_polygons_of_the_cells_and_a_box_of_them(tmp_path: Path) -> None:
-    path = snapshots.write(tmp_path, a_map(), START)
+    path = snapshots.write_snapshot(tmp_path, a_map(), START)
     frame = geopandas.read_parquet(path)
     assert frame.crs == "OGC:CRS84"
     assert frame.geometry.is_valid.all()
@@ -90,7 +90,7 @@ def test_the_sectors_of_a_cell_lie_side_by_side_and_fill_it(tmp_path: Path) -> N
     ):  # east, north, west, south of the middle
         off = quarters.iloc[sector].centroid
         assert (off.x - whole.centroid.x) * x + (off.y - whole.centroid.y) * y > 0.0
-    (square,) = geo.shapes(geo.with_cells(pa.table({"cell": [CELL]})))
+    (square,) = geo.geojson_shapes(geo.with_cells(pa.table({"cell": [CELL]})))
     assert square["coordinates"][0][:3:2] == [[west, south], [east, north]]
 
 

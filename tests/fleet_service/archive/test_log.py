@@ -58,7 +58,7 @@ def test_a_flush_settles_what_was_begun_and_what_came_since(log: SegmentLog[str]
 def test_failed_writes_are_not_settled_and_come_once_with_the_next(
     log: SegmentLog[str], tmp_path: Path
 ) -> None:
-    inbox = segments.folder(tmp_path, Kind.STATE)
+    inbox = segments.segment_folder(tmp_path, Kind.STATE)
     away = tmp_path / "away"
     add(log, "seen", 1)
     add(log, "state", 2, Kind.STATE)
@@ -83,7 +83,7 @@ def test_segment_order_does_not_depend_on_the_number_of_digits() -> None:
     newer, older = (
         layout.segment_name("shard-0-0000000007", number) for number in (100_000_000, 99_999_999)
     )
-    assert sorted([newer, older], key=layout.age) == [older, newer]
+    assert sorted([newer, older], key=layout.age_key) == [older, newer]
 
 
 def test_a_power_loss_after_the_first_key_was_given_never_takes_it_back(tmp_path: Path) -> None:

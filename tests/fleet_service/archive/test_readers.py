@@ -21,7 +21,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Seen]:
     root = tmp_path_factory.mktemp("archive")
     fill(root, 3, 100)
     compact(root)
-    table = pa.concat_tables(reading.read(root, Kind.OBSERVATION))
+    table = pa.concat_tables(reading.read_tables(root, Kind.OBSERVATION))
     told = table.num_rows - table["log_likelihood"].null_count
     return root, Seen(table.num_rows, float(np.mean(table["mu"].to_numpy())), told, 2)
 
@@ -41,6 +41,6 @@ def test_the_page_in_an_archive_names_every_column_with_its_unit(
     archive: tuple[Path, Seen],
 ) -> None:
     page = (archive[0] / "README.md").read_text()
-    assert page == readme.text()
+    assert page == readme.page_text()
     assert "| `speed` | float | m/s | mean speed over the visit; multiples of 0.015625 |" in page
     assert "| `vehicle_bits` | int64 | 64 bits | or; distinct vehicles" in page

@@ -39,7 +39,7 @@ MONTH = f"{DATE:%Y-%m}"
 def vehicles_in(root: Path, kind: Kind) -> list[str]:
     return sorted(
         row["vehicle"]
-        for table in reading.read(root, kind, ["vehicle"])
+        for table in reading.read_tables(root, kind, ["vehicle"])
         for row in table.to_pylist()
     )
 
@@ -49,7 +49,8 @@ def test_old_raw_rows_go_and_their_roll_ups_stay(tmp_path: Path) -> None:
     compact(tmp_path)
     assert retention.retire_rows(tmp_path, 31, DATE + timedelta(days=31)) == (0, 0)
     days = {
-        kind: [path.name for path in layout.days(tmp_path, layout.TABLES[kind])] for kind in Kind
+        kind: [path.name for path in layout.day_folders(tmp_path, layout.TABLES[kind])]
+        for kind in Kind
     }
     assert days == {kind: [f"date={DATE}", f"date={DATE + timedelta(days=1)}"] for kind in Kind}
     whole = len(identities(tmp_path, Kind.OBSERVATION))
@@ -61,7 +62,7 @@ def test_old_raw_rows_go_and_their_roll_ups_stay(tmp_path: Path) -> None:
         pq.read_table(p, partitioning=None) for p in (tmp_path / rollup.TABLE).rglob("*.parquet")
     ]
     assert sum(table["observations"].to_numpy().sum() for table in rolled) == whole - left
-    assert rollup.complete(tmp_path) == 2  # those of the day that stayed
+    assert rollup.complete_parts(tmp_path) == 2  # those of the day that stayed
 
 
 def test_too_few_days_are_refused_since_a_batch_may_come_again(tmp_path: Path) -> None:
@@ -114,7 +115,7 @@ def test_traces_of_a_forgotten_vehicle_are_removed_in_the_mirror_too(tmp_path: P
                 [Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "")], now
             )
         engine.settlement.flush()
-        snapshot = snapshots.write(root, engine.queries.whole_map(now), now)
+        snapshot = snapshots.write_snapshot(root, engine.queries.whole_map(now), now)
     assert main(["compact", "--archive", str(root), "--put-to", there.as_uri()]) == 0
     (root / "inbox" / f"shard-0-0000000001-00000001.parquet{BAD}").write_bytes(b"who knows")
     words = [
@@ -166,7 +167,7 @@ def acknowledge_batch(engine: Engine, sent: Batch, now: int) -> list[str]:
 
 
 def rows_kept(root: Path) -> int:
-    return sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["vehicle"]))
+    return sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["vehicle"]))
 
 
 def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: Path) -> None:
@@ -319,8 +320,8 @@ def test_parts_are_exported(
         str(DATE + timedelta(days=1)),
     ]
     assert main(["export", what, "--archive", str(root), *words, "--out", str(out)]) == 0
-    rows = pa.concat_tables(reading.read(root, Kind.OBSERVATION))
-    inside = (segments.nanoseconds(rows["leave_time"]) < START + 600 * 10**9) & (
+    rows = pa.concat_tables(reading.read_tables(root, Kind.OBSERVATION))
+    inside = (segments.to_nanoseconds(rows["leave_time"]) < START + 600 * 10**9) & (
         rows["latitude"].to_numpy() > 57
     )
     said = int(capsys.readouterr().out.split()[0])
@@ -355,6 +356,6 @@ def test_an_export_of_the_map_is_the_newest_snapshot_before_a_time(tmp_path: Pat
     from tests.fleet_service.archive.test_geo import a_map
 
     for k, cells in enumerate((5, 9)):
-        snapshots.write(tmp_path, a_map(cells), START + k * 3600 * 10**9)
+        snapshots.write_snapshot(tmp_path, a_map(cells), START + k * 3600 * 10**9)
     assert extract.map_then(tmp_path, extract.Extract(0, START + 1800 * 10**9)).num_rows == 5
     assert extract.map_then(tmp_path, extract.Extract(0, START + 3600 * 10**9)).num_rows == 9

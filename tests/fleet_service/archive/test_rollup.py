@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_service.archive.format import reading
-from fleet_service.archive.format.segments import nanoseconds
+from fleet_service.archive.format.segments import to_nanoseconds
 from fleet_service.archive.maintenance import rollup
 from fleet_service.archive.maintenance.compaction import compact
 from schemas import mugrid, tables
@@ -34,7 +34,7 @@ def merge_parts(root: Path) -> dict[tuple[int, int, int], dict[str, Any]]:
     for path in (root / rollup.TABLE).rglob("*.parquet"):
         table = pq.read_table(path, partitioning=None)
         assert table.schema.equals(tables.CELL_HOUR_SCHEMA)
-        hours = nanoseconds(table["hour"]).tolist()
+        hours = to_nanoseconds(table["hour"]).tolist()
         for row, hour in zip(table.drop_columns(["hour"]).to_pylist(), hours, strict=True):
             key = (row.pop("cell"), row.pop("sector"), hour)
             row |= {name: np.array(row[name]) for name in ("mu_histogram", "log_likelihood_sum")}
@@ -48,13 +48,13 @@ def merge_parts(root: Path) -> dict[tuple[int, int, int], dict[str, Any]]:
 def test_merged_parts_are_the_sums_over_all_rows(tmp_path: Path) -> None:
     fill(tmp_path, 3, 120)
     compact(tmp_path, round_rows=120)  # three rounds, three parts of an hour
-    assert rollup.complete(tmp_path) == 12
-    assert rollup.complete(tmp_path) == 0
-    rows = pa.concat_tables(reading.read(tmp_path, Kind.OBSERVATION))
+    assert rollup.complete_parts(tmp_path) == 12
+    assert rollup.complete_parts(tmp_path) == 0
+    rows = pa.concat_tables(reading.read_tables(tmp_path, Kind.OBSERVATION))
     direct: defaultdict[tuple[int, int, int], list[dict[str, Any]]] = defaultdict(list)
     for row, time in zip(
         rows.drop_columns(["leave_time", "enter_time", "received_at"]).to_pylist(),
-        nanoseconds(rows["leave_time"]).tolist(),
+        to_nanoseconds(rows["leave_time"]).tolist(),
         strict=True,
     ):
         direct[row["cell"], row["sector"], time // rollup.HOUR_NS * rollup.HOUR_NS].append(row)
@@ -82,7 +82,7 @@ def test_merged_parts_are_the_sums_over_all_rows(tmp_path: Path) -> None:
 def test_bits_count_distinct_vehicles_also_across_parts(tmp_path: Path) -> None:
     fill(tmp_path, 6, 60)  # five vehicles each, thirty in all
     compact(tmp_path, round_rows=60)
-    rollup.complete(tmp_path)
+    rollup.complete_parts(tmp_path)
     bits = np.bitwise_or.reduce([row["vehicle_bits"] for row in merge_parts(tmp_path).values()])
     set_bits = bin(int(bits) & (2**64 - 1)).count("1")
     assert 0.7 * 30 < -64 * np.log(1 - set_bits / 64) < 1.3 * 30

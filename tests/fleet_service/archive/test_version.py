@@ -29,7 +29,7 @@ from fleet_service.archive.format.files import (
     Encoding,
     write_table,
 )
-from fleet_service.archive.format.load import content
+from fleet_service.archive.format.load import read_content
 from fleet_service.archive.maintenance import rollup
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.archive.maintenance.retention import drop_checkpoints
@@ -79,12 +79,14 @@ def test_kept_archive_is_of_version_one_and_has_every_kind_of_file(old: Path) ->
     for path in files(old):
         with pq.ParquetFile(path) as file:
             assert (
-                version.judge(path, file.schema_arrow, version.entries_of(file.metadata.metadata))
+                version.check_version(
+                    path, file.schema_arrow, version.entries_of(file.metadata.metadata)
+                )
                 == version.OLDEST
             )
-            digests.add(version.digest(file.schema_arrow, {}))
+            digests.add(version.schema_digest(file.schema_arrow, {}))
     assert digests == version.FIRST
-    assert len(checkpoints.newest(old)) == 1
+    assert len(checkpoints.list_checkpoints(old)) == 1
 
 
 @pytest.mark.parametrize("begin", ["checkpoint", "log"])
@@ -113,9 +115,9 @@ def test_kept_and_new_files_compact_together_to_the_same_map(old: Path) -> None:
     rows = {str(kind): _identities(old, kind) for kind in Kind}
     assert {kind: len(found) for kind, found in rows.items()} == {"obs": 224, "state": 112}
     compact(old)
-    rollup.complete(old)
-    assert not any(segments.paths(old, kind) for kind in Kind)
-    said = Counter(str(content(path).version) for path in files(old))  # type: ignore[union-attr]
+    rollup.complete_parts(old)
+    assert not any(segments.list_segments(old, kind) for kind in Kind)
+    said = Counter(str(read_content(path).version) for path in files(old))  # type: ignore[union-attr]
     assert said.keys() == {"1.0", str(version.VERSION)}
     assert {str(kind): _identities(old, kind) for kind in Kind} == rows
     with closing(Engine(ServiceConfig(), old)) as engine:
@@ -125,7 +127,7 @@ def test_kept_and_new_files_compact_together_to_the_same_map(old: Path) -> None:
 
 
 def test_export_reads_the_kept_files(old: Path) -> None:
-    assert extract.observations(old, EVERYTHING).num_rows == MADE["rows"]["obs"]
+    assert extract.read_observations(old, EVERYTHING).num_rows == MADE["rows"]["obs"]
     assert extract.map_then(old, EVERYTHING).num_rows == len(MADE["cells"])
     assert (
         extract.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() == 8 * 2 * ROUNDS // 2
@@ -133,7 +135,7 @@ def test_export_reads_the_kept_files(old: Path) -> None:
 
 
 def _identities(root: Path, kind: Kind) -> list[tuple[str, int, int]]:
-    found = pa.concat_tables(reading.read(root, kind, ["vehicle", "seq", "row"]))
+    found = pa.concat_tables(reading.read_tables(root, kind, ["vehicle", "seq", "row"]))
     return sorted(zip(*(found[name].to_pylist() for name in found.column_names), strict=True))
 
 
@@ -141,7 +143,7 @@ def rewrite_file(
     path: Path, change: Callable[[pa.Table], pa.Table], said: str, encoding: Encoding = SEGMENT
 ) -> None:
     """Let a file be one of another version."""
-    found = content(path)
+    found = read_content(path)
     assert found is not None
     write_table(change(found.table), path, encoding, {**found.entries, version.KEY: said})
 
@@ -160,10 +162,10 @@ def with_columns(table: pa.Table) -> pa.Table:
 
 def test_a_missing_column_is_null_and_an_unknown_one_is_passed_over(tmp_path: Path) -> None:
     fill(tmp_path, 3, 20)
-    first, second, _ = segments.paths(tmp_path, Kind.OBSERVATION)
+    first, second, _ = segments.list_segments(tmp_path, Kind.OBSERVATION)
     rewrite_file(first, without_columns, "1.0")
     rewrite_file(second, with_columns, "1.7")
-    read = list(reading.read(tmp_path, Kind.OBSERVATION))
+    read = list(reading.read_tables(tmp_path, Kind.OBSERVATION))
     assert [table.schema.names for table in read] == 3 * [tables.OBSERVATION_ARCHIVE.names]
     assert [table["tyre_season"].null_count for table in read] == [20, 0, 0]
     rows = segments.rows_of(read[0])
@@ -179,9 +181,9 @@ def test_a_missing_column_is_null_and_an_unknown_one_is_passed_over(tmp_path: Pa
 def test_segments_before_1_3_tell_of_no_controller_and_no_wiper(tmp_path: Path) -> None:
     added = ["esc_active", "tcs_active", "wiper"]
     fill(tmp_path, 1, 20)
-    (path,) = segments.paths(tmp_path, Kind.OBSERVATION)
+    (path,) = segments.list_segments(tmp_path, Kind.OBSERVATION)
     rewrite_file(path, lambda table: table.drop_columns(added), "1.2")
-    (table,) = reading.read(tmp_path, Kind.OBSERVATION)
+    (table,) = reading.read_tables(tmp_path, Kind.OBSERVATION)
     assert [table[name].null_count for name in added] == [20, 20, 20]
     rows = segments.rows_of(table)
     assert (rows["esc_active"] == -1).all()
@@ -193,7 +195,7 @@ def test_segments_before_1_3_tell_of_no_controller_and_no_wiper(tmp_path: Path) 
 
 def test_compacting_segments_of_several_versions_loses_nothing(tmp_path: Path) -> None:
     fill(tmp_path, 3, 20)
-    first, second, _ = segments.paths(tmp_path, Kind.OBSERVATION)
+    first, second, _ = segments.list_segments(tmp_path, Kind.OBSERVATION)
     rewrite_file(first, without_columns, "1.0")
     rewrite_file(second, with_columns, "1.7")
     before = _identities(tmp_path, Kind.OBSERVATION)
@@ -201,7 +203,7 @@ def test_compacting_segments_of_several_versions_loses_nothing(tmp_path: Path) -
     assert _identities(tmp_path, Kind.OBSERVATION) == before
     parts = []
     for path in layout.compacted_files(tmp_path, Kind.OBSERVATION):
-        found = content(path)
+        found = read_content(path)
         assert found is not None
         assert found.version == (1, 7), "who knows the column may be told that it is there"
         parts.append(found.table)
@@ -222,7 +224,7 @@ def test_forgetting_keeps_columns_and_version_of_a_newer_minor(old: Path) -> Non
         == 0
     )
     for path in layout.compacted_files(old, Kind.OBSERVATION):
-        found = content(path)
+        found = read_content(path)
         assert found is not None
         assert (found.version, "road_wetness" in found.table.column_names) == ((1, 7), True)
         assert reading.SOURCES.decode() in found.entries
@@ -232,7 +234,7 @@ def test_forgetting_keeps_columns_and_version_of_a_newer_minor(old: Path) -> Non
 def test_questions_see_files_of_several_versions_as_one_table(tmp_path: Path) -> None:
     for seed, change in enumerate((without_columns, with_columns, lambda table: table)):
         fill(tmp_path, 1, 20, seed)
-        rewrite_file(segments.paths(tmp_path, Kind.OBSERVATION)[0], change, "1.7")
+        rewrite_file(segments.list_segments(tmp_path, Kind.OBSERVATION)[0], change, "1.7")
         compact(tmp_path)
     engine = pytest.importorskip("fleet_service.analytics.engines").QueryEngine(
         "duckdb", tmp_path, EVERYTHING
@@ -275,7 +277,7 @@ def test_the_commands_refuse_a_newer_major_version_in_one_line(
         more = ["--snapshot"] if what == "map" else []  # a replay of now reads the last month only
         assert cli.main(["export", what, *archive, *more]) == 2
         assert "is of version 2.0" in capsys.readouterr().err
-    rewrite_file(segments.paths(old, Kind.OBSERVATION)[0], lambda table: table, "3.1")
+    rewrite_file(segments.list_segments(old, Kind.OBSERVATION)[0], lambda table: table, "3.1")
     assert cli.main(["compact", "--archive", str(old)]) == 2
     assert "is of version 3.1" in capsys.readouterr().err
     assert not list(old.rglob("*.bad"))
@@ -283,7 +285,7 @@ def test_the_commands_refuse_a_newer_major_version_in_one_line(
 
 def test_a_column_without_which_a_row_is_none_is_said_by_name(tmp_path: Path) -> None:
     fill(tmp_path, 1, 5)
-    (path,) = segments.paths(tmp_path, Kind.OBSERVATION)
+    (path,) = segments.list_segments(tmp_path, Kind.OBSERVATION)
     rewrite_file(path, lambda table: table.drop_columns(["seq"]), "1.9")
     with pytest.raises(InputError, match="^archive: a file has no column seq; "):
         Engine(ServiceConfig(), tmp_path)
@@ -291,7 +293,7 @@ def test_a_column_without_which_a_row_is_none_is_said_by_name(tmp_path: Path) ->
 
 def test_a_wider_type_of_the_same_column_is_read(tmp_path: Path) -> None:
     fill(tmp_path, 2, 5)
-    path = segments.paths(tmp_path, Kind.OBSERVATION)[0]
+    path = segments.list_segments(tmp_path, Kind.OBSERVATION)[0]
 
     def wider(table: pa.Table) -> pa.Table:
         place = table.column_names.index("health")
@@ -300,7 +302,9 @@ def test_a_wider_type_of_the_same_column_is_read(tmp_path: Path) -> None:
     rewrite_file(path, wider, "1.2")
     compact(tmp_path)
     assert (
-        pa.concat_tables(reading.read(tmp_path, Kind.OBSERVATION)).schema.field("health").type
+        pa.concat_tables(reading.read_tables(tmp_path, Kind.OBSERVATION))
+        .schema.field("health")
+        .type
         == pa.int32()
     )
     rewrite_file(
@@ -311,7 +315,7 @@ def test_a_wider_type_of_the_same_column_is_read(tmp_path: Path) -> None:
         "1.2",
     )
     with pytest.raises(InputError, match="^archive: column health is string and not int32; "):
-        list(reading.read(tmp_path, Kind.OBSERVATION))
+        list(reading.read_tables(tmp_path, Kind.OBSERVATION))
 
 
 @pytest.mark.parametrize(
@@ -324,9 +328,9 @@ def test_a_changed_name_in_a_footer_is_damage_and_no_other_version(
     fill(tmp_path, 1, 5)
     compact(tmp_path)
     path = next(layout.compacted_files(tmp_path, Kind.OBSERVATION))
-    assert content(path) is not None
+    assert read_content(path) is not None
     path.write_bytes(path.read_bytes().replace(name.encode(), name[:-1].encode() + b"z"))
-    assert content(path) is None
+    assert read_content(path) is None
 
 
 def test_who_only_reads_passes_over_damage_and_renames_nothing(
@@ -334,7 +338,7 @@ def test_who_only_reads_passes_over_damage_and_renames_nothing(
 ) -> None:
     with closing(Engine(ServiceConfig(), old)) as engine:
         harmed = [
-            segments.paths(old, Kind.OBSERVATION)[0],
+            segments.list_segments(old, Kind.OBSERVATION)[0],
             next(layout.compacted_files(old, Kind.OBSERVATION)),
             next((old / rollup.TABLE).rglob("*.parquet")),
             next((old / "weather").glob("*.parquet")),
@@ -342,7 +346,7 @@ def test_who_only_reads_passes_over_damage_and_renames_nothing(
         for path in harmed:
             path.write_bytes(path.read_bytes()[:-30])
         whole = 8 * 2 * ROUNDS
-        assert extract.observations(old, EVERYTHING).num_rows < whole
+        assert extract.read_observations(old, EVERYTHING).num_rows < whole
         assert extract.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() < whole // 2
         past = query.parse({"at": "2024-10-05T00:01:00Z"})
         assert list(engine.queries.answer(past, lambda _: True, now_of(ROUNDS)))
@@ -359,11 +363,11 @@ def test_who_only_reads_passes_over_damage_and_renames_nothing(
 def test_every_file_that_is_written_says_version_and_digest(tmp_path: Path) -> None:
     make(tmp_path)
     for path in files(tmp_path):
-        found = content(path)
+        found = read_content(path)
         assert found is not None
         assert found.version == version.VERSION, path
         assert version.DIGEST in found.entries
-    for path in checkpoints.newest(tmp_path):
+    for path in checkpoints.list_checkpoints(tmp_path):
         for file in path.glob("*.arrow"):
             with pa.memory_map(str(file)) as source:
                 metadata = pa.ipc.open_file(source).schema.metadata or {}
@@ -375,6 +379,6 @@ def test_rows_with_null_are_written_again_as_they_are_read(tmp_path: Path) -> No
         ["speed"]
     )
     write_table(table, tmp_path / "one.parquet", SEGMENT)
-    found = content(tmp_path / "one.parquet")
+    found = read_content(tmp_path / "one.parquet")
     assert found is not None
     assert found.table.equals(table)

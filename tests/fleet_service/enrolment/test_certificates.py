@@ -51,7 +51,7 @@ def test_everyone_on_the_list_gets_a_certificate_of_the_authority(folder: Path) 
         assert (x509.oid.ExtendedKeyUsageOID.SERVER_AUTH in uses) == (name in ROUTERS), (
             "only a router is a server"
         )
-        assert ca.read(folder / name) is not None, "key and certificate belong together"
+        assert ca.read_pair(folder / name) is not None, "key and certificate belong together"
 
 
 def test_private_keys_are_for_their_owner_alone(folder: Path) -> None:
@@ -88,7 +88,7 @@ def test_a_router_with_another_address_gets_another_certificate(folder: Path) ->
 def test_a_pair_that_was_cut_off_half_way_is_made_whole(folder: Path) -> None:
     (folder / f"{READER}.key").write_bytes((folder / f"{SERVICE}.key").read_bytes())
     assert at(folder).enrol(make_enrolment()).made == [READER]
-    assert ca.read(folder / READER) is not None
+    assert ca.read_pair(folder / READER) is not None
 
 
 def test_removed_name_is_revoked_and_not_issued_until_expiry(folder: Path) -> None:

@@ -21,7 +21,7 @@ def convolve_bias(evidence: np.ndarray, kind: int, vote: np.ndarray) -> None:
 
 
 def vote_for(p: np.ndarray, vote: np.ndarray, strength: float) -> None:
-    b.vote(p, vote, strength)
+    b.apply_vote(p, vote, strength)
     p /= p.sum()
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.likelihoods import levelled, supported
+from fleet_service.fusion.likelihoods import bound_by_used, level_above_used
 from fleet_service.lab import situations
 from schemas import mugrid
 from tests.fleet_service.examples import at_least, belief, interval, observations
@@ -25,7 +25,7 @@ PATHS = ("protobuf posterior", "json posterior", "protobuf likelihood", "json li
 @settings(max_examples=6, deadline=None)
 @given(st.floats(0.0, 0.53))  # from .54 on the posterior of .9 is a value
 def test_a_hundred_vehicles_are_no_more_than_one_by_every_path(path: str, used: float) -> None:
-    assert situations.bounded(used, path) <= c.UTILISED_STD
+    assert situations.bound_excess(used, path) <= c.UTILISED_STD
 
 
 @settings(max_examples=15, deadline=None)
@@ -37,7 +37,7 @@ def test_any_number_of_bounds_leaves_belief_flat_above_the_grip_used(
     o = observations(
         np.arange(vehicles) * 2.0, np.arange(vehicles), at_least(np.full(vehicles, used))
     )
-    fusion.update(replace(o, evidence=levelled(o.evidence, np.full(vehicles, used))))
+    fusion.update(replace(o, evidence=level_above_used(o.evidence, np.full(vehicles, used))))
     lower, upper = interval(belief(fusion))
     assert lower <= max(used, interval(mugrid.PRIOR)[0]) + c.UTILISED_STD
     assert upper >= interval(mugrid.PRIOR)[1] - 0.02
@@ -51,7 +51,7 @@ def test_grip_used_counts_where_a_contradicted_estimator_reports_nothing(
     flat = np.zeros((vehicles, mugrid.BINS))
     o = observations(np.arange(vehicles) * 2.0, np.arange(vehicles), flat)
     fusion = Fusion(120.0)
-    fusion.update(replace(o, evidence=supported(o.evidence, np.full(vehicles, used))))
+    fusion.update(replace(o, evidence=bound_by_used(o.evidence, np.full(vehicles, used))))
     lower, upper = interval(belief(fusion))
     assert lower <= max(used, interval(mugrid.PRIOR)[0]) + c.UTILISED_STD
     assert upper >= interval(mugrid.PRIOR)[1] - 0.02
@@ -61,6 +61,6 @@ def test_grip_used_counts_where_a_contradicted_estimator_reports_nothing(
 
 def test_a_value_below_what_was_used_gives_way_to_it() -> None:
     value = mugrid.encode_log_likelihood(-0.5 * np.square((mugrid.CENTRES - 0.6) / 0.05))[None]
-    assert mugrid.CENTRES[np.argmin(supported(value, np.array([0.8]))[0])] > 0.65
-    assert np.array_equal(supported(value, np.array([np.nan])), value)
-    assert np.array_equal(supported(value, np.array([0.1])), value)
+    assert mugrid.CENTRES[np.argmin(bound_by_used(value, np.array([0.8]))[0])] > 0.65
+    assert np.array_equal(bound_by_used(value, np.array([np.nan])), value)
+    assert np.array_equal(bound_by_used(value, np.array([0.1])), value)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.constants import NEIGHBOURS
-from fleet_service.fusion.neighbours import stepped
+from fleet_service.fusion.neighbours import next_cell
 from fleet_service.fusion.weather import Reports
 from schemas import grid, mugrid
 from schemas.numeric import FloatArray
@@ -64,7 +64,7 @@ def dry(vehicles: int = 4) -> FloatArray:
 def test_the_next_cell_lies_in_the_sectors_direction(x: int, y: int, sector: int) -> None:
     dx, dy = DIRECTIONS[sector]
     expected = grid.interleave(np.array([(x + dx) % (1 << 21)]), np.array([y + dy]))[0]
-    assert stepped(int(grid.interleave(np.array([x]), np.array([y]))[0]), sector) == expected
+    assert next_cell(int(grid.interleave(np.array([x]), np.array([y]))[0]), sector) == expected
 
 
 def test_an_untested_cell_between_snow_is_probably_slippery() -> None:

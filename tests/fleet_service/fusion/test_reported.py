@@ -9,7 +9,7 @@ import pytest
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.likelihoods import evidence
+from fleet_service.fusion.likelihoods import make_evidence
 from fleet_service.fusion.reported import as_reported
 from schemas import mugrid
 from tests.fleet_service.examples import CELL, observations, value
@@ -44,7 +44,9 @@ def test_liar_is_compared_with_reported_values_not_with_used_parts() -> None:
     reading = np.where(who == 0, 0.25, 0.85 + 0.04 * rng.normal(size=n))
     steps = mugrid.encode_log_likelihood(value(reading))
     used = np.where(who == 0, 0.25, 0.5).astype(np.float32)
-    evidence_, reported = evidence({"log_likelihood": steps, "mu_utilised": used}, np.ones(n, bool))
+    evidence_, reported = make_evidence(
+        {"log_likelihood": steps, "mu_utilised": used}, np.ones(n, bool)
+    )
     o = observations(np.arange(n) * 1.0, who, value(reading))
     o = dataclasses.replace(
         o, cell=CELL + np.arange(n) // 30, evidence=evidence_, reported=reported, used=used

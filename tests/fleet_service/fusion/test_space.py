@@ -39,7 +39,7 @@ def read_beliefs(fusion: Fusion) -> FloatArray:
 def test_shares_of_all_cells_are_probabilities_that_sum_to_one_at_the_most(
     std: float, length: float
 ) -> None:
-    share = space.shares(np.array([std]), np.array([length]))[0]
+    share = space.cell_shares(np.array([std]), np.array([length]))[0]
     assert (share >= -1e-9).all()
     assert share.sum() <= 1.0 + 1e-9
     np.testing.assert_allclose(share, share[::-1], atol=1e-9)
@@ -52,7 +52,7 @@ def test_shares_match_simulated_visits_with_normal_position_error() -> None:
             (rng.uniform(0.0, WIDTH_M, 200_000) + std * rng.normal(size=200_000)) / WIDTH_M
         )
         drawn = [np.mean(at == k) for k in (-2, -1, 1, 2)]
-        assert space.shares(np.array([std]), np.array([WIDTH_M]))[0] == pytest.approx(
+        assert space.cell_shares(np.array([std]), np.array([WIDTH_M]))[0] == pytest.approx(
             drawn, abs=0.005
         )
 

@@ -7,7 +7,7 @@ import pytest
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.store.records import GRIP, ICE, NONE, PAIRS, REPORTERS_USED, VEHICLE
-from fleet_service.fusion.store.table import PAIRS_MOST, fill, rows_of
+from fleet_service.fusion.store.table import PAIRS_MOST, fill_table, rows_of
 from schemas import mugrid
 from tests.fleet_service.examples import CELL, SECOND, START, at_least, belief, observations, value
 
@@ -21,7 +21,7 @@ def test_a_table_of_any_length_finds_every_row_and_no_other(places: int) -> None
     rows = np.zeros(len(keys), VEHICLE)
     rows["key"] = keys
     table = np.full(places, NONE, np.int64)
-    fill(table, rows, len(rows))
+    fill_table(table, rows, len(rows))
     np.testing.assert_array_equal(rows_of(table, rows, keys), np.arange(len(keys)))
     absent = np.setdiff1d(keys + 1, keys)
     assert (rows_of(table, rows, absent) == NONE).all()

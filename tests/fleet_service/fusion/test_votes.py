@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fleet_service.fusion import Fusion
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.fuse import Before
-from fleet_service.fusion.likelihoods import evidence, levelled
+from fleet_service.fusion.likelihoods import level_above_used, make_evidence
 from schemas import mugrid
 from tests.fleet_service.examples import (
     START,
@@ -140,7 +140,7 @@ def test_bound_says_nothing_above_the_grip_used_and_value_is_unchanged(
     steps: list[int], used: float
 ) -> None:
     sent = np.array([steps], np.uint8) - np.uint8(min(steps))
-    found = levelled(sent, np.array([used], np.float32))
+    found = level_above_used(sent, np.array([used], np.float32))
     if sent[0, -1] >= c.VALUE_DROP_STEPS:
         np.testing.assert_array_equal(found, sent)
     else:
@@ -157,7 +157,7 @@ def test_upward_slopes_of_many_unexcited_visits_make_no_value() -> None:
     }
     fusion = Fusion(120.0)
     o = observations(np.arange(n) * 2.0, np.arange(n), value(np.full(n, 0.5)))
-    fusion.update(dataclasses.replace(o, evidence=evidence(columns, np.full(n, True)).steps))
+    fusion.update(dataclasses.replace(o, evidence=make_evidence(columns, np.full(n, True)).steps))
     lower, upper = interval(belief(fusion))
     assert lower < 0.3
     assert upper == pytest.approx(PRIOR_UPPER, abs=0.03)

@@ -44,7 +44,7 @@ def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGIO
 
 def compute_road_time(weather: w.Weather, begin: float, end: float) -> tuple[float, float]:
     """Hours of road time of drift and change."""
-    drift, change, _ = w.aged(weather, KEY, START + int(begin * HOUR), START + int(end * HOUR))
+    drift, change, _ = w.road_time(weather, KEY, START + int(begin * HOUR), START + int(end * HOUR))
     return drift / 3600.0, change / 3600.0
 
 
@@ -73,12 +73,12 @@ def test_road_time_integrates_the_weather_until_a_report_expires() -> None:
 
 def test_unknown_values_change_nothing() -> None:
     nothing = (np.nan, np.nan, np.nan)
-    assert w.rates(reports((0.0, nothing), (0.0, (20.0, np.nan, np.nan)))).tolist() == [
+    assert w.report_rates(reports((0.0, nothing), (0.0, (20.0, np.nan, np.nan)))).tolist() == [
         [1.0, 1.0],
         [1.0, 1.0],
     ]
     assert (
-        w.rates(reports((0.0, (1.0, np.nan, np.nan))))[0, 1] == w.FROST_CHANGE
+        w.report_rates(reports((0.0, (1.0, np.nan, np.nan))))[0, 1] == w.FROST_CHANGE
     )  # a road is colder than the air
 
 

@@ -16,8 +16,8 @@ import pytest
 
 from fleet_service.app.engine import Engine
 from fleet_service.archive.format import reading
-from fleet_service.archive.identity.pseudonyms import Pseudonyms, number
-from fleet_service.archive.identity.vehicle_ids import VehicleIds, read
+from fleet_service.archive.identity.pseudonyms import Pseudonyms, pseudonym_number
+from fleet_service.archive.identity.vehicle_ids import VehicleIds, read_numbers
 from fleet_service.archive.maintenance.retention import drop_checkpoints, forget_period
 from fleet_service.ingest.budgets import STREAMS_AT_ONCE, Bucket, NewCells
 from fleet_service.ingest.inbox import Message
@@ -59,7 +59,7 @@ def test_one_car_is_one_witness_over_midnight_live_and_after_replay(tmp_path: Pa
         engine.settlement.flush()
         assert engine.alerts.count == 0
         assert engine.state.fusion.live.vehicles[0] == 1
-    assert len(set(read(tmp_path / "keys"))) == 2, "two pseudonyms on disk"
+    assert len(set(read_numbers(tmp_path / "keys"))) == 2, "two pseudonyms on disk"
     drop_checkpoints(tmp_path)
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         assert again.state.fusion.live.vehicles[0] == 1
@@ -82,7 +82,7 @@ def test_a_start_over_midnight_of_a_month_links_no_pseudonyms(tmp_path: Path) ->
                 1,
                 2,
             ]
-    table = pa.concat_tables(reading.read(tmp_path, Kind.OBSERVATION, ["vehicle", "boot"]))
+    table = pa.concat_tables(reading.read_tables(tmp_path, Kind.OBSERVATION, ["vehicle", "boot"]))
     assert (vehicle, table.num_rows) == ("car-001", 2)
     assert len(set(table["vehicle"].to_pylist())) == len(set(table["boot"].to_pylist())) == 2
     assert sent[0].boot not in table["boot"].to_pylist()
@@ -123,14 +123,14 @@ def test_a_line_of_the_witnesses_that_is_damaged_is_left_out(tmp_path: Path) -> 
     pseudonyms = Pseudonyms(tmp_path)
     witnesses = VehicleIds(tmp_path)
     now = time.time_ns()
-    names = {f"car-{k:03}": number(pseudonyms.of(f"car-{k:03}", now)) for k in range(3)}
+    names = {f"car-{k:03}": pseudonym_number(pseudonyms.of(f"car-{k:03}", now)) for k in range(3)}
     known = {p: witnesses.id_of(name, pseudonyms.month(now), p) for name, p in names.items()}
-    assert read(tmp_path) == known
+    assert read_numbers(tmp_path) == known
     path = next(tmp_path.glob("*.witnesses"))
     data = bytearray(path.read_bytes())
     data[30] ^= 1
     path.write_bytes(data)
-    assert len(read(tmp_path)) == 2
+    assert len(read_numbers(tmp_path)) == 2
     assert (
         VehicleIds(tmp_path).id_of("car-000", pseudonyms.month(now), names["car-000"])
         == known[names["car-000"]]
@@ -146,15 +146,15 @@ def test_service_counts_removes_and_rewrites_damaged_lines(tmp_path: Path) -> No
         engine.settlement.flush()
         assert engine.counts["witnesses_damaged"] == 0
     path = next(tmp_path.glob("keys/*.witnesses"))
-    whole = read(path.parent)
+    whole = read_numbers(path.parent)
     data = bytearray(path.read_bytes())
     data[30] ^= 1
     path.write_bytes(data + b"half a li")  # what a full disk leaves of an append
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         assert engine.counts["witnesses_damaged"] == 2
-        assert len(read(path.parent)) == 2
+        assert len(read_numbers(path.parent)) == 2
         engine.intake.ingest([message(batch("car-001", 2, now, [0.8, 0.8]))], now)
-        assert read(path.parent) == whole
+        assert read_numbers(path.parent) == whole
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         assert engine.counts["witnesses_damaged"] == 0
 
@@ -270,4 +270,4 @@ def test_a_forgotten_month_leaves_nothing_that_names_a_vehicle(tmp_path: Path) -
         engine.settlement.flush()
     month = f"{datetime.fromtimestamp(now / SECOND, UTC) - timedelta(seconds=1):%Y-%m}"
     forget_period(tmp_path, month)
-    assert not read(tmp_path / "keys")
+    assert not read_numbers(tmp_path / "keys")

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from fleet_service.archive.identity.pseudonyms import Pseudonyms
-from fleet_service.ingest.acks import Acks, ranges
+from fleet_service.ingest.acks import Acks, consecutive_ranges
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.inbox import BatchIntake, Inbox, Message
 from fleet_service.ingest.rate_limit import RateLimiter
@@ -30,7 +30,7 @@ CLOCK = Clock(NOW, 30 * SECOND, 30 * 86_400 * SECOND)
 
 @given(st.sets(st.integers(1, 40)))
 def test_ranges_hold_exactly_their_numbers(numbers: set[int]) -> None:
-    runs = ranges(numbers)
+    runs = consecutive_ranges(numbers)
     assert {n for first, last in runs for n in range(first, last + 1)} == numbers
     assert all(a[1] + 1 < b[0] for a, b in pairwise(runs))
 

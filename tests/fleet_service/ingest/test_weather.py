@@ -28,10 +28,10 @@ from fleet_service.ingest.weather import (
     WeatherInbox,
     WeatherMessage,
     archived_reports,
-    files,
     join_daily_files,
     read_file,
-    retire,
+    retire_files,
+    weather_files,
 )
 from fleet_service.replay import checkpoints
 from schemas import grid, keys, mugrid, tables, weather, wire
@@ -168,25 +168,25 @@ def test_weather_reports_of_a_day_are_joined_and_the_map_stays(tmp_path: Path) -
             engine.intake.update_weather(start + 600 * k * SECOND)
             drive(engine, start + 600 * k * SECOND, 1 + k)
             if k == 3:
-                checkpoints.save(root, take_checkpoint(engine))
+                checkpoints.save_checkpoint(root, take_checkpoint(engine))
         now = start + 5000 * SECOND
         right = beliefs(engine, now)
         before = archived_reports(root)
-    path = files(root)[2]
+    path = weather_files(root)[2]
     shutil.copy(path, tmp_path / path.name)
-    assert (join_daily_files(root), join_daily_files(root), len(files(root))) == (5, 0, 1)
+    assert (join_daily_files(root), join_daily_files(root), len(weather_files(root))) == (5, 0, 1)
     shutil.copy(tmp_path / path.name, path)  # a power loss before its name was gone
     assert len(archived_reports(root).time) == 7
     for kept in (1, 0):
-        assert len(checkpoints.newest(root)) == kept
+        assert len(checkpoints.list_checkpoints(root)) == kept
         with closing(Engine(ServiceConfig(), root)) as again:
             np.testing.assert_array_equal(beliefs(again, now), right)
         drop_checkpoints(root)
     assert join_daily_files(root) == 1
     assert {*archived_reports(root).time.tolist()} == {*before.time.tolist()}
     day = start // DAY_NS
-    assert (retire(root, day - 2), len(files(root))) == (0, 1)
-    assert (retire(root, day + 1), len(files(root))) == (1, 0)
+    assert (retire_files(root, day - 2), len(weather_files(root))) == (0, 1)
+    assert (retire_files(root, day + 1), len(weather_files(root))) == (1, 0)
 
 
 def test_a_running_service_takes_weather_over_its_key(

@@ -32,21 +32,21 @@ def test_what_the_vehicles_write_is_joined_with_their_truth(tmp_path: Path) -> N
     figures = end_to_end.measure(drive, tmp_path, end_to_end.HILLS)
     assert figures["fusion.whole_way.hills.observations"] > 4
     assert figures["fusion.whole_way.hills.false_ice"] <= figures["fusion.whole_way.hills.alerts"]
-    columns = end_to_end.read(tmp_path / "whole_way.hills" / end_to_end.OBSERVATIONS)
+    columns = end_to_end.read_observations(tmp_path / "whole_way.hills" / end_to_end.OBSERVATIONS)
     truth = pq.read_table(tmp_path / "whole_way.hills" / end_to_end.TRUTH)
     reported = set(zip(columns["cell"].tolist(), columns["sector"].tolist(), strict=True))
     true = set(zip(truth["cell"].to_pylist(), truth["sector"].to_pylist(), strict=True))
     assert len(reported & true) > 0.5 * len(reported)
     fusion = Fusion(120.0)
     fusion.update(end_to_end.observations_in(columns))
-    slots, mu = end_to_end.joined(fusion, truth)
+    slots, mu = end_to_end.slots_with_truth(fusion, truth)
     assert 0 < len(slots) <= fusion.size
     assert ((mu > 0.05) & (mu < 1.2)).all()
 
 
 def test_a_figure_of_nothing_is_not_a_number_and_holds_no_bar() -> None:
-    assert np.isnan(end_to_end.mean(np.array([])))
-    assert end_to_end.mean(np.array([True, False])) == 0.5
+    assert np.isnan(end_to_end.mean_or_nan(np.array([])))
+    assert end_to_end.mean_or_nan(np.array([True, False])) == 0.5
 
 
 def visits(*rows: tuple[int, float, float]) -> pa.Table:
@@ -72,7 +72,7 @@ def visits(*rows: tuple[int, float, float]) -> pa.Table:
 def test_truth_of_a_cell_is_that_of_its_last_half_minute_or_all_visits() -> None:
     fusion = Fusion(120.0)
     fusion.update(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
-    slots, mu = end_to_end.joined(
+    slots, mu = end_to_end.slots_with_truth(
         fusion,
         visits(
             (0, 10.0, 0.9),
@@ -115,7 +115,7 @@ def test_excited_vehicles_are_counted_once_per_cell() -> None:
     fusion = Fusion(120.0)
     fusion.update(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
     rows = visits((0, 1.0, 0.9), (0, 2.0, 0.9), (0, 3.0, 0.9), (1, 4.0, 0.1), (1, 5.0, 0.9))
-    counts = end_to_end.excited(fusion, rows)
+    counts = end_to_end.excited_vehicles(fusion, rows)
     assert counts[fusion.slots_of(np.array([CELL, CELL + 1]), np.zeros(2, np.int64))].tolist() == [
         2,
         1,

@@ -22,8 +22,8 @@ from fleet_service.lab import (
     third_party,
     town,
 )
-from fleet_service.lab.drive import arrivals, novel, rows_of
-from fleet_service.lab.score import coverage, of_beliefs, safe
+from fleet_service.lab.drive import draw_arrivals, novel_deliveries, rows_of
+from fleet_service.lab.score import coverage, of_beliefs, safe_share
 from schemas import mugrid
 
 
@@ -116,10 +116,10 @@ def test_one_part_lists_the_figures_that_it_measures_and_no_others(
 
 def test_a_missing_figure_fails_the_campaign() -> None:
     found = dict.fromkeys(bars.BARS, 0.0)
-    assert len(bars.judged(found)) == len(bars.BARS)
-    (one,) = (figure for figure in bars.judged({}) if figure.name == "fusion.clean.rmse")
+    assert len(bars.judge_figures(found)) == len(bars.BARS)
+    (one,) = (figure for figure in bars.judge_figures({}) if figure.name == "fusion.clean.rmse")
     assert math.isnan(one.value)
-    assert not campaign.holds(bars.judged({}))
+    assert not campaign.all_hold(bars.judge_figures({}))
 
 
 def test_a_single_visit_without_bias_is_calibrated() -> None:
@@ -131,18 +131,24 @@ def test_a_single_visit_without_bias_is_calibrated() -> None:
     along = np.tile(np.arange(4), n // 4)
     sure = np.ones(n, bool)
     passes = agent.Passes(
-        who, mu, np.zeros(n), agent.shares(rng, sure), agent.noise(rng, along), who, sure
+        who,
+        mu,
+        np.zeros(n),
+        agent.used_shares(rng, sure),
+        agent.reading_noise(rng, along),
+        who,
+        sure,
     )
-    reports = agent.report(rng, exactly, passes)
+    reports = agent.draw_reports(rng, exactly, passes)
     belief = np.exp(reports.log_likelihood - reports.log_likelihood.max(axis=1, keepdims=True))
     belief /= belief.sum(axis=1, keepdims=True)
     assert coverage(of_beliefs(belief, mu, who + 1)) == pytest.approx(0.9, abs=0.015)
-    assert safe(of_beliefs(belief, mu, who + 1)) == pytest.approx(0.95, abs=0.015)
+    assert safe_share(of_beliefs(belief, mu, who + 1)) == pytest.approx(0.95, abs=0.015)
 
 
 def test_error_shared_in_one_place_is_not_averaged_out() -> None:
     rng = np.random.default_rng(4)
-    common = np.concatenate([town.build(rng, 1, 0.0).common for _ in range(40)])
+    common = np.concatenate([town.draw_town(rng, 1, 0.0).common for _ in range(40)])
     assert np.std(common) == pytest.approx(agent.COMMON, rel=0.15)
     n = 4000
     mu = 0.6
@@ -152,7 +158,7 @@ def test_error_shared_in_one_place_is_not_averaged_out() -> None:
     passes = agent.Passes(
         who, np.full(n, mu), np.full(n, 0.05), np.ones(n), rng.normal(size=n), 0 * who, sure
     )
-    readings = agent.report(rng, errors, passes).reading
+    readings = agent.draw_reports(rng, errors, passes).reading
     assert readings.mean() - mu == pytest.approx(0.05 * mu, abs=0.005)
 
 
@@ -163,16 +169,16 @@ def test_an_unexcited_visit_is_flat_above_the_grip_used_within_half_a_nat() -> N
     passes = agent.Passes(
         who, np.full(n, 0.8), np.zeros(n), np.full(n, 0.2), np.zeros(n), 0 * who, who < 0
     )
-    reports = agent.report(rng, agent.Errors.draw(rng, n), passes)
+    reports = agent.draw_reports(rng, agent.Errors.draw(rng, n), passes)
     above = reports.log_likelihood[:, mugrid.CENTRES > 0.35]
     assert np.ptp(above, axis=1).max() <= agent.SLOPE_NATS
 
 
 def test_what_is_delivered_twice_is_admitted_once() -> None:
     rng = np.random.default_rng(3)
-    visits = town.drive(rng, town.build(rng, 5, 0.0), agent.Errors.draw(rng, 10), 5)
-    _, which = arrivals(rng, visits)
-    kept = which[novel(rows_of(visits), visits.vehicle, which)]
+    visits = town.drive_fleet(rng, town.draw_town(rng, 5, 0.0), agent.Errors.draw(rng, 10), 5)
+    _, which = draw_arrivals(rng, visits)
+    kept = which[novel_deliveries(rows_of(visits), visits.vehicle, which)]
     assert len(which) > len(visits)
     np.testing.assert_array_equal(np.sort(kept), np.arange(len(visits)))
 
@@ -183,7 +189,7 @@ def test_federated_reset_is_inverse_variance_and_newest_is_the_last() -> None:
     reading = np.array([0.5, 0.7, np.nan])
     std = np.array([0.1, 0.1, np.nan])
     sent = np.array([[0.5, 0.01], [0.7, 0.01], [0.6, 0.05]])
-    found = rules.fuse(place, seconds, sent, reading, std, np.array([10.0]), 1)[0, :, 0]
+    found = rules.fuse_by_rules(place, seconds, sent, reading, std, np.array([10.0]), 1)[0, :, 0]
     federated, newest = (
         found[rules.RULES.index(name)] for name in ("federated reset", "newest report")
     )

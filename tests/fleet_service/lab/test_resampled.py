@@ -36,7 +36,9 @@ def visits_on(mu: FloatArray, vehicle: IntArray, low: FloatArray) -> DrivenVisit
 
 def a_town(seed: int) -> tuple[town.Visits, np.random.Generator]:
     rng = np.random.default_rng(seed)
-    return town.drive(rng, town.build(rng, MINUTES, 0.0), Errors.draw(rng, VEHICLES), MINUTES), rng
+    return town.drive_fleet(
+        rng, town.draw_town(rng, MINUTES, 0.0), Errors.draw(rng, VEHICLES), MINUTES
+    ), rng
 
 
 def test_vehicle_of_a_town_is_one_of_the_ways_on_the_towns_road() -> None:
@@ -44,7 +46,7 @@ def test_vehicle_of_a_town_is_one_of_the_ways_on_the_towns_road() -> None:
     low = np.array([0.7, 0.8, 0.9, 1.0, 1.1])
     mu = np.tile(np.geomspace(0.05, 1.2, 80), len(low))
     ways = visits_on(mu, np.repeat(np.arange(len(low)), 80), low)
-    found = resampled.drawn(rng, visits, ways, VEHICLES)
+    found = resampled.resample_visits(rng, visits, ways, VEHICLES)
     ratio = found.reports.reading / found.mu
     kept = [np.unique(np.round(ratio[found.vehicle == vehicle], 6)) for vehicle in range(VEHICLES)]
     assert all(len(of) == 1 for of in kept)  # what persists in a vehicle does in the town
@@ -62,7 +64,7 @@ def test_where_a_vehicle_never_was_on_such_a_road_another_s_visit_is_drawn() -> 
     visits = replace(visits, mu=np.full(len(visits), 0.15))
     mu = np.repeat([0.15, 0.9], 40)
     ways = visits_on(mu, (mu > 0.5).astype(np.int64), np.array([1.0, 0.5]))
-    found = resampled.drawn(rng, visits, ways, VEHICLES)
+    found = resampled.resample_visits(rng, visits, ways, VEHICLES)
     assert found.reports.reading == pytest.approx(np.full(len(visits), 0.15))
 
 
@@ -74,7 +76,7 @@ def test_the_truth_of_a_visit_is_where_its_vehicle_was_then() -> None:
         np.array([0.1, 0.9, 0.7]),
     )
     nan = np.full(4, np.nan, np.float32)
-    found = resampled.driven(
+    found = resampled.attach_truth(
         {
             "vehicle": np.array([1, 0, 0, 0]),
             "enter_time": np.array([5, 0, 8, 11]) * NS,
@@ -95,7 +97,7 @@ def test_the_truth_of_a_visit_is_where_its_vehicle_was_then() -> None:
 
 def test_vehicles_of_two_ways_are_different_ones() -> None:
     way = visits_on(np.full(4, 0.5), np.array([0, 0, 2, 2]), np.ones(3))
-    assert resampled.joined([way, way]).vehicle.tolist() == [0, 0, 2, 2, 3, 3, 5, 5]
+    assert resampled.join_ways([way, way]).vehicle.tolist() == [0, 0, 2, 2, 3, 3, 5, 5]
 
 
 def test_nothing_is_said_of_a_fleet_that_was_never_excited() -> None:

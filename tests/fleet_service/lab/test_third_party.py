@@ -17,7 +17,7 @@ def test_gain_error_moves_value_and_use_alike() -> None:
     n = 20_000
     gain = np.array([-0.1, 0.1])
     vehicle = np.arange(n) % 2
-    reports = third_party.report(rng, gain, vehicle, np.full(n, 0.5), np.ones(n, bool))
+    reports = third_party.make_reports(rng, gain, vehicle, np.full(n, 0.5), np.ones(n, bool))
     share = reports.used / reports.reading
     for who in (0, 1):
         assert reports.reading[vehicle == who].mean() == pytest.approx(
@@ -28,7 +28,7 @@ def test_gain_error_moves_value_and_use_alike() -> None:
 
 def test_columns_hold_no_optional_fact_and_fixes_are_right() -> None:
     drive, mu = third_party.drive_honest(np.random.default_rng(2), 0.05)
-    o = third_party.observe(drive)
+    o = third_party.make_observations(drive)
     assert set(o.manoeuvre.tolist()) == {-1}
     assert np.mean(mu[drive.visits.place] != drive.visits.mu) < 0.01, (
         "five metres are three standard deviations"

@@ -18,13 +18,13 @@ def town_that_freezes(minute: float) -> town.Town:
     mu[int(minute) :, : town.LENGTH] = 0.15
     changed = np.full(town.CELLS, np.inf)
     changed[: town.LENGTH] = minute
-    built = town.build(np.random.default_rng(1), value.MINUTES, 0.0)
+    built = town.draw_town(np.random.default_rng(1), value.MINUTES, 0.0)
     return dataclasses.replace(built, mu=mu, changed=changed)
 
 
 def traffic(cars: float, demand: float = 1.0) -> tuple[town.Town, TownTraffic]:
     place = town_that_freezes(120.0)
-    return place, value.drive(np.random.default_rng(2), place, cars, demand)
+    return place, value.drive_cars(np.random.default_rng(2), place, cars, demand)
 
 
 def test_ice_excites_everybody_and_makes_controllers_work() -> None:

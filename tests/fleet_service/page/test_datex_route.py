@@ -16,7 +16,7 @@ from fleet_service.client.datex_feed import DatexFile
 from fleet_service.fusion import Fusion
 from fleet_service.page.server import PageSettings
 from fleet_service.serve.encode import arrow_stream, batch_of
-from fleet_service.serve.view import view
+from fleet_service.serve.view import view_cells
 from schemas import grid, keys, wire
 from schemas.config import ZenohSettings
 from schemas.thresholds import NS
@@ -38,7 +38,7 @@ def made_up_service(session: zenoh.Session) -> Iterator[None]:
     """Answers for one cell of the region, so that it has a service."""
     fusion = Fusion(120.0)
     fusion.update(observations([0.0], [1], value([0.3])))
-    payload = arrow_stream(batch_of(view(fusion, np.arange(1), START), START))
+    payload = arrow_stream(batch_of(view_cells(fusion, np.arange(1), START), START))
 
     def answer(asked: zenoh.Query) -> None:
         with asked:

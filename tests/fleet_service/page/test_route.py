@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_service.fusion import Fusion
-from fleet_service.page.route import profile
+from fleet_service.page.route import grip_profile
 from fleet_service.serve.encode import cell_table
 from schemas import grid
 from schemas.errors import InputError
@@ -45,7 +45,7 @@ def shares(found: dict[str, Any]) -> dict[str, float]:
 
 
 def test_unmeasured_stretches_along_a_route_have_no_number() -> None:
-    found = profile(ends(-20, 30), make_ice_table())
+    found = grip_profile(ends(-20, 30), make_ice_table())
     stretches = found["stretches"]
     assert stretches[0]["from_m"] == 0.0
     assert stretches[-1]["to_m"] == pytest.approx(found["length_m"], abs=0.1)
@@ -65,16 +65,18 @@ def test_unmeasured_stretches_along_a_route_have_no_number() -> None:
 
 
 def test_the_other_direction_is_another_road() -> None:
-    found = profile(ends(10, -10), make_ice_table())
+    found = grip_profile(ends(10, -10), make_ice_table())
     assert found["share"]["unknown"] == pytest.approx(1.0)
     assert found["worst"] is None
 
 
 def test_a_route_that_nobody_knows_is_unknown_and_not_dry() -> None:
-    assert profile(ends(-5, 5), MAP_SCHEMA.empty_table())["share"]["unknown"] == pytest.approx(1.0)
+    assert grip_profile(ends(-5, 5), MAP_SCHEMA.empty_table())["share"]["unknown"] == pytest.approx(
+        1.0
+    )
 
 
 def test_a_point_or_a_continent_is_refused() -> None:
     for points in ([(11.0, 57.0)], [(11.0, 57.0), (11.0, 57.0)], [(11.0, 57.0), (11.0, 67.0)]):
         with pytest.raises(InputError, match="route"):
-            profile(points, MAP_SCHEMA.empty_table())
+            grip_profile(points, MAP_SCHEMA.empty_table())

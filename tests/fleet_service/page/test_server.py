@@ -27,7 +27,7 @@ from fleet_service.archive.format import snapshots
 from fleet_service.cli import main
 from fleet_service.fusion import Fusion
 from fleet_service.page.files import Files
-from fleet_service.page.health import values
+from fleet_service.page.health import parse_metrics
 from fleet_service.page.records import HEAD
 from fleet_service.page.watchers import WAITING, TooManyWatchersError, View, Watchers
 from fleet_service.page.world import MapMirror
@@ -292,7 +292,7 @@ def test_metrics_are_read_by_name_and_label() -> None:
     text = (
         '# HELP x\ngripmap_rows_total{kind="observation"} 12.0\ngripmap_cells 5.0\nother 1\n# EOF\n'
     )
-    assert values(text) == {"rows": {"observation": 12.0}, "cells": {"": 5.0}}
+    assert parse_metrics(text) == {"rows": {"observation": 12.0}, "cells": {"": 5.0}}
 
 
 def test_a_stranger_on_the_map_ends_nothing(
@@ -319,7 +319,7 @@ def test_every_option_of_the_command_does_what_it_says(
         pass
     fusion = Fusion(120.0)
     fusion.update(observations([0.0], [1], value([0.3])))
-    snapshots.write(archive, cell_table(fusion, np.arange(1), START), START)
+    snapshots.write_snapshot(archive, cell_table(fusion, np.arange(1), START), START)
     pq.write_table(pa.table({"cell": [7, 7], "sector": [1, 1], "mu": [0.2, 0.4]}), overlay)
     config.write_text(json.dumps({"zenoh": router.model_dump()}))
     to = ["--connect", router.connect[0]] if way == "connect" else ["--config", str(config)]

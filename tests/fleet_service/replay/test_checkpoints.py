@@ -63,7 +63,7 @@ def keep(engine: Engine, root: Path) -> Path:
         stop.set()
         thread.join()
     assert taken[0] is not None
-    return checkpoints.save(root, taken[0])
+    return checkpoints.save_checkpoint(root, taken[0])
 
 
 def beliefs(engine: Engine, at: int) -> FloatArray:
@@ -192,7 +192,7 @@ def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) 
         live = read_state(engine)
         assert engine.state.fusion.waiting
     for kept in (2, 1, 0):  # from the last checkpoint, from the one before, from the log alone
-        assert len(checkpoints.newest(tmp_path)) == kept
+        assert len(checkpoints.list_checkpoints(tmp_path)) == kept
         with closing(Engine(ServiceConfig(), tmp_path)) as again:
             found = read_state(again)
             assert (again.seen, again.counts["checkpoints_refused"]) == (
@@ -201,7 +201,7 @@ def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) 
             )
         assert [name for name in live if not np.array_equal(found[name], live[name])] == []
         if kept:
-            shutil.rmtree(checkpoints.newest(tmp_path)[0])
+            shutil.rmtree(checkpoints.list_checkpoints(tmp_path)[0])
 
 
 def test_what_is_in_a_checkpoint_is_on_disk(tmp_path: Path) -> None:
@@ -227,8 +227,8 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before_and_to_the_log(
             keep(engine, tmp_path)
         at = time.time_ns()
         running = beliefs(engine, at)
-    assert len(checkpoints.newest(tmp_path)) == checkpoints.KEPT
-    for refused, path in enumerate(checkpoints.newest(tmp_path), 1):
+    assert len(checkpoints.list_checkpoints(tmp_path)) == checkpoints.KEPT
+    for refused, path in enumerate(checkpoints.list_checkpoints(tmp_path), 1):
         file = path / "cells.arrow"
         if harm == "truncate":
             file.write_bytes(file.read_bytes()[:100])
@@ -245,7 +245,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before_and_to_the_log(
 
 def test_a_checkpoint_half_written_is_none(tmp_path: Path) -> None:
     (tmp_path / "checkpoints" / ".draft").mkdir(parents=True)
-    assert checkpoints.newest(tmp_path) == []
+    assert checkpoints.list_checkpoints(tmp_path) == []
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         assert engine.checkpoint(_set()) is None  # the service stops meanwhile
         assert keep(engine, tmp_path).exists()
@@ -298,9 +298,9 @@ def test_a_checkpoint_that_a_service_dies_of_is_given_up(tmp_path: Path) -> None
         engine.intake.ingest([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
         path = keep(engine, tmp_path)
     for _ in range(checkpoints.TRIES):
-        checkpoints.load(path)
-        checkpoints.begin(path)
+        checkpoints.load_checkpoint(path)
+        checkpoints.mark_begun(path)
     with pytest.raises(InputError, match="died at once"):
-        checkpoints.load(path)
+        checkpoints.load_checkpoint(path)
     checkpoints.mark_survived(tmp_path)
-    checkpoints.load(path)
+    checkpoints.load_checkpoint(path)

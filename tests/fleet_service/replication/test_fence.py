@@ -59,7 +59,7 @@ def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(
     )  # as if it had been frozen right behind its looks
     one.copy.sync()
     found = restore_archive(tmp_path / "new", bucket)
-    held = vehicle_ids.read(found / "keys")
+    held = vehicle_ids.read_numbers(found / "keys")
     assert {name: held.get(name) for name in known_there} == known_there
     assert set(archived_weather(found).region.tolist()) == {1, 2, 3, 4}
     two.close()

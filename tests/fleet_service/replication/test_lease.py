@@ -229,7 +229,7 @@ def test_what_a_frozen_service_had_under_way_counts_for_nothing(
     one.close()
     back = Machine(tmp_path / "one", bucket)
     assert sorted(rows_in(back.root, Kind.OBSERVATION)) == sorted(before)
-    assert not segments.paths(back.root, Kind.OBSERVATION)
+    assert not segments.list_segments(back.root, Kind.OBSERVATION)
     back.close()
 
 
@@ -258,14 +258,14 @@ def test_a_compaction_that_outlived_its_service_is_waited_for(
         one.write(1)
     has_read = threading.Event()
     goes_on = threading.Event()
-    place = compaction._place
+    place = compaction._place_files
 
     def count_placed(*args: Any) -> int:  # noqa: ANN401
         has_read.set()
         goes_on.wait()
         return place(*args)
 
-    monkeypatch.setattr(compaction, "_place", count_placed)
+    monkeypatch.setattr(compaction, "_place_files", count_placed)
     still = threading.Thread(target=compact, args=(one.root,))
     still.start()
     has_read.wait()

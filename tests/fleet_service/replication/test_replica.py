@@ -116,7 +116,7 @@ def test_a_put_that_landed_and_was_not_heard_of_is_no_fault(
     root = tmp_path / "archive"
     copy = make(root)
     with closing(fill_log(root, None)):
-        (first, *others) = segments.paths(root, Kind.OBSERVATION)
+        (first, *others) = segments.list_segments(root, Kind.OBSERVATION)
         bucket.path_of("inbox").mkdir(parents=True)
         bucket.path_of(f"inbox/{first.name}").write_bytes(first.read_bytes())
         copy.upload_segments([first])
@@ -149,7 +149,7 @@ def test_segment_compacted_before_its_upload_is_settled_by_the_result(
     root = tmp_path / "archive"
     copy = make(root)
     with closing(fill_log(root, None)):
-        gone = segments.paths(root, Kind.OBSERVATION)
+        gone = segments.list_segments(root, Kind.OBSERVATION)
         compact(root)
         copy.upload_segments(gone)
         assert there(bucket) == list_copied_files(root)
@@ -186,10 +186,10 @@ def test_what_was_cut_off_is_made_good_at_the_next_start(
     with closing(fill_log(root, copy)):
         copy.close()
     with closing(fill_log(root, None, range(3, 4))):  # written and not put
-        damaged = segments.paths(root, Kind.OBSERVATION)[0]
+        damaged = segments.list_segments(root, Kind.OBSERVATION)[0]
         whole = damaged.read_bytes()
         set_aside(damaged, "a bit has turned")
-        lost = bucket.path_of(f"inbox/{segments.paths(root, Kind.OBSERVATION)[1].name}")
+        lost = bucket.path_of(f"inbox/{segments.list_segments(root, Kind.OBSERVATION)[1].name}")
         lost.unlink()
         make(root)
         assert damaged.read_bytes() == whole

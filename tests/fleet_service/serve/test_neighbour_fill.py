@@ -6,7 +6,7 @@ import numpy as np
 
 from fleet_service.fusion import Fusion
 from fleet_service.lab.drive import CELL
-from fleet_service.serve.neighbour_fill import PRIOR_SHARE, REACH, impute
+from fleet_service.serve.neighbour_fill import PRIOR_SHARE, REACH, impute_cells
 from fleet_service.serve.view import CellView
 from schemas import grid, mugrid
 from schemas.numeric import IntArray
@@ -31,7 +31,7 @@ def borrow_beliefs(visited: dict[int, float], route: IntArray | None = ROUTE) ->
     slots = np.arange(fusion.size)
     tile = int(grid.tile_of(EAST[0]))
     assert (grid.tile_of(EAST) == tile).all()
-    return impute(fusion, tile, slots, route, now)
+    return impute_cells(fusion, tile, slots, route, now)
 
 
 def widths(cells: CellView) -> dict[int, float]:

@@ -20,7 +20,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints
 from fleet_service.serve.public_cells import PERIOD_NS
-from fleet_service.serve.view import CellView, coarsen
+from fleet_service.serve.view import CellView, coarsen_cells
 from fleet_service.serve.visitors import PART_NS, Visitors
 from schemas import grid, query, wire
 from schemas.config import ServiceConfig
@@ -140,10 +140,10 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
         zeros,
         zeros > 0,
     )
-    seen = coarsen(cells)
+    seen = coarsen_cells(cells)
     assert (seen.vehicles <= counts).all()
     assert (seen.vehicles >= 0.39 * counts).all()
-    assert (coarsen(seen).vehicles == seen.vehicles).all()
+    assert (coarsen_cells(seen).vehicles == seen.vehicles).all()
 
 
 def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Start) -> None:
@@ -185,7 +185,7 @@ def test_a_restart_knows_who_was_there_with_and_without_a_checkpoint(
     hear(engine, *MORE)
     engine.settlement.flush()
     taken = taken_from(engine)
-    checkpoints.save(tmp_path, taken)
+    checkpoints.save_checkpoint(tmp_path, taken)
     for _ in ("checkpoint", "log"):
         engine.close()
         engine = start(3)

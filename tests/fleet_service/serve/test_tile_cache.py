@@ -12,7 +12,7 @@ import pytest
 from fleet_service.fusion import Fusion
 from fleet_service.serve import tile_cache
 from fleet_service.serve.map_state import MapState
-from fleet_service.serve.query import answer
+from fleet_service.serve.query import answer_query
 from fleet_service.serve.tile_cache import TileCache
 from schemas import grid
 from schemas.query import MapQuery
@@ -122,7 +122,7 @@ def test_a_box_gets_exactly_the_cells_that_it_touches() -> None:
             and cell["south"] < y[1]
             and cell["vehicles"] >= query.min_vehicles
         }
-        replies = dict(answer(made, query, lambda tile: tile == TILE, NOW, TILE))
+        replies = dict(answer_query(made, query, lambda tile: tile == TILE, NOW, TILE))
         told = decode_tile(replies[TILE])["cell"].to_pylist() if replies else []
         assert set(told) == wanted
         assert len(told) == len(wanted)

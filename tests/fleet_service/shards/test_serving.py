@@ -203,7 +203,7 @@ def test_region_is_announced_only_while_queries_are_answered(
     router: ZenohSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = []
-    answering = Service._declared
+    answering = Service._declare_inputs
 
     @contextmanager
     def record_tokens(service: Service, session: zenoh.Session) -> Iterator[None]:
@@ -213,7 +213,7 @@ def test_region_is_announced_only_while_queries_are_answered(
             until(lambda: not tokens.active_tokens(session))
             seen.append(set())
 
-    monkeypatch.setattr(Service, "_declared", record_tokens)
+    monkeypatch.setattr(Service, "_declare_inputs", record_tokens)
     with (
         running(router, tmp_path / "one", name="first", regions=NAMES[:1]),
         zenoh_session(router) as other,

@@ -69,8 +69,8 @@ def test_kernels_compile_where_what_they_can_do_without_is_kept_out() -> None:
     words = (
         "import sys; from schemas.runtime.process import trim_memory, limit_memory; "
         "limit_memory('scipy')\n"
-        "import numpy as np; from fleet_service.fusion.normal import distribution\n"
-        "assert abs(distribution(np.array([1.0]))[0] - 0.8413447) < 1e-6\n"
+        "import numpy as np; from fleet_service.fusion.normal import normal_cdf\n"
+        "assert abs(normal_cdf(np.array([1.0]))[0] - 0.8413447) < 1e-6\n"
         "assert 'scipy' not in sys.modules and not np.zeros(1 << 20).any(); trim_memory()"
     )
     assert subprocess.run([sys.executable, "-W", "error", "-c", words], check=False).returncode == 0

@@ -23,8 +23,8 @@ from fleet_service.analytics.questions.contract import (
     LEAST_SHARE,
     SLOT_S,
     UNKNOWN,
-    breach,
-    slots,
+    longest_breach,
+    slot_intervals,
 )
 from fleet_service.cli import main
 from schemas.errors import InputError
@@ -40,7 +40,7 @@ def measure_contract(
     slot, mu = (np.array(column) for column in zip(*slot_mu, strict=True))
     half = np.full(len(mu), 1.645 * std)
     whole = (int(slot[0]) * SLOT_S, (int(slot[-1]) + 1) * SLOT_S)
-    return breach(slot, mu - half, mu, mu + half, LEVEL, span or whole)
+    return longest_breach(slot, mu - half, mu, mu + half, LEVEL, span or whole)
 
 
 def test_a_breach_runs_from_the_first_slot_below_to_the_next_that_is_not() -> None:
@@ -80,7 +80,7 @@ def test_the_interval_of_a_slot_covers_the_truth_as_often_as_it_says() -> None:
         keys = np.repeat(np.arange(2000), n)
         y = truth + rng.normal(0.0, std, len(keys))
         table = pa.table({"key": keys, "y": y, "variance": np.full(len(keys), std**2)})
-        found = slots(table)
+        found = slot_intervals(table)
         hits.append(float(((found["lower"] <= truth) & (truth <= found["upper"])).mean()))
     assert min(hits) > 0.88, hits
 
@@ -129,7 +129,7 @@ def test_the_time_that_was_agreed_and_the_share_measured_decide(asked: Ask, link
 
 def test_one_vehicle_s_ten_passes_are_one_witness() -> None:
     many = pa.table({"key": [0, 1], "y": [0.5, 0.5], "variance": [0.0064, 0.0064]})
-    found = slots(many)
+    found = slot_intervals(many)
     half = (found["upper"] - found["lower"])[0] / 2
     assert half == pytest.approx(INTERVAL_STD / 2 * np.hypot(0.08, 0.05))
 
