@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.inputs.block import Block, absolute
+from edge_agent.inputs.block import Block, to_utc_ns
 from edge_agent.lab.seeds import FIGURES
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.truth_file import TruthRecorder
@@ -46,7 +46,7 @@ def drive_fleet(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Column
     parts: list[RecordBlock] = []
     for block in range(int(duration_s * RATE_HZ / BLOCK)):
         t, signals = fleet.step(BLOCK)
-        samples = Block(t, absolute(t, START_NS), signals)
+        samples = Block(t, to_utc_ns(t, START_NS), signals)
         true = fleet.truth
         position = fleet.scenario.origin.to_latlon(true.x, true.y)
         recorder.add(samples.time, position, true.yaw, true.mu_wheel, true.utilisation)

@@ -27,7 +27,7 @@ from edge_agent.ahead.path import Pose
 from edge_agent.ahead.prior import MapPrior
 from edge_agent.ahead.warnings import Active, update_warnings
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.inputs.block import Block, absolute
+from edge_agent.inputs.block import Block, to_utc_ns
 from edge_agent.lab.seeds import FIGURES
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.simulation.listeners import WarnedDrivers
@@ -124,7 +124,7 @@ class ListeningTown:
 
     def _block(self) -> dict[str, Any]:
         t, signals = self.fleet.step(BLOCK)
-        samples = Block(t, absolute(t, START_NS), signals)
+        samples = Block(t, to_utc_ns(t, START_NS), signals)
         _, seen, _ = self.pipeline.step(samples)
         self._truth(float(t[-1, 0]))
         if self._listening:
@@ -163,13 +163,13 @@ class ListeningTown:
                     self.drive.alert_passes = float(len(self.drive.passed))
                 self.drive.alerts += 1
             key = keys.alert_key(int(grid.tile_of(alert.cell)))
-            self.heard.alert(decode_alert_message(key, wire.encode_alert(alert), now), now)
+            self.heard.store_alert(decode_alert_message(key, wire.encode_alert(alert), now), now)
 
     def _hear(self, second: int) -> None:
         """Pass on the changed tiles, and repeat the standing alerts."""
         now = self._now()
         for alert in self.alerts.standing_alerts:
-            self.heard.alert(alert, now)
+            self.heard.store_alert(alert, now)
         if second - self._asked < ASKED_S:
             return
         self._asked = second
@@ -179,7 +179,7 @@ class ListeningTown:
             payload = arrow_stream(
                 batch_of(view_cells(self.fusion, slots[tiles == tile], now), now)
             )
-            self.heard.take(*decode_cells(keys.map_key(tile), payload, now), now)
+            self.heard.store_cells(*decode_cells(keys.map_key(tile), payload, now), now)
 
     def _look(self) -> None:
         self.drivers.refresh()
@@ -206,8 +206,8 @@ class ListeningTown:
             return
         key: IntArray = self.pipeline.places
         map_beliefs: dict[int, FloatArray | None] = {
-            k: self.heard.belief(int(key[k]), self._now()) if key[k] >= 0 else None
-            for k in self.prior.enters(key)
+            k: self.heard.belief_at(int(key[k]), self._now()) if key[k] >= 0 else None
+            for k in self.prior.entered_vehicles(key)
         }
         informed = self.prior.step(key, *beliefs, map_beliefs)
         alone = np.exp(beliefs[0])

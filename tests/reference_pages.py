@@ -170,7 +170,7 @@ def all_metrics(root: Path) -> Shown:
         unsettled=lambda: 0,
     )
     progress: Any = SimpleNamespace(behind=0, now_s=0.0, lag_s=0.0)
-    return {"service": of_service, "agent": agent_metrics.metrics(publisher, progress)}
+    return {"service": of_service, "agent": agent_metrics.agent_metrics(publisher, progress)}
 
 
 def stored_name(metric: Metric) -> str:

@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.lab.simulation.roads import Road, rounded
+from edge_agent.lab.simulation.roads import Road, round_corners
 from edge_agent.lab.simulation.scenarios import Scenario
 from fleet_service.page.vector_tiles import EXTENT, LINE, POINT, POLYGON, TileShape, encode_tile
 from schemas.numeric import FloatArray
@@ -74,7 +74,7 @@ def town_of(scenario: Scenario) -> StreetPlan:
 
 def _centre_line(scenario: Scenario, road: Road) -> FloatArray:
     corners = [scenario.junctions[road.start], *road.bends, scenario.junctions[road.end]]
-    return rounded(corners, road.radius)[::16]
+    return round_corners(corners, road.radius)[::16]
 
 
 def _blob_outline(shape: tuple[float, float, float, float], seed: int) -> FloatArray:

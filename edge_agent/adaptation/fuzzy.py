@@ -22,7 +22,7 @@ LARGEST_FACTOR = 10.0
 
 
 @compiled
-def infer(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> float:
+def infer_step(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> float:
     """Return the log multiplier [nat]: outputs (5,) weighted by the triangular memberships of the
     mismatch at peaks inputs (5,).
 
@@ -40,7 +40,7 @@ def infer(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> float:
 
 
 @compiled
-def adapted(
+def adapted_factor(
     factor: float, actual: float, theoretical: float, inputs: FloatArray, outputs: FloatArray
 ) -> float:
     """Return the next factor on R: factor*exp(infer(actual/theoretical - 1)), bounded."""
@@ -59,10 +59,10 @@ def adapted_within(
     pace: float,
     bounds: tuple[float, float],
 ) -> float:
-    """Return `adapted` within other bounds, for `pace` times as many steps as the sets were made
-    for.
+    """Return `adapted_factor` within other bounds, for `pace` times as many steps as the sets were
+    made for.
     """
     if not theoretical > 0.0:
         return factor
-    step = pace * infer(actual / theoretical - 1.0, inputs, outputs)
+    step = pace * infer_step(actual / theoretical - 1.0, inputs, outputs)
     return min(max(factor * math.exp(step), bounds[0]), bounds[1])

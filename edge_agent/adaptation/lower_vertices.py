@@ -69,21 +69,21 @@ class LowerVertices:
                 "lower_vertices.feet", "two neighbours leave a gap", "let a pair sum to more than 1"
             )
 
-    def triangles(self) -> tuple[FloatArray, FloatArray]:
+    def triangle_sets(self) -> tuple[FloatArray, FloatArray]:
         """Return the sets of mismatch and of step, (5, 3) each: left foot, peak, right foot."""
-        return _triangles(self.peaks, self.feet), _triangles(self.out_peaks, self.out_feet)
+        return _triangle_sets(self.peaks, self.feet), _triangle_sets(self.out_peaks, self.out_feet)
 
     def step(self, mismatch: float) -> float:
         """Return ln of the factor on R [nat] for a mismatch [1]."""
-        inputs, outputs = self.triangles()
-        weight = _memberships(inputs, mismatch)
+        inputs, outputs = self.triangle_sets()
+        weight = _membership_weights(inputs, mismatch)
         total = float(weight.sum())
         return float(weight @ outputs.mean(axis=1)) / total if total > 0.0 else 0.0
 
-    def table(self, knots: int) -> tuple[FloatArray, FloatArray]:
+    def knot_table(self, knots: int) -> tuple[FloatArray, FloatArray]:
         """Return mismatches and steps, (knots,) each, between which the filter interpolates
         linearly."""
-        inputs, _ = self.triangles()
+        inputs, _ = self.triangle_sets()
         corners = np.unique(np.clip(inputs.ravel(), self.peaks[0], self.peaks[-1]))
         even = np.linspace(self.peaks[0], self.peaks[-1], knots - len(corners) + 2)
         at = np.unique(np.concatenate([corners, even]))[:knots]
@@ -109,7 +109,7 @@ class LowerVertices:
         return np.full(2 * FEET, 0.3), np.full(2 * FEET, 1.8)
 
 
-def _triangles(peaks: tuple[float, ...], feet: tuple[float, ...]) -> FloatArray:
+def _triangle_sets(peaks: tuple[float, ...], feet: tuple[float, ...]) -> FloatArray:
     """Return left foot, peak and right foot of each set, (5, 3); outer sets end at their peaks."""
     sets = np.repeat(np.asarray(peaks, float)[:, None], 3, axis=1)
     for k in range(SETS - 1):
@@ -119,7 +119,7 @@ def _triangles(peaks: tuple[float, ...], feet: tuple[float, ...]) -> FloatArray:
     return sets
 
 
-def _memberships(sets: FloatArray, mismatch: float) -> FloatArray:
+def _membership_weights(sets: FloatArray, mismatch: float) -> FloatArray:
     """Return the memberships (5,) of a mismatch; the outer sets are shoulders."""
     weight = np.zeros(SETS)
     for k, (left, peak, right) in enumerate(sets):

@@ -83,7 +83,7 @@ def is_high(value: float, ramp: FloatArray) -> float:
 
 
 @compiled
-def hurry(rules: RuleBase, wheels: float) -> float:
+def forgetting_rate(rules: RuleBase, wheels: float) -> float:
     """Return the rate, added to the usual one, at which offsets, slope and bank return to their
     prior [1/s].
     """

@@ -64,15 +64,15 @@ def infer_two(
     """Return ln of the factor on R: bilinear in alpha (peaks `at` (7,)) and rate (peaks `of` (5,)),
     constant beyond the ends.
     """
-    i, u = bracket(alpha, at)
-    j, v = bracket(rate, of)
+    i, u = bracket_peaks(alpha, at)
+    j, v = bracket_peaks(rate, of)
     lower = (1.0 - u) * levels[j, i] + u * levels[j, i + 1]
     upper = (1.0 - u) * levels[j + 1, i] + u * levels[j + 1, i + 1]
     return float((1.0 - v) * lower + v * upper)
 
 
 @compiled
-def bracket(value: float, peaks: FloatArray) -> tuple[int, float]:
+def bracket_peaks(value: float, peaks: FloatArray) -> tuple[int, float]:
     """Return (k, share) with value = (1 - share)*peaks[k] + share*peaks[k + 1], held at the
     ends.
     """

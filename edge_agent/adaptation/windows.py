@@ -13,7 +13,7 @@ from schemas.runtime.jit import compiled
 
 
 @compiled
-def push(window: FloatArray, innovation: float) -> None:
+def push_innovation(window: FloatArray, innovation: float) -> None:
     """Put the newest innovation first in window (N,), and drop the oldest."""
     for j in range(window.shape[0] - 1, 0, -1):
         window[j] = window[j - 1]

@@ -48,11 +48,11 @@ class RequestLog:
     def __init__(self) -> None:
         self._boxes: deque[tuple[Box, int]] = deque(maxlen=MOST_BOXES)
 
-    def forget(self) -> None:
+    def request_again(self) -> None:
         """Request everything again, because a session has come back."""
         self._boxes.clear()
 
-    def wanting(self, path: Path, pose: Pose, within: float) -> list[Box]:
+    def missing_boxes(self, path: Path, pose: Pose, within: float) -> list[Box]:
         """Return the boxes to request now, along a path; they count as requested.
 
         Nothing is requested until something nearer than `within` [m] is missing; then all of the
@@ -66,7 +66,7 @@ class RequestLog:
                 open_ &= ~(inside & (longitude >= box.west) & (longitude <= box.east))
         if not open_[: max(int(within / STEP), 1)].any():
             return []
-        found = [_around(path, first, last, pose) for first, last in _pieces(path, open_)]
+        found = [_box_around(path, first, last, pose) for first, last in _split_path(path, open_)]
         self._boxes.extend((box, pose.time) for box in found)
         return found
 
@@ -78,11 +78,11 @@ class Tiles:
         self._wanted: dict[int, int] = {}  # tile -> when it was wanted last [ns]
 
     @property
-    def heard(self) -> list[int]:
+    def subscribed_tiles(self) -> list[int]:
         """Return the tiles."""
         return list(self._wanted)
 
-    def follow(self, paths: list[Path], pose: Pose) -> tuple[list[int], list[int]]:
+    def update_subscriptions(self, paths: list[Path], pose: Pose) -> tuple[list[int], list[int]]:
         """Return the tiles to subscribe to and to unsubscribe from."""
         here = int(grid.tile_of(grid.cell_of(pose.latitude, pose.longitude)))
         ahead: list[int] = [here]
@@ -119,14 +119,14 @@ def _in_order(tiles: IntArray) -> list[int]:
     return list(dict.fromkeys(tiles.tolist()))
 
 
-def _pieces(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
+def _split_path(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
     """Return runs of the path, first and last metre, that have small boxes and contain every
     wanted point.
     """
     found: list[tuple[int, int]] = []
     first = last = -1
     for k in (np.flatnonzero(wanted) * STEP).tolist():
-        if first >= 0 and _fits(path, first, k):
+        if first >= 0 and _fits_box(path, first, k):
             last = k
             continue
         if first >= 0:
@@ -135,14 +135,14 @@ def _pieces(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
     return [*found, (first, last)] if first >= 0 else found
 
 
-def _fits(path: Path, first: int, last: int) -> bool:
+def _fits_box(path: Path, first: int, last: int) -> bool:
     wide, high = (
         float(np.ptp(side[first : last + 1])) + 2.0 * BESIDE_M for side in (path.x, path.y)
     )
     return last - first <= LONGEST_M and wide * high <= AREA_M2
 
 
-def _around(path: Path, first: int, last: int, pose: Pose) -> Box:
+def _box_around(path: Path, first: int, last: int, pose: Pose) -> Box:
     x = path.x[first : last + 1]
     y = path.y[first : last + 1]
     east = np.array([x.min() - BESIDE_M, x.max() + BESIDE_M])

@@ -28,7 +28,7 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
     Raises:
         WireError: it is not a valid message of a service; it is ignored completely.
     """
-    tile = _tile(key, "map")
+    tile = _tile_of_key(key, "map")
     if len(payload) > MOST_TILE_BYTES:
         raise WireError("tile", f"{len(payload)} bytes", f"ask for less than {MOST_TILE_BYTES}")
     table = decode_tile(payload)
@@ -38,9 +38,9 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
         for name in (*names, "mu_lower", "mu_upper", "p_slippery", "age_s", "basis")
     ):
         raise WireError("tile", "has holes", "send every needed column whole")
-    cell, sector, vehicles, last = (_whole(table, name) for name in names)
+    cell, sector, vehicles, last = (_int_column(table, name) for name in names)
     lower, mu, upper, p, age = (
-        _real(table, name) for name in ("mu_lower", "mu", "mu_upper", "p_slippery", "age_s")
+        _float_column(table, name) for name in ("mu_lower", "mu", "mu_upper", "p_slippery", "age_s")
     )
     basis = np.array([_BASIS.get(str(name), -1) for name in table["basis"].to_pylist()], np.int64)
     measured = np.isfinite(mu)
@@ -50,10 +50,10 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
         "vehicles": vehicles < 1,
         "last_time": (last <= 0) | (last > now + AHEAD_OF_TIME_S * NS),
         "basis": (basis < BOUND) | (measured == (basis == BOUND)),
-        "mu_lower": ~_ordered(mugrid.LOWER, lower, np.where(measured, mu, lower)),
-        "mu_upper": ~_ordered(np.where(measured, mu, lower), upper, mugrid.UPPER),
-        "p_slippery": ~_ordered(0.0, p, 1.0),
-        "age_s": ~_ordered(0.0, age, OLDEST_S),
+        "mu_lower": ~_is_ordered(mugrid.LOWER, lower, np.where(measured, mu, lower)),
+        "mu_upper": ~_is_ordered(np.where(measured, mu, lower), upper, mugrid.UPPER),
+        "p_slippery": ~_is_ordered(0.0, p, 1.0),
+        "age_s": ~_is_ordered(0.0, age, OLDEST_S),
     }
     for name, rows in wrong.items():
         if rows.any():
@@ -81,7 +81,7 @@ def decode_alert_message(key: str, payload: bytes, now: int) -> Alert:
     """
     if len(payload) > wire.MAX_BYTES:
         raise WireError("alert", f"{len(payload)} bytes", f"send at most {wire.MAX_BYTES}")
-    return _checked(wire.decode_alert(payload), _tile(key, "alert"), now)
+    return _check_alert(wire.decode_alert(payload), _tile_of_key(key, "alert"), now)
 
 
 def decode_standing_alerts(key: str, payload: bytes, now: int) -> tuple[int, list[Alert]]:
@@ -90,11 +90,11 @@ def decode_standing_alerts(key: str, payload: bytes, now: int) -> tuple[int, lis
     Raises:
         WireError: it is not a valid message of a service.
     """
-    tile = _tile(key, "alert")
-    return tile, [_checked(alert, tile, now) for alert in wire.decode_standing(payload)]
+    tile = _tile_of_key(key, "alert")
+    return tile, [_check_alert(alert, tile, now) for alert in wire.decode_standing(payload)]
 
 
-def _checked(alert: Alert, tile: int, now: int) -> Alert:
+def _check_alert(alert: Alert, tile: int, now: int) -> Alert:
     numbers = np.array([alert.mu_lower, alert.mu, alert.mu_upper, alert.p_slippery])
     possible = (
         alert.cell >= 0
@@ -102,8 +102,8 @@ def _checked(alert: Alert, tile: int, now: int) -> Alert:
         and 0 <= alert.sector < grid.SECTORS
         and 0 < alert.time <= now + AHEAD_OF_TIME_S * NS
         and bool(np.isfinite(numbers).all())
-        and bool(_ordered(mugrid.LOWER, numbers[:1], numbers[1:2])[0])
-        and bool(_ordered(numbers[1:2], numbers[2:3], mugrid.UPPER)[0])
+        and bool(_is_ordered(mugrid.LOWER, numbers[:1], numbers[1:2])[0])
+        and bool(_is_ordered(numbers[1:2], numbers[2:3], mugrid.UPPER)[0])
         and 0.0 <= alert.p_slippery <= 1.0
     )
     if not possible:
@@ -111,7 +111,7 @@ def _checked(alert: Alert, tile: int, now: int) -> Alert:
     return alert
 
 
-def _tile(key: str, topic: str) -> int:
+def _tile_of_key(key: str, topic: str) -> int:
     try:
         parsed = keys.parse(key)
     except InputError as error:
@@ -123,16 +123,16 @@ def _tile(key: str, topic: str) -> int:
     return parsed.quadint
 
 
-def _ordered(low: FloatArray | float, middle: FloatArray, high: FloatArray | float) -> BoolArray:
+def _is_ordered(low: FloatArray | float, middle: FloatArray, high: FloatArray | float) -> BoolArray:
     with np.errstate(invalid="ignore"):
         return np.asarray(
             (middle >= np.asarray(low) - SLACK) & (middle <= np.asarray(high) + SLACK)
         )
 
 
-def _whole(table: pa.Table, name: str) -> IntArray:
+def _int_column(table: pa.Table, name: str) -> IntArray:
     return np.asarray(table[name].cast(pa.int64()).to_numpy(), np.int64)
 
 
-def _real(table: pa.Table, name: str) -> FloatArray:
+def _float_column(table: pa.Table, name: str) -> FloatArray:
     return np.asarray(table[name].to_numpy(), np.float64)

@@ -115,18 +115,18 @@ class LocalMap:
         """Return the standing alerts known to the car."""
         return [alert for alert, _ in self._alerts.values()]
 
-    def take(self, tile: int, cells: ReceivedCells, now: int) -> None:
+    def store_cells(self, tile: int, cells: ReceivedCells, now: int) -> None:
         """Store received cells of a tile; they replace older knowledge only."""
         before = self._tiles.pop(tile, NOTHING)
-        both = _joined([_some(before, now - before.heard < HELD_S * NS), cells])
+        both = _concatenate_cells([_select_cells(before, now - before.heard < HELD_S * NS), cells])
         latest_first = np.lexsort((both.heard, both.key))[::-1]
         _, newest = np.unique(both.key[latest_first], return_index=True)
-        self._tiles[tile] = _some(both, latest_first[newest])
+        self._tiles[tile] = _select_cells(both, latest_first[newest])
         self._all = None
         while len(self._tiles) > 1 and self.cells > self._most:
             self._tiles.popitem(last=False)
 
-    def alert(self, alert: Alert, now: int) -> bool:
+    def store_alert(self, alert: Alert, now: int) -> bool:
         """Store a received alert; return True if it is new."""
         key = alert.cell * grid.SECTORS + alert.sector
         before = self._alerts.get(key)
@@ -139,7 +139,7 @@ class LocalMap:
             return before is None or before[0] != alert
         return self._alerts.pop(key, None) is not None
 
-    def standing(self, tile: int, alerts: list[Alert], now: int) -> list[int]:
+    def store_standing_alerts(self, tile: int, alerts: list[Alert], now: int) -> list[int]:
         """Store all standing alerts of a tile; return the places where this is new."""
         stand = {alert.cell * grid.SECTORS + alert.sector: alert for alert in alerts}
         news = [
@@ -149,9 +149,9 @@ class LocalMap:
         ]
         for key in news:
             del self._alerts[key]
-        return news + [key for key, alert in stand.items() if self.alert(alert, now)]
+        return news + [key for key, alert in stand.items() if self.store_alert(alert, now)]
 
-    def forget(self, now: int) -> None:
+    def drop_old(self, now: int) -> None:
         """Drop data that is too old."""
         for tile in [
             tile
@@ -169,7 +169,7 @@ class LocalMap:
         An alert for the opposite direction counts for this side too, as long as no better grip was
         found here since: ice and water are not limited to a lane.
         """
-        belief, basis, last, at, vehicles = self._rows(key)
+        belief, basis, last, at, vehicles = self._look_up(key)
         alerted = np.zeros(len(key), np.bool_)
         standing = np.fromiter(self._alerts, np.int64, len(self._alerts))
         for k in np.flatnonzero(
@@ -219,11 +219,11 @@ class LocalMap:
             alerted & there,
         )
 
-    def belief(self, key: int, now: int) -> FloatArray | None:
+    def belief_at(self, key: int, now: int) -> FloatArray | None:
         """Return the current belief about one place, (32,); None if nothing or only a bound is
         known.
         """
-        belief, basis, last, at, _ = self._rows(np.array([key]))
+        belief, basis, last, at, _ = self._look_up(np.array([key]))
         if basis[0] != MEASURED or now - at[0] > HELD_S * NS:
             return None
         share = -np.expm1(-max(now - int(last[0]), 0) / NS / CHANGE_S)
@@ -231,18 +231,18 @@ class LocalMap:
 
     def keys(self) -> IntArray:
         """Return the known places, sorted."""
-        return self._whole().key
+        return self._all_cells().key
 
-    def _whole(self) -> ReceivedCells:
+    def _all_cells(self) -> ReceivedCells:
         if self._all is None:
-            found = _joined(list(self._tiles.values()))
+            found = _concatenate_cells(list(self._tiles.values()))
             order = np.argsort(found.key)
-            self._all = _some(found, order)
+            self._all = _select_cells(found, order)
         return self._all
 
-    def _rows(self, key: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]:
+    def _look_up(self, key: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]:
         """Return belief, basis, last_time, time of receipt and vehicles of places (n,)."""
-        whole = self._whole()
+        whole = self._all_cells()
         if not len(whole.key):
             zero = np.zeros(len(key), np.int64)
             return np.tile(mugrid.PRIOR, (len(key), 1)), zero, zero.copy(), zero.copy(), zero.copy()
@@ -256,11 +256,11 @@ class LocalMap:
         return belief, basis, last, heard, vehicles
 
 
-def _some(cells: ReceivedCells, rows: IntArray | BoolArray) -> ReceivedCells:
+def _select_cells(cells: ReceivedCells, rows: IntArray | BoolArray) -> ReceivedCells:
     return ReceivedCells._make(column[rows] for column in cells)
 
 
-def _joined(parts: list[ReceivedCells]) -> ReceivedCells:
+def _concatenate_cells(parts: list[ReceivedCells]) -> ReceivedCells:
     return ReceivedCells._make(
         np.concatenate(columns) for columns in zip(NOTHING, *parts, strict=True)
     )

@@ -109,7 +109,7 @@ class Lookout:
         self._here = np.full((len(names), 3), np.nan)
         self._wake = threading.Event()
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="lookout", daemon=True)
+        self._thread = threading.Thread(target=self._look_loop, name="lookout", daemon=True)
         self.counts = LookoutCounts()
 
     def start(self) -> None:
@@ -121,7 +121,9 @@ class Lookout:
         k = self._number.get(name)
         if k is not None:
             watcher = self._watchers[k]
-            subscriber = MapSubscriber(name, session, lambda places: self._urge(watcher, places))
+            subscriber = MapSubscriber(
+                name, session, lambda places: self._look_sooner(watcher, places)
+            )
             watcher.subscriber = self.counts.subscribers[name] = subscriber
 
     def see(self, poses: Sequence[Pose]) -> None:
@@ -138,17 +140,17 @@ class Lookout:
         if beliefs is None:
             return
         map_beliefs: dict[int, FloatArray | None] = {}
-        for k in self._prior.enters(places):
+        for k in self._prior.entered_vehicles(places):
             subscriber = self._watchers[k].subscriber if k in self._watchers else None
             if subscriber is None or places[k] < 0:
                 map_beliefs[k] = None
-            elif subscriber.looking().acquire(
+            elif subscriber.map_lock().acquire(
                 blocking=False
             ):  # the loop does not wait: it asks again at the next
                 try:
-                    map_beliefs[k] = subscriber.known.belief(int(places[k]), time.time_ns())
+                    map_beliefs[k] = subscriber.local_map.belief_at(int(places[k]), time.time_ns())
                 finally:
-                    subscriber.looking().release()
+                    subscriber.map_lock().release()
         informed = self._prior.step(places, *beliefs, map_beliefs)
         self._here = np.column_stack([mugrid.quantiles(informed, q) for q in (0.5, 0.05, 0.95)])
 
@@ -163,14 +165,14 @@ class Lookout:
         if self._thread.ident is not None:
             self._thread.join(within_s)
 
-    def _urge(self, watcher: _Watcher, places: list[int]) -> None:
+    def _look_sooner(self, watcher: _Watcher, places: list[int]) -> None:
         if not watcher.places.isdisjoint(places) or any(
             not one.places.isdisjoint(places) for one in watcher.active
         ):
             watcher.urgent = True
             self._wake.set()
 
-    def _run(self) -> None:
+    def _look_loop(self) -> None:
         while not self._stop.is_set():
             self._wake.clear()
             now = time.monotonic()
@@ -181,7 +183,7 @@ class Lookout:
                 if watcher.due <= now or (watcher.urgent and now - watcher.looked >= AGAIN_S)
             ]
             for k in sorted(ready, key=lambda k: not self._watchers[k].urgent):
-                self._watch(k, now)
+                self._watch_vehicle(k, now)
                 if any(watcher.urgent for watcher in self._watchers.values()):
                     break  # who heard an alert goes first
             self.counts.busy_s += time.thread_time() - began
@@ -192,7 +194,7 @@ class Lookout:
                 )
                 self._wake.wait(AGAIN_S / 2.0 if urgent else max(next_due - time.monotonic(), 0.0))
 
-    def _watch(self, k: int, now: float) -> None:
+    def _watch_vehicle(self, k: int, now: float) -> None:
         watcher = self._watchers[k]
         # in turns, so that a thousand cars of one process do not look in the same moment
         first = watcher.looked < 0.0
@@ -208,20 +210,21 @@ class Lookout:
         if time.time_ns() - pose.time > STALE_S * NS:
             return
         try:
-            self._look(k, watcher, watcher.subscriber, pose)
+            self._look_ahead(k, watcher, watcher.subscriber, pose)
         except Exception:  # whatever it is: the car drives on, and so must this thread
             self.counts.failures += 1
             log.exception("a look ahead of %s failed; going on", watcher.name)
 
-    def _look(self, k: int, watcher: _Watcher, subscriber: MapSubscriber, pose: Pose) -> None:
+    def _look_ahead(self, k: int, watcher: _Watcher, subscriber: MapSubscriber, pose: Pose) -> None:
         length = horizon_length(pose.speed)
-        with subscriber.looking():
+        with subscriber.map_lock():
             paths = paths_ahead(pose, self._route_of(k), subscriber, length + FURTHER_M)
             horizons = [
-                look_ahead(path.near(length), subscriber.known, pose.time) for path in paths
+                look_ahead(path.first_metres(length), subscriber.local_map, pose.time)
+                for path in paths
             ]
             watcher.active, issued = update_warnings(
-                watcher.active, horizons, pose, subscriber.known
+                watcher.active, horizons, pose, subscriber.local_map
             )
         watcher.places = frozenset(np.concatenate([path.places.ravel() for path in paths]).tolist())
         self.counts.looks += 1
@@ -235,12 +238,12 @@ class Lookout:
             pose.time,
             paths[0].kind,
             (*(one.warning for one in watcher.active), *ended),
-            runs(horizons[0]),
+            runs_of_places(horizons[0]),
             tuple(self._here[k].tolist()),
         )
-        subscriber.follow(paths, pose, length)
+        subscriber.follow_paths(paths, pose, length)
         outlook = watcher.outlook
-        subscriber.tell(lambda: encode_ahead(outlook))
+        subscriber.publish_view(lambda: encode_ahead(outlook))
 
 
 def paths_ahead(
@@ -251,10 +254,10 @@ def paths_ahead(
     given = route.ahead(pose, length) if route is not None else None
     if given is not None:
         return [given]
-    return ways_on(pose, subscriber.known.keys(), length) or [straight_path(pose, length)]
+    return ways_on(pose, subscriber.local_map.keys(), length) or [straight_path(pose, length)]
 
 
-def runs(horizon: Horizon) -> Runs:
+def runs_of_places(horizon: Horizon) -> Runs:
     """Return a horizon as runs of metres in the same place."""
     key = horizon.key
     starts = np.append(

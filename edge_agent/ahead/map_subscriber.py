@@ -68,35 +68,37 @@ class MapSubscriber:
         )
         self.counts: Counter[str] = Counter()
 
-    def looking(self) -> threading.Lock:
-        """Return the lock under which `known` is read."""
+    def map_lock(self) -> threading.Lock:
+        """Return the lock under which `local_map` is read."""
         return self._lock
 
     @property
-    def known(self) -> LocalMap:
+    def local_map(self) -> LocalMap:
         """Return the local copy of the map; hold the lock."""
         return self._map
 
     @property
     def tiles(self) -> list[int]:
         """Return the tiles whose alerts are subscribed to."""
-        return self._tiles.heard
+        return self._tiles.subscribed_tiles
 
     @property
-    def connected(self) -> bool:
+    def is_connected(self) -> bool:
         """True if a router was connected at the last check."""
         return bool(self._routers)
 
-    def follow(self, paths: list[Path], pose: Pose, within: float) -> None:
+    def follow_paths(self, paths: list[Path], pose: Pose, within: float) -> None:
         """Subscribe and query along the ways on, the likeliest first; never waits for an answer.
 
         Alerts are subscribed to for the metres `within`; the map is requested farther ahead, see
-        `RequestLog.wanting`.
+        `RequestLog.missing_boxes`.
         """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
         back = bool(routers - self._routers)
         self._routers = routers
-        fresh, dropped = self._tiles.follow([path.near(within) for path in paths], pose)
+        fresh, dropped = self._tiles.update_subscriptions(
+            [path.first_metres(within) for path in paths], pose
+        )
         for tile in dropped:
             self._subscribers.pop(tile).undeclare()
         for tile in fresh:
@@ -112,18 +114,18 @@ class MapSubscriber:
             del self._again[0]
             back = not self._answered
         if back:
-            self._asked.forget()
+            self._asked.request_again()
         for tile in (
-            self._tiles.heard if back else fresh
+            self._tiles.subscribed_tiles if back else fresh
         ):  # after the subscription: none is missed in between
-            self._get(keys.alert_key(tile), self._on_standing)
+            self._send_query(keys.alert_key(tile), self._on_standing)
         for path in paths:
-            for box in self._asked.wanting(path, pose, within):
-                self._ask(box)
+            for box in self._asked.missing_boxes(path, pose, within):
+                self._query_box(box)
         with self._lock:
-            self._map.forget(pose.time)
+            self._map.drop_old(pose.time)
 
-    def tell(self, payload: Callable[[], bytes]) -> None:
+    def publish_view(self, payload: Callable[[], bytes]) -> None:
         """Publish the view ahead on the vehicle's own key, if somebody listens."""
         if self._publisher.matching_status.matching:  # type: ignore[attr-defined] # stub: bool
             self._publisher.put(payload())
@@ -136,31 +138,31 @@ class MapSubscriber:
         self._subscribers.clear()
         self._publisher.undeclare()
 
-    def _ask(self, box: Box) -> None:
+    def _query_box(self, box: Box) -> None:
         text = ",".join(f"{side:.6f}" for side in box)
         for region in keys_of(box):
             key = f"{keys.ROOT}/map/{keys.chunks(region, grid.REGION_ZOOM)}/*?bbox={text}"
-            self._get(key, self._on_cells)
+            self._send_query(key, self._on_cells)
             self.counts["questions"] += 1
 
-    def _get(self, selector: str, take: Callable[[str, bytes], None]) -> None:
-        def answered(reply: zenoh.Reply) -> None:
+    def _send_query(self, selector: str, take: Callable[[str, bytes], None]) -> None:
+        def receive_reply(reply: zenoh.Reply) -> None:
             if reply.ok is None:
                 self.counts["unanswered"] += 1
                 return
             self._answered = True
-            self._take(take, str(reply.ok.key_expr), reply.ok.payload.to_bytes())
+            self._pass_payload(take, str(reply.ok.key_expr), reply.ok.payload.to_bytes())
 
         try:
-            self._session.get(selector, answered, timeout=ANSWER_S)
+            self._session.get(selector, receive_reply, timeout=ANSWER_S)
         except zenoh.ZError as error:
             self.counts["unanswered"] += 1
             log.warning("the map cannot be asked: %s", error)
 
     def _on_alert(self, sample: zenoh.Sample) -> None:
-        self._take(self._hear_alert, str(sample.key_expr), sample.payload.to_bytes())
+        self._pass_payload(self._hear_alert, str(sample.key_expr), sample.payload.to_bytes())
 
-    def _take(self, take: Callable[[str, bytes], None], key: str, payload: bytes) -> None:
+    def _pass_payload(self, take: Callable[[str, bytes], None], key: str, payload: bytes) -> None:
         self.counts["bytes"] += len(key) + len(payload)
         try:
             take(key, payload)
@@ -173,7 +175,7 @@ class MapSubscriber:
         alert = decode_alert_message(key, payload, now)
         self.counts["alerts"] += 1
         with self._lock:
-            news = self._map.alert(alert, now)
+            news = self._map.store_alert(alert, now)
         if news:
             self._urgent([alert.cell * grid.SECTORS + alert.sector])
 
@@ -181,7 +183,7 @@ class MapSubscriber:
         now = self._clock()
         tile, alerts = decode_standing_alerts(key, payload, now)
         with self._lock:
-            news = self._map.standing(tile, alerts, now)
+            news = self._map.store_standing_alerts(tile, alerts, now)
         if news:
             self._urgent(news)
 
@@ -190,4 +192,4 @@ class MapSubscriber:
         tile, cells = decode_cells(key, payload, now)
         self.counts["cells"] += len(cells.key)
         with self._lock:
-            self._map.take(tile, cells, now)
+            self._map.store_cells(tile, cells, now)

@@ -66,7 +66,7 @@ class Path(NamedTuple):
     x: FloatArray
     y: FloatArray
 
-    def near(self, length: float) -> Path:
+    def first_metres(self, length: float) -> Path:
         """Return its first metres."""
         n = max(int(length), 1)
         return Path(
@@ -103,7 +103,7 @@ def path_along(
     `first` (n,) are known keys at the line's points; they precede those that follow from the
     position.
     """
-    run = _run(line)
+    run = _distance_along(line)
     count = max(int(min(run[-1], length)), 1)
     s = np.arange(1.0, count + 1.0)
     x = np.interp(s, run, line[:, 0])
@@ -111,10 +111,10 @@ def path_along(
     yaw = (
         np.unwrap(np.arctan2(np.gradient(y), np.gradient(x))) if count > 1 else np.full(1, pose.yaw)
     )
-    smooth = _smoothed(yaw, SMOOTH_M)
+    smooth = _moving_average(yaw, SMOOTH_M)
     curvature = np.gradient(smooth) if kind == "route" and count > 1 else np.full(count, np.nan)
     widen = BESIDE_M + (CORRIDOR_WIDENS * s if kind == "corridor" else 0.0)
-    places = _places(x, y, smooth, widen, pose)
+    places = _places_along(x, y, smooth, widen, pose)
     if first is not None:
         nearest = np.abs(run[None, :] - s[:, None]).argmin(axis=1)
         places = np.concatenate([first[nearest][:, None], places], axis=1)
@@ -145,8 +145,8 @@ class GivenRoute:
         """Return the way on along the route; None if the car has left it."""
         x, y = to_plane(self._latitude, self._longitude, pose)
         line = np.column_stack([x, y])
-        run = _run(line)
-        place = self._match(line, run, pose)
+        run = _distance_along(line)
+        place = self._match_position(line, run, pose)
         if place is None:
             return None
         self._metre = place
@@ -155,7 +155,7 @@ class GivenRoute:
         ahead = np.concatenate([[here], line[rest]])
         return path_along("route", ahead, pose, length) if len(ahead) > 1 else None
 
-    def _match(self, line: FloatArray, run: FloatArray, pose: Pose) -> float | None:
+    def _match_position(self, line: FloatArray, run: FloatArray, pose: Pose) -> float | None:
         """Return the metre of the route at which the car is: the next one after the last, with
         the same heading.
         """
@@ -182,7 +182,7 @@ class GivenRoute:
         return float(at[among[int(cost.argmin())]])
 
 
-def _places(
+def _places_along(
     x: FloatArray, y: FloatArray, yaw: FloatArray, widen: FloatArray | float, pose: Pose
 ) -> IntArray:
     sectors = [np.asarray(sector, np.int64) for sector in grid.sectors_touched(yaw)]
@@ -195,10 +195,10 @@ def _places(
     return np.column_stack(columns)
 
 
-def _smoothed(values: FloatArray, width: int) -> FloatArray:
+def _moving_average(values: FloatArray, width: int) -> FloatArray:
     padded = np.pad(values, width // 2, mode="edge")
     return np.convolve(padded, np.full(width, 1.0 / width), mode="valid")[: len(values)]
 
 
-def _run(line: FloatArray) -> FloatArray:
+def _distance_along(line: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])

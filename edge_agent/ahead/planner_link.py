@@ -37,12 +37,12 @@ class PlannerLink:
         self._limit = SteadyLimit()
         self._session: zenoh.Session | None = None
         self._sent = 0
-        threading.Thread(target=self._connect, name="planner", daemon=True).start()
+        threading.Thread(target=self._open_session, name="planner", daemon=True).start()
 
-    def _connect(self) -> None:
+    def _open_session(self) -> None:
         self._session = open_session(self._settings)
 
-    def hear(self, _: str, horizons: list[Horizon], pose: Pose) -> None:
+    def receive_horizons(self, _: str, horizons: list[Horizon], pose: Pose) -> None:
         """Take a look ahead; publish if the limit changed or was not repeated for REPEAT_S."""
         changed = self._limit.update(limit_of(horizons), pose.time)
         if self._session is None or not (changed or pose.time - self._sent >= REPEAT_S * NS):

@@ -55,7 +55,7 @@ class MapPrior:
         self._wrong = np.full(vehicles, SHARE)  # at the border
         self._found = np.full(vehicles, SHARE)  # now
 
-    def enters(self, keys: IntArray) -> list[int]:
+    def entered_vehicles(self, keys: IntArray) -> list[int]:
         """Return the vehicles that entered another place since the last step: their map beliefs
         are needed.
         """
@@ -74,12 +74,13 @@ class MapPrior:
             keys: (N,) current place of each, NOWHERE where unknown.
             own: (N, 32) log of the filter's posterior over uniform.
             visit: (N, 32) log-likelihood of the visit so far.
-            map_beliefs: the map's belief for the vehicles in `enters`; None where it knows nothing.
+            map_beliefs: the map's belief for the vehicles in `entered_vehicles`; None where it
+                knows nothing.
         """
-        now = _normal(np.exp(own))
+        now = _normalise_rows(np.exp(own))
         out = now.copy()
         for k, belief in map_beliefs.items():
-            self._enter(k, int(keys[k]), belief)
+            self._enter_place(k, int(keys[k]), belief)
         for k in [k for k, known in enumerate(self._map) if known is not None]:
             likelihood = np.exp(visit[k])
             informed = self._entry[k] * likelihood
@@ -93,7 +94,7 @@ class MapPrior:
         self._own = now
         return out
 
-    def _enter(self, k: int, key: int, belief: FloatArray | None) -> None:
+    def _enter_place(self, k: int, key: int, belief: FloatArray | None) -> None:
         before, self._map[k], self._key[k] = self._map[k], belief, key
         self._wrong[k] = self._found[k] = SHARE + KEPT * (self._found[k] - SHARE)
         if belief is None:
@@ -105,8 +106,8 @@ class MapPrior:
         )
         self._border[k] = (1.0 - LEAST_CHANGE) * self._own[k] + LEAST_CHANGE * mugrid.PRIOR
         carried = (1.0 - change) * self._own[k] + change * mugrid.PRIOR
-        self._entry[k] = _normal((carried * belief)[None])[0]
+        self._entry[k] = _normalise_rows((carried * belief)[None])[0]
 
 
-def _normal(weights: FloatArray) -> FloatArray:
+def _normalise_rows(weights: FloatArray) -> FloatArray:
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))

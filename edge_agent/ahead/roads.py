@@ -49,7 +49,7 @@ def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
     for key, (px, py) in places.items():
         by_cell.setdefault((math.floor(px / side), math.floor(py / side)), []).append(key)
     graph = _Neighbours(places, by_cell, side)
-    begin = graph.onward((0.0, 0.0), pose.yaw, BEGIN_CELLS)
+    begin = graph.next_places((0.0, 0.0), pose.yaw, BEGIN_CELLS)
     if not begin:
         return []
     ways = [[begin[0]]]
@@ -75,7 +75,7 @@ class _Neighbours:
         self._by_cell = by_cell
         self.side = side
 
-    def onward(self, here: tuple[float, float], heading: float, cells: float) -> list[int]:
+    def next_places(self, here: tuple[float, float], heading: float, cells: float) -> list[int]:
         """Return places that may come next, the likeliest first; one per road."""
         reach = cells * self.side
         found = []
@@ -91,13 +91,13 @@ class _Neighbours:
                     if not 0.3 * self.side < distance <= reach:
                         continue
                     link = math.atan2(dy, dx)
-                    turn = _apart(link, heading)
-                    turned = _apart(link, (key % grid.SECTORS) * math.pi / 2.0)
+                    turn = _angle_between(link, heading)
+                    turned = _angle_between(link, (key % grid.SECTORS) * math.pi / 2.0)
                     if turn <= TURN and turned <= LEAN:
                         found.append((distance * (1.0 + 2.0 * turn + 0.5 * turned), key, link))
         chosen: list[tuple[int, float]] = []
         for _, key, link in sorted(found):
-            if all(_apart(link, other) > FORK for _, other in chosen):
+            if all(_angle_between(link, other) > FORK for _, other in chosen):
                 chosen.append((key, link))
         return [key for key, _ in chosen]
 
@@ -110,8 +110,8 @@ def _follow_way(
     passed = set(way)
     for _ in range(MOST_STEPS):
         here = graph.places[way[-1]]
-        heading = _heading(way, graph.places, pose)
-        onward = [key for key in graph.onward(here, heading, LINK_CELLS) if key not in passed]
+        heading = _heading_of_way(way, graph.places, pose)
+        onward = [key for key in graph.next_places(here, heading, LINK_CELLS) if key not in passed]
         if not onward or run >= length:
             break
         if len(forks) < MOST_WAYS:
@@ -122,7 +122,7 @@ def _follow_way(
     return way
 
 
-def _heading(way: list[int], places: dict[int, tuple[float, float]], pose: Pose) -> float:
+def _heading_of_way(way: list[int], places: dict[int, tuple[float, float]], pose: Pose) -> float:
     """Return the heading of the last three links, because the cell centres of a slanting road
     zigzag.
     """
@@ -145,7 +145,7 @@ def _as_path(
     smooth[1:-1] = (line[:-2] + line[1:-1] + line[2:]) / 3.0
     known = np.array([way[0], *way])
     if beyond:
-        heading = _heading(way, places, pose)
+        heading = _heading_of_way(way, places, pose)
         metres = np.arange(STEP_M, CORRIDOR_M + 1.0, STEP_M)
         straight = smooth[-1] + metres[:, None] * [math.cos(heading), math.sin(heading)]
         smooth = np.concatenate([smooth, straight])
@@ -153,5 +153,5 @@ def _as_path(
     return path_along("road", smooth, pose, length, known)
 
 
-def _apart(a: float, b: float) -> float:
+def _angle_between(a: float, b: float) -> float:
     return abs((a - b + math.pi) % (2.0 * math.pi) - math.pi)

@@ -36,7 +36,11 @@ def read_route(path: Path) -> GivenRoute:
         ) from error
     if len(data) > MOST_BYTES:
         raise InputError("route", f"{path} has {len(data)} bytes", f"give at most {MOST_BYTES}")
-    points = _gpx(data) if data.lstrip().startswith((b"<", b"\xef\xbb\xbf<")) else _geojson(data)
+    points = (
+        _parse_gpx(data)
+        if data.lstrip().startswith((b"<", b"\xef\xbb\xbf<"))
+        else _parse_geojson(data)
+    )
     return route_of(points)
 
 
@@ -62,13 +66,13 @@ def route_of(points: list[tuple[float, float]]) -> GivenRoute:
     return GivenRoute(place[:, 0], place[:, 1])
 
 
-def _gpx(data: bytes) -> list[tuple[float, float]]:
+def _parse_gpx(data: bytes) -> list[tuple[float, float]]:
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in _POINTS}
 
-    def refuse(*_: object) -> None:
+    def refuse_doctype(*_: object) -> None:
         raise InputError("route", "declares a document type", "give plain GPX")
 
-    def element(name: str, attributes: dict[str, str]) -> None:
+    def read_point(name: str, attributes: dict[str, str]) -> None:
         kind = name.rpartition(":")[2]
         if kind in found:
             try:
@@ -79,8 +83,8 @@ def _gpx(data: bytes) -> list[tuple[float, float]]:
                 ) from error
 
     parser = expat.ParserCreate()
-    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
-    parser.StartElementHandler = element
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse_doctype
+    parser.StartElementHandler = read_point
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:
@@ -88,9 +92,9 @@ def _gpx(data: bytes) -> list[tuple[float, float]]:
     return next((points for points in found.values() if len(points) >= 2), [])
 
 
-def _geojson(data: bytes) -> list[tuple[float, float]]:
+def _parse_geojson(data: bytes) -> list[tuple[float, float]]:
     try:
-        line = _line(json.loads(data))
+        line = _find_line(json.loads(data))
         return [(float(point[1]), float(point[0])) for point in line]
     except (ValueError, TypeError, IndexError, KeyError, AttributeError, RecursionError) as error:
         raise InputError(
@@ -98,7 +102,7 @@ def _geojson(data: bytes) -> list[tuple[float, float]]:
         ) from error
 
 
-def _line(document: Any) -> list[Any]:  # noqa: ANN401 whatever JSON holds
+def _find_line(document: Any) -> list[Any]:  # noqa: ANN401 whatever JSON holds
     """Return the coordinates of the first line in a document."""
     kind = document["type"]
     if kind == "LineString":
@@ -106,7 +110,9 @@ def _line(document: Any) -> list[Any]:  # noqa: ANN401 whatever JSON holds
     if kind == "MultiLineString":
         return [point for part in document["coordinates"] for point in part]
     if kind == "Feature":
-        return _line(document["geometry"])
+        return _find_line(document["geometry"])
     if kind == "FeatureCollection":
-        return next((found for feature in document["features"] if (found := _line(feature))), [])
+        return next(
+            (found for feature in document["features"] if (found := _find_line(feature))), []
+        )
     return []

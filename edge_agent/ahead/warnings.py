@@ -66,7 +66,7 @@ def update_warnings(
     """
     issued: list[GripWarning] = []
     speed = pose.speed + GAIN if pose.speed > SLOWEST else 0.0
-    stretches = [stretch for horizon in horizons for stretch in _stretches(horizon, speed)]
+    stretches = [stretch for horizon in horizons for stretch in _slippery_stretches(horizon, speed)]
     kept: dict[str, Active] = {one.warning.id: one for one in active}
     here: set[str] = set()  # those that lie ahead now
     for places, ways in _by_place(stretches):
@@ -78,14 +78,14 @@ def update_warnings(
                 continue
             first = min(nearest.places)
             name = f"{grid.quadkey(first // grid.SECTORS, grid.CELL_ZOOM)}{first % grid.SECTORS}-{pose.time // NS:x}"
-            one = _warning(name, "raised", nearest, pose, sure)
+            one = _make_warning(name, "raised", nearest, pose, sure)
             issued.append(one)
             kept[name] = Active(one, places, pose.time, nearest.start)
             here.add(name)
             continue
         here.add(before.warning.id)
         name = before.warning.id
-        one = _warning(before.warning.id, "updated", nearest, pose, sure)
+        one = _make_warning(before.warning.id, "updated", nearest, pose, sure)
         grown = len(places - before.places) >= CHANGED_PLACES
         if grown or abs(one.mu - before.warning.mu) >= CHANGED_MU:
             issued.append(one)
@@ -97,19 +97,19 @@ def update_warnings(
             continue
         stands = justifies_warning(known.look_up(np.array(sorted(last.places)), pose.time)).any()
         if not stands or pose.time - last.seen > ABSENT_S * NS:
-            issued.append(_ended(last, pose, stands=bool(stands)))
+            issued.append(_end_warning(last, pose, stands=bool(stands)))
             del kept[name]
     return tuple(kept.values()), issued
 
 
-def _stretches(horizon: Horizon, speed: float) -> list[_Stretch]:
+def _slippery_stretches(horizon: Horizon, speed: float) -> list[_Stretch]:
     """Return runs of slippery metres of a horizon; runs less than LINK_M apart are joined."""
     brakes = np.concatenate([[0.0], braking_from(horizon)])
     begins = math.ceil(
         speed * (REACTION_S + UPDATE_S) + MARGIN_M
     )  # where the brakes bite at the latest
     found = []
-    for first, last in _runs(horizon.slippery):
+    for first, last in _find_runs(horizon.slippery):
         places = frozenset(
             horizon.key[first : last + 1][horizon.slippery[first : last + 1]].tolist()
         )
@@ -123,7 +123,7 @@ def _stretches(horizon: Horizon, speed: float) -> list[_Stretch]:
     return found
 
 
-def _runs(mask: BoolArray) -> list[tuple[int, int]]:
+def _find_runs(mask: BoolArray) -> list[tuple[int, int]]:
     at = np.flatnonzero(mask)
     if not len(at):
         return []
@@ -148,7 +148,7 @@ def _by_place(stretches: list[_Stretch]) -> list[tuple[frozenset[int], list[_Str
     return groups
 
 
-def _warning(
+def _make_warning(
     name: str, state: WarningState, stretch: _Stretch, pose: Pose, sure: bool
 ) -> GripWarning:
     horizon = stretch.horizon
@@ -183,7 +183,7 @@ def _warning(
     )
 
 
-def _ended(one: Active, pose: Pose, *, stands: bool) -> GripWarning:
+def _end_warning(one: Active, pose: Pose, *, stands: bool) -> GripWarning:
     if not stands:
         reason = "it is no longer slippery there, or nobody knows"
     elif one.distance_m <= NEAR_M:

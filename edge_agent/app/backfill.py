@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.app.estimates_file import EstimatesFile, writable
+from edge_agent.app.estimates_file import EstimatesFile, prepare_path
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.doctor.adopt import prepare_log
 from edge_agent.inputs.signal_log import read_log
@@ -67,7 +67,7 @@ def vehicle_file_of(log: Path) -> Path:
     return log.with_suffix(".json")
 
 
-def backfill(
+def estimate_drives(
     tasks: Sequence[Task], estimator: str, jobs: int, memberships: Memberships | None = None
 ) -> Iterator[Outcome]:
     """Estimate all drives, `jobs` at a time; yield outcomes as they arrive. A bad drive stops no
@@ -80,7 +80,7 @@ def backfill(
         raise InputError("jobs", f"{jobs} is below 1", "give at least one job")
     with ThreadPoolExecutor(jobs) as pool:
         for future in as_completed(
-            [pool.submit(estimate, task, estimator, memberships) for task in tasks]
+            [pool.submit(estimate_drive, task, estimator, memberships) for task in tasks]
         ):
             yield future.result()
 
@@ -88,14 +88,14 @@ def backfill(
 def backfill_on_spark(
     tasks: Sequence[Task], estimator: str, memberships: Memberships | None = None
 ) -> Iterator[Outcome]:
-    """Estimate like `backfill`, on the machines of Spark, all of which see the same files; outcomes
-    in the tasks' order.
+    """Estimate like `estimate_drives`, on the machines of Spark, all of which see the same files;
+    outcomes in the tasks' order.
 
     Raises:
         InputError: Spark is not available or gave up, or the folder of the estimates cannot be
             created.
     """
-    folders = {writable("out", task.out).parent for task in tasks}
+    folders = {prepare_path("out", task.out).parent for task in tasks}
     yield from spark.spread(
         spark.session(),
         tasks,
@@ -111,14 +111,14 @@ def estimate_atomically(task: Task, estimator: str, memberships: Memberships | N
     """
     folder = task.out.parent
     with own_drafts(folder) as drafts:
-        outcome = estimate(task._replace(out=drafts / task.out.name), estimator, memberships)
+        outcome = estimate_drive(task._replace(out=drafts / task.out.name), estimator, memberships)
         if outcome.error is None:
             (drafts / task.out.name).rename(task.out)
             sync_directory(folder)
     return outcome._replace(task=task)
 
 
-def estimate(task: Task, estimator: str, memberships: Memberships | None = None) -> Outcome:
+def estimate_drive(task: Task, estimator: str, memberships: Memberships | None = None) -> Outcome:
     """Estimate one drive."""
     try:
         vehicle = load_vehicle(task.vehicle)

@@ -34,7 +34,7 @@ WHEEL_COLUMNS = tuple(
 )
 
 
-def writable(field: str, path: Path) -> Path:
+def prepare_path(field: str, path: Path) -> Path:
     """Return the path after creating its folder.
 
     Raises:
@@ -65,7 +65,7 @@ def write_table(field: str, path: Path, table: pa.Table) -> None:
         InputError: the path cannot be written, or its ending is not one of ENDINGS.
     """
     with (
-        open_durably(writable(field, path)) as file,
+        open_durably(prepare_path(field, path)) as file,
         _table_writer(path, field)(file, table.schema) as writer,
     ):
         writer.write_table(table)
@@ -89,7 +89,7 @@ class EstimatesFile:
     def __init__(self, path: Path) -> None:
         with ExitStack() as opened:
             writer = _table_writer(path)
-            file = opened.enter_context(open_durably(writable("out", path)))
+            file = opened.enter_context(open_durably(prepare_path("out", path)))
             self._writer = opened.enter_context(writer(file, ESTIMATES_SCHEMA))
             self._opened = opened.pop_all()
 
@@ -106,10 +106,10 @@ class EstimatesFile:
 
     def write(self, t: FloatArray, estimates: Estimates) -> None:
         """Add a block: t (T, 1) and the estimates of a bank of one vehicle."""
-        self._writer.write_table(table(t, estimates))
+        self._writer.write_table(estimates_table(t, estimates))
 
 
-def table(t: FloatArray, estimates: Estimates) -> pa.Table:
+def estimates_table(t: FloatArray, estimates: Estimates) -> pa.Table:
     """Return estimates (T, 1) as a table of ESTIMATES_SCHEMA; the columns per wheel are null if
     the bank has one mu.
     """

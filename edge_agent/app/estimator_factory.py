@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.app.tuned_memberships import shipped
+from edge_agent.app.tuned_memberships import shipped_memberships
 from edge_agent.estimators import ESTIMATORS, TUNED, EstimatorBank, create
 from schemas.errors import InputError
 from schemas.runtime import plugins
@@ -54,5 +54,5 @@ def bank_of(
             f"choose one of {', '.join(known_estimators())}",
         )
     if memberships is None and estimator in TUNED:
-        memberships = shipped(TUNED[estimator])
+        memberships = shipped_memberships(TUNED[estimator])
     return create(estimator, vehicles, memberships=memberships, curve=curve)

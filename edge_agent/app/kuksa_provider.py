@@ -66,7 +66,7 @@ class KuksaProvider:
         self._latest: tuple[Mapping[str, float], int] | None = None
         self._changed = threading.Condition()
         self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="kuksa", daemon=True)
+        self._thread = threading.Thread(target=self._publish_loop, name="kuksa", daemon=True)
         self._thread.start()
 
     def write(self, signals: Mapping[str, float], time_ns: int) -> None:
@@ -82,11 +82,11 @@ class KuksaProvider:
             self._changed.notify()
         self._thread.join(LEAVE_S)
 
-    def _run(self) -> None:
+    def _publish_loop(self) -> None:
         connection = self._connection
         with connection.open_channel() as channel:
             answer = connection.messages.PublishValueResponse
-            publish = connection.method(channel.unary_unary, "PublishValue", answer)
+            publish = connection.make_call(channel.unary_unary, "PublishValue", answer)
             while True:
                 with self._changed:
                     self._changed.wait_for(lambda: self._latest is not None or self._stopping)
@@ -124,14 +124,14 @@ class KuksaProvider:
                 self._unknown.add(path)
                 log.warning("the databroker does not take %s: %s", path, error.details())
             else:
-                self._report(f"{code.name}: {error.details()}")
+                self._log_problem(f"{code.name}: {error.details()}")
             self.refused += 1  # after the log line, so that whoever sees the count finds the line
             return code not in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
-        self._report("")
+        self._log_problem("")
         self.written += 1
         return True
 
-    def _report(self, problem: str) -> None:
+    def _log_problem(self, problem: str) -> None:
         """Log a problem once, and its end."""
         if problem and not self._problem:
             log.warning("the databroker cannot be written (%s); trying again", problem)

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app import tuned_memberships
-from edge_agent.app.estimates_file import table
+from edge_agent.app.estimates_file import estimates_table
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates, EstimatorBank
 from edge_agent.inputs import signal_log
@@ -48,7 +48,7 @@ def load_vehicle(path: Path | str) -> Vehicle:
 
 def load_memberships(path: Path | str) -> Memberships:
     """Return the fuzzy sets that `edge-agent tune` wrote; InputError names the invalid field."""
-    return tuned_memberships.load(path).memberships
+    return tuned_memberships.load_tuned(path).memberships
 
 
 def make_bank(
@@ -79,7 +79,9 @@ def estimate(
     """
     log, vehicle, *_ = prepare_log(log, vehicle)
     bank = bank_of(estimator, [vehicle], memberships)
-    parts = [table(block.t, bank.advance(block.t, block.signals)) for block in log.blocks(0)]
+    parts = [
+        estimates_table(block.t, bank.advance(block.t, block.signals)) for block in log.blocks(0)
+    ]
     return pa.concat_tables([*parts, ESTIMATES_SCHEMA.empty_table()]).combine_chunks()
 
 
@@ -93,7 +95,7 @@ def to_table(t: FloatArray, estimates: Estimates, vehicle: int = 0) -> pa.Table:
     if not 0 <= vehicle < count:
         raise InputError("vehicle", f"{vehicle} is none of {count}", f"give 0 to {count - 1}")
     time = np.asarray(t if t.ndim == 1 else t[:, vehicle])[:, None]
-    return table(time, Estimates(estimates.values[:, vehicle : vehicle + 1]))
+    return estimates_table(time, Estimates(estimates.values[:, vehicle : vehicle + 1]))
 
 
 def plot(

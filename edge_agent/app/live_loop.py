@@ -43,7 +43,7 @@ class Progress:
     held: int = 0
 
 
-def drive(
+def run_live_loop(
     blocks: Iterator[Block],
     pipeline: Pipeline,
     publisher: Publisher,
@@ -68,7 +68,7 @@ def drive(
     started = first = float("nan")
     for block in blocks:
         _, observations, states = pipeline.step(block)
-        _offer(publisher, progress, admitted(), observations, states)
+        _offer_if_admitted(publisher, progress, admitted(), observations, states)
         after()
         _warn_of_flags(pipeline, doubted)
         if not progress.blocks:
@@ -86,11 +86,11 @@ def drive(
             break
         if clock() - started >= status_at:
             status_at += STATUS_EVERY_S
-            if not publisher.broken:
+            if not publisher.is_broken:
                 watchdog.notify_alive()
             on_status(progress)
     if (last := pipeline.finish()) is not None:
-        _offer(publisher, progress, admitted(), last)
+        _offer_if_admitted(publisher, progress, admitted(), last)
     return progress
 
 
@@ -107,14 +107,16 @@ def _warn_of_flags(pipeline: Pipeline, warned: set[tuple[int, str]]) -> None:
             )
 
 
-def _offer(publisher: Publisher, progress: Progress, admitted: bool, *records: RecordBlock) -> None:
+def _offer_if_admitted(
+    publisher: Publisher, progress: Progress, admitted: bool, *records: RecordBlock
+) -> None:
     if admitted:
         publisher.offer(*records)
     else:
         progress.held += sum(len(block.vehicle) for block in records)
 
 
-def summary(progress: Progress, publisher: Publisher) -> dict[str, float]:
+def final_counts(progress: Progress, publisher: Publisher) -> dict[str, float]:
     """Return the final counts of records, all kinds together and observations alone, and lags and
     blocks of the loop."""
     counts = publisher.counts
@@ -122,9 +124,9 @@ def summary(progress: Progress, publisher: Publisher) -> dict[str, float]:
     return {
         "published": sum(counts.published.values()),
         "acknowledged": sum(counts.acknowledged.values()),
-        "unsettled": publisher.unsettled(),
+        "unsettled": publisher.count_unsettled(),
         "rejected": sum(counts.rejected.values()),
-        "dropped": publisher.dropped,
+        "dropped": publisher.dropped_records,
         "held": progress.held,
         "behind": progress.behind,
         "blocks": progress.blocks,
@@ -133,6 +135,6 @@ def summary(progress: Progress, publisher: Publisher) -> dict[str, float]:
         "resent_batches": counts.resent_batches,
         "observations_published": counts.published[seen],
         "observations_acknowledged": counts.acknowledged[seen],
-        "observations_unsettled": publisher.unsettled(seen),
+        "observations_unsettled": publisher.count_unsettled(seen),
         "observations_rejected": counts.rejected[seen],
     }

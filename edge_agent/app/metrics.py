@@ -17,36 +17,49 @@ FULL: Final = 0.9  # of the outbox
 _NAMES: Final = {Kind.OBSERVATION: "observation", Kind.STATE: "state"}
 
 
-def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
+def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
     """Return all current values; records are counted by kind."""
     counts = publisher.counts
     return [
         Metric(
-            "published_records", "counter", "put on disk and sent", _named(counts.published), "kind"
+            "published_records",
+            "counter",
+            "put on disk and sent",
+            _by_kind_name(counts.published),
+            "kind",
         ),
         Metric(
             "acknowledged_records",
             "counter",
             "held by a service",
-            _named(counts.acknowledged),
+            _by_kind_name(counts.acknowledged),
             "kind",
         ),
         Metric(
-            "rejected_records", "counter", "rejected by a service", _named(counts.rejected), "kind"
+            "rejected_records",
+            "counter",
+            "rejected by a service",
+            _by_kind_name(counts.rejected),
+            "kind",
         ),
-        Metric("dropped_records", "counter", "dropped for lack of room", {"": publisher.dropped}),
+        Metric(
+            "dropped_records",
+            "counter",
+            "dropped for lack of room",
+            {"": publisher.dropped_records},
+        ),
         Metric(
             "late_batches",
             "counter",
             "batches that arrived after the map had moved on",
-            _named(counts.late),
+            _by_kind_name(counts.late),
             "kind",
         ),
         Metric(
             "unanswered_records",
             "counter",
             "given up because only later batches were answered",
-            {"": publisher.unanswered},
+            {"": publisher.unanswered_records},
         ),
         Metric("resent_batches", "counter", "sent again", {"": counts.resent_batches}),
         Metric(
@@ -56,10 +69,13 @@ def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
             "damaged_spools",
             "counter",
             "times that the outbox was found damaged",
-            {"": publisher.damage[0]},
+            {"": publisher.damage_counts[0]},
         ),
         Metric(
-            "damaged_records", "counter", "lost by damage of the outbox", {"": publisher.damage[1]}
+            "damaged_records",
+            "counter",
+            "lost by damage of the outbox",
+            {"": publisher.damage_counts[1]},
         ),
         Metric(
             "sender_failures",
@@ -67,7 +83,11 @@ def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
             "failed rounds of the sending thread",
             {"": counts.failures},
         ),
-        gauge("stranded_records", "records in the outbox under a former name", publisher.stranded),
+        gauge(
+            "stranded_records",
+            "records in the outbox under a former name",
+            publisher.stranded_records,
+        ),
         gauge(
             "unanswered_seconds",
             "time for which sent batches have not been answered",
@@ -78,11 +98,11 @@ def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
             "lag of the vehicle's clock behind the service's",
             publisher.clock_behind_s,
         ),
-        gauge("outbox_fill", "share of the outbox that is full", publisher.fill),
+        gauge("outbox_fill", "share of the outbox that is full", publisher.fill_share),
         gauge(
             "unsettled_records",
             "records neither acknowledged nor rejected yet",
-            publisher.unsettled(),
+            publisher.count_unsettled(),
         ),
         gauge("sessions", "open sessions", publisher.links),
         *link_metrics(publisher.link_watches),
@@ -99,24 +119,24 @@ def health_problems(publisher: Publisher, progress: Progress) -> list[str]:
         found.append("a session has no router")
     if publisher.unanswered_s > UNANSWERED_S:
         found.append(f"nothing was acknowledged for {publisher.unanswered_s:.0f} s")
-    if publisher.fill > FULL:
+    if publisher.fill_share > FULL:
         found.append("the outbox is full: the oldest states are dropped first")
     if abs(publisher.clock_behind_s) > CLOCK_OFF_S:
         found.append(
             f"the clock is {publisher.clock_behind_s:.0f} s behind the service's: reports arrive "
             "late or are refused"
         )
-    if publisher.stranded:
+    if publisher.stranded_records:
         found.append(
-            f"{publisher.stranded} records are stored under a former name; run once with the "
+            f"{publisher.stranded_records} records are stored under a former name; run once with the "
             "former --name"
         )
-    if publisher.broken:
+    if publisher.is_broken:
         found.append("the sending thread has died; restart the agent")
     if progress.now_s > BEHIND_S:
         found.append(f"{progress.now_s:.1f} s behind real time")
     return found
 
 
-def _named(counts: Mapping[Kind, int]) -> dict[str, float]:
+def _by_kind_name(counts: Mapping[Kind, int]) -> dict[str, float]:
     return {_NAMES[kind]: number for kind, number in counts.items()}

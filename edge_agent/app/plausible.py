@@ -92,7 +92,7 @@ class Plausibility:
         }
         return [words for words, bad in found.items() if bad]
 
-    def line(self) -> str:
+    def summary_line(self) -> str:
         """Return the summary line."""
         n = max(self.samples, 1)
         summary = (

@@ -58,7 +58,7 @@ class SignalWatch:
         self.began = clock()
         self._seen: dict[str, float] = {}
 
-    def blocks(self, source: Iterator[Block]) -> Iterator[Block]:
+    def watch_blocks(self, source: Iterator[Block]) -> Iterator[Block]:
         """Yield the blocks of a source and record their contents."""
         for block in source:
             self.add(block)
@@ -79,12 +79,12 @@ class SignalWatch:
         }
         self._seen.update({name: now for name, here in present.items() if here})
 
-    def missing(self, name: str) -> bool:
+    def is_missing(self, name: str) -> bool:
         """Return True if the blocks have lacked something for MISSING_S."""
         return bool(self._seen) and self._clock() - self._seen[name] > MISSING_S
 
 
-def reasons(
+def reasons_not_publishing(
     watch: SignalWatch, publisher: PublisherState, endpoints: Sequence[str], troubles: Sequence[str]
 ) -> list[str]:
     """Return the reasons why nothing is published, the first cause first; empty if records can be
@@ -97,11 +97,11 @@ def reasons(
         troubles: of the sources and of the signal doctor.
     """
     found = list(troubles)
-    if watch.missing("wheels"):
+    if watch.is_missing("wheels"):
         found.append("no wheel speed in the signals: compare the profile with what the car sends")
-    elif watch.missing("turning"):
+    elif watch.is_missing("turning"):
         found.append("the vehicle stands: only a moving vehicle visits cells")
-    if watch.missing("position"):
+    if watch.is_missing("position"):
         found.append(
             "no position: connect a receiver (gpsd:HOST:PORT) or a source with latitude and "
             "longitude"
@@ -148,7 +148,7 @@ class ReasonReporter:
         self._due: float | None = None
         self._told: list[str] = []
 
-    def look(self) -> None:
+    def print_if_due(self) -> None:
         """Print the reasons if they are due and differ from those that were printed last."""
         now = self._clock()
         if self._due is None:

@@ -22,7 +22,7 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from edge_agent.calibration.learn import DriveEstimates, one_drive, surer, weighed
+from edge_agent.calibration.learn import DriveEstimates, one_drive, surer_values, weigh_estimates
 from edge_agent.inputs.block import Block
 from edge_agent.inputs.correct import Corrector
 from edge_agent.inputs.doctor.findings import diagnose
@@ -70,10 +70,10 @@ class Trip:
         self._plain = vehicle.model_copy(update={"calibration": None})
         self._path = path
         self._trusted = trusted
-        self._known = _read(path, _identity(self._plain, profile))
-        learned = weighed(self._known.drives, self._plain)
+        self._known = _read_state(path, _car_identity(self._plain, profile))
+        learned = weigh_estimates(self._known.drives, self._plain)
         self.vehicle = vehicle.model_copy(
-            update={"calibration": surer(vehicle.calibration, learned)}
+            update={"calibration": surer_values(vehicle.calibration, learned)}
         )
         self._blocks: list[
             tuple[FloatArray, FloatArray, FloatArray]
@@ -83,17 +83,17 @@ class Trip:
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="doctor")
         self._looking: Future[None] | None = None
 
-    def admitted(self) -> bool:
+    def is_admitted(self) -> bool:
         """True if the signals are verified."""
         return self._trusted or self._known.passed
 
-    def troubles(self) -> list[str]:
+    def health_problems(self) -> list[str]:
         """Return the reasons why nothing is published, if any."""
-        if self.admitted():
+        if self.is_admitted():
             return []
         return [f"the signal doctor: {', '.join(self._faults) or 'has not passed the signals yet'}"]
 
-    def blocks(
+    def corrected_blocks(
         self, source: Generator[Block], ground: Callable[[], FloatArray]
     ) -> Generator[Block]:
         """Yield the blocks of a source with known device errors corrected; the raw ones are kept
@@ -101,7 +101,7 @@ class Trip:
 
         `ground` returns the speed over ground (T,) of the last block.
         """
-        if not self.admitted():
+        if not self.is_admitted():
             log.info(
                 "nothing is published until the signal doctor has passed half a minute of turns "
                 "and braking"
@@ -109,13 +109,13 @@ class Trip:
         corrector = Corrector(self.vehicle)
         with closing(source):
             for block in source:
-                self._keep(block, ground())
+                self._keep_block(block, ground())
                 mended = corrector.advance(block.t[:, 0], block.signals[:, 0])
                 yield replace(block, signals=mended[:, None])
 
-    def end(self) -> None:
+    def learn_rest(self) -> None:
         """Start to learn from the rest."""
-        self._look(final=True)
+        self._start_examination(final=True)
 
     def close(self) -> None:
         """Wait shortly for the learning to end."""
@@ -126,18 +126,18 @@ class Trip:
                 log.warning("the end of this trip is not learned from: no time left")
         self._worker.shutdown(wait=False, cancel_futures=True)
 
-    def _keep(self, block: Block, ground: FloatArray) -> None:
+    def _keep_block(self, block: Block, ground: FloatArray) -> None:
         now = float(block.t[-1, 0])
         if not self._blocks:
             self._since = self._looked = float(block.t[0, 0])
         self._blocks.append((block.t[:, 0], block.signals[:, 0], ground))
         if now - self._since >= PART_S:
-            self._look(final=True)
-        elif not self.admitted() and now - self._looked >= LOOK_S:
+            self._start_examination(final=True)
+        elif not self.is_admitted() and now - self._looked >= LOOK_S:
             self._looked = now
-            self._look(final=False)
+            self._start_examination(final=False)
 
-    def _look(self, *, final: bool) -> None:
+    def _start_examination(self, *, final: bool) -> None:
         """Examine the part next to the loop; the last examination of a part ends it."""
         if not self._blocks:
             return
@@ -146,9 +146,11 @@ class Trip:
         part = list(self._blocks)
         if final:
             self._blocks = []
-        self._looking = self._worker.submit(self._examine, part, final)
+        self._looking = self._worker.submit(self._examine_part, part, final)
 
-    def _examine(self, part: list[tuple[FloatArray, FloatArray, FloatArray]], final: bool) -> None:
+    def _examine_part(
+        self, part: list[tuple[FloatArray, FloatArray, FloatArray]], final: bool
+    ) -> None:
         t, signals, ground = (np.concatenate(columns) for columns in zip(*part, strict=True))
         try:
             diagnosis = diagnose(t, signals, self._plain, ground)
@@ -156,23 +158,23 @@ class Trip:
             if self._faults:
                 log.warning("the signal doctor: %s", ", ".join(self._faults))
             estimates: DriveEstimates = {}
-            if diagnosis.passed and final and t[-1] - t[0] >= LEAST_S:
+            if diagnosis.is_passed and final and t[-1] - t[0] >= LEAST_S:
                 estimates = one_drive(t, signals, self._plain)
         except (ValueError, FloatingPointError, np.linalg.LinAlgError) as error:
             log.warning("a part of this trip cannot be examined: %s", error)
             return
-        if diagnosis.passed and not self._known.passed:
+        if diagnosis.is_passed and not self._known.passed:
             log.info(
                 "the signal doctor has passed: units, signs, clocks and offsets agree with each "
                 "other"
             )
-        passed = diagnosis.passed or (self._known.passed and not self._faults)
+        passed = diagnosis.is_passed or (self._known.passed and not self._faults)
         if estimates or passed != self._known.passed:
             drives = (
                 [*self._known.drives, estimates][-MOST_DRIVES:] if estimates else self._known.drives
             )
             self._known = self._known.model_copy(update={"passed": passed, "drives": drives})
-            _write(self._path, self._known)
+            _write_state(self._path, self._known)
 
 
 def state_path_for(spool: Path, name: str) -> Path:
@@ -180,12 +182,12 @@ def state_path_for(spool: Path, name: str) -> Path:
     return spool.with_name(f"{spool.stem}.{name}.json")
 
 
-def _identity(vehicle: Vehicle, profile: Profile) -> str:
-    text = vehicle.model_dump_json(exclude_none=True) + profile.text()
+def _car_identity(vehicle: Vehicle, profile: Profile) -> str:
+    text = vehicle.model_dump_json(exclude_none=True) + profile.to_json()
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _read(path: Path, identity: str) -> Known:
+def _read_state(path: Path, identity: str) -> Known:
     """Return the stored knowledge of the car; empty if the file is missing, broken, or of
     another car.
     """
@@ -204,7 +206,7 @@ def _read(path: Path, identity: str) -> Known:
     return known
 
 
-def _write(path: Path, known: Known) -> None:
+def _write_state(path: Path, known: Known) -> None:
     """Write the knowledge atomically."""
     part = path.with_suffix(".part")
     try:

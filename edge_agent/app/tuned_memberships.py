@@ -102,7 +102,7 @@ class Tuned:
     document: Document
 
 
-def parse(text: str | bytes, where: str) -> Tuned:
+def parse_tuned(text: str | bytes, where: str) -> Tuned:
     """Return the tuned memberships in a document.
 
     Raises:
@@ -126,7 +126,7 @@ def parse(text: str | bytes, where: str) -> Tuned:
     return Tuned(Memberships.from_json(document.memberships), document)
 
 
-def load(path: Path | str) -> Tuned:
+def load_tuned(path: Path | str) -> Tuned:
     """Read a tuned file; InputError names the invalid field, or the file if it cannot be read."""
     try:
         text = Path(path).read_bytes()
@@ -134,33 +134,33 @@ def load(path: Path | str) -> Tuned:
         raise InputError(
             "memberships", f"cannot read {path} ({error.strerror})", "name a tuned file"
         ) from error
-    return parse(text, f"tuned file {path}")
+    return parse_tuned(text, f"tuned file {path}")
 
 
-def shipped(estimator: str) -> Memberships:
+def shipped_memberships(estimator: str) -> Memberships:
     """Return the memberships that come with the package for an estimator.
 
     Raises:
         InputError: there are none for that estimator.
     """
-    return load(FOLDER / f"{estimator}.json").memberships
+    return load_tuned(FOLDER / f"{estimator}.json").memberships
 
 
 def search_results(estimator: str) -> dict[str, list[Memberships]]:
     """Return the results of every search behind the shipped file, by search; empty if the file
     does not have them.
     """
-    document = load(FOLDER / f"{estimator}.json").document
+    document = load_tuned(FOLDER / f"{estimator}.json").document
     return {
         way: [Memberships.from_json(one) for one in found]
         for way, found in document.candidates.items()
     }
 
 
-def save(path: Path, document: Document) -> None:
-    """Write a document after parsing it, so that no file is written that `load` would refuse."""
+def save_tuned(path: Path, document: Document) -> None:
+    """Write a document after parsing it, so that no file is written that `load_tuned` would refuse."""
     text = json.dumps(document.model_dump(), indent=1, ensure_ascii=False) + "\n"
-    parse(text, f"tuned file {path}")
+    parse_tuned(text, f"tuned file {path}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")

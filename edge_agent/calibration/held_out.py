@@ -13,7 +13,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from edge_agent.calibration.learn import learn
+from edge_agent.calibration.learn import learn_calibration
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.vehicle import Calibration, Vehicle
@@ -63,13 +63,13 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
     Raises:
         InputError: no drive is excited enough, or one drive is too short to hold a part out.
     """
-    whole = learn(drives, vehicle)
+    whole = learn_calibration(drives, vehicle)
     folds = split_folds(drives)
     candidates = []
     judged = []
     for taught, held in folds:
         try:
-            candidates.append(learn(taught, vehicle))
+            candidates.append(learn_calibration(taught, vehicle))
         except InputError:
             continue
         judged.append(held)
@@ -88,7 +88,9 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
             continue
         tried = [
             judge(
-                vehicle.model_copy(update={"calibration": restrict(candidate, [*kept, group])}),
+                vehicle.model_copy(
+                    update={"calibration": restrict_groups(candidate, [*kept, group])}
+                ),
                 held,
             )
             for candidate, held in zip(candidates, judged, strict=True)
@@ -98,7 +100,13 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
         else:
             best = tried
             kept.append(group)
-    return HeldOut(restrict(whole, kept), refused, _mean(before), _mean(best), len(judged))
+    return HeldOut(
+        restrict_groups(whole, kept),
+        refused,
+        _mean_prediction(before),
+        _mean_prediction(best),
+        len(judged),
+    )
 
 
 def split_folds(drives: Sequence[Drive]) -> list[tuple[list[Drive], Drive]]:
@@ -121,7 +129,7 @@ def split_folds(drives: Sequence[Drive]) -> list[tuple[list[Drive], Drive]]:
     ]
 
 
-def restrict(calibration: Calibration, groups: Sequence[str]) -> Calibration:
+def restrict_groups(calibration: Calibration, groups: Sequence[str]) -> Calibration:
     """Return the calibration with the quantities of some groups alone."""
     names = {name for group in groups for name in GROUPS[group]}
     update = {name: None for every in GROUPS.values() for name in every if name not in names}
@@ -132,12 +140,12 @@ def is_worse(tried: Sequence[Prediction], best: Sequence[Prediction]) -> bool:
     """Return True if predictions are worse on the mean of the drives, or one drive is
     contradicted for longer.
     """
-    lost = _mean(best).log_likelihood - _mean(tried).log_likelihood
+    lost = _mean_prediction(best).log_likelihood - _mean_prediction(tried).log_likelihood
     longer = max(new.contradicted - old.contradicted for new, old in zip(tried, best, strict=True))
     return lost > WORSE or longer > LONGER
 
 
-def _mean(predictions: Sequence[Prediction]) -> Prediction:
+def _mean_prediction(predictions: Sequence[Prediction]) -> Prediction:
     likelihood = float(np.mean([prediction.log_likelihood for prediction in predictions]))
     return Prediction(
         likelihood, float(np.mean([prediction.contradicted for prediction in predictions]))

@@ -36,9 +36,9 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, prepare
-from edge_agent.inputs.doctor.identities import CORRELATED_S, fits, robust
-from edge_agent.inputs.doctor.lags import lags
+from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, prepare_drive
+from edge_agent.inputs.doctor.identities import CORRELATED_S, fit_identities, fit_robustly
+from edge_agent.inputs.doctor.lags import find_lags
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import WHEELS
@@ -107,14 +107,16 @@ it.
 """
 
 
-def learn(drives: Sequence[tuple[FloatArray, FloatArray]], vehicle: Vehicle) -> Calibration:
+def learn_calibration(
+    drives: Sequence[tuple[FloatArray, FloatArray]], vehicle: Vehicle
+) -> Calibration:
     """Calibration of a vehicle from its drives, (t (T,), signals (T, 18)) each.
 
     Raises:
         InputError: none of them is excited enough.
     """
     estimates = [one_drive(t, signals, vehicle) for t, signals in drives]
-    calibration = weighed(estimates, vehicle)
+    calibration = weigh_estimates(estimates, vehicle)
     if calibration is None:
         raise InputError(
             "log",
@@ -124,7 +126,7 @@ def learn(drives: Sequence[tuple[FloatArray, FloatArray]], vehicle: Vehicle) -> 
     return calibration
 
 
-def weighed(drives: Sequence[DriveEstimates], vehicle: Vehicle) -> Calibration | None:
+def weigh_estimates(drives: Sequence[DriveEstimates], vehicle: Vehicle) -> Calibration | None:
     """Means over several drives with standard deviations; None where no drive was excited."""
     estimates: dict[str, list[float]] = {}
     for drive in drives:
@@ -139,11 +141,11 @@ def weighed(drives: Sequence[DriveEstimates], vehicle: Vehicle) -> Calibration |
             continue
         kind = name.partition("_")[0] if name.startswith("radius") else name
         unknown = min(estimates.get(f"{name}_std", [0.0]))
-        learned[name] = _posterior(kind, np.array(values), bias[kind], unknown)
+        learned[name] = _posterior_of(kind, np.array(values), bias[kind], unknown)
     return Calibration.model_validate({"drives": len(drives), **learned})
 
 
-def surer(one: Calibration | None, other: Calibration | None) -> Calibration | None:
+def surer_values(one: Calibration | None, other: Calibration | None) -> Calibration | None:
     """Return, of each quantity, the value with the smaller standard deviation of two
     calibrations of a car.
     """
@@ -158,7 +160,9 @@ def surer(one: Calibration | None, other: Calibration | None) -> Calibration | N
     return other.model_copy(update={**better, "drives": max(one.drives, other.drives)})
 
 
-def _posterior(kind: str, values: FloatArray, bias: float, unknown: float) -> tuple[float, float]:
+def _posterior_of(
+    kind: str, values: FloatArray, bias: float, unknown: float
+) -> tuple[float, float]:
     """Value and standard deviation by the estimates of drives (n,).
 
     `unknown` is the standard deviation that the best drive leaves; such estimates are drawn to what
@@ -181,19 +185,21 @@ def one_drive(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> DriveEsti
     """Return estimates of one drive, t (T,) [s] and signals (T, 18), by quantity; quantities
     without enough excitation are left out.
     """
-    return _quantities(prepare(t, signals, vehicle), vehicle) | lags(t, signals, vehicle)
+    return _estimate_quantities(prepare_drive(t, signals, vehicle), vehicle) | find_lags(
+        t, signals, vehicle
+    )
 
 
-def _quantities(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
+def _estimate_quantities(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
     moving = drive.moving > 0
-    axle = fits(drive)["axle"]
+    axle = fit_identities(drive)["axle"]
     quantities: DriveEstimates = {}
-    if axle.known and axle.error < 0.1:
+    if axle.is_known and axle.error < 0.1:
         quantities["yaw_rate"] = -axle.offset / axle.gain
         drive = replace(
             drive, r=drive.r - quantities["yaw_rate"]
         )  # else taken for offsets of steering and a_y
-    quantities |= _radii(drive, vehicle) | _force_gain(drive, vehicle)
+    quantities |= _estimate_radii(drive, vehicle) | _force_gain(drive, vehicle)
     calm = moving & np.isfinite(drive.ax) & np.isfinite(drive.v_dot)
     if calm.sum() > LEAST_S * RATE_HZ:
         quantities["ax"] = float(np.median((drive.ax - drive.v_dot)[calm]))
@@ -217,7 +223,7 @@ def trace_steering(drive: EvenDrive) -> DriveEstimates:
         [np.ones(int(rows.sum())), drive.wheelbase * (drive.r / fast)[rows], across[rows]], axis=1
     )
     angle = drive.delta[rows]
-    away = angle - table @ robust(table, angle)
+    away = angle - table @ fit_robustly(table, angle)
     spread = max(ROBUST * float(np.median(np.abs(away))), LEAST_ANGLE)
     near = np.abs(away) <= 3.0 * spread
     usual = np.array([USUAL[name] for name in TRACED])
@@ -235,7 +241,7 @@ def trace_steering(drive: EvenDrive) -> DriveEstimates:
     }
 
 
-def _radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
+def _estimate_radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
     """Return how much faster each wheel turns than the mean of the four, but for yaw and slip."""
     calm = (
         (drive.moving > 0) & (np.abs(drive.v_dot) < CALM) & (np.abs(drive.v * drive.r) < STRAIGHT)
@@ -247,7 +253,7 @@ def _radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
         [-vehicle.track_front, vehicle.track_front, -vehicle.track_rear, vehicle.track_rear]
     )
     rims = drive.wheels[calm] - half * drive.r[calm, None]
-    faster = rims / rims.mean(axis=1, keepdims=True) - _slips(drive, vehicle, calm)
+    faster = rims / rims.mean(axis=1, keepdims=True) - _wheel_slips(drive, vehicle, calm)
     ratio = np.median(faster, axis=0) - 1.0
     return {f"radius_{wheel}": float(value) for wheel, value in zip(WHEELS, ratio, strict=True)}
 
@@ -263,10 +269,10 @@ def _force_gain(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
         return {}
     moved = vehicle.mass + 4.0 * vehicle.wheel_inertia / vehicle.wheel_radius**2
     table = np.stack([moved * drive.v_dot[rows], np.ones(int(rows.sum()))], axis=1)
-    return {"force_gain": float(robust(table, drive.torque[rows] / vehicle.wheel_radius)[0])}
+    return {"force_gain": float(fit_robustly(table, drive.torque[rows] / vehicle.wheel_radius)[0])}
 
 
-def _slips(drive: EvenDrive, vehicle: Vehicle, rows: BoolArray) -> FloatArray:
+def _wheel_slips(drive: EvenDrive, vehicle: Vehicle, rows: BoolArray) -> FloatArray:
     """Return the slip of the wheels against the mean of the four, (n, 4): the slip from the driving
     force minus the slip that turns the other wheels.
 

@@ -95,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with (
         nullcontext() if chosen is None or chosen in LIVE else progress_messages.show_status(chosen)
     ):  # what it loads takes a second
-        code, left = _run(arguments, limited=argv is None and chosen in LIVE, chosen=chosen)
+        code, left = _run_command(arguments, limited=argv is None and chosen in LIVE, chosen=chosen)
     if left:
         from schemas.runtime.process import force_exit
 
@@ -103,7 +103,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
-def _run(arguments: Sequence[str], *, limited: bool, chosen: str | None) -> tuple[int, bool]:
+def _run_command(
+    arguments: Sequence[str], *, limited: bool, chosen: str | None
+) -> tuple[int, bool]:
     """Return the exit code, and whether a remaining thread would keep the process from ending."""
     args = commandline.parser_of(*LINE, chosen).parse_args(arguments)
     level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.INFO

@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Learn, judge on held-out drives and write; return 0."""
-    from edge_agent.app.estimates_file import writable
+    from edge_agent.app.estimates_file import prepare_path
     from edge_agent.calibration.held_out import learn_validated
     from edge_agent.inputs.correct import scale_axles
     from edge_agent.inputs.doctor.findings import diagnose
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     text = vehicle.model_copy(update={"calibration": found.calibration}).model_dump_json(
         indent=1, exclude_none=True
     )
-    writable("out", args.out).write_text(text + "\n", encoding="utf-8")
+    prepare_path("out", args.out).write_text(text + "\n", encoding="utf-8")
     print("\n".join(report_lines(found)))
     print(f"{args.out}: learned from {len(drives)} {'drive' if len(drives) == 1 else 'drives'}")
     return 0
@@ -74,13 +74,13 @@ def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.calibration.held_out import Prediction
     from edge_agent.estimators.estimates import Column
-    from edge_agent.inputs.correct import corrected
+    from edge_agent.inputs.correct import correct_log
     from schemas.signals import Health
 
     t, signals = drive
     values = (
         bank_of(ESTIMATOR, [vehicle])
-        .advance(t[:, None], corrected(t, signals, vehicle)[:, None])
+        .advance(t[:, None], correct_log(t, signals, vehicle)[:, None])
         .values[:, 0]
     )
     contradicted = (values[:, Column.HEALTH].astype(int) & int(Health.CONTRADICTION)) != 0

@@ -38,11 +38,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Check; return 0 if the log has passed, 1 if something is wrong or unknown."""
     from edge_agent.app.backfill import vehicle_file_of
-    from edge_agent.app.estimates_file import writable
+    from edge_agent.app.estimates_file import prepare_path
     from edge_agent.inputs.bring_in import profile_of
     from edge_agent.inputs.doctor.findings import diagnose
-    from edge_agent.inputs.doctor.fix import corrections, fixed
-    from edge_agent.inputs.doctor.report import advice, document, lines, page
+    from edge_agent.inputs.doctor.fix import apply_findings, list_corrections
+    from edge_agent.inputs.doctor.report import (
+        publishing_advice,
+        report_document,
+        report_lines,
+        report_page,
+    )
     from edge_agent.inputs.signal_log import read_log
     from schemas.vehicle import load_vehicle
 
@@ -50,11 +55,11 @@ def run(args: argparse.Namespace) -> int:
     vehicle = load_vehicle(file)
     log = read_log(args.log)
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
-    doubts = _doubted(log)
+    doubts = _doubted_flags(log)
     if args.json:
         print(
             json.dumps(
-                {"log": str(args.log), **document(diagnosis), "doubted_flags": doubts},
+                {"log": str(args.log), **report_document(diagnosis), "doubted_flags": doubts},
                 allow_nan=False,
             )
         )
@@ -63,29 +68,33 @@ def run(args: argparse.Namespace) -> int:
             f"{'no weight':<10}{name} {reason}: it counts as unknown"
             for name, reason in doubts.items()
         ]
-        print("\n".join([*lines(diagnosis), *flags, f"{args.log}: {advice(diagnosis)}"]))
-    if args.out is not None:
-        writable("out", args.out).write_text(
-            page(diagnosis, f"{args.log.name}, {vehicle.name}"), encoding="utf-8"
+        print(
+            "\n".join(
+                [*report_lines(diagnosis), *flags, f"{args.log}: {publishing_advice(diagnosis)}"]
+            )
         )
-    mended = corrections(diagnosis)
+    if args.out is not None:
+        prepare_path("out", args.out).write_text(
+            report_page(diagnosis, f"{args.log.name}, {vehicle.name}"), encoding="utf-8"
+        )
+    mended = list_corrections(diagnosis)
     if args.fix is not None and mended:
-        profile, corrected, left = fixed(mended, profile_of(args.log), vehicle)
-        writable("fix", args.fix).write_text(profile.text(), encoding="utf-8")
+        profile, corrected, left = apply_findings(mended, profile_of(args.log), vehicle)
+        prepare_path("fix", args.fix).write_text(profile.to_json(), encoding="utf-8")
         if corrected != vehicle:
-            writable("vehicle", file).write_text(
+            prepare_path("vehicle", file).write_text(
                 corrected.model_dump_json(indent=1, exclude_none=True) + "\n"
             )
         for finding in left:
-            _tell(
+            _print_stderr(
                 f"not mended: {finding.channel} {finding.kind}: its recording must be decoded "
                 "otherwise"
             )
-        _tell(f"{args.fix}: the corrected profile; import the recording again with it")
-    return 0 if diagnosis.passed else NOT_PASSED
+        _print_stderr(f"{args.fix}: the corrected profile; import the recording again with it")
+    return 0 if diagnosis.is_passed else NOT_PASSED
 
 
-def _doubted(log: SignalLog) -> dict[str, str]:
+def _doubted_flags(log: SignalLog) -> dict[str, str]:
     """Controller flags of a log that carry no weight at some time, and why."""
     from edge_agent.observe.controller_flags import doubted_flags, new_flag_records, trusted_context
 
@@ -98,5 +107,5 @@ def _doubted(log: SignalLog) -> dict[str, str]:
     return found
 
 
-def _tell(line: str) -> None:
+def _print_stderr(line: str) -> None:
     print(line, file=sys.stderr)

@@ -57,7 +57,7 @@ def publisher_of(
     Raises:
         InputError: Zenoh refuses its settings, or the outbox is in use or unusable.
     """
-    from edge_agent.app.estimates_file import writable
+    from edge_agent.app.estimates_file import prepare_path
     from edge_agent.publish.outbox import Outbox
     from edge_agent.publish.publisher import Publisher
     from schemas.runtime.zenoh_session import configuration
@@ -66,7 +66,7 @@ def publisher_of(
         name
     ) in names:  # a bad setting, or a missing certificate, is to be an error here, not in a thread
         configuration(config.zenoh, name)
-    spool = writable("spool", config.spool_of(names[0] if len(names) == 1 else FLEET))
+    spool = prepare_path("spool", config.spool_of(names[0] if len(names) == 1 else FLEET))
     outbox = Outbox(
         spool, capacity_bytes=round(config.spool_mb * 1e6), first_resend_s=config.resend_s
     )
@@ -81,17 +81,17 @@ def require_valid_signals(diagnosis: Diagnosis) -> None:
     Raises:
         InputError: the signal doctor finds a fault, or cannot decide.
     """
-    from edge_agent.inputs.doctor.report import advice, lines
+    from edge_agent.inputs.doctor.report import publishing_advice, report_lines
 
-    if not diagnosis.passed:
+    if not diagnosis.is_passed:
         print(
-            "\n".join(line for line in lines(diagnosis) if not line.startswith("sound")),
+            "\n".join(line for line in report_lines(diagnosis) if not line.startswith("sound")),
             file=sys.stderr,
         )
         raise InputError(
             "log",
             "is not fit to be published",
-            f"{advice(diagnosis)}; --trust publishes it as it is",
+            f"{publishing_advice(diagnosis)}; --trust publishes it as it is",
         )
 
 
@@ -112,7 +112,7 @@ def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
         notes.append(
             "note: the signal doctor did not pass this log; replay --publish would refuse it"
         )
-    elif not diagnosis.passed:
+    elif not diagnosis.is_passed:
         channels = ", ".join(diagnosis.unknown)
         notes.append(f"note: the signal doctor did not pass this log: it cannot judge {channels}")
     return notes
@@ -151,24 +151,24 @@ def close_publisher(
 
     Unsettled records stay in the outbox for the next start.
     """
-    from edge_agent.app.live_loop import summary
+    from edge_agent.app.live_loop import final_counts
 
     clean = publisher.close(drain_s)
     if not clean:
         print_line("warning: a session did not close; leaving it behind", sys.stderr)
         left_behind.set()
-    print(json.dumps(summary(progress, publisher) | more), flush=True)
+    print(json.dumps(final_counts(progress, publisher) | more), flush=True)
 
 
 def print_status(progress: Progress, publisher: Publisher, log_line: Callable[[str], None]) -> None:
     """Print one line of progress."""
-    from edge_agent.app.live_loop import summary
+    from edge_agent.app.live_loop import final_counts
 
     counts = publisher.counts
     late = f", behind real time by {progress.lag_s:.1f} s at the most" if progress.behind else ""
     text = (
         f"{progress.signals_s:7.1f} s  {publisher.links} sessions, "
         f"{sum(counts.published.values())} records published, "
-        f"{sum(counts.acknowledged.values())} acknowledged, {publisher.unsettled()} unsettled{late}"
+        f"{sum(counts.acknowledged.values())} acknowledged, {publisher.count_unsettled()} unsettled{late}"
     )
-    log_line(LogLine(text, event="status", **summary(progress, publisher)))
+    log_line(LogLine(text, event="status", **final_counts(progress, publisher)))

@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
         InputError: too few seeds, the folder cannot be created, or matplotlib is not installed.
     """
     from edge_agent.lab.evaluation.bars import figures as figures_of
-    from edge_agent.lab.evaluation.campaign import run as campaign
+    from edge_agent.lab.evaluation.campaign import run_campaign as campaign
     from edge_agent.lab.evaluation.report import report
     from edge_agent.lab.seeds import FIGURES
     from schemas.runtime.figures import write
@@ -106,19 +106,19 @@ def run(args: argparse.Namespace) -> int:
             "out", f"cannot make {args.out} ({error.strerror})", "name another folder"
         ) from error
     if args.paper:
-        return _paper(args, count)
+        return _evaluate_paper(args, count)
     if args.only == "searches":
-        return _searches(args, count)
+        return _evaluate_searches(args, count)
     if args.only == "worth":
-        return _worth(args, count)
+        return _evaluate_worth(args, count)
     if args.only == "ahead":
-        return _ahead(args, count)
+        return _evaluate_ahead(args, count)
     if args.only == "detection":
-        return _detection(args, count)
+        return _evaluate_detection(args, count)
     if args.only == "real":
-        return _real(args)
+        return _evaluate_real_logs(args)
     if args.only:
-        return _inputs(args)
+        return _evaluate_inputs(args)
     began = time.monotonic()
     seeds = range(FIGURES, FIGURES + count)
     results = campaign(
@@ -141,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
 
 
-def _paper(args: argparse.Namespace, count: int) -> int:
+def _evaluate_paper(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.evaluation.papers.page import markdown_tables, summary
     from edge_agent.lab.evaluation.papers.reproductions import write_paper
     from edge_agent.lab.seeds import FIGURES
@@ -150,10 +150,10 @@ def _paper(args: argparse.Namespace, count: int) -> int:
         args.paper, range(FIGURES, FIGURES + count), args.out, plots=not args.no_plots
     )
     print(f"{markdown_tables(done.tables)}\n\n{summary(done)}")
-    return 1 if done.missed else 0
+    return 1 if done.missed_rows else 0
 
 
-def _searches(args: argparse.Namespace, count: int) -> int:
+def _evaluate_searches(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.seeds import FIGURES
     from edge_agent.lab.tuning.search_comparison import compare_searches, comparison_markdown
     from schemas.runtime.figures import write
@@ -169,7 +169,7 @@ def _searches(args: argparse.Namespace, count: int) -> int:
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
 
 
-def _worth(args: argparse.Namespace, count: int) -> int:
+def _evaluate_worth(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.evaluation import worth
     from edge_agent.lab.seeds import FIGURES
     from schemas.runtime.figures import markdown, write
@@ -189,12 +189,12 @@ def _worth(args: argparse.Namespace, count: int) -> int:
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
 
 
-def _inputs(args: argparse.Namespace) -> int:
+def _evaluate_inputs(args: argparse.Namespace) -> int:
     from edge_agent.lab.seeds import FIGURES
     from schemas.runtime.figures import markdown, write
 
     with tempfile.TemporaryDirectory(dir=args.out) as scratch:
-        figures = _measured(Path(scratch), args)
+        figures = _measure_inputs(Path(scratch), args)
     write(
         args.out / "figures.json",
         "edge-agent evaluate --only inputs",
@@ -207,7 +207,7 @@ def _inputs(args: argparse.Namespace) -> int:
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
 
 
-def _real(args: argparse.Namespace) -> int:
+def _evaluate_real_logs(args: argparse.Namespace) -> int:
     from edge_agent.lab.evaluation.real_logs import judge_folder, summarise, table
     from schemas.runtime.figures import markdown, write
 
@@ -226,7 +226,7 @@ def _real(args: argparse.Namespace) -> int:
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
 
 
-def _ahead(args: argparse.Namespace, count: int) -> int:
+def _evaluate_ahead(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.ahead import approaches, cost, entry, latency
     from edge_agent.lab.seeds import FIGURES
     from schemas.runtime.figures import markdown, write
@@ -234,12 +234,14 @@ def _ahead(args: argparse.Namespace, count: int) -> int:
     seeds = range(FIGURES, FIGURES + count)
     quick = args.quick
     rows: list[Callable[[], list[Figure]]] = [
-        lambda: cost.figures(FIGURES, 2e3 if quick else 20e3),
-        lambda: latency.figures(FIGURES, 20 if quick else 300, 20 if quick else latency.VEHICLES),
-        lambda: approaches.figures(
+        lambda: cost.cost_figures(FIGURES, 2e3 if quick else 20e3),
+        lambda: latency.latency_figures(
+            FIGURES, 20 if quick else 300, 20 if quick else latency.VEHICLES
+        ),
+        lambda: approaches.approach_figures(
             seeds[:1] if quick else seeds, 60.0 if quick else APPROACHES_S, 6 if quick else 24
         ),
-        lambda: entry.figures(
+        lambda: entry.entry_figures(
             seeds[:1] if quick else seeds[:ENTRY_TOWNS], 40.0 if quick else 90.0, 6 if quick else 16
         ),
     ]
@@ -258,7 +260,7 @@ def _ahead(args: argparse.Namespace, count: int) -> int:
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
 
 
-def _detection(args: argparse.Namespace, count: int) -> int:
+def _evaluate_detection(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.evaluation.detection_bars import detection_figures
     from edge_agent.lab.evaluation.detection_campaign import campaign
     from edge_agent.lab.evaluation.report import detection_report
@@ -292,7 +294,7 @@ def _detection(args: argparse.Namespace, count: int) -> int:
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
 
 
-def _measured(folder: Path, args: argparse.Namespace) -> list[Figure]:
+def _measure_inputs(folder: Path, args: argparse.Namespace) -> list[Figure]:
     from edge_agent.lab.evaluation import calibrated, imports, planted
     from edge_agent.lab.live import judge
     from edge_agent.lab.seeds import FIGURES

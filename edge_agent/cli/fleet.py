@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Drive until the duration has passed or a signal arrives; write the truth before the end."""
     from edge_agent.ahead.lookout import Lookout
-    from edge_agent.app.estimates_file import writable
+    from edge_agent.app.estimates_file import prepare_path
     from edge_agent.cli.live import drive_live, warm_up_simulation, warning_lines
     from edge_agent.lab.simulation import SimulatedFleet
     from edge_agent.lab.simulation.blocks import blocks
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
     config = load(args.config, AgentConfig)
     if args.truth:
-        writable("truth", args.truth)
+        prepare_path("truth", args.truth)
     fleet = SimulatedFleet(
         args.scenario, args.vehicles, args.seed, args.rate, rough=args.rough, winter=args.winter
     )
@@ -81,11 +81,11 @@ def run(args: argparse.Namespace) -> int:
     if drivers.warned.any():
         show = warning_lines(config)
 
-        def tell(name: str, warning: GripWarning) -> None:
+        def pass_warning(name: str, warning: GripWarning) -> None:
             show(name, warning)
             drivers.hear(name, warning)
 
-        lookout = Lookout(fleet.names, tell, drivers.route_of, drivers.listens)
+        lookout = Lookout(fleet.names, pass_warning, drivers.route_of, drivers.listens)
         source = drivers.heeding(source)
     return drive_live(
         fleet.vehicles,

@@ -45,17 +45,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Import; return 0 if the log was written."""
-    from edge_agent.app.estimates_file import writable
+    from edge_agent.app.estimates_file import prepare_path
     from edge_agent.inputs.bring_in import database_of, read_source, write_log
     from edge_agent.inputs.doctor.adopt import align_import
-    from edge_agent.inputs.merge import merge
-    from edge_agent.inputs.names import draft
-    from edge_agent.inputs.profile import load_profile, shipped
+    from edge_agent.inputs.merge import merge_recordings
+    from edge_agent.inputs.names import draft_profile
+    from edge_agent.inputs.profile import load_profile, shipped_profiles
     from schemas.errors import InputError
     from schemas.vehicle import load_vehicle
 
     if args.list:
-        print_list({name: load_profile(name)[0].about for name in shipped()}, as_json=args.json)
+        print_list(
+            {name: load_profile(name)[0].about for name in shipped_profiles()}, as_json=args.json
+        )
         return 0
     if not args.source or args.out is None:
         raise InputError(
@@ -63,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         )
     if any(args.out.resolve() == source.resolve() for source in args.source):
         raise InputError("out", f"would replace the recording {args.out}", "name another file")
-    out = writable("out", args.out)
+    out = prepare_path("out", args.out)
     profile, folder = load_profile(args.profile) if args.profile else (None, Path())
     vehicle = load_vehicle(args.vehicle) if args.vehicle else None
     database = database_of(profile, folder, args.dbc)
@@ -74,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
             for one in reversed(recordings)
             for name, series in one.signals.items()
         }
-        profile = draft(units, args.out.stem)
+        profile = draft_profile(units, args.out.stem)
         if not profile.channels:
             seen = ", ".join(sorted(units)[:MOST_NAMES]) or "nothing"
             raise InputError(
@@ -82,15 +84,15 @@ def run(args: argparse.Namespace) -> int:
                 f"no signal has a known name; seen: {seen}",
                 "write a profile that names them",
             )
-        target = writable("draft", args.draft or out.with_suffix(".profile.json"))
-        target.write_text(profile.text(), encoding="utf-8")
+        target = prepare_path("draft", args.draft or out.with_suffix(".profile.json"))
+        target.write_text(profile.to_json(), encoding="utf-8")
         print(f"{target}: drafted from names, {len(profile.channels)} channels; look it over")
     merge_with = partial(
-        merge,
+        merge_recordings,
         recordings,
         wheel_radius=vehicle.wheel_radius if vehicle else None,
         steering_ratio=vehicle.steering_ratio if vehicle else None,
-        shifts=_shifts(args.clock),
+        shifts=_parse_shifts(args.clock),
     )
     merged = merge_with(profile)
     if vehicle is not None:
@@ -112,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _shifts(given: list[str]) -> dict[str, float]:
+def _parse_shifts(given: list[str]) -> dict[str, float]:
     from schemas.errors import InputError
 
     shifts = {}

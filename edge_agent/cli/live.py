@@ -14,9 +14,15 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.ahead.lookout import Lookout
 from edge_agent.ahead.path import Pose
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.app.live_loop import ENDED_DRAIN_S, STATUS_EVERY_S, STOPPED_DRAIN_S, Progress, drive
-from edge_agent.app.metrics import health_problems, metrics
-from edge_agent.app.publishing_reasons import ReasonReporter, SignalWatch, reasons
+from edge_agent.app.live_loop import (
+    ENDED_DRAIN_S,
+    STATUS_EVERY_S,
+    STOPPED_DRAIN_S,
+    Progress,
+    run_live_loop,
+)
+from edge_agent.app.metrics import agent_metrics, health_problems
+from edge_agent.app.publishing_reasons import ReasonReporter, SignalWatch, reasons_not_publishing
 from edge_agent.cli.common import close_publisher, print_status, publisher_of, stop_on_signal
 from edge_agent.inputs.block import Block
 from edge_agent.observe.pipeline import Pipeline
@@ -83,7 +89,9 @@ def drive_live(
         serve_metrics(
             config.metrics_host,
             config.metrics_port,
-            lambda: [metric for publisher in running for metric in metrics(publisher, progress)],
+            lambda: [
+                metric for publisher in running for metric in agent_metrics(publisher, progress)
+            ],
             lambda: (
                 [*health_problems(running[0], progress), *troubled()]
                 if running
@@ -94,20 +102,20 @@ def drive_live(
         if address:
             print_line(f"metrics: {address}/metrics", sys.stderr)
 
-        def opened(name: str, session: zenoh.Session) -> None:
+        def attach_session(name: str, session: zenoh.Session) -> None:
             for one in (lookout, vss):
                 if one is not None:
                     one.attach(name, session)
 
-        def after() -> None:
-            reporter.look()
+        def after_block() -> None:
+            reporter.print_if_due()
             if lookout is not None:
-                _show(lookout, pipeline)
+                _update_lookout(lookout, pipeline)
             if vss is not None and admitted():
-                vss.tell(pipeline.grip)
+                vss.report_grip(pipeline.grip)
 
         pipeline = Pipeline(bank_of(chosen, vehicles, memberships), len(vehicles), config)
-        publisher = publisher_of(names, config, chosen, opened)
+        publisher = publisher_of(names, config, chosen, attach_session)
         running.append(publisher)
         log_line = line_logger(config.log, sys.stderr)
         who = names[0] if len(names) == 1 else f"{len(names)} vehicles"
@@ -120,13 +128,14 @@ def drive_live(
         )
         watch = SignalWatch()
         reporter = ReasonReporter(
-            lambda: reasons(watch, publisher, config.zenoh.connect, troubled()), log_line
+            lambda: reasons_not_publishing(watch, publisher, config.zenoh.connect, troubled()),
+            log_line,
         )
         report = partial(print_status, publisher=publisher, log_line=log_line)
         if lookout is not None:
             lookout.start()
-        drive(
-            watch.blocks(blocks),
+        run_live_loop(
+            watch.watch_blocks(blocks),
             pipeline,
             publisher,
             stop,
@@ -134,7 +143,7 @@ def drive_live(
             duration_s=duration_s,
             progress=progress,
             admitted=admitted,
-            after=after,
+            after=after_block,
         )
         heard: dict[str, float] = {}
         if lookout is not None:
@@ -149,7 +158,7 @@ def drive_live(
     return 0
 
 
-def _show(lookout: Lookout, pipeline: Pipeline) -> None:
+def _update_lookout(lookout: Lookout, pipeline: Pipeline) -> None:
     """Pass the vehicles' positions and their filters' beliefs to a lookout."""
     if pipeline.seen is not None:
         lookout.see(
@@ -163,7 +172,7 @@ def warning_lines(config: AgentConfig) -> Callable[[str, GripWarning], None]:
     infinite time is null there."""
     say = line_logger(config.log, sys.stdout)
 
-    def tell(vehicle: str, warning: GripWarning) -> None:
+    def print_warning(vehicle: str, warning: GripWarning) -> None:
         values = {
             name: None if value == math.inf else value
             for name, value in vars(warning).items()
@@ -179,4 +188,4 @@ def warning_lines(config: AgentConfig) -> Callable[[str, GripWarning], None]:
             )
         )
 
-    return tell
+    return print_warning

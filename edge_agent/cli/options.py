@@ -24,9 +24,9 @@ def add_estimator(parser: argparse.ArgumentParser) -> None:
 
 def memberships_of(args: argparse.Namespace) -> Memberships | None:
     """Return the fuzzy sets of the option; None if it was not given."""
-    from edge_agent.app.tuned_memberships import load
+    from edge_agent.app.tuned_memberships import load_tuned
 
-    return load(args.memberships).memberships if args.memberships else None
+    return load_tuned(args.memberships).memberships if args.memberships else None
 
 
 def add_json(parser: argparse.ArgumentParser, what: str) -> None:

@@ -81,7 +81,12 @@ def run(args: argparse.Namespace) -> int:
     """Replay; return 0 if all was written and acknowledged, 1 if something was left or refused,
     3 if not plausible.
     """
-    from edge_agent.app.backfill import backfill, backfill_on_spark, tasks_of, vehicle_file_of
+    from edge_agent.app.backfill import (
+        backfill_on_spark,
+        estimate_drives,
+        tasks_of,
+        vehicle_file_of,
+    )
     from edge_agent.app.estimates_file import EstimatesFile
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
@@ -106,7 +111,9 @@ def run(args: argparse.Namespace) -> int:
         tasks = tasks_of(args.log, args.vehicle, args.out)  # refuses to write over a log
         if args.engine == SPARK:
             return _print_outcomes(backfill_on_spark(tasks, estimator, memberships), len(tasks))
-        return _print_outcomes(backfill(tasks, estimator, args.jobs, memberships), len(tasks))
+        return _print_outcomes(
+            estimate_drives(tasks, estimator, args.jobs, memberships), len(tasks)
+        )
     if args.compare is not None and args.out.suffix not in REPORTS:
         raise InputError(
             "compare", f"is of no use for {args.out.name}", f"write {', '.join(REPORTS)}"
@@ -120,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
         )
     bank_of(estimator, [vehicle], memberships)  # a wrong name is an error before the log is read
     log = read_log(path)
-    start_ns = _start(args.start, log)
+    start_ns = _start_time(args.start, log)
     log, vehicle, diagnosis, notes = prepare_log(log, vehicle)
     bank = bank_of(estimator, [vehicle], memberships)
     plausibility = Plausibility(vehicle.wheel_radius)
@@ -129,28 +136,28 @@ def run(args: argparse.Namespace) -> int:
     else:
         notes += warn_about_faults(diagnosis)
     if args.out.suffix in REPORTS:
-        notes += _write_report(args, log, vehicle, [estimator, *_more(args.compare)])
+        notes += _write_report(args, log, vehicle, [estimator, *_split_names(args.compare)])
         print("\n".join(notes), file=sys.stderr)
         return 0
     with EstimatesFile(args.out) as file:
         code = 0
 
-        def keep(block: Block, estimates: Estimates) -> None:
+        def keep_estimates(block: Block, estimates: Estimates) -> None:
             plausibility.add(block.t, block.signals, estimates)
             file.write(block.t, estimates)
 
         if args.publish:
-            code = _published(
-                args.name or vehicle.name, log, start_ns, bank, estimator, config, keep
+            code = _publish_log(
+                args.name or vehicle.name, log, start_ns, bank, estimator, config, keep_estimates
             )
         else:
             for block in log.blocks(start_ns):
-                keep(block, bank.advance(block.t, block.signals))
-    print("\n".join([*notes, plausibility.line()]), file=sys.stderr)
+                keep_estimates(block, bank.advance(block.t, block.signals))
+    print("\n".join([*notes, plausibility.summary_line()]), file=sys.stderr)
     return code or (IMPLAUSIBLE if plausibility.problems() else 0)
 
 
-def _more(names: str | None) -> list[str]:
+def _split_names(names: str | None) -> list[str]:
     return [] if names is None else [name.strip() for name in names.split(",") if name.strip()]
 
 
@@ -161,11 +168,11 @@ def _write_report(
     import pyarrow as pa
 
     from edge_agent.app import drive_report
-    from edge_agent.app.estimates_file import writable
+    from edge_agent.app.estimates_file import prepare_path
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.app.library import to_table
 
-    writable("out", args.out)
+    prepare_path("out", args.out)
     found = {}
     for name in dict.fromkeys(names):
         progress_messages.set_status(f"estimating with {name}")
@@ -217,7 +224,7 @@ def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
     return 2 if bad else 0
 
 
-def _published(
+def _publish_log(
     name: str,
     log: SignalLog,
     start_ns: int,
@@ -251,10 +258,10 @@ def _published(
             else "the reasons stand above"
         )
         print(f"error: publish: {refused} records were refused; {fix}", file=sys.stderr)
-    return 1 if refused or publisher.unsettled() else 0
+    return 1 if refused or publisher.count_unsettled() else 0
 
 
-def _start(given: str | None, log: SignalLog) -> int:
+def _start_time(given: str | None, log: SignalLog) -> int:
     """Return the time of t = 0 [ns UTC]."""
     from schemas.config import moment
 

@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("autoware", "is of no use without --ahead", "give both, or neither")
     sources = args.source or [SIMULATED]
     if all(is_live(source) for source in sources):
-        return _live(args, sources, config)
+        return _run_live(args, sources, config)
     if len(sources) > 1:
         raise InputError(
             "source", f"{', '.join(sources)} do not go together", "name live ones, or one log"
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
         )
     else:
         vehicle, name, blocks = (
-            _simulated(args) if kind == SIMULATED else _logged(args, Path(sources[0]))
+            _simulated_source(args) if kind == SIMULATED else _log_source(args, Path(sources[0]))
         )
     return drive_live(
         [vehicle],
@@ -134,13 +134,13 @@ def run(args: argparse.Namespace) -> int:
         config,
         args.estimator,
         args.duration,
-        lookout=_lookout(args, name, config),
-        vss=_vss(args, name, config),
+        lookout=_make_lookout(args, name, config),
+        vss=_make_vss_output(args, name, config),
         memberships=memberships_of(args),
     )
 
 
-def _lookout(args: argparse.Namespace, name: str, config: AgentConfig) -> Lookout | None:
+def _make_lookout(args: argparse.Namespace, name: str, config: AgentConfig) -> Lookout | None:
     if not args.ahead:
         return None
     from edge_agent.ahead.lookout import Lookout
@@ -154,28 +154,32 @@ def _lookout(args: argparse.Namespace, name: str, config: AgentConfig) -> Lookou
     from edge_agent.ahead.planner_link import PlannerLink
 
     planner = PlannerLink(args.autoware, args.autoware_hash or ANY_HASH)
-    return Lookout([name], warning_lines(config), lambda _: route, on_horizons=planner.hear)
+    return Lookout(
+        [name], warning_lines(config), lambda _: route, on_horizons=planner.receive_horizons
+    )
 
 
-def _vss(args: argparse.Namespace, name: str, config: AgentConfig) -> RoadFrictionOutput | None:
+def _make_vss_output(
+    args: argparse.Namespace, name: str, config: AgentConfig
+) -> RoadFrictionOutput | None:
     if not args.vss and args.kuksa is None:
         return None
     from edge_agent.publish.vss import RoadFrictionOutput
     from schemas.runtime.process import print_line
 
-    def say(line: str) -> None:
+    def print_signal(line: str) -> None:
         if args.vss:
             print_line(line, sys.stdout)
 
     if args.kuksa is None:
-        return RoadFrictionOutput([name], say, config.state_rate_hz)
+        return RoadFrictionOutput([name], print_signal, config.state_rate_hz)
     from edge_agent.app.kuksa_provider import KuksaProvider
 
     provider = KuksaProvider(args.kuksa)
-    return RoadFrictionOutput([name], say, config.state_rate_hz, provider)
+    return RoadFrictionOutput([name], print_signal, config.state_rate_hz, provider)
 
 
-def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> int:
+def _run_live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> int:
     from edge_agent.app.trip import Trip, state_path_for
     from edge_agent.cli.common import checked_name, left_behind
     from edge_agent.cli.live import drive_live
@@ -188,7 +192,7 @@ def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> 
     feeds, profile, clock = open_sources(sources, args.profile, args.dbc)
     rows = LiveRows(feeds, profile, vehicle, clock)
     trip = Trip(vehicle, profile, state_path_for(config.spool_of(name), name), trusted=args.trust)
-    blocks = trip.blocks(rows.blocks(), lambda: rows.ground)
+    blocks = trip.corrected_blocks(rows.blocks(), lambda: rows.ground)
     try:
         return drive_live(
             [trip.vehicle],
@@ -197,11 +201,11 @@ def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> 
             config,
             args.estimator,
             args.duration,
-            trip.end,
-            admitted=trip.admitted,
-            troubled=lambda: [*rows.troubles(), *trip.troubles()],
-            lookout=_lookout(args, name, config),
-            vss=_vss(args, name, config),
+            trip.learn_rest,
+            admitted=trip.is_admitted,
+            troubled=lambda: [*rows.health_problems(), *trip.health_problems()],
+            lookout=_make_lookout(args, name, config),
+            vss=_make_vss_output(args, name, config),
             memberships=memberships_of(args),
         )
     finally:
@@ -219,7 +223,7 @@ def _vehicle_file(args: argparse.Namespace) -> Path:
     return Path(args.vehicle)
 
 
-def _simulated(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]:
+def _simulated_source(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]:
     from edge_agent.cli.live import warm_up_simulation
     from edge_agent.lab.simulation import SimulatedFleet
     from edge_agent.lab.simulation.blocks import blocks
@@ -229,7 +233,7 @@ def _simulated(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]
     return fleet.vehicles[0], args.name or fleet.names[0], blocks(fleet, args.rate)
 
 
-def _logged(args: argparse.Namespace, source: Path) -> tuple[Vehicle, str, Iterator[Block]]:
+def _log_source(args: argparse.Namespace, source: Path) -> tuple[Vehicle, str, Iterator[Block]]:
     from edge_agent.cli.common import require_valid_signals
     from edge_agent.inputs.doctor.adopt import prepare_log
     from edge_agent.inputs.signal_log import read_log

@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate, or list the manoeuvres."""
-    from edge_agent.app.estimates_file import writable, write_table
+    from edge_agent.app.estimates_file import prepare_path, write_table
     from edge_agent.lab.simulation import MANOEUVRES, Fault, simulate_manoeuvre
     from schemas.errors import InputError
 
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     )
     write_table("out", args.out, log)
     if args.vehicle_out is not None:
-        writable("vehicle-out", args.vehicle_out).write_text(
+        prepare_path("vehicle-out", args.vehicle_out).write_text(
             vehicle.model_dump_json(indent=1, exclude_none=True) + "\n"
         )
     print(f"{args.out}: {log.num_rows} samples of {args.manoeuvre}")

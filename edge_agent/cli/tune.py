@@ -28,7 +28,7 @@ from edge_agent.app.tuned_memberships import (
     Provenance,
     Score,
     SplitScores,
-    save,
+    save_tuned,
 )
 from edge_agent.cli.common import warn_about_faults
 from edge_agent.inputs.doctor.findings import diagnose
@@ -125,10 +125,10 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(name, f"{value} is too small", f"use {least} or more")
     duration = QUICK_DURATION_S if args.quick else DURATION_S
     if args.study is not None:
-        return _study(args, ants, iterations)
+        return _run_study(args, ants, iterations)
 
     chosen = args.objective or ("predictive" if args.log else "interval")
-    train, held_out = _drives(args, chosen, duration)
+    train, held_out = _tuning_drives(args, chosen, duration)
     print_line(
         f"{len(train.vehicles)} drives to search on, {len(held_out.vehicles)} to judge by, "
         f"{duration:g} s each"
@@ -137,7 +137,9 @@ def run(args: argparse.Namespace) -> int:
     objective(
         Memberships().to_vector()
     )  # loads the compiled filter: the first iteration's time tells the others'
-    results = [_search(objective, ants, iterations, args.seed + k) for k in range(args.repeats)]
+    results = [
+        _run_searches(objective, ants, iterations, args.seed + k) for k in range(args.repeats)
+    ]
     sets = {
         way: [Memberships.from_vector(found[way].best) for found in results] for way in WAYS[1:]
     }
@@ -149,11 +151,14 @@ def run(args: argparse.Namespace) -> int:
         way: Memberships.from_vector(vector) for way, vector in best.items()
     }
     scores = {
-        way: SplitScores(train=_score(found[way], train), held_out=_score(found[way], held_out))
+        way: SplitScores(
+            train=_score_memberships(found[way], train),
+            held_out=_score_memberships(found[way], held_out),
+        )
         for way in WAYS
     }
-    print(table(scores))
-    winner = max(WAYS, key=lambda way: _worth(scores[way].held_out, chosen))
+    print(comparison_table(scores))
+    winner = max(WAYS, key=lambda way: _search_worth(scores[way].held_out, chosen))
     evaluations = {way: sum(found[way].evaluations for found in results) for way in WAYS[1:]}
     command = (
         f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --repeats "
@@ -161,7 +166,7 @@ def run(args: argparse.Namespace) -> int:
         " --objective "
         f"{chosen}{' --quick' * args.quick}{''.join(f' {log.name}' for log in args.log)}"
     )
-    document = _document(
+    document = _make_document(
         found[winner],
         chosen,
         scores,
@@ -170,12 +175,12 @@ def run(args: argparse.Namespace) -> int:
         args.seed,
     )
     candidates = {way: [one.to_json() for one in found] for way, found in sets.items()}
-    save(args.out, document.model_copy(update={"winner": winner, "candidates": candidates}))
+    save_tuned(args.out, document.model_copy(update={"winner": winner, "candidates": candidates}))
     print(f"wrote {args.out}: what {winner} found")
     return 0
 
 
-def _drives(
+def _tuning_drives(
     args: argparse.Namespace, objective: str, duration_s: float
 ) -> tuple[TuningSet, TuningSet]:
     """Return the drives to search on and to judge by: simulated ones, or parts of the given
@@ -197,7 +202,7 @@ def _drives(
     return own_drives(logs, duration_s)
 
 
-def _worth(score: Score, objective: str) -> float:
+def _search_worth(score: Score, objective: str) -> float:
     """Return the worth of a search: minus the cost of false and missed ice if truth is known,
     else the objective.
     """
@@ -211,7 +216,7 @@ def _worth(score: Score, objective: str) -> float:
     )
 
 
-def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
+def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
     """Run the study and write it into a folder."""
     from edge_agent.lab.tuning import study_report
 
@@ -230,7 +235,7 @@ def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
         positions=POSITIONS,
         seeds=seeds,
         duration_s=QUICK_DURATION_S if args.quick else STUDY_DURATION_S,
-        reporter=lambda way: reporter(way, iterations, time.monotonic, print_line),
+        reporter=lambda way: progress_printer(way, iterations, time.monotonic, print_line),
     )
     listed = study_report.figures(done)
     title = "edge-agent tune --study" + " --quick" * args.quick
@@ -246,7 +251,7 @@ def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
     command = (
         f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --study DIR"
     )
-    document = _document(
+    document = _make_document(
         done.best("colony"),
         "innovation",
         scores,
@@ -255,12 +260,12 @@ def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
         args.seed,
         "paper-aco-fckf",
     )
-    save(args.study / "paper-aco-fckf.json", document)
+    save_tuned(args.study / "paper-aco-fckf.json", document)
     print_line(text)
     return 0
 
 
-def _search(objective: Objective, ants: int, iterations: int, seed: int) -> dict[str, Result]:
+def _run_searches(objective: Objective, ants: int, iterations: int, seed: int) -> dict[str, Result]:
     """Run random search and ant colony from the same start, with the same positions and budget."""
     problem = Problem(objective, choices(POSITIONS), Memberships().to_vector())
     results = {}
@@ -272,7 +277,7 @@ def _search(objective: Objective, ants: int, iterations: int, seed: int) -> dict
             ants=ants,
             iterations=iterations,
             rng=np.random.default_rng([seed, stream]),
-            progress=reporter(way, iterations, time.monotonic, print_line),
+            progress=progress_printer(way, iterations, time.monotonic, print_line),
         )
     return results
 
@@ -282,7 +287,7 @@ def print_line(line: str) -> None:
     print(line, flush=True)
 
 
-def reporter(
+def progress_printer(
     way: str, iterations: int, clock: Callable[[], float], write: Callable[[str], None]
 ) -> Progress:
     """Return a function that prints one line per iteration: best, mean, elapsed and expected
@@ -301,14 +306,14 @@ def reporter(
     return log_line
 
 
-def _score(memberships: Memberships, drives: TuningSet) -> Score:
+def _score_memberships(memberships: Memberships, drives: TuningSet) -> Score:
     found = asdict(scores_of(memberships, drives, ESTIMATOR))
     return Score.model_validate(
         {name: None if math.isnan(value) else value for name, value in found.items()}
     )
 
 
-def _document(
+def _make_document(
     memberships: Memberships,
     objective: str,
     scores: dict[str, SplitScores],
@@ -331,11 +336,11 @@ def _document(
     )
 
 
-def _number(value: float | None, digits: int) -> str:
+def _format_number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def table(scores: dict[str, SplitScores]) -> str:
+def comparison_table(scores: dict[str, SplitScores]) -> str:
     """Return the comparison as plain text, one row per search and set of drives."""
     lines = [
         (
@@ -347,8 +352,8 @@ def table(scores: dict[str, SplitScores]) -> str:
     for way, row in scores.items():
         for drives, score in (("train", row.train), ("held out", row.held_out)):
             lines.append(
-                f"{way:<8} {drives:<9} {_number(score.interval_score, 4):>15} "
-                f"{_number(score.coverage, 3):>9}"
+                f"{way:<8} {drives:<9} {_format_number(score.interval_score, 4):>15} "
+                f"{_format_number(score.coverage, 3):>9}"
                 f" {score.log_likelihood:>20.2f} {score.nis_ratio:>6.2f}"
             )
     return "\n".join(lines)

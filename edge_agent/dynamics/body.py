@@ -18,7 +18,7 @@ from schemas.runtime.jit import compiled
 
 
 @compiled
-def accelerations(
+def planar_accelerations(
     row: FloatArray, force_x: FloatArray, force_y: FloatArray, delta: FloatArray
 ) -> tuple[float, float, float]:
     """Return (a_x, a_y [m/s^2], yaw acceleration [rad/s^2]); force_x, force_y [N] and delta [rad]

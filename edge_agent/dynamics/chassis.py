@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import Body, Four, Parameter, body
-from edge_agent.dynamics.slip import slips, wheel_position
+from edge_agent.dynamics.parameters import Body, Four, Parameter, body_of
+from edge_agent.dynamics.slip import wheel_position, wheel_slips
 from edge_agent.dynamics.tyres import combined_dugoff, combined_magic
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, inlined
@@ -36,7 +36,7 @@ def wheel_inputs(delta: FloatArray, omega: FloatArray) -> FloatArray:
 
 
 @inlined
-def _slips(
+def _wheel_slips(
     radius: float, ahead: float, aside: float, cos: float, sin: float, omega: float
 ) -> tuple[float, float]:
     """Return the slips of a wheel whose centre moves by ahead, aside [m/s] in body axes, at
@@ -44,7 +44,7 @@ def _slips(
     """
     along = cos * ahead + sin * aside
     across = cos * aside - sin * ahead
-    slip_x, slip_y = slips(radius, omega, along, across)
+    slip_x, slip_y = wheel_slips(radius, omega, along, across)
     return (0.0 if math.isnan(omega) else slip_x), slip_y
 
 
@@ -77,13 +77,13 @@ def tyre_forces(
     wheels: (4, 3) of `wheel_inputs`, a wheel whose speed is NaN rolls freely; mu (4,); shape: c of
     the Magic Formula (e = 0), or DUGOFF.
     """
-    parameters = body(row)
+    parameters = body_of(row)
     loads = wheel_loads(parameters, motion[3], motion[4])
     for wheel in range(4):
         x, y = wheel_position(row, wheel)
         ahead = motion[0] - y * motion[2]
         aside = motion[1] + x * motion[2]
-        slip = _slips(
+        slip = _wheel_slips(
             row[Parameter.RADIUS],
             ahead,
             aside,
@@ -120,7 +120,9 @@ class WheelInputs(NamedTuple):
 
 
 @inlined
-def response(body: Body, motion: PlanarMotion, wheels: WheelInputs) -> tuple[float, float, float]:
+def planar_response(
+    body: Body, motion: PlanarMotion, wheels: WheelInputs
+) -> tuple[float, float, float]:
     """Return (a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) from the forces of four Dugoff tyres.
 
     Written out per wheel, with scalars and no arrays between, because the papers' filters spend
@@ -134,17 +136,17 @@ def response(body: Body, motion: PlanarMotion, wheels: WheelInputs) -> tuple[flo
     front = 0.5 * body.track_front
     rear = 0.5 * body.track_rear
     aside = vy + a * rate
-    x_fl, y_fl = _pull(
+    x_fl, y_fl = _wheel_force(
         body, vx - front * rate, aside, (fl, mu[0], cos[0], sin[0], omega[0], force_x[0]), False
     )
-    x_fr, y_fr = _pull(
+    x_fr, y_fr = _wheel_force(
         body, vx + front * rate, aside, (fr, mu[1], cos[1], sin[1], omega[1], force_x[1]), False
     )
     aside = vy - b * rate
-    x_rl, y_rl = _pull(
+    x_rl, y_rl = _wheel_force(
         body, vx - rear * rate, aside, (rl, mu[2], cos[2], sin[2], omega[2], force_x[2]), True
     )
-    x_rr, y_rr = _pull(
+    x_rr, y_rr = _wheel_force(
         body, vx + rear * rate, aside, (rr, mu[3], cos[3], sin[3], omega[3], force_x[3]), True
     )
     moment = a * (y_fl + y_fr) - b * (y_rl + y_rr) + front * (x_fr - x_fl) + rear * (x_rr - x_rl)
@@ -158,7 +160,7 @@ def response(body: Body, motion: PlanarMotion, wheels: WheelInputs) -> tuple[flo
 
 
 @inlined
-def _pull(
+def _wheel_force(
     body: Body,
     ahead: float,
     aside: float,
@@ -169,7 +171,7 @@ def _pull(
     and given longitudinal force.
     """
     load, mu, cos, sin, omega, given_x = wheel
-    slip = _slips(body.radius, ahead, aside, cos, sin, omega)
+    slip = _wheel_slips(body.radius, ahead, aside, cos, sin, omega)
     force_x, force_y = combined_dugoff(slip, stiffness(body, load, mu, rear), mu, load)
     force_x = force_x if math.isnan(given_x) else given_x
     return cos * force_x - sin * force_y, sin * force_x + cos * force_y

@@ -64,7 +64,9 @@ def slip_share(radius: float, omega: float, along: float) -> float:
 
 
 @compiled
-def blended(share: FloatArray, model: FloatArray, observed: FloatArray, out: FloatArray) -> None:
+def blend_forces(
+    share: FloatArray, model: FloatArray, observed: FloatArray, out: FloatArray
+) -> None:
     """Compute out (4,) = share*model + (1 - share)*observed: the compensated force (33)."""
     for wheel in range(4):
         out[wheel] = share[wheel] * model[wheel] + (1.0 - share[wheel]) * observed[wheel]

@@ -98,7 +98,7 @@ class Body(NamedTuple):
 
 
 @inlined
-def body(row: FloatArray) -> Body:
+def body_of(row: FloatArray) -> Body:
     """Return the body of a row (15,)."""
     p = Parameter
     return Body(
@@ -123,6 +123,6 @@ Four: TypeAlias = tuple[float, float, float, float]
 
 
 @inlined
-def four(values: FloatArray) -> Four:
+def as_four(values: FloatArray) -> Four:
     """Return values (4,) as four scalars."""
     return values[0], values[1], values[2], values[3]

@@ -52,7 +52,7 @@ def along_wheel(
 
 
 @inlined
-def slips(radius: float, omega: float, along: float, across: float) -> tuple[float, float]:
+def wheel_slips(radius: float, omega: float, along: float, across: float) -> tuple[float, float]:
     """Return (slip_x, slip_y) [1]: (R*omega - v_wx)/|v_wx| and -v_wy/|v_wx|, the tangent of the
     slip angle.
 

@@ -26,10 +26,10 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from edge_agent.adaptation.windows import push, weighted_noise
-from edge_agent.dynamics.body import accelerations
+from edge_agent.adaptation.windows import push_innovation, weighted_noise
+from edge_agent.dynamics.body import planar_accelerations
 from edge_agent.dynamics.chassis import tyre_forces, wheel_inputs
-from edge_agent.dynamics.drive_wheel import WheelState, blended, drive_wheel, slip_share
+from edge_agent.dynamics.drive_wheel import WheelState, blend_forces, drive_wheel, slip_share
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import wheel_velocity
 from edge_agent.estimators.adaptive_federated_ckf import DRY
@@ -43,8 +43,8 @@ from edge_agent.estimators.elements import Element
 from edge_agent.estimators.estimates import Column
 from edge_agent.filters.cholesky import variance
 from edge_agent.filters.householder import predict, update
-from edge_agent.filters.points import deviations, sigma_points, weighted_mean
-from edge_agent.filters.sigma import cubature
+from edge_agent.filters.points import centred_deviations, sigma_points, weighted_mean
+from edge_agent.filters.sigma import cubature_rule
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import records
@@ -54,10 +54,10 @@ from schemas.vehicle import Vehicle
 A_STATES = 19
 A_ROWS = 9
 B_STATES = 3
-A_XI = cubature(A_STATES).xi
-A_WEIGHT = cubature(A_STATES).w_cov
-B_XI = cubature(B_STATES).xi
-B_WEIGHT = cubature(B_STATES).w_cov
+A_XI = cubature_rule(A_STATES).xi
+A_WEIGHT = cubature_rule(A_STATES).w_cov
+B_XI = cubature_rule(B_STATES).xi
+B_WEIGHT = cubature_rule(B_STATES).w_cov
 SHAPE = 1.4  # c of the Magic Formula (12): between the usual lateral 1.3 and longitudinal 1.65
 WINDOW = 25  # samples; the paper's N is not given
 # of the nominal R
@@ -182,7 +182,7 @@ def _compensated_forces(
             if math.isnan(omega[wheel])
             else slip_share(row[Parameter.RADIUS], omega[wheel], along)
         )
-    blended(share, force_x, observed, force_x)
+    blend_forces(share, force_x, observed, force_x)
 
 
 @compiled
@@ -206,7 +206,7 @@ def _step_wheel_filter(memory: CompensatedMemory, context: FrictionSet, dt: floa
     sigma_points(mean, root, A_XI, points)
     for p in range(points.shape[0]):
         x = points[p]
-        _, _, turn = accelerations(row, x[X.FORCE : X.FORCE + 4], force_y, delta)
+        _, _, turn = planar_accelerations(row, x[X.FORCE : X.FORCE + 4], force_y, delta)
         vx = x[X.VX]
         vy = x[X.VY]
         rate = x[X.YAW_RATE]
@@ -232,7 +232,7 @@ def _step_wheel_filter(memory: CompensatedMemory, context: FrictionSet, dt: floa
         rows[r] = root[place]
         innovation[r] = reading - mean[place]
         if not math.isnan(innovation[r]):
-            push(memory.window[r], innovation[r])
+            push_innovation(memory.window[r], innovation[r])
         std[r] = math.sqrt(
             weighted_noise(memory.window[r], variance(root, place), A_NOISE[r], LEAST, LARGEST)
         )
@@ -275,7 +275,7 @@ def _step_motion_filter(memory: CompensatedMemory, context: FrictionSet, dt: flo
                 force_x,
                 force_y,
             )
-            ax, ay, turn = accelerations(row, force_x, force_y, delta)
+            ax, ay, turn = planar_accelerations(row, force_x, force_y, delta)
             if act == 0:
                 vx = x[X.VX]
                 vy = x[X.VY]
@@ -289,8 +289,8 @@ def _step_motion_filter(memory: CompensatedMemory, context: FrictionSet, dt: flo
                 noise[i, i] = B_PROCESS[i] * math.sqrt(dt)
             predict(points, B_WEIGHT, B_WEIGHT, noise, mean, root, context.work)
     weighted_mean(outcomes, B_WEIGHT, predicted)
-    deviations(points, mean, B_WEIGHT, state, 0)
-    deviations(outcomes, predicted, B_WEIGHT, measured, 0)
+    centred_deviations(points, mean, B_WEIGHT, state, 0)
+    centred_deviations(outcomes, predicted, B_WEIGHT, measured, 0)
     largest = 0.0
     for r in range(B_STATES):
         innovation[r] = (now[S.YAW_RATE] if r == 0 else now[S.AX + r - 1]) - predicted[r]
@@ -298,7 +298,7 @@ def _step_motion_filter(memory: CompensatedMemory, context: FrictionSet, dt: flo
         for p in range(count):
             spread += measured[r, p] ** 2
         if not math.isnan(innovation[r]):
-            push(memory.fused_window[r], innovation[r])
+            push_innovation(memory.fused_window[r], innovation[r])
         adapted = weighted_noise(memory.fused_window[r], spread, B_NOISE[r], LEAST, LARGEST)
         std[r] = math.sqrt(adapted)
         largest = max(largest, adapted / B_NOISE[r])
@@ -327,7 +327,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "accelerations from wheel forces",
         "corrected",
         "1/m belongs on the whole bracket",
-        "dynamics.body.accelerations",
+        "dynamics.body.planar_accelerations",
     ),
     Element("(6)", "sideslip angle beta", "as printed", where="common.output.write_motion"),
     Element(
@@ -378,7 +378,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "the derivative of F' is meant; sgn mixes units: tanh",
         "dynamics.drive_wheel",
     ),
-    Element("(33)", "compensation of F_x", "as printed", where="dynamics.drive_wheel.blended"),
+    Element("(33)", "compensation of F_x", "as printed", where="dynamics.drive_wheel.blend_forces"),
     Element(
         "(34)",
         "compensation of F_y",

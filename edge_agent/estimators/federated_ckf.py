@@ -23,8 +23,8 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from edge_agent.dynamics.chassis import PlanarMotion, WheelInputs, response
-from edge_agent.dynamics.parameters import body, four
+from edge_agent.dynamics.chassis import PlanarMotion, WheelInputs, planar_response
+from edge_agent.dynamics.parameters import as_four, body_of
 from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.common.inputs import wheel_force
 from edge_agent.estimators.common.motion import has_diverged
@@ -55,10 +55,10 @@ from edge_agent.estimators.gaussian.wheel_friction import (
     return_to_prior,
 )
 from edge_agent.filters.cholesky import variance
-from edge_agent.filters.federated import fuse, share
+from edge_agent.filters.federated import fuse_estimates, share_information
 from edge_agent.filters.householder import update
-from edge_agent.filters.points import axis_points, deviations, weighted_mean
-from edge_agent.filters.sigma import cubature
+from edge_agent.filters.points import axis_points, centred_deviations, weighted_mean
+from edge_agent.filters.sigma import cubature_rule
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -69,7 +69,7 @@ from schemas.vehicle import Vehicle
 
 WHEELS = 4
 ROWS = 3
-RULE = cubature(WHEELS)
+RULE = cubature_rule(WHEELS)
 XI = RULE.xi
 WEIGHT = RULE.w_cov
 NOISE_STD = np.array(
@@ -138,7 +138,7 @@ def _step_friction(memory: JointMemory, dt: float) -> None:
     sizes = np.ones(2)
     return_to_prior(memory.mean, memory.root, metres, work)
     for sub in range(2):
-        share(memory.root, memory.beta if sub == 0 else 1.0 - memory.beta, root)
+        share_information(memory.root, memory.beta if sub == 0 else 1.0 - memory.beta, root)
         mean[:] = memory.mean
         _update_sub_filter(memory, sub, dt, mean, root, work)
         sizes[sub] = 0.0
@@ -146,7 +146,7 @@ def _step_friction(memory: JointMemory, dt: float) -> None:
             sizes[sub] += variance(root, i)
         if sub == 0:
             first_mean[:], first_root[:] = mean, root
-    fuse(first_mean, first_root, mean, root, work)
+    fuse_estimates(first_mean, first_root, mean, root, work)
     for i in range(WHEELS):
         limit_friction(first_mean, first_root, i, PRIOR_MU_STD)
     memory.mean[:], memory.root[:] = first_mean, first_root
@@ -174,9 +174,9 @@ def _update_sub_filter(
     for wheel in range(4):
         force_x[wheel] = wheel_force(row, track, wheel, dt)
     axis_points(mean, root, XI, points)
-    cos = four(track.steering[0])
-    sin = four(track.steering[1])
-    omega = four(use[S.OMEGA : S.TORQUE])
+    cos = as_four(track.steering[0])
+    sin = as_four(track.steering[1])
+    omega = as_four(use[S.OMEGA : S.TORQUE])
     motion = PlanarMotion(
         x[PlanarState.VX],
         x[PlanarState.VY],
@@ -187,13 +187,13 @@ def _update_sub_filter(
     for p in range(points.shape[0]):
         for wheel in range(4):
             mu[wheel] = min(max(points[p, wheel], LOWER), UPPER)
-        ax, ay, turn = response(
-            body(row), motion, WheelInputs(cos, sin, omega, four(force_x), four(mu))
+        ax, ay, turn = planar_response(
+            body_of(row), motion, WheelInputs(cos, sin, omega, as_four(force_x), as_four(mu))
         )
         outcomes[p, 0], outcomes[p, 1], outcomes[p, 2] = ax, ay, memory.yaw_rate + dt * turn
     weighted_mean(outcomes, WEIGHT, predicted)
-    deviations(points, mean, WEIGHT, state, 0)
-    deviations(outcomes, predicted, WEIGHT, measured, 0)
+    centred_deviations(points, mean, WEIGHT, state, 0)
+    centred_deviations(outcomes, predicted, WEIGHT, measured, 0)
     inflation = dependence_factor(math.hypot(use[S.AX], use[S.AY]) / GRAVITY, dt)
     for r in range(ROWS):
         innovation[r] = now[r] - predicted[r]
@@ -227,7 +227,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "corrected",
         "rear axle: a_x takes -F_y*sin(delta), a_y takes +F_x*sin(delta) + F_y*cos(delta), arms "
         "accordingly",
-        "dynamics.chassis.response",
+        "dynamics.chassis.planar_response",
     ),
     Element(
         "(7)",
@@ -272,7 +272,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(15) to (20)",
         "information shares of the sub-filters",
         "as printed",
-        where="filters.federated.share",
+        where="filters.federated.share_information",
     ),
     Element(
         "(21), (22), (26), (27)",
@@ -298,7 +298,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "corrected",
         "P_f, printed is its inverse; a_y and r, used by both sub-filters, have twice the variance "
         "in each",
-        "filters.federated.fuse",
+        "filters.federated.fuse_estimates",
     ),
     Element(
         "(53)",

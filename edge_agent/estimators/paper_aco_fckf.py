@@ -39,9 +39,9 @@ from edge_agent.estimators.elements import Element
 from edge_agent.estimators.estimates import Column
 from edge_agent.estimators.gaussian.planar import POINTS, PlanarState, propagate_points
 from edge_agent.filters.cholesky import variance
-from edge_agent.filters.columns import gather, spread
+from edge_agent.filters.columns import gather_points, spread_points
 from edge_agent.filters.householder import LOG_TWO_PI
-from edge_agent.filters.sequential import carlson
+from edge_agent.filters.sequential import carlson_update
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import records
@@ -141,7 +141,7 @@ def make_bank(
     context["start"] = np.sqrt(chosen.start)
     context["noise"] = chosen.noise
     if isinstance(memberships, LowerVertices):
-        context["fuzzy_inputs"], context["fuzzy_outputs"] = memberships.table(KNOTS)
+        context["fuzzy_inputs"], context["fuzzy_outputs"] = memberships.knot_table(KNOTS)
     else:
         rest = KNOTS - len(memberships.inputs)
         context["fuzzy_inputs"] = np.pad(memberships.inputs, (0, rest), mode="edge")
@@ -180,9 +180,9 @@ def _step_filter(memory: FuzzyMemory, context: FuzzyContext, dt: float) -> bool:
     points = context.points
     noise = context.adapted
     pace = dt / STEP_S
-    spread(mean, root, points)
+    spread_points(mean, root, points)
     propagate_points(memory.row, points, memory.factor, memory.track, dt, False, context.dual_motor)
-    gather(points, context.process, math.sqrt(pace), mean, root)
+    gather_points(points, context.process, math.sqrt(pace), mean, root)
     _adapt_noise(memory, context, pace, math.exp(-math.log(2.0) * dt / WINDOW_S))
     used = 0
     square = 0.0
@@ -191,7 +191,9 @@ def _step_filter(memory: FuzzyMemory, context: FuzzyContext, dt: float) -> bool:
         # the measurement is linear, a state itself
         reading = memory.track.now[r]
         if not math.isnan(reading):
-            far, expected = carlson(mean, root, PlanarState.AX + r, reading, noise[r], context.gain)
+            far, expected = carlson_update(
+                mean, root, PlanarState.AX + r, reading, noise[r], context.gain
+            )
             used = used + 1
             square = square + far
             determinant = determinant * expected

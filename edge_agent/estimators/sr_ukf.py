@@ -29,12 +29,12 @@ from edge_agent.dynamics.chassis import (
     DUGOFF,
     PlanarMotion,
     WheelInputs,
-    response,
+    planar_response,
     tyre_forces,
     wheel_inputs,
 )
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import Parameter, body, four
+from edge_agent.dynamics.parameters import Parameter, as_four, body_of
 from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.common.inputs import InputTrack, wheel_force
 from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD, has_diverged
@@ -65,8 +65,8 @@ from edge_agent.estimators.gaussian.wheel_friction import (
 from edge_agent.filters.cholesky import variance
 from edge_agent.filters.downdate import update_by_downdate
 from edge_agent.filters.householder import predict
-from edge_agent.filters.points import deviations, sigma_points, weighted_mean
-from edge_agent.filters.sigma import unscented
+from edge_agent.filters.points import centred_deviations, sigma_points, weighted_mean
+from edge_agent.filters.sigma import unscented_rule
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -78,7 +78,7 @@ from schemas.vehicle import Vehicle
 # rows: speed of the wheels, r, a_y, four longitudinal forces
 STATES = 7
 ROWS = 7
-RULE = unscented(STATES, 1.0, 2.0, 0.0)
+RULE = unscented_rule(STATES, 1.0, 2.0, 0.0)
 XI = RULE.xi
 W_MEAN = RULE.w_mean
 W_COV = RULE.w_cov
@@ -164,10 +164,12 @@ def _tyre_accelerations(
     use = track.inputs
     unknown = (math.nan, math.nan, math.nan, math.nan)
     motion = PlanarMotion(x[0], x[1], x[WheelFrictionState.YAW_RATE], use[S.AX], use[S.AY])
-    cos = four(track.steering[0])
-    sin = four(track.steering[1])
-    omega = four(use[S.OMEGA : S.TORQUE])
-    _, ay, turn = response(body(row), motion, WheelInputs(cos, sin, omega, unknown, four(mu)))
+    cos = as_four(track.steering[0])
+    sin = as_four(track.steering[1])
+    omega = as_four(use[S.OMEGA : S.TORQUE])
+    _, ay, turn = planar_response(
+        body_of(row), motion, WheelInputs(cos, sin, omega, unknown, as_four(mu))
+    )
     return ay, turn
 
 
@@ -241,13 +243,13 @@ def _update_filter(
         motion[:3] = points[p, :3]
         tyre_forces(row, motion, wheels, mu, DUGOFF, outcomes[p, 3:], force_y)
     weighted_mean(outcomes, W_MEAN, predicted)
-    deviations(points, mean, W_COV, state, 0)
-    deviations(outcomes, predicted, W_COV, measured, 0)
+    centred_deviations(points, mean, W_COV, state, 0)
+    centred_deviations(outcomes, predicted, W_COV, measured, 0)
     inflation = math.sqrt(max(INDEPENDENT_S / dt, 1.0))
     speed, std[0] = slip_free_speed(row, track, dt)
     innovation[0], innovation[1], innovation[2] = speed, now[S.YAW_RATE], now[S.AY]
     std[1], std[2] = RATE_STD, inflation * math.hypot(AY_STD, AY_SHARE * use[S.AY])
-    loads = wheel_loads(body(row), use[S.AX], use[S.AY])
+    loads = wheel_loads(body_of(row), use[S.AX], use[S.AY])
     for wheel in range(4):
         force = wheel_force(row, track, wheel, dt)
         slip_std = SLIP_STD + OMEGA_STD * row[Parameter.RADIUS] / max(

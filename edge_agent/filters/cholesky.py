@@ -46,7 +46,9 @@ def factorize(covariance: FloatArray, sqrt_cov: FloatArray, least: float) -> Non
 
 
 @compiled
-def multiply(sqrt_cov: FloatArray, variances: FloatArray, covariance: FloatArray) -> None:
+def covariance_of_factor(
+    sqrt_cov: FloatArray, variances: FloatArray, covariance: FloatArray
+) -> None:
     """Compute covariance (n, n) = L*L' + diag(q), of any square root L (n, n) and variances q (n,)
     of independent noise.
     """

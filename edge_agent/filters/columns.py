@@ -6,7 +6,7 @@ Legend
     x           points in columns                                                                      (n, 2n)
     q           standard deviations of the process noise, independent                                  (n,)
 
-Points and prediction equal those of `points` and `householder` with `sigma.cubature`, with less
+Points and prediction equal those of `points` and `householder` with `sigma.cubature_rule`, with less
 work because all weights are 1/(2n). Points lie along the contiguous axis, so that the model moves
 several at once.
 """
@@ -21,7 +21,7 @@ from schemas.runtime.jit import inlined
 
 
 @inlined
-def spread(mean: FloatArray, sqrt_cov: FloatArray, points: FloatArray) -> None:
+def spread_points(mean: FloatArray, sqrt_cov: FloatArray, points: FloatArray) -> None:
     """Fill points (n, 2n): column j is m + sqrt(n)*L[:, j], column n + j is m - sqrt(n)*L[:, j]."""
     n = mean.shape[0]
     size = math.sqrt(n)
@@ -32,7 +32,7 @@ def spread(mean: FloatArray, sqrt_cov: FloatArray, points: FloatArray) -> None:
 
 
 @inlined
-def gather(
+def gather_points(
     points: FloatArray, noise_std: FloatArray, pace: float, mean: FloatArray, sqrt_cov: FloatArray
 ) -> None:
     """Compute mean and sqrt_cov of moved points (n, 2n), which become deviations, with process

@@ -12,7 +12,7 @@ from schemas.runtime.jit import compiled
 
 
 @compiled
-def share(sqrt_cov: FloatArray, beta: float, out: FloatArray) -> None:
+def share_information(sqrt_cov: FloatArray, beta: float, out: FloatArray) -> None:
     """Compute out (n, n) = sqrt_cov of a sub-filter that gets the share beta in (0, 1] of the
     information.
     """
@@ -23,7 +23,7 @@ def share(sqrt_cov: FloatArray, beta: float, out: FloatArray) -> None:
 
 
 @compiled
-def fuse(
+def fuse_estimates(
     mean: FloatArray,
     sqrt_cov: FloatArray,
     other: FloatArray,

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.filters.points import deviations, weighted_mean
+from edge_agent.filters.points import centred_deviations, weighted_mean
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
@@ -76,7 +76,7 @@ def predict(
     """
     count, n = points.shape
     weighted_mean(points, w_mean, mean)
-    deviations(points, mean, w_cov, work, 0)
+    centred_deviations(points, mean, w_cov, work, 0)
     for i in range(n):
         for j in range(n):
             work[i, count + j] = sqrt_noise[i, j]

@@ -63,7 +63,7 @@ def weighted_mean(points: FloatArray, w_mean: FloatArray, mean: FloatArray) -> N
 
 
 @compiled
-def deviations(
+def centred_deviations(
     points: FloatArray, mean: FloatArray, w_cov: FloatArray, out: FloatArray, row: int
 ) -> None:
     """Compute out[row + i, j] = sqrt(w_cov[j])*(points[j, i] - mean[i]): the factor of a covariance

@@ -8,7 +8,7 @@ Legend
 
 No variance is ever subtracted from another, so none can become negative. Rows with independent
 noise may be taken in one by one in any order. The deviations f of the remaining rows change with L,
-and `project` updates them in the same way.
+and `apply_projection` updates them in the same way.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from schemas.runtime.jit import inlined
 
 
 @inlined
-def potter(f: FloatArray, noise: float) -> tuple[float, float]:
+def potter_factors(f: FloatArray, noise: float) -> tuple[float, float]:
     """Return (a, g) of a row f (k,) with noise variance > 0: then m <- m + L*f*nu/a and L <- L*(I -
     g*f*f') (Potter 1963).
     """
@@ -32,7 +32,9 @@ def potter(f: FloatArray, noise: float) -> tuple[float, float]:
 
 
 @inlined
-def project(mean: FloatArray, root: FloatArray, f: FloatArray, step: float, gain: float) -> None:
+def apply_projection(
+    mean: FloatArray, root: FloatArray, f: FloatArray, step: float, gain: float
+) -> None:
     """Compute mean (n,) += L*f*step, root L (n, k or more) <- L*(I - gain*f*f'); f (k,) is zero
     beyond.
     """
@@ -47,7 +49,7 @@ def project(mean: FloatArray, root: FloatArray, f: FloatArray, step: float, gain
 
 
 @inlined
-def carlson(
+def carlson_update(
     mean: FloatArray,
     sqrt_cov: FloatArray,
     i: int,

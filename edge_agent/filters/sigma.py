@@ -68,7 +68,7 @@ class SigmaRule:
         return int(self.xi.shape[1])
 
 
-def unscented(n: int, alpha: float, beta: float, kappa: float) -> SigmaRule:
+def unscented_rule(n: int, alpha: float, beta: float, kappa: float) -> SigmaRule:
     """Return the scaled unscented rule (Julier 2002); a centre without any weight is left out.
 
     lambda = alpha^2*(n + kappa) - n; points 0 and +-sqrt(n + lambda)*e_i; w_mean_0 = lambda/(n +
@@ -94,7 +94,7 @@ def unscented(n: int, alpha: float, beta: float, kappa: float) -> SigmaRule:
     )
 
 
-def cubature(n: int) -> SigmaRule:
+def cubature_rule(n: int) -> SigmaRule:
     """Return the third-degree spherical-radial rule (Arasaratnam and Haykin 2009): +-sqrt(n)*e_i
     with weights 1/(2n).
     """

@@ -27,7 +27,7 @@ class Block:
     context: FloatArray | None = None
 
 
-def absolute(t: FloatArray, start_ns: int) -> IntArray:
+def to_utc_ns(t: FloatArray, start_ns: int) -> IntArray:
     """Seconds since the start as ns UTC, rounded to the ns; same shape."""
     whole = t.astype(np.int64)
     time: IntArray = start_ns + whole * NS + np.rint((t - whole) * NS).astype(np.int64)

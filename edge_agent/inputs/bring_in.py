@@ -17,7 +17,7 @@ from edge_agent.inputs.merge import Merged
 from edge_agent.inputs.profile import FOLDER, Channel, Profile
 from edge_agent.inputs.readers import can_log, can_text, gnss, mdf, racelogic, rosbag, tabular
 from edge_agent.inputs.readers.dbc import Database, read_dbc
-from edge_agent.inputs.recording import Recording, foreign
+from edge_agent.inputs.recording import Recording, foreign_errors
 from schemas.errors import InputError
 from schemas.signals import CHANNELS, CONTEXT
 from schemas.thresholds import NS
@@ -34,14 +34,14 @@ def read_source(path: Path, profile: Profile | None, database: Database | None) 
         InputError: the file is unknown, broken, needs a database, or needs a library that is not
             installed.
     """
-    wanted = None if profile is None else profile.needs()
+    wanted = None if profile is None else profile.needed_signals()
     suffix = path.suffix.lower()
     if not path.exists():
         raise InputError("source", f"{path} does not exist", "give the path of a recording")
     if rosbag.is_bag(path):
         with rosbag.open_bag(path) as reader:
             if rosbag.has_frames(reader):
-                return _decoded(
+                return _decode_frames(
                     lambda ids: rosbag.bag_frames(reader, path, ids), path, profile, database
                 )
             return rosbag.read_bag(reader, path, wanted)
@@ -52,14 +52,14 @@ def read_source(path: Path, profile: Profile | None, database: Database | None) 
         content = mdf.read_isolated(path, identifiers, wanted)
         if content.recording is not None:
             return content.recording
-        return _decoded(lambda _: content.frames or ({}, 0.0), path, profile, database)
+        return _decode_frames(lambda _: content.frames or ({}, 0.0), path, profile, database)
     if path.name.lower().startswith(RLOGS):
         fix = "export CAN frames (candump) or a CSV with openpilot's LogReader"
         raise InputError("source", f"{path} is an openpilot log, which is not read here", fix)
     if suffix == ".trc" and can_text.is_bare_trace(path):
-        return _decoded(lambda ids: can_text.trace_frames(path, ids), path, profile, database)
+        return _decode_frames(lambda ids: can_text.trace_frames(path, ids), path, profile, database)
     if suffix in can_log.SUFFIXES:
-        return _decoded(lambda ids: can_log.log_frames(path, ids), path, profile, database)
+        return _decode_frames(lambda ids: can_log.log_frames(path, ids), path, profile, database)
     if suffix in gnss.SUFFIXES:
         return gnss.read_gnss(path)
     if suffix in racelogic.SUFFIXES:
@@ -68,7 +68,9 @@ def read_source(path: Path, profile: Profile | None, database: Database | None) 
         if suffix != ".parquet" and racelogic.is_vbo(path):
             return racelogic.read_vbo(path)
         if suffix == ".csv" and can_text.is_gvret(path):
-            return _decoded(lambda ids: can_text.gvret_frames(path, ids), path, profile, database)
+            return _decode_frames(
+                lambda ids: can_text.gvret_frames(path, ids), path, profile, database
+            )
         time, unit = (profile.time, profile.time_unit) if profile else (None, None)
         return tabular.read_table(path, time, unit)
     known = sorted(
@@ -86,7 +88,7 @@ def read_source(path: Path, profile: Profile | None, database: Database | None) 
     )
 
 
-def _decoded(
+def _decode_frames(
     frames: can_log.Taker, path: Path, profile: Profile | None, database: Database | None
 ) -> Recording:
     if database is None:
@@ -94,14 +96,14 @@ def _decoded(
     every = {
         f"{message.name}.{signal}" for message in database.values() for signal in message.signals
     }
-    wanted = every if profile is None else profile.needs()
+    wanted = every if profile is None else profile.needed_signals()
     buses = (
         {c.message: c.bus for c in profile.channels.values() if c.message and c.bus is not None}
         if profile
         else {}
     )
-    with foreign(path, "CAN log"):
-        return can_log.decoded(frames, path.name, database, wanted, buses)
+    with foreign_errors(path, "CAN log"):
+        return can_log.decode_log(frames, path.name, database, wanted, buses)
 
 
 def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Database | None:
@@ -123,7 +125,7 @@ def profile_of(log: Path) -> Profile:
     Raises:
         InputError: the file cannot be read.
     """
-    with foreign(log, "Parquet"):
+    with foreign_errors(log, "Parquet"):
         schema = pq.ParquetFile(log).schema_arrow
         if (provenance := (schema.metadata or {}).get(PROVENANCE)) is not None:
             return Profile.model_validate(json.loads(provenance)["profile"])
@@ -147,7 +149,7 @@ def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[st
         )  # as dated ones read: one drive is one log in all formats
     columns |= {name: pa.array(values, from_pandas=True) for name, values in merged.columns.items()}
     provenance: Mapping[str, object] = {
-        "profile": json.loads(profile.text()),
+        "profile": json.loads(profile.to_json()),
         "sources": list(sources),
         "channels": merged.origins,
         "notes": merged.notes,

@@ -63,7 +63,10 @@ def held_readings(name: str, series: Series, t: FloatArray, *, lasting: bool) ->
 def lasting_signals(profile: Profile) -> set[str]:
     """Whole names of the signals that are sent when they change."""
     return {
-        name for channel in profile.channels.values() if channel.lasting for name in channel.needs()
+        name
+        for channel in profile.channels.values()
+        if channel.lasting
+        for name in channel.needed_signals()
     }
 
 
@@ -73,7 +76,7 @@ def context_signals(profile: Profile) -> set[str]:
         name
         for channel in CONTEXT
         if channel in profile.channels
-        for name in profile.channels[channel].needs()
+        for name in profile.channels[channel].needed_signals()
     }
 
 

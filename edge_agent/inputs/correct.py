@@ -32,7 +32,7 @@ class Corrector:
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
         self._known = vehicle.calibration
-        self._waits = _waits(self._known)
+        self._waits = _device_waits(self._known)
         self._t = np.empty(0)
         self._rows = np.empty((0, len(CHANNELS)))
 
@@ -41,7 +41,7 @@ class Corrector:
         known.
         """
         if self._known is not None:
-            signals = _mended(signals, self._known)
+            signals = _correct_signals(signals, self._known)
         if self._waits:
             signals = self._wait_for_latest(t, signals)
         signals = scale_axles(signals, self._vehicle)
@@ -73,7 +73,7 @@ class Corrector:
         return together
 
 
-def corrected(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> FloatArray:
+def correct_log(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> FloatArray:
     """A whole log, times t (T,) [s] and signals (T, 18), as a `Corrector` makes it."""
     return Corrector(vehicle).advance(t, signals)
 
@@ -111,20 +111,20 @@ def free_rear_wheels(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
     return signals
 
 
-def _mended(signals: FloatArray, known: Calibration) -> FloatArray:
+def _correct_signals(signals: FloatArray, known: Calibration) -> FloatArray:
     signals = signals.copy()
     for channel, estimate in ((S.AX, known.ax), (S.YAW_RATE, known.yaw_rate)):
-        signals[..., channel] -= _value(estimate, 0.0)
+        signals[..., channel] -= _value_or(estimate, 0.0)
     for i, wheel in enumerate(WHEELS):
-        signals[..., S.OMEGA + i] /= 1.0 + _value(getattr(known, f"radius_{wheel}"), 0.0)
-    signals[..., S.TORQUE : S.TORQUE + 4] /= _value(known.force_gain, 1.0)
+        signals[..., S.OMEGA + i] /= 1.0 + _value_or(getattr(known, f"radius_{wheel}"), 0.0)
+    signals[..., S.TORQUE : S.TORQUE + 4] /= _value_or(known.force_gain, 1.0)
     front = slice(S.DELTA, S.DELTA + 2)
-    signals[..., front] -= _value(known.steer_offset, 0.0)
-    signals[..., front] /= _value(known.steer_gain, 1.0)
+    signals[..., front] -= _value_or(known.steer_offset, 0.0)
+    signals[..., front] /= _value_or(known.steer_gain, 1.0)
     return signals
 
 
-def _waits(known: Calibration | None) -> dict[tuple[int, int], float]:
+def _device_waits(known: Calibration | None) -> dict[tuple[int, int], float]:
     """Return how long the readings of a device's channels wait for the latest device [s]; the
     latest is left out.
     """
@@ -132,12 +132,12 @@ def _waits(known: Calibration | None) -> dict[tuple[int, int], float]:
         return {}
     late = {
         INERTIAL: 0.0,
-        STEERING: _value(known.steer_lag, 0.0),
-        TURNING: _value(known.wheel_lag, 0.0),
+        STEERING: _value_or(known.steer_lag, 0.0),
+        TURNING: _value_or(known.wheel_lag, 0.0),
     }
     latest = max(late.values())
     return {channels: latest - lag for channels, lag in late.items() if lag < latest}
 
 
-def _value(estimate: tuple[float, float] | None, sound: float) -> float:
+def _value_or(estimate: tuple[float, float] | None, sound: float) -> float:
     return sound if estimate is None else estimate[0]

@@ -19,7 +19,7 @@ from edge_agent.inputs.context import context_values, held_readings
 from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.inputs.recording import Recording, Series
 from edge_agent.inputs.signal_log import GROUND
-from edge_agent.inputs.units import QUANTITY, ZEROS, to_si, understood
+from edge_agent.inputs.units import QUANTITY, ZEROS, to_si, unit_of_channel
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, CONTEXT
@@ -59,7 +59,7 @@ class Merged:
     )  # per channel: source, rate, missing, jitter
 
 
-def merge(
+def merge_recordings(
     recordings: Sequence[Recording],
     profile: Profile,
     *,
@@ -85,7 +85,7 @@ def merge(
     notes = [note for recording in recordings for note in recording.notes]
     found = found_in(recordings, profile)
     if not found:
-        names = ", ".join(sorted(profile.needs())[:6])
+        names = ", ".join(sorted(profile.needed_signals())[:6])
         raise InputError(
             "profile", f"no recording has any of its signals ({names}, …)", "choose another profile"
         )
@@ -93,17 +93,17 @@ def merge(
         (place for name, (place, _) in found.items() if name.startswith("omega")),
         next(iter(found.values()))[0],
     )
-    offsets, start_ns = _clocks(recordings, reference, shifts or {}, notes)
+    offsets, start_ns = _align_clocks(recordings, reference, shifts or {}, notes)
     series: dict[str, Series] = {}
     origins: dict[str, dict[str, object]] = {}
     for name, (place, channel) in found.items():
-        one, jitter = made(name, channel, recordings[place], radius, ratio)
+        one, jitter = make_channel(name, channel, recordings[place], radius, ratio)
         series[name] = Series(one.t + offsets[place] - channel.delay_s, one.values)
         source = recordings[place].name
         origins[name] = {
             "source": source,
             "signals": channel.signals,
-            **_rates(one),
+            **_describe_rates(one),
             "jitter_s": jitter,
         }
     _still_courses(series)
@@ -112,7 +112,7 @@ def merge(
         raise InputError(
             "profile", "no recording has any of the channels", "context alone is no drive"
         )
-    merged = _rows(series, profile, recordings, found)
+    merged = _build_rows(series, profile, recordings, found)
     for name, one in context.items():
         if len(one.t) == len(merged.t) and np.array_equal(one.t, merged.t):
             merged.columns[name] = one.values  # a table's own rows stay as they are
@@ -151,11 +151,11 @@ def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tup
     return found
 
 
-def _clocks(
+def _align_clocks(
     recordings: Sequence[Recording], reference: int, shifts: Mapping[str, float], notes: list[str]
 ) -> tuple[list[float], int | None]:
     """Seconds to add to each recording's times, and the ns UTC of time 0."""
-    spans = [_span(recording) for recording in recordings]
+    spans = [_time_span(recording) for recording in recordings]
     base = recordings[reference].start_ns
     dated = next(
         (r.start_ns for r in recordings if {"latitude", "course"} <= r.signals.keys()), None
@@ -180,7 +180,7 @@ def _clocks(
         meets = [
             zone
             for zone in zones
-            if _meet(spans[place], lead + shift + zone * ZONE_S, spans[reference])
+            if _spans_overlap(spans[place], lead + shift + zone * ZONE_S, spans[reference])
         ]
         if not meets:
             raise InputError(
@@ -200,17 +200,17 @@ def _clocks(
     return offsets, start_ns
 
 
-def _span(recording: Recording) -> tuple[float, float]:
+def _time_span(recording: Recording) -> tuple[float, float]:
     ends = [(series.t[0], series.t[-1]) for series in recording.signals.values() if len(series.t)]
     return (min(first for first, _ in ends), max(last for _, last in ends)) if ends else (0.0, 0.0)
 
 
-def _meet(span: tuple[float, float], shift: float, other: tuple[float, float]) -> bool:
+def _spans_overlap(span: tuple[float, float], shift: float, other: tuple[float, float]) -> bool:
     common = min(span[1] + shift, other[1]) - max(span[0] + shift, other[0])
     return common > 0.5 * min(span[1] - span[0], other[1] - other[0])
 
 
-def made(
+def make_channel(
     name: str, channel: Channel, recording: Recording, radius: float | None, ratio: float | None
 ) -> tuple[Series, float]:
     """A channel in SI on its own times, and how unsteady its stamps were [s].
@@ -228,7 +228,7 @@ def made(
         values = np.mod(values, channel.wrap)
     factor = 1.0
     if name != GROUND:
-        unit = channel.unit or understood(name, first.unit) or next(iter(QUANTITY[name]))
+        unit = channel.unit or unit_of_channel(name, first.unit) or next(iter(QUANTITY[name]))
         known = to_si(name, unit, radius)
         if known is None:
             raise InputError(
@@ -248,41 +248,41 @@ def made(
         factor /= ratio
     values = values * (factor * channel.scale)
     if channel.sign is not None:
-        flag = recording.signals.get(channel.whole(channel.sign.signal))
+        flag = recording.signals.get(channel.full_name(channel.sign.signal))
         if flag is None:
             raise InputError(
                 where, f"its sign {channel.sign.signal} is not there", "name the signal of the sign"
             )
-        values = np.where(_held(flag, first.t) == channel.sign.negative, -values, values)
+        values = np.where(_hold_last(flag, first.t) == channel.sign.negative, -values, values)
     values = values + channel.offset
     for gate, good in channel.gates.items():
         if gate in recording.signals:
             values = np.where(
-                np.isin(_held(recording.signals[gate], first.t), good), values, np.nan
+                np.isin(_hold_last(recording.signals[gate], first.t), good), values, np.nan
             )
     if channel.course:
         values = np.mod(np.pi / 2.0 - values + np.pi, 2.0 * np.pi) - np.pi
     if name in CONTEXT:
         return Series(first.t, context_values(name, values, channel.active)), 0.0
-    t, jitter = (first.t, 0.0) if recording.rows else steady(first.t)
+    t, jitter = (first.t, 0.0) if recording.rows else straighten_times(first.t)
     return Series(t, values), jitter
 
 
-def _held(series: Series, t: FloatArray) -> FloatArray:
+def _hold_last(series: Series, t: FloatArray) -> FloatArray:
     """The last reading at or before each time."""
     return series.values[
         np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, len(series.t) - 1)
     ]
 
 
-def _rates(series: Series) -> dict[str, object]:
+def _describe_rates(series: Series) -> dict[str, object]:
     steps = np.diff(series.t)
     period = float(np.median(steps)) if len(steps) else 0.0
     missing = float(np.mean(~np.isfinite(series.values)))
     return {"readings": len(series.t), "period_s": round(period, 6), "missing": round(missing, 4)}
 
 
-def steady(t: FloatArray) -> tuple[FloatArray, float]:
+def straighten_times(t: FloatArray) -> tuple[FloatArray, float]:
     """Times of a periodic signal whose stamps come in bursts, straightened; and how far they were
     off (std) [s].
 
@@ -311,7 +311,7 @@ def _still_courses(series: dict[str, Series]) -> None:
         series["yaw"] = Series(yaw.t, np.where(speed > COURSE_SPEED, yaw.values, np.nan))
 
 
-def _rows(
+def _build_rows(
     series: dict[str, Series],
     profile: Profile,
     recordings: Sequence[Recording],
@@ -334,24 +334,26 @@ def _rows(
         )
     first = max(one.t[0] for one in dense.values())
     last = min(one.t[-1] for one in dense.values())
-    rate = profile.rate_hz or _rate(dense)
+    rate = profile.rate_hz or _row_rate(dense)
     if not last - first > 1.0 / rate:
         raise InputError(
             "source", "its channels have no common time", "record them together, or give --clock"
         )
     t = first + np.arange(int((last - first) * rate + 1e-6) + 1) / rate
     return Merged(
-        t, {name: sampled(one, t, sparse=name in SPARSE) for name, one in series.items()}, None
+        t,
+        {name: sample_at_rows(one, t, sparse=name in SPARSE) for name, one in series.items()},
+        None,
     )
 
 
-def _rate(dense: Mapping[str, Series]) -> float:
+def _row_rate(dense: Mapping[str, Series]) -> float:
     """The rate of the fastest channel, rounded up to a usual one."""
     fastest = max(1.0 / max(float(np.median(np.diff(one.t))), 1e-3) for one in dense.values())
     return next((rate for rate in RATES if rate >= 0.95 * fastest), RATES[-1])
 
 
-def sampled(series: Series, t: FloatArray, *, sparse: bool) -> FloatArray:
+def sample_at_rows(series: Series, t: FloatArray, *, sparse: bool) -> FloatArray:
     """The series at the rows' times; NaN where no reading is near enough."""
     good = np.isfinite(series.values)
     known = series.t[good]

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from typing import Final, TypeAlias
 
 from edge_agent.inputs.profile import Channel, Profile
-from edge_agent.inputs.units import QUANTITY, understood
+from edge_agent.inputs.units import QUANTITY, unit_of_channel
 from schemas.signals import WHEELS
 
 _WORDS: Final = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+")
@@ -72,7 +72,7 @@ STEERING: Final[Rule] = (
 COURSE: Final = re.compile(r"heading|course|track")
 
 
-def words(name: str) -> str:
+def split_words(name: str) -> str:
     """A name in lower-case words with a blank between."""
     return " ".join(_WORDS.findall(name)).lower()
 
@@ -89,7 +89,7 @@ def place_of(plain: str) -> str | None:
     return None
 
 
-def draft(signals: Mapping[str, str], name: str) -> Profile:
+def draft_profile(signals: Mapping[str, str], name: str) -> Profile:
     """Return a profile drafted from the names.
 
     Args:
@@ -99,9 +99,9 @@ def draft(signals: Mapping[str, str], name: str) -> Profile:
     channels: dict[str, Channel] = {}
     for signal, unit in signals.items():
         field = signal.partition(".")[2]
-        plain = words(signal if field in ("", "data") else field)
-        if (channel := _channel(plain, signal)) and channel not in channels:
-            channels[channel] = _entry(channel, signal, unit, plain)
+        plain = split_words(signal if field in ("", "data") else field)
+        if (channel := _channel_of(plain, signal)) and channel not in channels:
+            channels[channel] = _make_channel(channel, signal, unit, plain)
     if (
         "delta_fl" in channels
         and "delta_fr" not in channels
@@ -116,27 +116,27 @@ def draft(signals: Mapping[str, str], name: str) -> Profile:
     return Profile(name=re.sub(r"\W+", "-", name)[:64] or "drafted", about=about, channels=order)
 
 
-def _channel(plain: str, signal: str) -> str | None:
+def _channel_of(plain: str, signal: str) -> str | None:
     if signal in QUANTITY:
         return signal
     place = place_of(plain)
-    if place is not None and _fits(plain, SPEED):
+    if place is not None and _fits_rule(plain, SPEED):
         return f"omega_{place}"
     if place is not None and "torque" in plain:
         return f"torque_{place}"
     for channel, rule in RULES.items():
-        if _fits(plain, rule):
+        if _fits_rule(plain, rule):
             return channel
-    if _fits(plain, STEERING):
+    if _fits_rule(plain, STEERING):
         return f"delta_{place}" if place in WHEELS else "delta_fl"
     return None
 
 
-def _fits(plain: str, rule: Rule) -> bool:
+def _fits_rule(plain: str, rule: Rule) -> bool:
     return bool(re.search(rule[0], plain)) and not re.search(rule[1], plain)
 
 
-def _entry(channel: str, signal: str, unit: str, plain: str) -> Channel:
+def _make_channel(channel: str, signal: str, unit: str, plain: str) -> Channel:
     message, dot, short = signal.partition(".")
     bus = bool(dot) and not signal.startswith("/")
     wheel = (
@@ -147,7 +147,7 @@ def _entry(channel: str, signal: str, unit: str, plain: str) -> Channel:
     return Channel(
         signal=short if bus else signal,
         message=message if bus else None,
-        unit=understood(channel, unit),
+        unit=unit_of_channel(channel, unit),
         at="steering wheel" if wheel else "road wheel",
         course=channel == "yaw" and bool(COURSE.search(plain)),
     )

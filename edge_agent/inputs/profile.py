@@ -81,20 +81,24 @@ class Channel(Part):
     def signals(self) -> list[str]:
         """Whole names of the signals that are added."""
         names = [self.signal] if isinstance(self.signal, str) else self.signal
-        return [self.whole(name) for name in names]
+        return [self.full_name(name) for name in names]
 
     @property
     def gates(self) -> dict[str, list[float]]:
         """Whole names of the signals that vouch for it."""
-        return {self.whole(name): values for name, values in self.valid.items()}
+        return {self.full_name(name): values for name, values in self.valid.items()}
 
-    def whole(self, name: str) -> str:
+    def full_name(self, name: str) -> str:
         """The name under which readers give a signal of this channel's message."""
         return name if self.message is None else f"{self.message}.{name}"
 
-    def needs(self) -> list[str]:
+    def needed_signals(self) -> list[str]:
         """Every signal that it reads."""
-        return [*self.signals, *self.gates, *([self.whole(self.sign.signal)] if self.sign else [])]
+        return [
+            *self.signals,
+            *self.gates,
+            *([self.full_name(self.sign.signal)] if self.sign else []),
+        ]
 
 
 class Profile(Part):
@@ -116,7 +120,7 @@ class Profile(Part):
     channels: dict[str, Channel]
 
     @model_validator(mode="after")
-    def _known(self) -> Self:
+    def _check_channels(self) -> Self:
         for name, channel in self.channels.items():
             if name not in QUANTITY:
                 raise ValueError(f"there is no channel {name}; choose of {', '.join(QUANTITY)}")
@@ -128,11 +132,11 @@ class Profile(Part):
                 raise ValueError(f"{name} is lasting; only {', '.join(CONTEXT)} may be")
         return self
 
-    def needs(self) -> set[str]:
+    def needed_signals(self) -> set[str]:
         """Every signal that it reads."""
-        return {name for channel in self.channels.values() for name in channel.needs()}
+        return {name for channel in self.channels.values() for name in channel.needed_signals()}
 
-    def text(self) -> str:
+    def to_json(self) -> str:
         """Return the profile as JSON, without unset fields."""
         return (
             json.dumps(self.model_dump(exclude_defaults=True) | {"version": self.version}, indent=1)
@@ -140,7 +144,7 @@ class Profile(Part):
         )
 
 
-def shipped() -> list[str]:
+def shipped_profiles() -> list[str]:
     """Names of the profiles that come with the package."""
     return sorted(path.stem for path in FOLDER.glob("*.json"))
 
@@ -152,11 +156,11 @@ def load_profile(name: str) -> tuple[Profile, Path]:
     Raises:
         InputError: it cannot be read, or a field is missing, unknown or out of range.
     """
-    path = FOLDER / f"{name}.json" if name in shipped() else Path(name)
+    path = FOLDER / f"{name}.json" if name in shipped_profiles() else Path(name)
     try:
         return Profile.model_validate_json(path.read_bytes()), path.parent
     except OSError as error:
-        known = ", ".join(shipped())
+        known = ", ".join(shipped_profiles())
         raise InputError(
             "profile", f"cannot read {path} ({error.strerror})", f"name a file, or one of {known}"
         ) from error

@@ -46,7 +46,7 @@ class Recording:
 
 
 @contextmanager
-def foreign(path: Path, kind: str) -> Iterator[None]:
+def foreign_errors(path: Path, kind: str) -> Iterator[None]:
     """Turn whatever a library raises over a broken file into one line that names it.
 
     Raises:
@@ -67,7 +67,7 @@ def foreign(path: Path, kind: str) -> Iterator[None]:
         ) from error
 
 
-def library(name: str, extra: str = "inputs") -> Any:  # noqa: ANN401 modules of optional libraries have no common type
+def import_optional(name: str, extra: str = "inputs") -> Any:  # noqa: ANN401 modules of optional libraries have no common type
     """An optional library, imported now.
 
     Raises:

@@ -22,7 +22,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from edge_agent.inputs.block import Block, absolute
+from edge_agent.inputs.block import Block, to_utc_ns
 from edge_agent.inputs.context import context_values
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -58,7 +58,9 @@ class SignalLog:
         for first in range(0, len(self.t), rows):
             t = self.t[first : first + rows, None]
             context = None if self.context is None else self.context[first : first + rows, None]
-            yield Block(t, absolute(t, start_ns), self.signals[first : first + rows, None], context)
+            yield Block(
+                t, to_utc_ns(t, start_ns), self.signals[first : first + rows, None], context
+            )
 
 
 def read_log(path: Path) -> SignalLog:
@@ -69,24 +71,24 @@ def read_log(path: Path) -> SignalLog:
             column that is not numeric, no row, or time that is missing or goes back; names the
             column (and row) and the fix.
     """
-    table = _table(path)
+    table = _read_table(path)
     if not table.num_rows:
         raise InputError("log", f"{path} has no rows", "give a log with at least one sample")
-    t, start_ns = _time(table)
+    t, start_ns = _read_time(table)
     signals = np.full((table.num_rows, len(CHANNELS)), np.nan)
     for index, name in enumerate(CHANNELS):
         if name in table.column_names:
-            signals[:, index] = _numbers(table, name)
+            signals[:, index] = _float_column(table, name)
     signals[np.isinf(signals)] = np.nan
-    _check(table, signals)
+    _check_log(table, signals)
     fill_steering(
         signals, [name not in table.column_names for name in (*FRONT_STEERING, *REAR_STEERING)]
     )
-    ground = _numbers(table, GROUND) if GROUND in table.column_names else None
-    return SignalLog(t, signals, start_ns, ground, _context(table))
+    ground = _float_column(table, GROUND) if GROUND in table.column_names else None
+    return SignalLog(t, signals, start_ns, ground, _read_context(table))
 
 
-def _table(path: Path) -> pa.Table:
+def _read_table(path: Path) -> pa.Table:
     try:
         with pq.ParquetFile(path) as file:
             present = set(file.schema_arrow.names)
@@ -108,18 +110,18 @@ def _table(path: Path) -> pa.Table:
         ) from error
 
 
-def _context(table: pa.Table) -> FloatArray | None:
+def _read_context(table: pa.Table) -> FloatArray | None:
     """Context (T, len(CONTEXT)), None where the log has no column of it."""
     if not set(CONTEXT) & set(table.column_names):
         return None
     context = np.full((table.num_rows, len(CONTEXT)), np.nan)
     for index, name in enumerate(CONTEXT):
         if name in table.column_names:
-            context[:, index] = context_values(name, _numbers(table, name), None)
+            context[:, index] = context_values(name, _float_column(table, name), None)
     return context
 
 
-def _numbers(table: pa.Table, name: str) -> FloatArray:
+def _float_column(table: pa.Table, name: str) -> FloatArray:
     """A column as float64, null as NaN; a copy, since Arrow's own is read-only and numba would
     compile again for it.
     """
@@ -132,7 +134,7 @@ def _numbers(table: pa.Table, name: str) -> FloatArray:
     return np.array(values.to_numpy(zero_copy_only=False), dtype=np.float64)
 
 
-def _time(table: pa.Table) -> tuple[FloatArray, int | None]:
+def _read_time(table: pa.Table) -> tuple[FloatArray, int | None]:
     """t [s] and the ns UTC of t = 0, None for a log that has only `t`."""
     name = next((name for name in ("t", "timestamp") if name in table.column_names), None)
     if name is None:
@@ -140,10 +142,10 @@ def _time(table: pa.Table) -> tuple[FloatArray, int | None]:
             "t", "the log has neither t nor timestamp", "add the time of each sample, t in seconds"
         )
     if name == "t":
-        t = _numbers(table, name)
+        t = _float_column(table, name)
         start_ns = None
     else:
-        t, start_ns = _timestamps(table[name])
+        t, start_ns = _seconds_from_first(table[name])
     bad = np.flatnonzero(~np.isfinite(t))
     if len(bad):
         raise InputError(name, f"row {bad[0]} has no time", "give every sample its time")
@@ -153,7 +155,7 @@ def _time(table: pa.Table) -> tuple[FloatArray, int | None]:
     return t, start_ns
 
 
-def _timestamps(column: Any) -> tuple[FloatArray, int | None]:  # noqa: ANN401 pyarrow's column types are not generic
+def _seconds_from_first(column: Any) -> tuple[FloatArray, int | None]:  # noqa: ANN401 pyarrow's column types are not generic
     """Seconds since the first sample, and the ns UTC of that sample."""
     if column.null_count:
         row = int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])
@@ -174,7 +176,7 @@ def _timestamps(column: Any) -> tuple[FloatArray, int | None]:  # noqa: ANN401 p
     return (values - values[0]) / NS, int(values[0])
 
 
-def _check(table: pa.Table, signals: FloatArray) -> None:
+def _check_log(table: pa.Table, signals: FloatArray) -> None:
     for name in NEEDED:
         if name not in table.column_names:
             raise InputError(

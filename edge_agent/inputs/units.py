@@ -92,15 +92,15 @@ QUANTITY: Final[dict[str, dict[str, float]]] = {
 assert set(QUANTITY) == {*CHANNELS, *CONTEXT}
 
 
-def spelled(text: str) -> str:
+def standard_spelling(text: str) -> str:
     """Return the standard spelling of a unit; an unknown unit is returned in lower case."""
     plain = re.sub(r"\s", "", text.lower())
     return SPELLINGS.get(plain, plain)
 
 
-def understood(channel: str, text: str) -> str | None:
+def unit_of_channel(channel: str, text: str) -> str | None:
     """The unit of a channel as a recording tells it; None where it tells none that fits."""
-    unit = spelled(text)
+    unit = standard_spelling(text)
     return unit if unit in QUANTITY[channel] else None
 
 

@@ -66,7 +66,7 @@ class TruthRecorder:
         for n in range(len(self.names)):
             edges = [0, *(np.flatnonzero(changes[:, n]) + 1).tolist(), len(time)]
             for first, last in pairwise(edges):
-                visit = self._visit(
+                visit = self._visit_of(
                     n, int(cells[first, n]), int(sectors[first, n]), int(time[first, n])
                 )
                 visit.leave = int(time[last - 1, n])
@@ -74,7 +74,7 @@ class TruthRecorder:
                 visit.mu += float(mean[first:last, n].sum())
                 visit.utilisation = max(visit.utilisation, float(largest[first:last, n].max()))
 
-    def _visit(self, n: int, cell: int, sector: int, time: int) -> _Visit:
+    def _visit_of(self, n: int, cell: int, sector: int, time: int) -> _Visit:
         visit = self._open.get(n)
         if visit is None or (visit.cell, visit.sector) != (cell, sector):
             visit = self._open[n] = _Visit(cell, sector, time)

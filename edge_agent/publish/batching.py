@@ -92,7 +92,7 @@ class Batcher:
             group.rows += len(chosen)
             group.urgent |= bool(records.urgent[chosen].any())
 
-    def due(self, now: float, *, everything: bool = False) -> list[Draft]:
+    def take_due(self, now: float, *, everything: bool = False) -> list[Draft]:
         """Remove and return the batches that are due."""
         drafts: list[Draft] = []
         for place, group in list(self._groups.items()):
@@ -105,14 +105,14 @@ class Batcher:
                 name: np.concatenate([part[name] for part in group.parts])
                 for name in group.parts[0]
             }
-            for first, last in _runs(joined[_TIME[place.kind]], ready, self._rows):
-                drafts.append(self._draft(place, _slice(joined, first, last)))
+            for first, last in _batch_ranges(joined[_TIME[place.kind]], ready, self._rows):
+                drafts.append(self._make_draft(place, _slice_columns(joined, first, last)))
             if ready < group.rows:
-                rest = _slice(joined, ready, group.rows)
+                rest = _slice_columns(joined, ready, group.rows)
                 self._groups[place] = _Group(now, rows=group.rows - ready, parts=[rest])
         return drafts
 
-    def _draft(self, place: _Place, columns: Columns) -> Draft:
+    def _make_draft(self, place: _Place, columns: Columns) -> Draft:
         name = self._names[place.vehicle]
         batch = Batch(
             place.kind,
@@ -127,7 +127,7 @@ class Batcher:
         return Draft(name, place.kind, place.region, batch.rows, partial(_encode_batch, batch))
 
 
-def _runs(time: IntArray, ready: int, rows: int) -> Iterator[tuple[int, int]]:
+def _batch_ranges(time: IntArray, ready: int, rows: int) -> Iterator[tuple[int, int]]:
     """Yield the first and last position of each batch, limited in rows and in time span (a replayed
     drive can be long)."""
     first = 0
@@ -137,7 +137,7 @@ def _runs(time: IntArray, ready: int, rows: int) -> Iterator[tuple[int, int]]:
             first = at
 
 
-def _slice(columns: Columns, first: int, last: int) -> Columns:
+def _slice_columns(columns: Columns, first: int, last: int) -> Columns:
     return {name: column[first:last] for name, column in columns.items()}
 
 

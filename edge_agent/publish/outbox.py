@@ -56,7 +56,7 @@ class Stream(NamedTuple):
 
 @dataclass(frozen=True)
 class StoredBatch:
-    """Unsettled batch on disk; send `fresh` ones now, others when `due` returns them."""
+    """Unsettled batch on disk; send `fresh` ones now, others when `due_batches` returns them."""
 
     key: int
     stream: Stream
@@ -140,20 +140,22 @@ class Outbox:
         self._path = path
         self._database, aside = spool_file.open_file(path)
         self.counts.damages += aside is not None
-        self._restore()
+        self._load_batches()
 
-    def _restore(self) -> None:
+    def _load_batches(self) -> None:
         """Load the batches of an earlier start; all are due at once."""
         rows = self._database.execute(
             "SELECT id, vehicle, boot, kind, region, seq, records, LENGTH(payload) FROM batch "
             "ORDER BY id"
         )
         for key, vehicle, boot, kind, region, seq, records, size in rows:
-            self._hold(key, _Entry(Stream(vehicle, boot, Kind(kind), region), seq, records, size))
-            self._pacer(self._entries[key]).wait(key)
-        self._evict()
+            self._hold_entry(
+                key, _Entry(Stream(vehicle, boot, Kind(kind), region), seq, records, size)
+            )
+            self._pacer_of(self._entries[key]).queue_batch(key)
+        self._evict_oldest()
 
-    def recover(self) -> None:
+    def recover_file(self) -> None:
         """Continue in a new file with the readable content of the current, damaged one.
 
         Raises sqlite3.Error or OSError if the disk refuses; the call may then be repeated.
@@ -176,15 +178,15 @@ class Outbox:
         self._later = []
         self._deletable = []
         self._bytes = 0
-        self._restore()
+        self._load_batches()
         self.counts.damaged += max(
             before - sum(entry.records for entry in self._entries.values()), 0
         )
 
-    def _pacer(self, entry: _Entry) -> Pacer:
+    def _pacer_of(self, entry: _Entry) -> Pacer:
         return self._pacers.setdefault((entry.stream.vehicle, entry.stream.region), Pacer())
 
-    def _hold(self, key: int, entry: _Entry) -> None:
+    def _hold_entry(self, key: int, entry: _Entry) -> None:
         self._entries[key] = entry
         oldest = self._oldest[entry.stream.kind]
         oldest.append(key)
@@ -198,14 +200,14 @@ class Outbox:
         sequence.next = max(sequence.next, entry.seq + 1)
         self._bytes += entry.size
 
-    def _forget(self, key: int) -> _Entry:
+    def _drop_entry(self, key: int) -> _Entry:
         entry = self._entries.pop(key)
         sequence = self._streams[entry.stream]
         del sequence.held[entry.seq]
         if not sequence.held and entry.stream.boot != self.boot:
             del self._streams[entry.stream]
         if entry.due is not None:
-            self._pacer(entry).record_settled()
+            self._pacer_of(entry).record_settled()
         self._bytes -= entry.size
         self._deletable.append(key)
         return entry
@@ -215,7 +217,7 @@ class Outbox:
         """Number of held batches."""
         return len(self._entries)
 
-    def records(self, vehicles: Collection[str], kind: Kind | None = None) -> int:
+    def count_records(self, vehicles: Collection[str], kind: Kind | None = None) -> int:
         """Return the number of records in held batches of some vehicles, of one kind or of all."""
         held = list(self._entries.values())
         return sum(
@@ -224,7 +226,7 @@ class Outbox:
             if e.stream.vehicle in vehicles and kind in (None, e.stream.kind)
         )
 
-    def stranded(self, vehicles: Collection[str]) -> int:
+    def count_stranded(self, vehicles: Collection[str]) -> int:
         """Return the number of records of other vehicles than these: of a former name, which is
         not sent.
         """
@@ -250,23 +252,23 @@ class Outbox:
         """
         ahead: dict[Stream, int] = {}
         with self._database:
-            self._delete()
-            held = [self._insert(draft, ahead) for draft in drafts]
+            self._delete_rows()
+            held = [self._insert_draft(draft, ahead) for draft in drafts]
         self._deletable.clear()
         for place, batch in enumerate(held):
             entry = _Entry(batch.stream, batch.seq, batch.records, len(batch.payload))
-            self._hold(batch.key, entry)
+            self._hold_entry(batch.key, entry)
             self.counts.stored += batch.records
-            pacer = self._pacer(entry)
+            pacer = self._pacer_of(entry)
             if pacer.silent:
-                pacer.wait(batch.key)
+                pacer.queue_batch(batch.key)
                 held[place] = replace(batch, fresh=False)
             else:
                 self._mark_in_flight(batch.key, now)
-        self._evict()
+        self._evict_oldest()
         return [batch for batch in held if batch.key in self._entries]
 
-    def _insert(self, draft: Draft, ahead: dict[Stream, int]) -> StoredBatch:
+    def _insert_draft(self, draft: Draft, ahead: dict[Stream, int]) -> StoredBatch:
         stream = Stream(draft.vehicle, self.boot, draft.kind, draft.region)
         known = self._streams.get(stream) or _Sequence(stream)
         seq = ahead.get(stream, known.next)
@@ -275,7 +277,7 @@ class Outbox:
         cursor = self._database.execute(
             f"INSERT INTO batch ({spool_file.NAME}, payload, checksum) VALUES (?, ?, ?, ?, ?, ?, "
             "?, ?)",
-            (*name, payload, spool_file.checksum(name, payload)),
+            (*name, payload, spool_file.batch_checksum(name, payload)),
         )
         ahead[stream] = seq + 1
         key = cursor.lastrowid
@@ -291,14 +293,14 @@ class Outbox:
             self.first_resend_s * 2.0 ** min(entry.attempts, 16),
         )
         entry.attempts += 1
-        entry.due = now + delay * self._jitter()
+        entry.due = now + delay * self._random_jitter()
         heapq.heappush(self._later, (entry.due, key))
-        self._pacer(entry).record_sent(now)
+        self._pacer_of(entry).record_sent(now)
 
-    def _jitter(self) -> float:
+    def _random_jitter(self) -> float:
         return self._random.uniform(1 - JITTER, 1 + JITTER)
 
-    def reoffer(self, vehicle: str, now: float) -> None:
+    def reset_in_flight(self, vehicle: str, now: float) -> None:
         """Treat everything a vehicle had in flight as lost: it has just found a router again."""
         for (name, _), pacer in self._pacers.items():
             if name == vehicle:
@@ -308,17 +310,17 @@ class Outbox:
             if entry is not None and entry.stream.vehicle == vehicle and entry.due is not None:
                 entry.due = None
                 entry.attempts = 0
-                self._pacer(entry).wait(key)
+                self._pacer_of(entry).queue_batch(key)
 
-    def _evict(self) -> None:
+    def _evict_oldest(self) -> None:
         """Keep within the capacity: drop the oldest state first, then the oldest observation."""
         for kind in EVICTION_ORDER:
             while self._bytes > self.capacity_bytes and self._oldest[kind]:
                 key = self._oldest[kind].popleft()
                 if key in self._entries:
-                    self.counts.evicted[kind] += self._forget(key).records
+                    self.counts.evicted[kind] += self._drop_entry(key).records
 
-    def _delete(self) -> None:
+    def _delete_rows(self) -> None:
         self._database.executemany(
             "DELETE FROM batch WHERE id = ?", [(key,) for key in self._deletable]
         )
@@ -329,10 +331,10 @@ class Outbox:
         """
         if self._deletable:
             with self._database:
-                self._delete()
+                self._delete_rows()
             self._deletable.clear()
 
-    def settle(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> int:
+    def settle_ranges(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> int:
         """Remove the batches of inclusive seq ranges; return the number of records. Unknown seqs
         are ignored.
 
@@ -345,12 +347,12 @@ class Outbox:
         pacer = self._pacers.get((stream.vehicle, stream.region))
         if pacer is not None:
             pacer.record_answer()
-        keys = {key for first, last in ranges for key in _within(sequence.held, first, last)}
-        records = sum(self._forget(key).records for key in keys)
+        keys = {key for first, last in ranges for key in _keys_within(sequence.held, first, last)}
+        records = sum(self._drop_entry(key).records for key in keys)
         self.counts.settled += records
         return records
 
-    def due(
+    def due_batches(
         self, now: float, limit: int, vehicles: Collection[str] | None = None
     ) -> list[StoredBatch]:
         """Return at most `limit` batches to send now, oldest first, of these vehicles or of all;
@@ -363,22 +365,22 @@ class Outbox:
             entry = self._entries.get(key)
             if entry is not None and entry.due == at:
                 entry.due = None
-                self._pacer(entry).record_timeout(now, self._jitter())
+                self._pacer_of(entry).record_timeout(now, self._random_jitter())
                 if self._is_passed_over(entry):
-                    self.counts.unanswered += self._forget(key).records
+                    self.counts.unanswered += self._drop_entry(key).records
                 else:
-                    self._pacer(entry).wait(key)
+                    self._pacer_of(entry).queue_batch(key)
         keys: list[int] = []
         for (vehicle, _), pacer in self._pacers.items():
             if vehicles is None or vehicle in vehicles:
-                taken = pacer.take(now, self._jitter(), limit - len(keys), self._entries)
+                taken = pacer.take_due(now, self._random_jitter(), limit - len(keys), self._entries)
                 for key in taken:
                     self._mark_in_flight(key, now)
                 keys += taken
         self._pacers = {
-            name: pacer for name, pacer in self._pacers.items() if not pacer.idle or pacer.silent
+            name: pacer for name, pacer in self._pacers.items() if not pacer.is_idle or pacer.silent
         }
-        return [batch for key in sorted(keys) if (batch := self._read(key)) is not None]
+        return [batch for key in sorted(keys) if (batch := self._read_batch(key)) is not None]
 
     def _is_passed_over(self, entry: _Entry) -> bool:
         """Return True if PASSED_OVER later batches of the stream were settled and this one, the
@@ -390,16 +392,20 @@ class Outbox:
 
     def held_batches(self) -> list[StoredBatch]:
         """Return all held batches, oldest first. Raises sqlite3.Error."""
-        return [batch for key in list(self._entries) if (batch := self._read(key)) is not None]
+        return [
+            batch for key in list(self._entries) if (batch := self._read_batch(key)) is not None
+        ]
 
-    def _read(self, key: int) -> StoredBatch | None:
+    def _read_batch(self, key: int) -> StoredBatch | None:
         """Return a batch with its payload; None, and count it, if damage removed its row."""
         entry = self._entries[key]
         query = f"SELECT {spool_file.NAME}, payload, checksum FROM batch WHERE id = ?"
         row = self._database.execute(query, (key,)).fetchone()
-        if row is None or (row[-1] is not None and spool_file.checksum(row[:6], row[6]) != row[-1]):
+        if row is None or (
+            row[-1] is not None and spool_file.batch_checksum(row[:6], row[6]) != row[-1]
+        ):
             self.counts.damaged += max(
-                self._forget(key).records, 1
+                self._drop_entry(key).records, 1
             )  # the number may be what is damaged
             return None
         return StoredBatch(key, entry.stream, entry.seq, entry.records, row[6])
@@ -412,7 +418,7 @@ class Outbox:
             self._database.close()
 
 
-def _within(held: dict[int, int], first: int, last: int) -> list[int]:
+def _keys_within(held: dict[int, int], first: int, last: int) -> list[int]:
     """Return the keys of held seqs in [first, last], without iterating over a hostile range."""
     if last - first < len(held):
         return [held[seq] for seq in range(first, last + 1) if seq in held]

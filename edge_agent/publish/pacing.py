@@ -68,7 +68,7 @@ class Pacer:
         self._turn = 0
 
     @property
-    def idle(self) -> bool:
+    def is_idle(self) -> bool:
         """True if nothing is in flight and nothing waits."""
         return not self.flying and not self._waiting
 
@@ -77,7 +77,7 @@ class Pacer:
         """Return since when sent batches are unanswered; None if none are."""
         return self._unanswered_since
 
-    def wait(self, key: int) -> None:
+    def queue_batch(self, key: int) -> None:
         """Queue a batch; lower keys are older and are sent first."""
         heapq.heappush(self._waiting, key)
 
@@ -130,7 +130,7 @@ class Pacer:
         self._probe_at = now
         self._probe_s = FIRST_PROBE_S
 
-    def take(self, now: float, jitter: float, most: int, held: Container[int]) -> list[int]:
+    def take_due(self, now: float, jitter: float, most: int, held: Container[int]) -> list[int]:
         """Return the keys of at most `most` batches to send now, oldest first; keys that are not
         `held` are dropped.
         """
@@ -138,7 +138,7 @@ class Pacer:
             self._answered = False
             self._unanswered_since = now if self.flying else None
         if self.silent:
-            return self._probe(now, jitter, held)
+            return self._take_probe(now, jitter, held)
         out: list[int] = []
         free = min(most, int(self._window) - self.flying)
         while self._waiting and len(out) < free:
@@ -147,7 +147,7 @@ class Pacer:
                 out.append(key)
         return out
 
-    def _probe(self, now: float, jitter: float, held: Container[int]) -> list[int]:
+    def _take_probe(self, now: float, jitter: float, held: Container[int]) -> list[int]:
         """Return the oldest or the newest batch in turn, so that an unreadable one does not
         block the route.
         """

@@ -96,8 +96,8 @@ class Publisher:
         self._closing = threading.Event()
         self._stopped = threading.Event()
         self._deadline = float("inf")
-        self._sender = threading.Thread(target=self._send, name="sender", daemon=True)
-        self._connector = threading.Thread(target=self._connect, name="connector", daemon=True)
+        self._sender = threading.Thread(target=self._send_loop, name="sender", daemon=True)
+        self._connector = threading.Thread(target=self._open_links, name="connector", daemon=True)
         self.counts = Counts()
 
     def start(self) -> None:
@@ -126,27 +126,27 @@ class Publisher:
         return self._outbox.unanswered_s(self._clock())
 
     @property
-    def stranded(self) -> int:
+    def stranded_records(self) -> int:
         """Records in the outbox under names of other vehicles: of a former name."""
-        return self._outbox.stranded(self._names)
+        return self._outbox.count_stranded(self._names)
 
     @property
-    def fill(self) -> float:
+    def fill_share(self) -> float:
         """Used share of the outbox."""
         return self._outbox.bytes / self._outbox.capacity_bytes
 
     @property
-    def unanswered(self) -> int:
+    def unanswered_records(self) -> int:
         """Records of batches that were given up, because only later ones were answered."""
         return self._outbox.counts.unanswered
 
     @property
-    def damage(self) -> tuple[int, int]:
+    def damage_counts(self) -> tuple[int, int]:
         """Number of times that the outbox was found damaged, and records known to be lost by it."""
         return self._outbox.counts.damages, self._outbox.counts.damaged
 
     @property
-    def broken(self) -> bool:
+    def is_broken(self) -> bool:
         """True if the sending thread has died: records are accepted, and dropped when there is
         no room.
         """
@@ -156,17 +156,17 @@ class Publisher:
             and not self._closing.is_set()
         )
 
-    def unsettled(self, kind: Kind | None = None) -> int:
+    def count_unsettled(self, kind: Kind | None = None) -> int:
         """Return the number of unsettled records: in the outbox, also of an earlier start, or on
         their way to it.
         """
         counts = self.counts
         kinds = Kind if kind is None else (kind,)
         coming = sum(counts.offered[k] - counts.dropped[k] - counts.published[k] for k in kinds)
-        return coming + self._outbox.records(self._names, kind)
+        return coming + self._outbox.count_records(self._names, kind)
 
     @property
-    def dropped(self) -> int:
+    def dropped_records(self) -> int:
         """Records dropped for lack of room, in the queue or in the outbox."""
         return sum(self.counts.dropped.values()) + sum(self._outbox.counts.evicted.values())
 
@@ -189,7 +189,7 @@ class Publisher:
         self._closing.set()
         self._sender.join(within_s + CLOSE_GRACE_S)
         self._stopped.set()
-        closer = threading.Thread(target=self._disconnect, name="closer", daemon=True)
+        closer = threading.Thread(target=self._close_links, name="closer", daemon=True)
         closer.start()
         closer.join(CLOSE_GRACE_S)
         if self._sender.is_alive() or closer.is_alive():
@@ -202,7 +202,7 @@ class Publisher:
             )
         return True
 
-    def _connect(self) -> None:
+    def _open_links(self) -> None:
         for name in self._names:
             link = Link.open(self._config.zenoh, name, self._receive_ack, self._stopped)
             if link is None:
@@ -210,7 +210,7 @@ class Publisher:
             self._links[name] = link
             self._on_open(name, link.session)
 
-    def _disconnect(self) -> None:
+    def _close_links(self) -> None:
         self._connector.join()
         for link in self._links.values():
             link.close()
@@ -218,10 +218,10 @@ class Publisher:
     def _receive_ack(self, vehicle: str, payload: bytes) -> None:
         self._acks.put((vehicle, payload))
 
-    def _send(self) -> None:
-        while not self._finished():
+    def _send_loop(self) -> None:
+        while not self._is_finished():
             try:
-                self._round()
+                self._send_round()
             except sqlite3.Error as error:
                 if is_damage(error):
                     self._recover_outbox()
@@ -233,36 +233,36 @@ class Publisher:
                 log.exception("a round of sending failed; going on")
                 self._stopped.wait(TICK_S)
 
-    def _round(self) -> None:
-        self._take()
-        self._settle()
+    def _send_round(self) -> None:
+        self._take_offered()
+        self._settle_acks()
         self._check_connections()
-        self._waiting += self._batcher.due(self._clock(), everything=self._closing.is_set())
-        self._store()
+        self._waiting += self._batcher.take_due(self._clock(), everything=self._closing.is_set())
+        self._store_and_send()
         self._outbox.delete_settled()
-        self._resend()
+        self._resend_due()
 
     def _recover_outbox(self) -> None:
         """Save the readable content of an outbox that was damaged during use, and continue."""
         try:
-            self._outbox.recover()
+            self._outbox.recover_file()
         except (sqlite3.Error, OSError) as error:
             log.warning("the damaged outbox cannot be mended (%s); trying again", error)
 
-    def _finished(self) -> bool:
+    def _is_finished(self) -> bool:
         if not self._closing.is_set():
             return False
-        return not self.unsettled() or self._clock() >= self._deadline
+        return not self.count_unsettled() or self._clock() >= self._deadline
 
-    def _take(self) -> None:
+    def _take_offered(self) -> None:
         try:
-            self._add(self._offered.get(timeout=TICK_S))
+            self._add_records(self._offered.get(timeout=TICK_S))
             while True:
-                self._add(self._offered.get_nowait())
+                self._add_records(self._offered.get_nowait())
         except queue.Empty:
             return
 
-    def _add(self, records: RecordBlock) -> None:
+    def _add_records(self, records: RecordBlock) -> None:
         try:
             self._batcher.add(records, self._clock())
         except Exception:
@@ -270,7 +270,7 @@ class Publisher:
             self.counts.dropped[records.kind] += len(records.vehicle)
             log.exception("%d records that nobody can send are dropped", len(records.vehicle))
 
-    def _store(self) -> None:
+    def _store_and_send(self) -> None:
         """Commit waiting records, then send them. A disk that refuses is tried again in the next
         round.
         """
@@ -312,10 +312,10 @@ class Publisher:
             else:
                 self._waiting.append(draft)
 
-    def _resend(self) -> None:
+    def _resend_due(self) -> None:
         there = {name for name, connected in self._connected.items() if connected}
         limit = min(RESEND_LIMIT, RESEND_PER_VEHICLE * len(there))
-        for batch in self._outbox.due(self._clock(), limit, there) if there else ():
+        for batch in self._outbox.due_batches(self._clock(), limit, there) if there else ():
             self.counts.resent_batches += self._links[batch.stream.vehicle].put(batch)
 
     def _compare_clocks(self, reported: int) -> None:
@@ -339,10 +339,10 @@ class Publisher:
             epoch = link.watch.epoch
             if epoch != self._epochs.get(name, 0):
                 self._epochs[name] = epoch
-                self._outbox.reoffer(name, self._clock())
-            self._connected[name] = link.connected
+                self._outbox.reset_in_flight(name, self._clock())
+            self._connected[name] = link.is_connected
 
-    def _settle(self) -> None:
+    def _settle_acks(self) -> None:
         while not self._acks.empty():
             vehicle, payload = self._acks.get()
             try:
@@ -356,11 +356,13 @@ class Publisher:
                 continue
             for ack in streams:
                 stream = Stream(vehicle, ack.boot, ack.kind, ack.region)
-                self.counts.acknowledged[ack.kind] += self._outbox.settle(stream, ack.durable)
+                self.counts.acknowledged[ack.kind] += self._outbox.settle_ranges(
+                    stream, ack.durable
+                )
                 self.counts.late[ack.kind] += sum(last - first + 1 for first, last in ack.late)
                 self._compare_clocks(ack.time)
                 for seq, row, reason in ack.rejected:
-                    records = self._outbox.settle(stream, [(seq, seq)])
+                    records = self._outbox.settle_ranges(stream, [(seq, seq)])
                     self.counts.rejected[ack.kind] += records
                     if records:
                         log.warning(

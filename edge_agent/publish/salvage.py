@@ -35,10 +35,12 @@ def recover_rows(database: bytes, log: bytes) -> Iterator[tuple[int, list[Value]
     ]
     held = pages | dict(newer)
     for number, page in [*reversed(newer), *pages.items()]:
-        yield from _cells(number, page, held)
+        yield from _leaf_cells(number, page, held)
 
 
-def _cells(number: int, page: bytes, pages: dict[int, bytes]) -> Iterator[tuple[int, list[Value]]]:
+def _leaf_cells(
+    number: int, page: bytes, pages: dict[int, bytes]
+) -> Iterator[tuple[int, list[Value]]]:
     begin = _HEADER if number == 1 else 0
     if len(page) < PAGE or page[begin] != _LEAF:
         return
@@ -46,14 +48,14 @@ def _cells(number: int, page: bytes, pages: dict[int, bytes]) -> Iterator[tuple[
     for place in range(count):
         at = int.from_bytes(page[begin + 8 + 2 * place : begin + 10 + 2 * place], "big")
         try:
-            yield _cell(page, at, pages)
+            yield _read_cell(page, at, pages)
         except (IndexError, KeyError, ValueError):  # torn; also UnicodeDecodeError
             continue
 
 
-def _cell(page: bytes, at: int, pages: dict[int, bytes]) -> tuple[int, list[Value]]:
-    size, at = _varint(page, at)
-    key, at = _varint(page, at)
+def _read_cell(page: bytes, at: int, pages: dict[int, bytes]) -> tuple[int, list[Value]]:
+    size, at = _read_varint(page, at)
+    key, at = _read_varint(page, at)
     if size > _LARGEST:
         raise ValueError("no row is so large")
     local = size
@@ -66,23 +68,23 @@ def _cell(page: bytes, at: int, pages: dict[int, bytes]) -> tuple[int, list[Valu
         more = pages[following]
         following = int.from_bytes(more[:4], "big")
         record = record + more[4:]
-    return key, _record(record[:size])
+    return key, _read_record(record[:size])
 
 
-def _record(record: bytes) -> list[Value]:
-    end, at = _varint(record, 0)
+def _read_record(record: bytes) -> list[Value]:
+    end, at = _read_varint(record, 0)
     types = []
     values = []
     while at < end:
-        kind, at = _varint(record, at)
+        kind, at = _read_varint(record, at)
         types.append(kind)
     for kind in types:
-        value, at = _value(record, at, kind)
+        value, at = _read_value(record, at, kind)
         values.append(value)
     return values
 
 
-def _value(record: bytes, at: int, kind: int) -> tuple[Value, int]:
+def _read_value(record: bytes, at: int, kind: int) -> tuple[Value, int]:
     if kind == 0:
         return None, at
     if kind in (8, 9):
@@ -96,7 +98,7 @@ def _value(record: bytes, at: int, kind: int) -> tuple[Value, int]:
     return (part.decode() if kind % 2 else part), at + size
 
 
-def _varint(data: bytes, at: int) -> tuple[int, int]:
+def _read_varint(data: bytes, at: int) -> tuple[int, int]:
     value = 0
     for place in range(9):
         byte = data[at]

@@ -48,7 +48,7 @@ _CORRUPT: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 Row = tuple[object, ...]
 
 
-def checksum(name: Row, payload: bytes) -> int:
+def batch_checksum(name: Row, payload: bytes) -> int:
     """Return the CRC-32 of a batch's name (the columns NAME) and bytes."""
     return zlib.crc32(payload, zlib.crc32(repr(name).encode()))
 
@@ -68,9 +68,9 @@ def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
     try:
         make_folder(path.parent)
         try:
-            return _opened(path), None
+            return _open_database(path), None
         except sqlite3.DatabaseError as error:
-            if not is_damage(error) or not _ours(path):
+            if not is_damage(error) or not _is_outbox(path):
                 raise
             log.warning(
                 "the outbox %s is damaged (%s): set aside, and what can be read is saved",
@@ -107,10 +107,10 @@ def recover_file(path: Path) -> tuple[sqlite3.Connection, Path]:
         with suppress(FileNotFoundError):
             path.with_name(path.name + ending).rename(aside.with_name(aside.name + ending))
     sync_directory(path.parent)
-    database = _opened(path)
+    database = _open_database(path)
     saved = 0
     with database:
-        for row in _readable(aside):
+        for row in _readable_batches(aside):
             database.execute(
                 f"INSERT OR IGNORE INTO batch (id, {NAME}, payload, checksum) VALUES (?, ?, ?, ?, "
                 "?, ?, ?, ?, ?)",
@@ -121,7 +121,7 @@ def recover_file(path: Path) -> tuple[sqlite3.Connection, Path]:
     return database, aside
 
 
-def _opened(path: Path) -> sqlite3.Connection:
+def _open_database(path: Path) -> sqlite3.Connection:
     database = sqlite3.connect(path, timeout=0.0, check_same_thread=False)
     try:
         database.execute("PRAGMA locking_mode = EXCLUSIVE")
@@ -142,7 +142,7 @@ def _opened(path: Path) -> sqlite3.Connection:
     return database
 
 
-def _ours(path: Path) -> bool:
+def _is_outbox(path: Path) -> bool:
     """Return True if a file was an outbox: it begins like SQLite except for a few bytes, or is
     completely erased.
     """
@@ -151,7 +151,7 @@ def _ours(path: Path) -> bool:
     return not any(begin) or sum(a == b for a, b in zip(begin, _MAGIC, strict=False)) >= _SIMILAR
 
 
-def _readable(path: Path) -> list[Row]:
+def _readable_batches(path: Path) -> list[Row]:
     """Return the batches of a damaged file by age, each once, with a correct checksum or from
     before checksums.
     """
@@ -169,6 +169,6 @@ def _readable(path: Path) -> list[Row]:
         payload = values[7]
         given = values[8]
         assert isinstance(payload, bytes)
-        if given is None or given == checksum(name, payload):
+        if given is None or given == batch_checksum(name, payload):
             found.setdefault(key, (key, *values[1:]))
     return [found[key] for key in sorted(found)]

@@ -90,7 +90,7 @@ class RoadFrictionOutput:
             keys.vss_key(name), encoding=ENCODING, **quality_of(_TOPIC)
         )
 
-    def tell(self, grip: Grip | None) -> None:
+    def report_grip(self, grip: Grip | None) -> None:
         """Report the current belief. Never waits: a message that finds no room is dropped."""
         if grip is None or int(grip.time.max()) < self._due:
             return

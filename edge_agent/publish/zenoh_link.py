@@ -48,11 +48,11 @@ class Link:
         self._pause = pause
         self._free_at = dict.fromkeys(Kind, 0.0)  # when the next message of a kind may be sent
 
-        def heard(sample: zenoh.Sample) -> None:
+        def receive_sample(sample: zenoh.Sample) -> None:
             on_ack(vehicle, sample.payload.to_bytes())
 
         self.watch = LinkWatch(session, vehicle)
-        self._acks = session.declare_subscriber(keys.ack_key(vehicle), heard)
+        self._acks = session.declare_subscriber(keys.ack_key(vehicle), receive_sample)
         self._alive = session.liveliness().declare_token(keys.alive_key(vehicle))
 
     @staticmethod
@@ -67,7 +67,7 @@ class Link:
         return None if session is None else Link(session, vehicle, on_ack)
 
     @property
-    def connected(self) -> bool:
+    def is_connected(self) -> bool:
         """True if a router is connected now."""
         return self.watch.is_connected
 

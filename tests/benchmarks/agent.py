@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from edge_agent.app.backfill import backfill, tasks_of
+from edge_agent.app.backfill import estimate_drives, tasks_of
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.cli import main as edge
 from edge_agent.inputs.signal_log import read_log
@@ -189,7 +189,7 @@ def measure_replay(folder: Path) -> list[Figure]:
         lambda: bank_of("aco-fckf", [vehicle]).advance(block.t, block.signals), 3
     )
     tasks = tasks_of([log for log, _ in logs], None, folder / "estimates")
-    whole = median_s(lambda: list(backfill(tasks, "aco-fckf", 2)), 3)
+    whole = median_s(lambda: list(estimate_drives(tasks, "aco-fckf", 2)), 3)
     return [
         Figure(
             "bench.replay.efficiency",

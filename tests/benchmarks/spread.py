@@ -11,7 +11,13 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from edge_agent.app.backfill import Task, backfill, backfill_on_spark, estimate_atomically, tasks_of
+from edge_agent.app.backfill import (
+    Task,
+    backfill_on_spark,
+    estimate_atomically,
+    estimate_drives,
+    tasks_of,
+)
 from edge_agent.cli import main as edge_agent
 from fleet_service.analytics.rebuilding import Rebuild, rebuild, rebuild_zone, zones_of
 from fleet_service.analytics.synthetic import SyntheticFleet
@@ -60,7 +66,7 @@ def replay_difference(logs: Sequence[Path], folder: Path) -> float:
     with spark_sessions.spark_session(2) as session:
         dying = spark_sessions.killed_at_first(work, lambda task: task.log.name, tries)
         told = spark.spread(session, tasks_of(logs, None, there), dying)
-    ours = list(backfill(tasks_of(logs, None, here), ESTIMATOR, 1))
+    ours = list(estimate_drives(tasks_of(logs, None, here), ESTIMATOR, 1))
     if len(list(tries.iterdir())) != len(logs) or any(outcome.error for outcome in (*told, *ours)):
         raise RuntimeError("a drive was not estimated, or its task was not killed")
     names = {path.name for folder in (here, there) for path in folder.iterdir()}

@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.app.tuned_memberships import shipped
+from edge_agent.app.tuned_memberships import shipped_memberships
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators import TUNED, Estimates, EstimatorBank
 from edge_agent.lab.simulation import simulate_manoeuvre
@@ -72,7 +72,9 @@ Kind = TypeVar("Kind", Limit, VectorLimit)
 def make_limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> Kind:
     """C filters at the first sample."""
     rows = parameter_table([drive.vehicle] * vehicles)
-    return kind(rows, np.repeat(drive.readings[:1], vehicles, 0), speed, shipped(TUNED[NAME]))
+    return kind(
+        rows, np.repeat(drive.readings[:1], vehicles, 0), speed, shipped_memberships(TUNED[NAME])
+    )
 
 
 def same_filter(drive: Drive) -> float:

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from edge_agent.inputs.block import Block, absolute
+from edge_agent.inputs.block import Block, to_utc_ns
 from edge_agent.observe.cell_tracker import Located, locate_vehicles, new_tracks
 from edge_agent.observe.observation_builder import OpenVisits, RecordBlock, build_records
 from schemas import mugrid
@@ -83,7 +83,7 @@ def ground(
     signals[..., S.YAW] = yaw
     hidden = np.arange(shape[0]) % fix_every != 0
     signals[hidden, :, S.LATITUDE :] = np.nan
-    return Block(t, absolute(t, START_NS), signals)
+    return Block(t, to_utc_ns(t, START_NS), signals)
 
 
 def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:

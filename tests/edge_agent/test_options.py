@@ -449,7 +449,7 @@ def test_waiting_time_and_rows_of_a_batch_change_the_batches(flush_s: float, row
     def batches(wait: float, most: int) -> int:
         batcher = Batcher(["car-a", "car-b"], 1, "ckf", flush_s=wait, rows=most)
         batcher.add(states, now=0.0)
-        return len(batcher.due(0.5))
+        return len(batcher.take_due(0.5))
 
     assert batches(flush_s, rows) != batches(1.0, 50)
 

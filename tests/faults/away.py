@@ -125,14 +125,14 @@ def _run_outage(site: Site, engine: Engine) -> list[Figure]:
                 fresh = outbox.store([draft], now)
             made += sum(len(batch.payload) for batch in fresh)
             stored += len(fresh)
-            for one in [one for one in fresh if one.fresh] + outbox.due(now, 640):
+            for one in [one for one in fresh if one.fresh] + outbox.due_batches(now, 640):
                 service.put(one)
         now += STEP_S
         before = engine.counts[Kind.OBSERVATION]
         for vehicle, ack in service.store_queued(now):
             for stream in wire.decode_ack(ack)[1]:
                 found = Stream(vehicle, stream.boot, stream.kind, stream.region)
-                outboxes[int(vehicle.removeprefix("car-"))].settle(found, stream.durable)
+                outboxes[int(vehicle.removeprefix("car-"))].settle_ranges(found, stream.durable)
         return engine.counts[Kind.OBSERVATION] - before
 
     def advance_seconds(seconds: float, driving: bool = True) -> list[int]:

@@ -57,7 +57,7 @@ def _run_history(random_: random.Random, folder: Path) -> list[str]:
         before = Files.read_files(path)
         sure = set(held)
         settled = {seq for seq in held if random_.random() < 0.3}
-        outbox.settle(stream, [(seq, seq) for seq in settled])
+        outbox.settle_ranges(stream, [(seq, seq) for seq in settled])
         payload = random_.randbytes(random_.choice((50, 3000, 400_000)))
         batches = outbox.store(
             [Draft("car-a", Kind.OBSERVATION, 1, 1, lambda s, f, p=payload: p)] * 2,  # type: ignore[misc]

@@ -69,12 +69,12 @@ class WatchedOutbox(Outbox):
         print_events("+", ((batch.stream, batch.seq, batch.records) for batch in held))
         return held
 
-    def settle(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> int:
+    def settle_ranges(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> int:
         settled = list(ranges)
         print_events(
             "-", ((stream, seq, 0) for first, last in settled for seq in range(first, last + 1))
         )
-        return super().settle(stream, settled)
+        return super().settle_ranges(stream, settled)
 
 
 def make_visits(
@@ -146,17 +146,21 @@ def main(path: str) -> int:
     publisher.start()
     print("ready: load", flush=True)
     late, longest = offer_blocks(plan, publisher, quiet)
-    while publisher.unsettled() and not leave.wait(BLOCK_S):
+    while publisher.count_unsettled() and not leave.wait(BLOCK_S):
         pass
     clean = publisher.close(STOPPED_DRAIN_S)
     found = {
         "late_blocks": late,
         "longest_lag_s": round(longest, 3),
-        "unsettled": publisher.unsettled(),
+        "unsettled": publisher.count_unsettled(),
     }
     print(
         json.dumps(
-            {**found, "dropped": publisher.dropped, "resent": publisher.counts.resent_batches}
+            {
+                **found,
+                "dropped": publisher.dropped_records,
+                "resent": publisher.counts.resent_batches,
+            }
         ),
         flush=True,
     )

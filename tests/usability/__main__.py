@@ -25,7 +25,7 @@ import pytest
 import fleet_service.cli
 from deploy.router import open_router
 from edge_agent.inputs.doctor.findings import diagnose
-from edge_agent.inputs.doctor.report import page as doctors_page
+from edge_agent.inputs.doctor.report import report_page as doctors_page
 from edge_agent.lab.evaluation.planted import drives
 from fleet_service.analytics import synthetic
 from fleet_service.archive.maintenance.compaction import compact

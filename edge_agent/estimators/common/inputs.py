@@ -13,7 +13,7 @@ import math
 from typing import Annotated
 
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import Parameter, body
+from edge_agent.dynamics.parameters import Parameter, body_of
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.excitation import Excitation, begin_excitation, note_excitation
 from edge_agent.estimators.common.readings import (
@@ -128,7 +128,7 @@ def _grip_used(track: InputTrack, row: FloatArray) -> float:
     radius and load, and lateral g.
     """
     use = track.inputs
-    loads = wheel_loads(body(row), use[S.AX], use[S.AY])
+    loads = wheel_loads(body_of(row), use[S.AX], use[S.AY])
     most = 0.0
     for wheel in range(4):
         most = max(most, abs(use[S.TORQUE + wheel]) / loads[wheel])

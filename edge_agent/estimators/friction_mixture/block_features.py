@@ -13,7 +13,7 @@ import math
 from edge_agent.adaptation.rule_base import wide_noise
 from edge_agent.dynamics.body import axle_lateral_forces
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import Parameter, body
+from edge_agent.dynamics.parameters import Parameter, body_of
 from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position
 from edge_agent.dynamics.wheel import force_from_torque
 from edge_agent.estimators import flags
@@ -54,7 +54,7 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
     ax = mean_or(block, S.AX, 0.0)
     ay = mean_or(block, S.AY, 0.0)
     loads = features.loads
-    loads[0], loads[1], loads[2], loads[3] = wheel_loads(body(row), ax, ay)
+    loads[0], loads[1], loads[2], loads[3] = wheel_loads(body_of(row), ax, ay)
     for wheel in range(4):
         features.steer_cos[wheel] = math.cos(last.delta[wheel])
         features.steer_sin[wheel] = math.sin(last.delta[wheel])

@@ -40,8 +40,8 @@ from edge_agent.estimators.friction_mixture.residuals import (
 )
 from edge_agent.estimators.friction_mixture.tyre_curve import TyreCurve
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, NodeWorkspace, Scratch
-from edge_agent.filters.cholesky import multiply
-from edge_agent.filters.sequential import potter, project
+from edge_agent.filters.cholesky import covariance_of_factor
+from edge_agent.filters.sequential import apply_projection, potter_factors
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
@@ -335,13 +335,15 @@ def take_rows(
         if math.isnan(node.residual[r]):
             continue
         used += 1
-        variance, gain = potter(node.deviation[r], node.inflated[r])
+        variance, gain = potter_factors(node.deviation[r], node.inflated[r])
         step = node.residual[r] * (1.0 / variance)
         loss += 0.5 * node.residual[r] * step
         if r >= 4:
             loss += 0.5 * axle_penalty * math.log(variance)
-        project(mean, root, node.deviation[r], step, gain)
-        project(node.residual[r + 1 :], node.deviation[r + 1 :], node.deviation[r], -step, gain)
+        apply_projection(mean, root, node.deviation[r], step, gain)
+        apply_projection(
+            node.residual[r + 1 :], node.deviation[r + 1 :], node.deviation[r], -step, gain
+        )
     return loss, used
 
 
@@ -399,4 +401,4 @@ def predict_node(
     mean[NodeState.VY] = turn_cos * vy - turn_sin * vx + gained_y
     for i in range(NodeState.LN_KX, n):
         mean[i] = nominal.mean[i] + keep[i] * (mean[i] - nominal.mean[i])
-    multiply(root, noise, covariance)
+    covariance_of_factor(root, noise, covariance)

@@ -20,7 +20,7 @@ from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.residuals import gained_velocity
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
-from edge_agent.filters.sequential import potter, project
+from edge_agent.filters.sequential import apply_projection, potter_factors
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
@@ -187,6 +187,6 @@ def _take_velocity(
     for k in range(row.shape[0]):
         row[k] = direction[0] * root[NodeState.VX, k] + direction[1] * root[NodeState.VY, k]
         own += row[k] ** 2
-    total, gain = potter(row, max(variance, (innovation / huber) ** 2 - own))
-    project(memory.mean[j], root, row, innovation / total, gain)
+    total, gain = potter_factors(row, max(variance, (innovation / huber) ** 2 - own))
+    apply_projection(memory.mean[j], root, row, innovation / total, gain)
     return 0.5 * innovation * innovation / total

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.adaptation.rule_base import hurry
+from edge_agent.adaptation.rule_base import forgetting_rate
 from edge_agent.estimators import flags
 from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign, Nominal
@@ -64,7 +64,7 @@ def update_consistency(
     trust.strain = belief_strain(
         cost, degrees_of_freedom(memory.overall_covariance, design.nominal), constants.strain_prior
     )
-    trust.hurry = hurry(
+    trust.hurry = forgetting_rate(
         design.rules, memory.actual[0] / max(memory.theoretical[0], LEAST_VARIANCE) - 1.0
     )
     if trust.distrust > 0.0:

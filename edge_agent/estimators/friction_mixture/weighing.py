@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.adaptation.fuzzy import adapted
+from edge_agent.adaptation.fuzzy import adapted_factor
 from edge_agent.adaptation.rule_base import evidence_share
 from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
@@ -171,7 +171,7 @@ def adapt_noise(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) 
                 keep * memory.theoretical[group] + (1.0 - keep) * scratch.theoretical_sum[group]
             )
             if design.adaptive:
-                memory.factor[group] = adapted(
+                memory.factor[group] = adapted_factor(
                     memory.factor[group],
                     memory.actual[group],
                     memory.theoretical[group],

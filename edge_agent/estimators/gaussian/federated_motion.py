@@ -19,17 +19,17 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import Parameter, body
+from edge_agent.dynamics.parameters import Parameter, body_of
 from edge_agent.dynamics.slip import wheel_velocity
 from edge_agent.estimators.common.inputs import InputTrack, wheel_force
 from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD
 from edge_agent.estimators.common.readings import rolling_speed
 from edge_agent.estimators.common.run import PaperMemory
 from edge_agent.estimators.gaussian.planar import POINTS, PlanarState, propagate_points
-from edge_agent.filters.federated import fuse, share
+from edge_agent.filters.federated import fuse_estimates, share_information
 from edge_agent.filters.householder import predict, update
-from edge_agent.filters.points import axis_points, deviations, weighted_mean
-from edge_agent.filters.sigma import cubature
+from edge_agent.filters.points import axis_points, centred_deviations, weighted_mean
+from edge_agent.filters.sigma import cubature_rule
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import RecordArray
@@ -37,7 +37,7 @@ from schemas.signals import S
 
 STATES = 6
 ROWS = 4
-RULE = cubature(STATES)
+RULE = cubature_rule(STATES)
 XI = RULE.xi
 WEIGHT = RULE.w_cov
 STEP_S = 0.02  # process variances are per so much time
@@ -156,7 +156,7 @@ def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> Non
     memory.nis = memory.log_likelihood = 0.0
     for sub in range(2):
         beta = motion.beta if sub == 0 else 1.0 - motion.beta
-        share(motion.root, beta, root)
+        share_information(motion.root, beta, root)
         axis_points(motion.mean, root, XI, points)
         columns[:] = points.T
         propagate_points(row, columns, friction, track, dt, True)
@@ -167,7 +167,7 @@ def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> Non
         _update_sub_filter(memory, SubFilter(sub, mean, root, points, work), dt)
         if sub == 0:
             first_mean[:], first_root[:] = mean, root
-    fuse(first_mean, first_root, mean, root, work)
+    fuse_estimates(first_mean, first_root, mean, root, work)
     motion.mean[:], motion.root[:] = first_mean, first_root
 
 
@@ -191,8 +191,8 @@ def _update_sub_filter(memory: FederatedMemory, at: SubFilter, dt: float) -> Non
             outcomes[p, r] = points[p, PlanarState.AX + r]
         outcomes[p, 3] = mean_wheel_velocity(row, track, points[p], PlanarState.YAW_RATE)
     weighted_mean(outcomes, WEIGHT, predicted)
-    deviations(points, mean, WEIGHT, state, 0)
-    deviations(outcomes, predicted, WEIGHT, measured, 0)
+    centred_deviations(points, mean, WEIGHT, state, 0)
+    centred_deviations(outcomes, predicted, WEIGHT, measured, 0)
     innovation = motion.innovation[sub]
     for r in range(3):
         innovation[r] = track.now[r] - predicted[r]
@@ -247,7 +247,7 @@ def slip_free_speed(row: FloatArray, track: InputTrack, dt: float) -> tuple[floa
     without any wheel.
     """
     use = track.inputs
-    loads = wheel_loads(body(row), use[S.AX], use[S.AY])
+    loads = wheel_loads(body_of(row), use[S.AX], use[S.AY])
     total = 0.0
     most = 0.0
     count = 0

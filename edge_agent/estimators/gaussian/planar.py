@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from edge_agent.dynamics.body import advance_velocity
-from edge_agent.dynamics.chassis import PlanarMotion, WheelInputs, response
+from edge_agent.dynamics.chassis import PlanarMotion, WheelInputs, planar_response
 from edge_agent.dynamics.dual_motor import axle_force, midpoint_speed
-from edge_agent.dynamics.parameters import Body, Four, Parameter, body, four
+from edge_agent.dynamics.parameters import Body, Four, Parameter, as_four, body_of
 from edge_agent.estimators.common.inputs import InputTrack, wheel_force
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
@@ -92,21 +92,21 @@ def propagate_points(
     force_x = _torque_forces(row, track, dt) if by_torque else unknown
     if by_motor:
         force_x = _motor_forces(row, track, dt)
-    mu = four(np.minimum(np.maximum(friction, LOWER), UPPER)) if by_torque else unknown
+    mu = as_four(np.minimum(np.maximum(friction, LOWER), UPPER)) if by_torque else unknown
     before = track.inputs_before
     use = track.inputs
-    cos = four(track.steering_before[0])
-    sin = four(track.steering_before[1])
-    begin = WheelInputs(cos, sin, four(before[S.OMEGA : S.TORQUE]), force_x, mu)
+    cos = as_four(track.steering_before[0])
+    sin = as_four(track.steering_before[1])
+    begin = WheelInputs(cos, sin, as_four(before[S.OMEGA : S.TORQUE]), force_x, mu)
     for k in range(times):
-        cos = four(track.steering[0])
-        sin = four(track.steering[1])
-        end = WheelInputs(cos, sin, four(use[S.OMEGA : S.TORQUE]), force_x, mu)
+        cos = as_four(track.steering[0])
+        sin = as_four(track.steering[1])
+        end = WheelInputs(cos, sin, as_four(use[S.OMEGA : S.TORQUE]), force_x, mu)
         if k + 1 < times:
             end = _interpolate_inputs(track, (k + 1) / times, force_x, mu)
         drive = HeunInputs(begin, end, dt / times, by_torque)
-        _apply_heun_step(body(row), columns, 0, ABREAST, drive)
-        _apply_heun_step(body(row), columns, ABREAST, POINTS, drive)
+        _apply_heun_step(body_of(row), columns, 0, ABREAST, drive)
+        _apply_heun_step(body_of(row), columns, ABREAST, POINTS, drive)
         begin = end
 
 
@@ -133,7 +133,9 @@ def _apply_heun_step(
         z = column_z[p]
         one = min(max(z, LOWER), UPPER)
         mu = begin.mu if by_torque else (one, one, one, one)
-        _, _, turn = response(vehicle, PlanarMotion(v, u, r, ax, ay), _with_friction(begin, mu))
+        _, _, turn = planar_response(
+            vehicle, PlanarMotion(v, u, r, ax, ay), _with_friction(begin, mu)
+        )
         turn = z if by_torque else turn
         slope_x = ax + r * u
         slope_y = ay - r * v
@@ -141,14 +143,14 @@ def _apply_heun_step(
         aside = u + step * slope_y
         rate = r + step * turn
         vx, vy = advance_velocity(v, u, ax, ay, r, step) if by_torque else (ahead, aside)
-        felt_x, felt_y, again = response(
+        felt_x, felt_y, again = planar_response(
             vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with_friction(end, mu)
         )
         if not by_torque:
             vx = v + 0.5 * step * (slope_x + felt_x + rate * aside)
             vy = u + 0.5 * step * (slope_y + felt_y - rate * ahead)
         rate = r + 0.5 * step * (turn + again)
-        felt_x, felt_y, again = response(
+        felt_x, felt_y, again = planar_response(
             vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with_friction(end, mu)
         )
         column_v[p], column_u[p], column_x[p], column_y[p], column_r[p] = (

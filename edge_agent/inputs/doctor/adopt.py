@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge_agent.inputs.correct import corrected, free_rear_wheels
+from edge_agent.inputs.correct import correct_log, free_rear_wheels
 from edge_agent.inputs.doctor.diagnosis import Diagnosis
 from edge_agent.inputs.doctor.findings import diagnose
-from edge_agent.inputs.doctor.fix import OF_DEVICE, fixed
+from edge_agent.inputs.doctor.fix import OF_DEVICE, apply_findings
 from edge_agent.inputs.merge import Merged
 from edge_agent.inputs.profile import Profile
 from edge_agent.inputs.signal_log import SignalLog
@@ -40,7 +40,7 @@ def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
     """Return a log as the estimator gets it: corrected by its calibration, then by the doctor's
     measurements.
     """
-    return adopt_measured(replace(log, signals=corrected(log.t, log.signals, vehicle)), vehicle)
+    return adopt_measured(replace(log, signals=correct_log(log.t, log.signals, vehicle)), vehicle)
 
 
 def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
@@ -100,7 +100,7 @@ def align_import(
     late = [fault for fault in found if fault.delay_s and fault.channel in OF_DEVICE]
     if not late:
         return merged, profile
-    profile, *_ = fixed(late, profile, vehicle)
+    profile, *_ = apply_findings(late, profile, vehicle)
     aligned = merge_with(profile)
     aligned.notes += [
         f"{fault.channel} {fault.words}; corrected by delay_s of the profile" for fault in late
@@ -116,11 +116,13 @@ def align_devices(t: FloatArray, signals: FloatArray, delays: Mapping[str, float
     for device, seconds in delays.items():
         for name in OF_DEVICE[device]:
             column = CHANNELS.index(name)
-            signals[:, column] = _moved(t, signals[:, column], seconds, angle=column == S.YAW)
+            signals[:, column] = _shift_channel(
+                t, signals[:, column], seconds, angle=column == S.YAW
+            )
     return signals
 
 
-def _moved(t: FloatArray, values: FloatArray, seconds: float, *, angle: bool) -> FloatArray:
+def _shift_channel(t: FloatArray, values: FloatArray, seconds: float, *, angle: bool) -> FloatArray:
     """Return values (T,) as they were read `seconds` later; missing readings stay missing."""
     at = t + seconds
     after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)

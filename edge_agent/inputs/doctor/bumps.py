@@ -50,13 +50,13 @@ def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
         return 0
     wheelbase = vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle
     front, rear = (
-        _unevenness(np.interp(at, way, (rims[:, right] - rims[:, left])[rows]), wheelbase)
+        _side_unevenness(np.interp(at, way, (rims[:, right] - rims[:, left])[rows]), wheelbase)
         for left, right in ((0, 1), (2, 3))
     )
-    return _direction(front, rear, fast, wheelbase)
+    return _travel_direction(front, rear, fast, wheelbase)
 
 
-def _unevenness(apart: FloatArray, wheelbase: float) -> FloatArray:
+def _side_unevenness(apart: FloatArray, wheelbase: float) -> FloatArray:
     """Return what sides differ by (n,) less its mean over some wheelbases."""
     width = 2 * round(0.5 * WINDOW * wheelbase / STEP_M) + 1
     if width >= len(apart):
@@ -64,7 +64,9 @@ def _unevenness(apart: FloatArray, wheelbase: float) -> FloatArray:
     return np.asarray(apart - np.convolve(apart, np.ones(width) / width, "same"))
 
 
-def _direction(front: FloatArray, rear: FloatArray, fast: BoolArray, wheelbase: float) -> int:
+def _travel_direction(
+    front: FloatArray, rear: FloatArray, fast: BoolArray, wheelbase: float
+) -> int:
     most = round(2.0 * wheelbase / STEP_M)
     among = fast.copy()
     among[:most] = False

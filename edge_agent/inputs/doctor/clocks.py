@@ -21,7 +21,7 @@ LARGEST_LAG_S: Final = 0.085  # devices of sound cars lie within .06 s
 def wheels_speak_late(axle: Fit, seconds: float) -> bool:
     """Return True if the wheels' yaw rate is late as well, by half of it at least."""
     return (
-        axle.known
+        axle.is_known
         and np.isfinite(axle.lag_error_s)
         and axle.lag_s * np.sign(seconds) > 0.5 * abs(seconds)
     )
@@ -54,6 +54,6 @@ def late_devices(diagnosis: Diagnosis) -> dict[str, float]:
         return {"wheels": wheel, "steering": steer}
     late = -0.5 * (wheel + steer)
     along = diagnosis.fits["longitudinal"]
-    told = along.known and np.isfinite(along.lag_error_s)
+    told = along.is_known and np.isfinite(along.lag_error_s)
     alone = told and abs(along.lag_s - CLOCK_CENTRE_S["longitudinal"]) < 0.5 * abs(late)
     return {"gyro" if alone else "imu": late}

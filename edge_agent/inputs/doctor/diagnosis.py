@@ -50,6 +50,6 @@ class Diagnosis:
     )  # quantities that only some parts of the drive speak against
 
     @property
-    def passed(self) -> bool:
+    def is_passed(self) -> bool:
         """True if every channel was found to be in order."""
         return not self.findings and not self.unknown

@@ -67,7 +67,7 @@ class EvenDrive:
         return np.asarray(np.gradient(self.v, self.t))
 
 
-def smooth(x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
+def smooth_twice(x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
     """Return a running mean over `seconds`, applied twice, that skips NaN; NaN where half of the
     window is NaN.
     """
@@ -80,7 +80,7 @@ def smooth(x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
     return x
 
 
-def even(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray:
+def interpolate_near(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray:
     """Readings at other times, linear where they are near enough, else NaN."""
     good = np.isfinite(x)
     if good.sum() < 2:
@@ -96,8 +96,8 @@ def over_ground(
     t: FloatArray, latitude: FloatArray, longitude: FloatArray, at: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Speed [m/s] and course [rad] at times, from fixes half of FIX_S before and behind."""
-    north = even(t, np.radians(latitude) * EARTH_RADIUS_M, at)
-    east = even(t, np.radians(longitude) * EARTH_RADIUS_M, at) * np.cos(
+    north = interpolate_near(t, np.radians(latitude) * EARTH_RADIUS_M, at)
+    east = interpolate_near(t, np.radians(longitude) * EARTH_RADIUS_M, at) * np.cos(
         np.radians(np.nanmean(latitude))
     )
     half = round(0.5 * FIX_S * RATE_HZ)
@@ -111,7 +111,7 @@ def over_ground(
     return speed, course
 
 
-def prepare(
+def prepare_drive(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None
 ) -> EvenDrive:
     """Signals (T, 18) at times t (T,) [s] as a drive.
@@ -126,11 +126,11 @@ def prepare(
     last = min(t[-1], t[0] + LONGEST_S)
     at = np.arange(t[0], last, 1.0 / RATE_HZ)
 
-    def column(index: int) -> FloatArray:
-        return smooth(even(t, signals[:, index], at))
+    def even_column(index: int) -> FloatArray:
+        return smooth_twice(interpolate_near(t, signals[:, index], at))
 
     wheels = (
-        np.stack([even(t, signals[:, S.OMEGA + i], at) for i in range(4)], axis=1)
+        np.stack([interpolate_near(t, signals[:, S.OMEGA + i], at) for i in range(4)], axis=1)
         * vehicle.wheel_radius
     )
     some = np.isfinite(wheels).any(axis=1)
@@ -140,8 +140,8 @@ def prepare(
     wheels = np.where(
         np.abs(wheels - middle[:, None]) > 0.25 * np.abs(middle[:, None]) + 1.0, np.nan, wheels
     )
-    rims = np.stack([smooth(wheels[:, i]) for i in range(4)], axis=1)
-    v = smooth(np.where(np.isfinite(middle), middle, np.nan))
+    rims = np.stack([smooth_twice(wheels[:, i]) for i in range(4)], axis=1)
+    v = smooth_twice(np.where(np.isfinite(middle), middle, np.nan))
     tracks = vehicle.track_front, vehicle.track_rear
     axles = [(rims[:, 2 * k + 1] - rims[:, 2 * k]) / tracks[k] for k in range(2)]
     r_wheels = np.where(np.isfinite(axles[1]), axles[1], axles[0])
@@ -151,32 +151,40 @@ def prepare(
     nothing = np.full(len(at), np.nan)
     v_ground, course = over_ground(t, *place, at) if located else (nothing, nothing)
     if ground is not None and np.isfinite(ground).sum() > 5:
-        v_ground = smooth(even(t, ground, at))
+        v_ground = smooth_twice(interpolate_near(t, ground, at))
     yaw = signals[:, S.YAW]
-    yaw_at = even(t, np.unwrap(yaw), at) if np.isfinite(yaw).all() else _yaw(t, yaw, at)
+    yaw_at = (
+        interpolate_near(t, np.unwrap(yaw), at)
+        if np.isfinite(yaw).all()
+        else _nearest_yaw(t, yaw, at)
+    )
     delta = signals[:, S.DELTA]
     return EvenDrive(
         t=at,
-        ax=column(S.AX),
-        ay=column(S.AY),
-        r=column(S.YAW_RATE),
-        delta=smooth(even(t, np.where(np.isfinite(delta), delta, signals[:, S.DELTA + 1]), at)),
+        ax=even_column(S.AX),
+        ay=even_column(S.AY),
+        r=even_column(S.YAW_RATE),
+        delta=smooth_twice(
+            interpolate_near(t, np.where(np.isfinite(delta), delta, signals[:, S.DELTA + 1]), at)
+        ),
         wheels=rims,
         v=v,
         r_wheels=r_wheels,
         v_ground=v_ground,
         course=course,
         course_yaw=yaw_at,
-        moving=((np.abs(v) > CREEP * fast) & ~slipping(raw, fast)).astype(float),
+        moving=((np.abs(v) > CREEP * fast) & ~is_slipping(raw, fast)).astype(float),
         grips=(~left_ground(v, v_ground, fast)).astype(float),
         wheelbase=vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle,
-        torque=smooth(even(t, signals[:, S.TORQUE : S.TORQUE + 4].sum(axis=1), at)),
+        torque=smooth_twice(
+            interpolate_near(t, signals[:, S.TORQUE : S.TORQUE + 4].sum(axis=1), at)
+        ),
         yaw_front=axles[0],
         yaw_rear=axles[1],
     )
 
 
-def slipping(wheels: FloatArray, fast: float) -> BoolArray:
+def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
     """Return where a wheel spins or locks, (n,), by comparison of the wheels (n, 4), in any unit.
 
     Front and rear wheels of a side roll nearly alike, in turns as well; a constant difference is
@@ -210,14 +218,16 @@ def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
     if known.sum() < 5 * RATE_HZ:
         return np.zeros(len(v), bool)
     ratio = np.where(
-        known, smooth(v_ground, 1.0) / np.where(v == 0.0, np.nan, smooth(v, 1.0)), np.nan
+        known,
+        smooth_twice(v_ground, 1.0) / np.where(v == 0.0, np.nan, smooth_twice(v, 1.0)),
+        np.nan,
     )
     usual = float(np.nanmedian(ratio))
     with np.errstate(invalid="ignore"):
         return np.asarray(np.abs(ratio - usual) > LEFT * abs(usual))
 
 
-def _yaw(t: FloatArray, yaw: FloatArray, at: FloatArray) -> FloatArray:
+def _nearest_yaw(t: FloatArray, yaw: FloatArray, at: FloatArray) -> FloatArray:
     """The nearest reading of a sparse angle, which must not be averaged across its end."""
     good = np.flatnonzero(np.isfinite(yaw))
     if len(good) < 2:

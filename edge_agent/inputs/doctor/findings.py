@@ -16,11 +16,11 @@ import numpy as np
 from edge_agent.inputs.doctor.bumps import leading_axle
 from edge_agent.inputs.doctor.clocks import measure_clocks, wheels_speak_late
 from edge_agent.inputs.doctor.diagnosis import Diagnosis, Finding
-from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, even, prepare
-from edge_agent.inputs.doctor.identities import PARTS, Fit, fits, robust
+from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, interpolate_near, prepare_drive
+from edge_agent.inputs.doctor.identities import PARTS, Fit, fit_identities, fit_robustly
 from edge_agent.inputs.doctor.lift import is_on_lift
-from edge_agent.inputs.doctor.places import exchanged, yaw_findings
-from edge_agent.inputs.doctor.scales import CLOCK_SETTLED, LAWS, Verdict, clocks, explain
+from edge_agent.inputs.doctor.places import has_exchanged_position, yaw_findings
+from edge_agent.inputs.doctor.scales import CLOCK_SETTLED, LAWS, Verdict, explain_fits, late_clocks
 from edge_agent.inputs.doctor.slip import (
     RADIUS_PARTS,
     STEADY,
@@ -75,7 +75,7 @@ def diagnose(
     where it was recorded.
     """
     diagnosis = Diagnosis()
-    t, slow = _seconds(t, diagnosis)
+    t, slow = _in_seconds(t, diagnosis)
     if slow:
         return diagnosis
     if is_on_lift(t, signals, vehicle):
@@ -83,18 +83,18 @@ def diagnose(
         diagnosis.findings.append(Finding("omega", "lift", words))
         return diagnosis
     signals = signals.copy()
-    _jumps(signals, diagnosis)
-    drive = prepare(t, signals, vehicle, ground)
+    _find_jumps(signals, diagnosis)
+    drive = prepare_drive(t, signals, vehicle, ground)
     if _axes_exchanged(drive):
         words = "a_x follows v·r and a_y the wheels' acceleration"
         diagnosis.findings.append(Finding("ax", "exchanged with ay", words))
         signals[:, [S.AX, S.AY]] = signals[:, [S.AY, S.AX]]
-        drive = prepare(t, signals, vehicle, ground)
-    if exchanged(t, signals, drive):
+        drive = prepare_drive(t, signals, vehicle, ground)
+    if has_exchanged_position(t, signals, drive):
         words = "the fixes go as fast as the wheels only when latitude and longitude are exchanged"
         diagnosis.findings.append(Finding("latitude", "exchanged with longitude", words))
         signals[:, [S.LATITUDE, S.LONGITUDE]] = signals[:, [S.LONGITUDE, S.LATITUDE]]
-        drive = prepare(t, signals, vehicle, ground)
+        drive = prepare_drive(t, signals, vehicle, ground)
     for axle, (left, right) in find_exchanged_axles(drive):
         words = (
             f"the {axle} wheels turn against the yaw rate, the others with it: left and right "
@@ -104,19 +104,19 @@ def diagnose(
         signals[:, [S.OMEGA + left, S.OMEGA + right]] = signals[
             :, [S.OMEGA + right, S.OMEGA + left]
         ]
-        drive = prepare(t, signals, vehicle, ground)
+        drive = prepare_drive(t, signals, vehicle, ground)
     diagnosis.locked = find_locked_axles(drive)
     if diagnosis.locked == ["rear"]:
         drive = replace(drive, r_wheels=drive.yaw_front)
-    found = fits(drive)
-    verdict = explain(found, vehicle)
+    found = fit_identities(drive)
+    verdict = explain_fits(found, vehicle)
     diagnosis.fits = found
     diagnosis.drive = drive
-    _scales(verdict, found, diagnosis)
+    _find_scales(verdict, found, diagnosis)
     scaled = any(
         fault is not None for fault in verdict.faults.values()
     )  # offsets and radii in wrong units say nothing
-    late = clocks(found)
+    late = late_clocks(found)
     if "wheels" in late and not wheels_speak_late(found["axle"], late["wheels"][0]):
         # in a slide wheels slow down before the car does; their yaw rate is not late then
         late = {}
@@ -133,7 +133,9 @@ def diagnose(
         measure_clocks(t, signals, vehicle, diagnosis)
     diagnosis.findings += yaw_findings(signals, drive)
     if not scaled:
-        diagnosis.findings += _radii(drive, vehicle, diagnosis.doubts) + _offsets(drive, found)
+        diagnosis.findings += _find_radii(drive, vehicle, diagnosis.doubts) + _find_offsets(
+            drive, found
+        )
         exchanged_axles = any(
             finding.kind == "front and rear exchanged" for finding in diagnosis.findings
         )
@@ -143,15 +145,15 @@ def diagnose(
     for quantity, channel in CHANNELS_OF.items():
         if any(finding.channel == channel for finding in diagnosis.findings):
             continue
-        told = verdict.settled(quantity) and quantity not in diagnosis.doubts
+        told = verdict.is_settled(quantity) and quantity not in diagnosis.doubts
         (diagnosis.sound if told else diagnosis.unknown).append(channel)
     found_wrong = {finding.channel for finding in diagnosis.findings}
     if np.isfinite(signals[:, S.LATITUDE]).any() and not found_wrong & {"latitude", "yaw"}:
-        (diagnosis.sound if found["ground"].known else diagnosis.unknown).append("latitude")
+        (diagnosis.sound if found["ground"].is_known else diagnosis.unknown).append("latitude")
     return diagnosis
 
 
-def _seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
+def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
     """Times in seconds, and whether they are too few to say anything."""
     step = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
     if step > 0.0 and not 1.0 / FASTEST_HZ <= step <= 1.0 / SLOWEST_HZ:
@@ -166,7 +168,7 @@ def _seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
     return t, False
 
 
-def _jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
+def _find_jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
     """Status bits above a wheel's number: readings far off the other three, and back.
 
     A wheel that spins or locks is off as well, but gets there in steps and by any amount. A bit is
@@ -199,7 +201,7 @@ def _jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
 def _axes_exchanged(drive: EvenDrive) -> bool:
     """Return True if the axes of the accelerometer are exchanged."""
 
-    def alike(x: FloatArray, y: FloatArray) -> float:
+    def axis_likeness(x: FloatArray, y: FloatArray) -> float:
         good = np.isfinite(x) & np.isfinite(y) & (drive.moving > 0)
         if good.sum() < 10 * RATE_HZ or x[good].std() == 0 or y[good].std() == 0:
             return 0.0
@@ -207,8 +209,8 @@ def _axes_exchanged(drive: EvenDrive) -> bool:
 
     along = drive.v_dot
     across = drive.v * drive.r
-    right = alike(drive.ax, along) + alike(drive.ay, across)
-    return alike(drive.ax, across) + alike(drive.ay, along) > right + 0.5
+    right = axis_likeness(drive.ax, along) + axis_likeness(drive.ay, across)
+    return axis_likeness(drive.ax, across) + axis_likeness(drive.ay, along) > right + 0.5
 
 
 WORDS: Final = {
@@ -229,11 +231,11 @@ ASKED: Final = {
 }
 
 
-def _scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) -> None:
+def _find_scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) -> None:
     for quantity, fault in verdict.faults.items():
-        if fault is None or quantity == "place" or not verdict.settled(quantity):
+        if fault is None or quantity == "place" or not verdict.is_settled(quantity):
             continue
-        if not _always(quantity, verdict, found, diagnosis.drive):
+        if not _holds_throughout(quantity, verdict, found, diagnosis.drive):
             diagnosis.doubts.add(quantity)
             continue
         gain = found[ASKED[quantity]].gain if quantity in ASKED else np.nan
@@ -252,17 +254,22 @@ def _scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) -> No
         )
 
 
-def _always(
+def _holds_throughout(
     quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenDrive | None
 ) -> bool:
     """Return True if the drive's parts all have the gains that the faults make: a slide does not
     keep a gain.
     """
     fault = verdict.faults[quantity]
-    if quantity == "ay" and fault is not None and "g" in fault.name and not _turns(verdict, found):
+    if (
+        quantity == "ay"
+        and fault is not None
+        and "g" in fault.name
+        and not _turns_as_steered(verdict, found)
+    ):
         return False
     ground = found["ground"]
-    if quantity == "v" and fault is not None and drive is not None and ground.known:
+    if quantity == "v" and fault is not None and drive is not None and ground.is_known:
         like_slip = abs(np.log(fault.factor)) < NEAR_ONE
         if (
             like_slip
@@ -272,7 +279,7 @@ def _always(
             return False
     shares = []
     for name, law in LAWS.items():
-        if not found[name].known or quantity not in {member.quantity for member in law.members}:
+        if not found[name].is_known or quantity not in {member.quantity for member in law.members}:
             continue
         gain = law.centre
         for member in law.members:
@@ -290,7 +297,7 @@ def _always(
     return bool(shares) and min(shares) >= STEADY_SHARE
 
 
-def _turns(verdict: Verdict, found: dict[str, Fit]) -> bool:
+def _turns_as_steered(verdict: Verdict, found: dict[str, Fit]) -> bool:
     """Return True if the car turns as it is steered or as its course does: in a spin v·r is not
     an acceleration.
     """
@@ -302,7 +309,7 @@ def _turns(verdict: Verdict, found: dict[str, Fit]) -> bool:
                 gain *= fault.factor**member.power
         fit = found[name]
         if (
-            fit.known
+            fit.is_known
             and abs(fit.correlation) > TURNS_LIKE
             and share_of_parts(fit, gain) >= STEADY_SHARE
         ):
@@ -310,7 +317,7 @@ def _turns(verdict: Verdict, found: dict[str, Fit]) -> bool:
     return False
 
 
-def _radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Finding]:
+def _find_radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Finding]:
     """Return wheels that turn faster or slower than the others on calm, straight moments; exchanged
     axles.
 
@@ -352,10 +359,10 @@ def _radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Finding
         len(findings) > 1
     ):  # three cannot all be off the median: that is a slip they share, or an axle of other tyres
         findings = findings if len(findings) == 2 else []
-    return findings + _axles(drive)
+    return findings + _compare_axles(drive)
 
 
-def _axles(drive: EvenDrive) -> list[Finding]:
+def _compare_axles(drive: EvenDrive) -> list[Finding]:
     """Front wheels go the longer way in a turn: v_f² = v_r² + (L r)²."""
     front = drive.wheels[:, :2].mean(axis=1)
     rear = drive.wheels[:, 2:].mean(axis=1)
@@ -374,7 +381,7 @@ def _axles(drive: EvenDrive) -> list[Finding]:
     x = 0.5 * turn[good]
     y = front[good] / rear[good] - 1.0
     table = np.stack([x, np.ones(len(x))], axis=1)
-    solution = robust(table, y)
+    solution = fit_robustly(table, y)
     spread = 1.4826 * float(np.median(np.abs(y - table @ solution)))
     count = max(len(x) / RATE_HZ, 1.0)
     error = spread / max(float(x.std()) * np.sqrt(count), 1e-12)
@@ -384,7 +391,7 @@ def _axles(drive: EvenDrive) -> list[Finding]:
     return []
 
 
-def _offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
+def _find_offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
     """Return constant errors that are beyond the largest usual one by SURE standard deviations."""
     moving = drive.moving > 0
     lateral = found["lateral"]
@@ -408,7 +415,7 @@ def _offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
         listed.append(
             ("ay", float(np.nanmedian(beside)), spread_of_parts(beside), LARGEST_AY, "m/s^2")
         )
-    if axle.known and abs(abs(axle.gain) - 1.0) < 0.2 and axle.correlation > 0.9:
+    if axle.is_known and abs(abs(axle.gain) - 1.0) < 0.2 and axle.correlation > 0.9:
         error = float(
             np.hypot(axle.offset_error, spread_of_parts((drive.r_wheels - drive.r)[moving]))
         )
@@ -417,14 +424,14 @@ def _offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
         ):  # one way round, a gain is an offset as well
             error = np.inf
         listed.append(("yaw_rate", -axle.offset / axle.gain, error, LARGEST_RATE, "rad/s"))
-    elif lateral.known and np.isfinite(drive.r).any():
+    elif lateral.is_known and np.isfinite(drive.r).any():
         still = (drive.moving == 0) & (np.abs(drive.v) < 0.05)
         if still.sum() > RATE_HZ:
             listed.append(
                 ("yaw_rate", float(np.nanmedian(drive.r[still])), 0.0, LARGEST_RATE, "rad/s")
             )
     if (
-        steering.known
+        steering.is_known
         and abs(steering.correlation) > 0.9
         and 0.7 < steering.gain < 1.6
         and is_steady(steering)
@@ -437,4 +444,4 @@ def _offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
     ]
 
 
-__all__ = ["Diagnosis", "Finding", "diagnose", "even"]
+__all__ = ["Diagnosis", "Finding", "diagnose", "interpolate_near"]

@@ -39,7 +39,7 @@ def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
     return {name: lag for name, lag in late_devices(diagnosis).items() if abs(lag) > FILTER_BEARS_S}
 
 
-def corrections(diagnosis: Diagnosis) -> list[Finding]:
+def list_corrections(diagnosis: Diagnosis) -> list[Finding]:
     """Return the findings, and the small lags in the same form: everything that a corrected profile
     removes.
     """
@@ -50,7 +50,7 @@ def corrections(diagnosis: Diagnosis) -> list[Finding]:
     ]
 
 
-def fixed(
+def apply_findings(
     findings: Sequence[Finding], profile: Profile, vehicle: Vehicle
 ) -> tuple[Profile, Vehicle, list[Finding]]:
     """Return profile and vehicle corrected by the findings, and the findings that cannot be
@@ -71,11 +71,11 @@ def fixed(
                 update={"wheel_radius": vehicle.wheel_radius * finding.scale}
             )
         elif finding.channel == "yaw":
-            channels["yaw"] = _yaw(channels["yaw"], finding.kind)
+            channels["yaw"] = _correct_yaw(channels["yaw"], finding.kind)
         elif finding.scale != 1.0 or finding.offset or finding.delay_s:
             for name in OF_DEVICE.get(finding.channel, (finding.channel,)):
                 if name in channels:
-                    channels[name] = _corrected(channels[name], finding)
+                    channels[name] = _correct_channel(channels[name], finding)
         else:
             left.append(finding)
     if vehicle.wheel_radius != profile.wheel_radius and profile.wheel_radius is not None:
@@ -83,7 +83,7 @@ def fixed(
     return profile.model_copy(update=update | {"channels": channels}), vehicle, left
 
 
-def _corrected(channel: Channel, finding: Finding) -> Channel:
+def _correct_channel(channel: Channel, finding: Finding) -> Channel:
     return channel.model_copy(
         update={
             "scale": channel.scale * finding.scale,
@@ -93,7 +93,7 @@ def _corrected(channel: Channel, finding: Finding) -> Channel:
     )
 
 
-def _yaw(channel: Channel, kind: str) -> Channel:
+def _correct_yaw(channel: Channel, kind: str) -> Channel:
     update: dict[str, object] = {}
     if "deg" in kind:
         update["unit"] = "deg"

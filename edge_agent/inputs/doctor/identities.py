@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, smooth
+from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, smooth_twice
 from schemas.numeric import BoolArray, FloatArray
 
 LONGEST_LAG_S: Final = 1.0
@@ -55,7 +55,7 @@ class Fit:
     offset_error: float = np.inf  # standard deviation of the offset
 
     @property
-    def known(self) -> bool:
+    def is_known(self) -> bool:
         """True if the fit carries information."""
         return self.excited_s >= FEWEST_S and self.error < 0.3 and abs(self.correlation) > 0.45
 
@@ -81,17 +81,17 @@ class Relation(NamedTuple):
     length: float = 1.0  # [m] wheelbase in the right side, where there is one
 
 
-def _lateral(d: EvenDrive) -> Relation:
+def _lateral_relation(d: EvenDrive) -> Relation:
     return Relation(d.ay, d.v * d.r)
 
 
-def _longitudinal(d: EvenDrive) -> Relation:
+def _longitudinal_relation(d: EvenDrive) -> Relation:
     # slope, offset and drift lie below .1 Hz; what is left of both sides is braking and
     # accelerating
-    return Relation(d.ax - smooth(d.ax, 10.0), d.v_dot - smooth(d.v_dot, 10.0))
+    return Relation(d.ax - smooth_twice(d.ax, 10.0), d.v_dot - smooth_twice(d.v_dot, 10.0))
 
 
-def _steering(d: EvenDrive) -> Relation:
+def _steering_relation(d: EvenDrive) -> Relation:
     # times v: turns at walking speed, where the angle is large and its map bent, would else
     # outweigh all others
     fast = np.nanpercentile(np.abs(d.v), 95) if np.isfinite(d.v).any() else 1.0
@@ -105,42 +105,42 @@ def _steering(d: EvenDrive) -> Relation:
     )
 
 
-def _axle(d: EvenDrive) -> Relation:
+def _axle_relation(d: EvenDrive) -> Relation:
     return Relation(d.r_wheels, d.r, (d.v,), loose=(UNLIKE_RADII,))
 
 
-def _ground(d: EvenDrive) -> Relation:
-    return Relation(d.v_ground, smooth(d.v))
+def _ground_relation(d: EvenDrive) -> Relation:
+    return Relation(d.v_ground, smooth_twice(d.v))
 
 
-def _turning(d: EvenDrive) -> Relation:
+def _turning_relation(d: EvenDrive) -> Relation:
     fast = np.nanpercentile(d.v_ground, 95) if np.isfinite(d.v_ground).any() else 0.0
     known = np.isfinite(d.course) & (d.v_ground > 0.3 * fast)
     course = np.where(known, d.course, 0.0)
     rate = np.angle(np.exp(1j * np.diff(course, prepend=course[:1]))) * RATE_HZ
     rate = np.where(known & np.roll(known, 1), rate, np.nan)
-    return Relation(smooth(rate, 1.0), smooth(smooth(d.r, 1.0)))
+    return Relation(smooth_twice(rate, 1.0), smooth_twice(smooth_twice(d.r, 1.0)))
 
 
 IDENTITIES: Final[dict[str, Callable[[EvenDrive], Relation]]] = {
-    "lateral": _lateral,
-    "longitudinal": _longitudinal,
-    "steering": _steering,
-    "axle": _axle,
-    "ground": _ground,
-    "turning": _turning,
+    "lateral": _lateral_relation,
+    "longitudinal": _longitudinal_relation,
+    "steering": _steering_relation,
+    "axle": _axle_relation,
+    "ground": _ground_relation,
+    "turning": _turning_relation,
 }
 
 
-def fits(drive: EvenDrive) -> dict[str, Fit]:
+def fit_identities(drive: EvenDrive) -> dict[str, Fit]:
     """Every identity of a drive."""
     return {
-        name: fit(sides(drive), drive.moving, drive.grips, level=name == "ground")
+        name: fit_identity(sides(drive), drive.moving, drive.grips, level=name == "ground")
         for name, sides in IDENTITIES.items()
     }
 
 
-def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) -> Fit:
+def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) -> Fit:
     """Fit left = gain · right + offset + Σ k · term, over the moving part, after removal of the
     lag.
 
@@ -157,12 +157,12 @@ def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) 
     right = sides.right
     if level:  # what is large all along has no edge of its own: its change has
         lag, lag_error = lag_of(
-            np.gradient(smooth(left, 1.0)), np.gradient(smooth(right, 1.0)), moving
+            np.gradient(smooth_twice(left, 1.0)), np.gradient(smooth_twice(right, 1.0)), moving
         )
     else:
         lag, lag_error = lag_of(left, right, moving)
     if np.isfinite(lag_error) and abs(lag) > 1.0 / RATE_HZ:
-        left = shifted(left, -lag)
+        left = shift_series(left, -lag)
     good = np.isfinite(left) & np.isfinite(right) & (moving > 0) & (grips > 0)
     for other in (*sides.beside, *(one for one in (sides.per, sides.bend) if one is not None)):
         good &= np.isfinite(other)
@@ -174,13 +174,13 @@ def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) 
     excited = np.ones(len(x), bool) if level else np.abs(x - np.median(x)) > SLOW_SHARE * size
     excited_s = excited.sum() / RATE_HZ
     if level:
-        gain = _ratio(x, y)
+        gain = _median_ratio(x, y)
         correlation = float(np.corrcoef(x, y)[0, 1]) if x.std() > 0 and y.std() > 0 else 0.0
         spread = float(np.std(y - gain * x)) / max(
             abs(gain) * float(np.sqrt(np.mean(x * x))), 1e-12
         )
         error = spread / np.sqrt(max(excited_s / CORRELATED_S, 1.0)) + 0.003
-        parts = _gains(x, y, excited)
+        parts = _gains_of_parts(x, y, excited)
         return Fit(
             gain,
             0.0,
@@ -203,7 +203,7 @@ def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) 
         bend, unsure = _bend_of(x, y, constant, sides.bend[good], count)
         x = x * (1.0 + bend * sides.bend[good])
     table = np.stack([x, constant, *besides], axis=1)
-    solution, errors = _loose(table, y, sides.loose, count)
+    solution, errors = _fit_with_priors(table, y, sides.loose, count)
     rest = y - table[:, 1:] @ solution[1:]
     correlation = float(np.corrcoef(x, rest)[0, 1]) if x.std() > 0 and rest.std() > 0 else 0.0
     slope = float(np.sign(correlation)) * float(rest.std() / max(x.std(), 1e-12))
@@ -228,7 +228,7 @@ def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) 
         y,
         x,
         found,
-        _gains(x, rest, excited),
+        _gains_of_parts(x, rest, excited),
         float(errors[1]),
     )
 
@@ -246,7 +246,7 @@ def _bend_of(
     gains = np.zeros(len(BENDS))
     for k, share in enumerate(BENDS):
         table = np.stack([x * (1.0 + share * bend), constant], axis=1)
-        solution = robust(table, y)
+        solution = fit_robustly(table, y)
         left = float(np.median(np.abs(y - table @ solution))) + 1e-3 * float(np.std(y)) + 1e-12
         costs[k] = 2.0 * count * np.log(left) + ((share - USUAL_BEND) / BEND_SPREAD) ** 2
         gains[k] = np.log(max(abs(solution[0]), 1e-12))
@@ -256,13 +256,13 @@ def _bend_of(
     return float(weights @ BENDS), float(np.sqrt(weights @ np.square(gains - centre)))
 
 
-def _loose(
+def _fit_with_priors(
     table: FloatArray, y: FloatArray, loose: tuple[float, ...], count: float
 ) -> tuple[FloatArray, FloatArray]:
     """Robust least squares with the last columns' gains drawn to zero, and standard deviations
     of all gains.
     """
-    solution = robust(table, y)
+    solution = fit_robustly(table, y)
     off = np.abs(y - table @ solution)
     spread = max(1.4826 * float(np.median(off)), 1e-9)
     near = off <= 3.0 * spread
@@ -278,7 +278,7 @@ def _loose(
     return solution, np.sqrt(np.diag(inverse))
 
 
-def _gains(x: FloatArray, y: FloatArray, excited: BoolArray) -> tuple[float, ...]:
+def _gains_of_parts(x: FloatArray, y: FloatArray, excited: BoolArray) -> tuple[float, ...]:
     """Gains of the parts of the excited time, in the order of time."""
     rows = np.flatnonzero(excited)
     found = []
@@ -291,12 +291,12 @@ def _gains(x: FloatArray, y: FloatArray, excited: BoolArray) -> tuple[float, ...
     return tuple(found)
 
 
-def _ratio(x: FloatArray, y: FloatArray) -> float:
+def _median_ratio(x: FloatArray, y: FloatArray) -> float:
     big = np.abs(x) > 0.3 * np.percentile(np.abs(x), 95)
     return float(np.median(y[big] / x[big])) if big.any() else 0.0
 
 
-def robust(table: FloatArray, y: FloatArray) -> FloatArray:
+def fit_robustly(table: FloatArray, y: FloatArray) -> FloatArray:
     """Fit least squares twice, the second time without points that are three robust standard
     deviations off.
     """
@@ -308,7 +308,7 @@ def robust(table: FloatArray, y: FloatArray) -> FloatArray:
     return np.asarray(solution)
 
 
-def shifted(x: FloatArray, seconds: float) -> FloatArray:
+def shift_series(x: FloatArray, seconds: float) -> FloatArray:
     """x at times later by `seconds`: positive moves it back to where it belongs when it is
     early.
     """
@@ -328,16 +328,21 @@ def lag_of(left: FloatArray, right: FloatArray, moving: FloatArray) -> tuple[flo
     The lags of the two halves of the drive are compared as well: their difference adds to the
     error.
     """
-    lag, sharp = _peak(left, right, moving)
+    lag, sharp = _correlation_peak(left, right, moving)
     if not sharp:
         return 0.0, np.inf
     half = len(left) // 2
-    parts = [_peak(left[p], right[p], moving[p]) for p in (slice(None, half), slice(half, None))]
+    parts = [
+        _correlation_peak(left[p], right[p], moving[p])
+        for p in (slice(None, half), slice(half, None))
+    ]
     apart = [abs(part[0] - lag) for part in parts if part[1]]
     return lag, 0.02 + (0.7 * float(np.mean(apart)) if apart else 0.1)
 
 
-def _peak(left: FloatArray, right: FloatArray, moving: FloatArray) -> tuple[float, bool]:
+def _correlation_peak(
+    left: FloatArray, right: FloatArray, moving: FloatArray
+) -> tuple[float, bool]:
     good = np.isfinite(left) & np.isfinite(right) & moving.astype(bool)
     if good.sum() < FEWEST_S * RATE_HZ:
         return 0.0, False

@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from edge_agent.inputs.doctor.drive import RATE_HZ, even, smooth
+from edge_agent.inputs.doctor.drive import RATE_HZ, interpolate_near, smooth_twice
 from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import S
 from schemas.vehicle import Vehicle
@@ -40,7 +40,7 @@ SLOWEST: Final = 3.0  # [m/s] for which the model's slip has a meaning
 LEAD: Final = {"wheel_lag": 0.013, "steer_lag": 0.017}
 
 
-def lags(
+def find_lags(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, least: float = LEAST_LIKE
 ) -> dict[str, float]:
     """Lags [s] of a drive, t (T,) [s] and signals (T, 18), by quantity; those that its turns do not
@@ -51,26 +51,27 @@ def lags(
     """
     at = np.arange(t[0], min(t[-1], t[0] + LONGEST_DRIVE_S), 1.0 / RATE_HZ)
 
-    def column(index: int) -> FloatArray:
-        return smooth(even(t, signals[:, index], at), SMOOTH_S)
+    def even_column(index: int) -> FloatArray:
+        return smooth_twice(interpolate_near(t, signals[:, index], at), SMOOTH_S)
 
-    rims = [column(S.OMEGA + wheel) * vehicle.wheel_radius for wheel in range(4)]
+    rims = [even_column(S.OMEGA + wheel) * vehicle.wheel_radius for wheel in range(4)]
     v = np.mean(rims, axis=0)
-    gyro = column(S.YAW_RATE)
+    gyro = even_column(S.YAW_RATE)
     left = signals[:, S.DELTA]
     front = (rims[1] - rims[0]) / vehicle.track_front
     rear = (rims[3] - rims[2]) / vehicle.track_rear
-    delta = smooth(
-        even(t, np.where(np.isfinite(left), left, signals[:, S.DELTA + 1]), at), SMOOTH_S
+    delta = smooth_twice(
+        interpolate_near(t, np.where(np.isfinite(left), left, signals[:, S.DELTA + 1]), at),
+        SMOOTH_S,
     )
     driven = (v > DRIVEN) & np.isfinite(gyro)
     ways = {
         "wheel_lag": (0.5 * (front + rear), front, rear),
-        "steer_lag": (_bicycle(v, delta, vehicle),),
+        "steer_lag": (_bicycle_yaw_rate(v, delta, vehicle),),
     }
     found = {}
     for name, sides in ways.items():
-        peaks = [_behind(side, gyro, driven & np.isfinite(side), least) for side in sides]
+        peaks = [_find_delay(side, gyro, driven & np.isfinite(side), least) for side in sides]
         told = [peak for peak in peaks if peak is not None]
         if (
             told
@@ -89,14 +90,16 @@ class _Peak(NamedTuple):
     likeness: float
 
 
-def _behind(left: FloatArray, right: FloatArray, among: BoolArray, least: float) -> _Peak | None:
+def _find_delay(
+    left: FloatArray, right: FloatArray, among: BoolArray, least: float
+) -> _Peak | None:
     """Return by how much `left` is behind `right`; None where the drive does not tell."""
     most = round(LONGEST_S * RATE_HZ)
     among = among.copy()
     among[: most + 1] = among[len(among) - most - 1 :] = False
     if among.sum() < LEAST_S * RATE_HZ:
         return None
-    left, right = ((x - smooth(x, SLOW_S)) for x in (left, right))
+    left, right = ((x - smooth_twice(x, SLOW_S)) for x in (left, right))
     if (
         np.nanstd(left[among]) < LEAST_RATE or np.nanstd(right[among]) < LEAST_RATE
     ):  # a locked axle, or straight on
@@ -114,7 +117,7 @@ def _behind(left: FloatArray, right: FloatArray, among: BoolArray, least: float)
     return _Peak(float(seconds), float(here))
 
 
-def _bicycle(speed: FloatArray, steering: FloatArray, vehicle: Vehicle) -> FloatArray:
+def _bicycle_yaw_rate(speed: FloatArray, steering: FloatArray, vehicle: Vehicle) -> FloatArray:
     """Yaw rate that the vehicle file's bicycle makes of the steering, by the trapezoidal rule."""
     m = vehicle.mass
     inertia = vehicle.yaw_inertia

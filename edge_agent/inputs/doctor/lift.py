@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.inputs.doctor.drive import RATE_HZ, even, smooth
+from edge_agent.inputs.doctor.drive import RATE_HZ, interpolate_near, smooth_twice
 from schemas.numeric import FloatArray
 from schemas.signals import S
 from schemas.vehicle import Vehicle
@@ -33,10 +33,14 @@ def is_on_lift(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> bool:
     if len(at) < LEAST_S * RATE_HZ:
         return False
     rims = (
-        np.stack([even(t, signals[:, S.OMEGA + wheel], at) for wheel in range(4)], axis=1)
+        np.stack(
+            [interpolate_near(t, signals[:, S.OMEGA + wheel], at) for wheel in range(4)], axis=1
+        )
         * vehicle.wheel_radius
     )
-    axles = [smooth(np.abs(rims[:, 2 * axle : 2 * axle + 2]).mean(axis=1)) for axle in range(2)]
+    axles = [
+        smooth_twice(np.abs(rims[:, 2 * axle : 2 * axle + 2]).mean(axis=1)) for axle in range(2)
+    ]
     fastest = np.fmax(axles[0], axles[1])
     slowest = np.fmin(axles[0], axles[1])
     with np.errstate(invalid="ignore"):
@@ -45,7 +49,8 @@ def is_on_lift(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> bool:
     if turns.sum() < LEAST_S * RATE_HZ:
         return False
     along, across, yaw = (
-        smooth(even(t, signals[:, channel], at)) for channel in (S.AX, S.AY, S.YAW_RATE)
+        smooth_twice(interpolate_near(t, signals[:, channel], at))
+        for channel in (S.AX, S.AY, S.YAW_RATE)
     )
     rests = all(
         np.isfinite(value[turns]).any()

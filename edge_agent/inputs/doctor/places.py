@@ -42,29 +42,29 @@ def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
     if good.sum() > FEWEST and np.ptp(np.unwrap(drive.course[good])) > 0.5:
         yaw = drive.course_yaw[good]
         course = drive.course[good]
-        fits = {name: _agreement(made(yaw), course) for name, made in COMPASS.items()}
+        fits = {name: _course_agreement(made(yaw), course) for name, made in COMPASS.items()}
         best = max(fits, key=lambda name: fits[name])
-        turns = min(_turned(COMPASS[best](yaw)), _turned(course))
-        if turns > LEAST_TURN and fits[best] > max(_agreement(yaw, course) + BETTER, SOUND):
+        turns = min(_total_turn(COMPASS[best](yaw)), _total_turn(course))
+        if turns > LEAST_TURN and fits[best] > max(_course_agreement(yaw, course) + BETTER, SOUND):
             words = f"agrees with the course over ground only as {best} ({fits[best]:.2f} of 1)"
             findings.append(Finding("yaw", best, words))
     return findings
 
 
-def _turned(angle: FloatArray) -> float:
+def _total_turn(angle: FloatArray) -> float:
     """Return how far an angle (n,) goes [rad], but for its ends."""
     unwrapped = np.unwrap(angle)
     return float(np.percentile(unwrapped, 95) - np.percentile(unwrapped, 5))
 
 
-def _agreement(yaw: FloatArray, course: FloatArray) -> float:
+def _course_agreement(yaw: FloatArray, course: FloatArray) -> float:
     """1 where they are equal, by the part of the mean resultant that lies along no difference at
     all.
     """
     return float(np.mean(np.cos(yaw - course)))
 
 
-def exchanged(t: FloatArray, signals: FloatArray, drive: EvenDrive) -> bool:
+def has_exchanged_position(t: FloatArray, signals: FloatArray, drive: EvenDrive) -> bool:
     """Return True if the fixes agree with the wheels only after latitude and longitude are
     exchanged.
     """

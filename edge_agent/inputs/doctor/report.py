@@ -39,7 +39,7 @@ STYLE: Final = (
 )
 
 
-def lines(diagnosis: Diagnosis) -> list[str]:
+def report_lines(diagnosis: Diagnosis) -> list[str]:
     """Return the findings, one line each."""
     lines = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in diagnosis.findings]
     lines += [
@@ -56,34 +56,34 @@ def lines(diagnosis: Diagnosis) -> list[str]:
     return [*lines, *(f"{'sound':<8} {channel}" for channel in diagnosis.sound)]
 
 
-def document(diagnosis: Diagnosis) -> dict[str, object]:
+def report_document(diagnosis: Diagnosis) -> dict[str, object]:
     """Return the findings for a program; scale, offset and delay correct a channel, in this
     order.
     """
     return {
-        "passed": diagnosis.passed,
-        "advice": advice(diagnosis),
+        "passed": diagnosis.is_passed,
+        "advice": publishing_advice(diagnosis),
         "sound": diagnosis.sound,
         "unknown": diagnosis.unknown,
         "lags_s": {name: round(lag, 4) for name, lag in diagnosis.lags.items()},
         "findings": [
-            {name: _finite(value) for name, value in asdict(finding).items()}
+            {name: _finite_or_none(value) for name, value in asdict(finding).items()}
             for finding in diagnosis.findings
         ],
         "identities": {
-            name: {what: _finite(getattr(fit, what)) for what in SHOWN}
+            name: {what: _finite_or_none(getattr(fit, what)) for what in SHOWN}
             for name, fit in diagnosis.fits.items()
         },
     }
 
 
-def _finite(value: object) -> object:
+def _finite_or_none(value: object) -> object:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def advice(diagnosis: Diagnosis) -> str:
+def publishing_advice(diagnosis: Diagnosis) -> str:
     """One line: whether the log may be published, and what to do if not."""
-    if diagnosis.passed:
+    if diagnosis.is_passed:
         return "passed: units, signs, clocks and offsets agree with each other"
     if diagnosis.findings:
         return "not passed: correct the profile (--fix writes it), import again"
@@ -92,7 +92,7 @@ def advice(diagnosis: Diagnosis) -> str:
     )
 
 
-def page(diagnosis: Diagnosis, title: str) -> str:
+def report_page(diagnosis: Diagnosis, title: str) -> str:
     """A page of HTML: verdict, findings, and each identity as a plot."""
     rows = [
         f"<tr class='bad'><td>{escape(f.channel)}<td>{escape(f.kind)}<td>{escape(f.words)}"
@@ -103,15 +103,17 @@ def page(diagnosis: Diagnosis, title: str) -> str:
         for channel in diagnosis.unknown
     ]
     rows += [f"<tr><td>{escape(channel)}<td>sound<td>" for channel in diagnosis.sound]
-    plots = "".join(_figure(name, fit) for name, fit in diagnosis.fits.items() if len(fit.right))
+    plots = "".join(
+        _scatter_plot(name, fit) for name, fit in diagnosis.fits.items() if len(fit.right)
+    )
     return (
         f"<!doctype html><meta charset='utf-8'><title>{escape(title)}</title><style>{STYLE}</style>"
-        f"<h1>{escape(title)}</h1><p>{escape(advice(diagnosis))}</p>"
-        f"<table><tr><th>channel<th>finding<th>evidence{''.join(rows)}</table>{_table(diagnosis.fits)}{plots}\n"
+        f"<h1>{escape(title)}</h1><p>{escape(publishing_advice(diagnosis))}</p>"
+        f"<table><tr><th>channel<th>finding<th>evidence{''.join(rows)}</table>{_identity_table(diagnosis.fits)}{plots}\n"
     )
 
 
-def _table(fits: dict[str, Fit]) -> str:
+def _identity_table(fits: dict[str, Fit]) -> str:
     rows = [
         f"<tr><td>{name}<td>{fit.gain:.3g}<td>{fit.offset:.3g}<td>{fit.correlation:.2f}<td>{fit.excited_s:.0f}"
         f"<td>{fit.lag_s:+.2f} ± {fit.lag_error_s:.2f}"
@@ -124,7 +126,7 @@ def _table(fits: dict[str, Fit]) -> str:
     )
 
 
-def _figure(name: str, fit: Fit) -> str:
+def _scatter_plot(name: str, fit: Fit) -> str:
     """Return a scatter plot of both sides, with the identity itself (grey) and the measured
     relation (red).
     """
@@ -136,7 +138,7 @@ def _figure(name: str, fit: Fit) -> str:
     if not (high > low and top > bottom):
         return ""
 
-    def at(across: FloatArray, up: FloatArray) -> list[str]:
+    def points_at(across: FloatArray, up: FloatArray) -> list[str]:
         right = EDGE + (across - low) / (high - low) * (SIDE - 2 * EDGE)
         down = SIDE - EDGE - (up - bottom) / (top - bottom) * (SIDE - 2 * EDGE)
         return [
@@ -145,10 +147,10 @@ def _figure(name: str, fit: Fit) -> str:
         ]
 
     dots = "".join(
-        f"<circle cx='{p.split(',')[0]}' cy='{p.split(',')[1]}' r='1.3'/>" for p in at(x, y)
+        f"<circle cx='{p.split(',')[0]}' cy='{p.split(',')[1]}' r='1.3'/>" for p in points_at(x, y)
     )
     ends = np.array([low, high])
-    law, found = (" ".join(at(ends, gain * ends + fit.offset)) for gain in (1.0, fit.gain))
+    law, found = (" ".join(points_at(ends, gain * ends + fit.offset)) for gain in (1.0, fit.gain))
     across, up = AXES[name]
     return (
         f"<figure><svg width='{SIDE}' height='{SIDE}' viewBox='0 0 {SIDE} {SIDE}' role='img'>"

@@ -104,7 +104,7 @@ def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
     ratio = vehicle.steering_ratio or 16.0
     radius = vehicle.wheel_radius
     rims = [Mistake(unit, radius / SPEED[unit]) for unit in SPEED]
-    if ground.known and 0.7 < ground.gain < 1.4 and abs(ground.gain - 1.0) > 0.03:
+    if ground.is_known and 0.7 < ground.gain < 1.4 and abs(ground.gain - 1.0) > 0.03:
         rims.append(Mistake("radius", 1.0 / ground.gain))
     angles = [
         Mistake("deg", 1.0 / ANGLE["deg"]),
@@ -144,29 +144,33 @@ class Verdict:
     faults: dict[str, Mistake | None]
     margins: dict[str, float]
 
-    def settled(self, quantity: str) -> bool:
+    def is_settled(self, quantity: str) -> bool:
         """Return True if no other explanation of the quantity is plausible."""
         return self.margins[quantity] >= SETTLED
 
 
-def explain(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
+def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
     """The fewest faults of unit and sign that explain the identities."""
     choices = faults_of(vehicle, found["ground"])
-    known = {name: fit for name, fit in found.items() if fit.known}
+    known = {name: fit for name, fit in found.items() if fit.is_known}
     costs: list[tuple[float, dict[str, Mistake]]] = []
-    for guess, price in _guesses(choices):
-        costs.append((price + sum(_misfit(name, fit, guess) for name, fit in known.items()), guess))
+    for guess, price in _enumerate_guesses(choices):
+        costs.append(
+            (price + sum(_misfit_of(name, fit, guess) for name, fit in known.items()), guess)
+        )
     best_cost, best = min(costs, key=lambda pair: pair[0])
     margins = {}
     for quantity in QUANTITIES:
         others = [
-            cost for cost, guess in costs if not _alike(guess.get(quantity), best.get(quantity))
+            cost
+            for cost, guess in costs
+            if not _are_equivalent(guess.get(quantity), best.get(quantity))
         ]
-        margins[quantity] = min(others) - best_cost if _asked(quantity, known) else 0.0
+        margins[quantity] = min(others) - best_cost if _is_in_relations(quantity, known) else 0.0
     return Verdict({quantity: best.get(quantity) for quantity in QUANTITIES}, margins)
 
 
-def _alike(one: Mistake | None, other: Mistake | None) -> bool:
+def _are_equivalent(one: Mistake | None, other: Mistake | None) -> bool:
     """Return True if two faults are equivalent: km/h equals a radius of .28 m, which no drive
     separates from a wrong radius.
     """
@@ -175,11 +179,13 @@ def _alike(one: Mistake | None, other: Mistake | None) -> bool:
     return abs(math.log(abs(one.factor / other.factor))) < ALIKE and one.factor * other.factor > 0.0
 
 
-def _asked(quantity: str, known: Mapping[str, Fit]) -> bool:
+def _is_in_relations(quantity: str, known: Mapping[str, Fit]) -> bool:
     return any(member.quantity == quantity for name in known for member in LAWS[name].members)
 
 
-def _guesses(choices: Mapping[str, list[Mistake]]) -> Iterator[tuple[dict[str, Mistake], float]]:
+def _enumerate_guesses(
+    choices: Mapping[str, list[Mistake]],
+) -> Iterator[tuple[dict[str, Mistake], float]]:
     yield {}, 0.0
     for count in (1, 2):
         for quantities in combinations(QUANTITIES, count):
@@ -193,7 +199,7 @@ def _guesses(choices: Mapping[str, list[Mistake]]) -> Iterator[tuple[dict[str, M
         yield chosen, 1.25 * FAULT_COST
 
 
-def _misfit(name: str, fit: Fit, guess: Mapping[str, Mistake]) -> float:
+def _misfit_of(name: str, fit: Fit, guess: Mapping[str, Mistake]) -> float:
     law = LAWS[name]
     factor = law.centre
     for quantity, power in law.members:
@@ -206,7 +212,7 @@ def _misfit(name: str, fit: Fit, guess: Mapping[str, Mistake]) -> float:
     return min(cost, 400.0)
 
 
-def clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
+def late_clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
     """Device -> (seconds that its clock is late, the margin of that), for the fewest late
     devices; empty for none.
     """
@@ -214,13 +220,13 @@ def clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
         name: fit
         for name, fit in found.items()
         if name in CLOCKS
-        and fit.known
+        and fit.is_known
         and math.isfinite(fit.lag_error_s)
         and abs(fit.correlation) > CLOCK_LIKE
     }
     devices = sorted({device for name in known for device in CLOCKS[name]})
 
-    def cost(late: Mapping[str, float]) -> float:
+    def lateness_cost(late: Mapping[str, float]) -> float:
         total = 0.0
         for name, fit in known.items():
             left, right = CLOCKS[name]
@@ -228,7 +234,7 @@ def clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
             total += min(away**2 / (CLOCK_SPREAD_S[name] ** 2 + fit.lag_error_s**2), 100.0)
         return total
 
-    base = cost({})
+    base = lateness_cost({})
     options = []
     for device in devices:
         guesses = []
@@ -236,7 +242,9 @@ def clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
             if device in CLOCKS[name]:
                 sign = 1.0 if CLOCKS[name][0] == device else -1.0
                 guesses.append(sign * (fit.lag_s - CLOCK_CENTRE_S[name]))
-        options += [(cost({device: guess}) + CLOCK_COST, device, guess) for guess in guesses]
+        options += [
+            (lateness_cost({device: guess}) + CLOCK_COST, device, guess) for guess in guesses
+        ]
     if not options:
         return {}
     best, device, late = min(options)

@@ -6,9 +6,9 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, smooth
+from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, smooth_twice
 from edge_agent.inputs.doctor.identities import Fit
-from edge_agent.inputs.doctor.lags import lags
+from edge_agent.inputs.doctor.lags import find_lags
 from schemas.numeric import BoolArray, FloatArray
 from schemas.vehicle import Vehicle
 
@@ -70,14 +70,14 @@ def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
     With both exchanged the axles agree, and the identity of the axles tells it.
     """
 
-    def likeness(yaw: FloatArray) -> float:
+    def yaw_likeness(yaw: FloatArray) -> float:
         good = np.isfinite(yaw) & np.isfinite(drive.r) & (drive.moving > 0)
         if good.sum() < 10 * RATE_HZ or yaw[good].std() == 0.0 or drive.r[good].std() == 0.0:
             return 0.0
         return float(np.corrcoef(yaw[good], drive.r[good])[0, 1])
 
-    front = likeness(drive.yaw_front)
-    rear = likeness(drive.yaw_rear)
+    front = yaw_likeness(drive.yaw_front)
+    rear = yaw_likeness(drive.yaw_rear)
     if min(abs(front), abs(rear)) < AXLES_LIKE or front * rear > 0.0:
         return []
     good = np.isfinite(drive.ay) & np.isfinite(drive.r) & (drive.moving > 0)
@@ -142,7 +142,9 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
     Wheels that spin turn too fast while they are driven, wheels under brakes too slowly; a wrong
     radius always is.
     """
-    ratio = smooth(drive.v_ground, 1.0) / np.where(drive.v == 0.0, np.nan, smooth(drive.v, 1.0))
+    ratio = smooth_twice(drive.v_ground, 1.0) / np.where(
+        drive.v == 0.0, np.nan, smooth_twice(drive.v, 1.0)
+    )
     known = np.isfinite(ratio) & (drive.moving > 0)
     for rows in (known & (drive.v_dot > 0.1), known & (drive.v_dot < -0.1)):
         if rows.sum() < 2 * RATE_HZ or abs(float(np.median(ratio[rows])) / gain - 1.0) > 0.04:
@@ -187,9 +189,9 @@ def measure_lags_twice(
     time again.
     """
     half = len(t) // 2
-    whole = lags(t, signals, vehicle)
+    whole = find_lags(t, signals, vehicle)
     halves = [
-        lags(t[rows], signals[rows], vehicle, HALF_LIKE)
+        find_lags(t[rows], signals[rows], vehicle, HALF_LIKE)
         for rows in (slice(None, half), slice(half, None))
     ]
     parts = [whole, *halves]
@@ -197,7 +199,7 @@ def measure_lags_twice(
     for name, identity in (("wheel_lag", "axle"), ("steer_lag", "steering")):
         fit = found[identity]
         sound = (
-            fit.known
+            fit.is_known
             and fit.correlation > TURNS_LIKE
             and abs(np.log(abs(fit.gain))) < 0.35
             and is_steady(fit)

@@ -7,9 +7,9 @@ from typing import Any, Final
 
 from edge_agent.inputs.live.feed import TICK_S, Feed, Heard, HostClock
 from edge_agent.inputs.profile import Profile
-from edge_agent.inputs.readers.can_log import Frames, Log, decoded
+from edge_agent.inputs.readers.can_log import Frames, Log, decode_log
 from edge_agent.inputs.readers.dbc import Database
-from edge_agent.inputs.recording import Series, library
+from edge_agent.inputs.recording import Series, import_optional
 from schemas.thresholds import NS
 
 EXTENDED_MASK = 0x1FFFFFFF
@@ -31,7 +31,9 @@ class Decoder:
         self.database = {
             name: message for name, message in database.items() if name not in elsewhere
         }
-        self.wanted = {name for name in profile.needs() if name.partition(".")[0] in self.database}
+        self.wanted = {
+            name for name in profile.needed_signals() if name.partition(".")[0] in self.database
+        }
         messages = {name.partition(".")[0] for name in self.wanted}
         self.identifiers = {
             (self.database[name].identifier, self.database[name].extended) for name in messages
@@ -42,7 +44,7 @@ class Decoder:
         log: Log = {}
         for time, (identifier, extended, data) in heard:
             log.setdefault((0, identifier, extended), Frames()).add(time, data)
-        return decoded(lambda _: (log, 0.0), OWN, self.database, self.wanted).signals
+        return decode_log(lambda _: (log, 0.0), OWN, self.database, self.wanted).signals
 
 
 class CanFeed(Feed):
@@ -62,7 +64,7 @@ class CanFeed(Feed):
         self, name: str, clock: HostClock, decoder: Decoder, options: Mapping[str, Any]
     ) -> None:
         super().__init__(name, clock)
-        self._can = library("can")
+        self._can = import_optional("can")
         self._decoder = decoder
         self._options = dict(options)
 

@@ -59,18 +59,20 @@ class DatabrokerFeed(Feed):
         """
         connection = self._connection
         with connection.open_channel() as channel:
-            known = self._known(channel)
+            known = self._known_paths(channel)
             if not known:
                 raise ConnectionError("it knows none of the profile's signals")
             m = self._messages
-            self._call = connection.method(channel.unary_stream, "Subscribe", m.SubscribeResponse)(
+            self._call = connection.make_call(
+                channel.unary_stream, "Subscribe", m.SubscribeResponse
+            )(
                 m.SubscribeRequest(signal_paths=known, buffer_size=BUFFER),
                 metadata=connection.metadata,
             )
             try:
                 for place, update in enumerate(self._call):
                     self.openings += not place
-                    self._hear(update, standing=not place)
+                    self._hear_update(update, standing=not place)
                     if self.stopping.is_set():
                         return
             finally:
@@ -92,13 +94,13 @@ class DatabrokerFeed(Feed):
             values.setdefault(path, []).append(value)
         return {path: Series(np.array(times[path]), np.array(values[path])) for path in times}
 
-    def _known(self, channel: Any) -> list[str]:  # noqa: ANN401
+    def _known_paths(self, channel: Any) -> list[str]:  # noqa: ANN401
         """The paths that the broker knows: a subscription with an unknown one is refused as a
         whole.
         """
         m = self._messages
         connection = self._connection
-        ask = connection.method(channel.unary_unary, "GetValue", m.GetValueResponse)
+        ask = connection.make_call(channel.unary_unary, "GetValue", m.GetValueResponse)
         known = []
         for path in self._paths:
             try:
@@ -111,7 +113,7 @@ class DatabrokerFeed(Feed):
                 self.say(f"does not know {path}")
         return known
 
-    def _hear(self, update: Any, *, standing: bool) -> None:  # noqa: ANN401
+    def _hear_update(self, update: Any, *, standing: bool) -> None:  # noqa: ANN401
         for path, point in update.entries.items():
             kind = point.value.WhichOneof("typed_value")
             if kind in NUMBERS and (not standing or path in self._lasting):

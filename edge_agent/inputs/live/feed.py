@@ -48,7 +48,7 @@ class HostClock:
         """Seconds since the start."""
         return time.monotonic() - self.steady_s
 
-    def of(self, stamp_ns: int) -> float:
+    def seconds_of(self, stamp_ns: int) -> float:
         """Seconds since the start of a date in ns UTC."""
         return (stamp_ns - self.start_ns) / NS
 
@@ -66,7 +66,7 @@ class Stamps:
         least = min(self._before, self._lately)
         return 0.0 if -EARLY_S <= least < BELIEVED_S or least == float("inf") else least
 
-    def place(self, stamp: float, arrival: float) -> float:
+    def host_time(self, stamp: float, arrival: float) -> float:
         """The host's time of a stamp that arrived now."""
         if arrival - self._turned > WHILE_S:
             self._before = self._lately
@@ -96,7 +96,7 @@ class Feed(ABC):
         self.newest = 0.0  # the latest stamp, on the host's clock
         self._reasons: set[str] = set()
         self._waiting: deque[Heard] = deque()
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread = threading.Thread(target=self._listen_loop, name=name, daemon=True)
 
     @abstractmethod
     def listen(self) -> None:
@@ -132,7 +132,7 @@ class Feed(ABC):
         if len(self._waiting) >= MOST_WAITING:
             self._waiting.popleft()
             self.lost += 1
-        placed = self.stamps.place(self.clock.of(stamp_ns), self.last)
+        placed = self.stamps.host_time(self.clock.seconds_of(stamp_ns), self.last)
         self._waiting.append((placed, what))
         self.newest = max(self.newest, placed)
 
@@ -152,7 +152,7 @@ class Feed(ABC):
         silent = self.clock.now() - self.last
         return f"{self.name} is silent for {silent:.0f} s" if silent > SILENT_S else None
 
-    def _run(self) -> None:
+    def _listen_loop(self) -> None:
         while not self.stopping.is_set():
             reason = "it ended"
             try:

@@ -41,9 +41,9 @@ class GpsdFeed(Feed):
                 if len(rest) > LONGEST_LINE:
                     raise ValueError("a line without an end")
                 for line in lines:
-                    self._line(line)
+                    self._read_line(line)
 
-    def _line(self, line: bytes) -> None:
+    def _read_line(self, line: bytes) -> None:
         try:
             fix = parse_gpsd(line.decode("ascii", errors="replace")) if line.strip() else None
         except (

@@ -19,7 +19,7 @@ import numpy as np
 from edge_agent.inputs.live.can_bus import Decoder
 from edge_agent.inputs.live.feed import Feed, Heard, HostClock
 from edge_agent.inputs.readers.rosbag import FRAME, Leaf, leaves_of, stamp_of
-from edge_agent.inputs.recording import Series, library
+from edge_agent.inputs.recording import Series, import_optional
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 from schemas.runtime.zenoh_session import open_session
@@ -84,7 +84,7 @@ class Ros2Feed(Feed):
                 "names no topic",
                 "call its signals /topic.field, as import drafts them from a bag",
             )
-        self._store = _typestore(types)
+        self._store = _load_typestore(types)
         self._leaves: dict[str, list[Leaf]] = {}
         self._after: dict[bytes, int] = {}  # publisher -> the sequence number that is next
 
@@ -96,7 +96,7 @@ class Ros2Feed(Feed):
         with session:
             held = [
                 session.declare_subscriber(
-                    f"{self._domain}/{topic.strip('/')}/*/*", self._hearing(topic)
+                    f"{self._domain}/{topic.strip('/')}/*/*", self._make_listener(topic)
                 )
                 for topic in self._topics
             ]
@@ -120,18 +120,18 @@ class Ros2Feed(Feed):
             name: Series(np.array(times[name]), np.array(values[name])) for name in times
         }
 
-    def _hearing(self, topic: str) -> Any:  # noqa: ANN401
-        def heard(sample: Any) -> None:  # noqa: ANN401 the session's type is its library's own
+    def _make_listener(self, topic: str) -> Any:  # noqa: ANN401
+        def receive_sample(sample: Any) -> None:  # noqa: ANN401 the session's type is its library's own
             try:
-                self._sample(topic, sample)
+                self._take_sample(topic, sample)
             except Exception as error:  # noqa: BLE001 hostile bytes may raise anything, and Zenoh would swallow it
                 self.unreadable(f"{topic}: a message that cannot be read ({type(error).__name__})")
 
-        return heard
+        return receive_sample
 
-    def _sample(self, topic: str, sample: Any) -> None:  # noqa: ANN401
+    def _take_sample(self, topic: str, sample: Any) -> None:  # noqa: ANN401
         kind = type_of(str(sample.key_expr))
-        published = self._published(
+        published = self._publication_time(
             sample.attachment.to_bytes() if sample.attachment is not None else b""
         )
         message = self._store.deserialize_cdr(sample.payload.to_bytes(), kind)
@@ -147,7 +147,7 @@ class Ros2Feed(Feed):
             self._leaves[topic] = [leaf for leaf in named if leaf[0] in self._wanted]
         self.hear(at, {name: float(take(message)) for name, take in self._leaves[topic]})
 
-    def _published(self, attachment: bytes) -> int:
+    def _publication_time(self, attachment: bytes) -> int:
         """Return the time of publication [ns], 0 where it is missing; count the messages lost
         before it.
         """
@@ -173,8 +173,8 @@ def type_of(key: str) -> str:
     return f"{place.replace('::', '/')}/{name[:-1]}"
 
 
-def _typestore(folder: Path | None) -> Any:  # noqa: ANN401
-    typesys = library("rosbags.typesys")
+def _load_typestore(folder: Path | None) -> Any:  # noqa: ANN401
+    typesys = import_optional("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
     texts = {FRAME: CAN_FRAME}
     for file in sorted(folder.glob("*/*.msg")) if folder else ():

@@ -21,7 +21,7 @@ import numpy as np
 from edge_agent.inputs.block import Block
 from edge_agent.inputs.context import context_signals, held_readings
 from edge_agent.inputs.live.feed import TICK_S, Feed, HostClock
-from edge_agent.inputs.merge import COURSE_SPEED, SPARSE, found_in, made, sampled
+from edge_agent.inputs.merge import COURSE_SPEED, SPARSE, found_in, make_channel, sample_at_rows
 from edge_agent.inputs.profile import Profile
 from edge_agent.inputs.recording import Recording, Series
 from edge_agent.inputs.signal_log import GROUND, fill_steering
@@ -97,24 +97,24 @@ class LiveRows:
             while True:
                 due = (self._next + size) / self.rate_hz + DELAY_S
                 self._wait(max(0.0, due - self._clock.now()))
-                while self._behind(due - DELAY_S) and self._clock.now() < due + PATIENCE_S:
+                while self._may_deliver(due - DELAY_S) and self._clock.now() < due + PATIENCE_S:
                     self._wait(TICK_S / 10.0)
                 behind = int((self._clock.now() - due) * self.rate_hz)
                 if behind > MOST_BEHIND_S * self.rate_hz:
                     self._next += behind
                     self.skipped += behind
-                yield self._block(size)
+                yield self._make_block(size)
         finally:
             for feed in self.feeds:
                 feed.stopping.set()
             for feed in self.feeds:
                 feed.close()
 
-    def troubles(self) -> list[str]:
+    def health_problems(self) -> list[str]:
         """Sources that are silent."""
         return [trouble for feed in self.feeds if (trouble := feed.trouble)]
 
-    def _behind(self, time: float) -> bool:
+    def _may_deliver(self, time: float) -> bool:
         """Return True if a source may still deliver readings of a time: not a silent source, and
         not a receiver, whose fixes are rare.
         """
@@ -123,11 +123,12 @@ class LiveRows:
             for feed, kept in zip(self.feeds, self._readings, strict=True)
         )
 
-    def _block(self, size: int) -> Block:
+    def _make_block(self, size: int) -> Block:
         t = np.arange(self._next, self._next + size) / self.rate_hz
         self._next += size
         recordings = [
-            self._recording(place, feed, t[0] - KEPT_S) for place, feed in enumerate(self.feeds)
+            self._recent_recording(place, feed, t[0] - KEPT_S)
+            for place, feed in enumerate(self.feeds)
         ]
         signals = np.full((size, len(CHANNELS)), np.nan)
         context = np.full((size, len(CONTEXT)), np.nan)
@@ -136,7 +137,7 @@ class LiveRows:
         for name, (place, channel) in found_in(recordings, self._profile).items():
             sparse = name in SPARSE  # a fix has its own date, all else the time at which it came
             try:
-                series, _ = made(
+                series, _ = make_channel(
                     name,
                     channel,
                     replace(recordings[place], rows=sparse),
@@ -152,15 +153,15 @@ class LiveRows:
             elif sparse:
                 fixes[name] = series
             else:
-                signals[:, CHANNELS.index(name)] = sampled(series, t, sparse=False)
-        self._place(fixes, t, signals)
-        self._steer(signals)
+                signals[:, CHANNELS.index(name)] = sample_at_rows(series, t, sparse=False)
+        self._place_fixes(fixes, t, signals)
+        self._fill_steering(signals)
         time = self._start_ns() + np.rint(t * NS).astype(np.int64)
         return Block(
             t[:, None], time[:, None], signals[:, None], context[:, None] if self._context else None
         )
 
-    def _recording(self, place: int, feed: Feed, oldest: float) -> Recording:
+    def _recent_recording(self, place: int, feed: Feed, oldest: float) -> Recording:
         """Return the recent readings of a source."""
         kept = self._readings[place]
         fresh_ones = feed.take()
@@ -188,7 +189,7 @@ class LiveRows:
                 kept[name] = Series(series.t[first:], series.values[first:], series.unit)
         return Recording(feed.name, dict(kept))
 
-    def _place(self, fixes: dict[str, Series], t: FloatArray, signals: FloatArray) -> None:
+    def _place_fixes(self, fixes: dict[str, Series], t: FloatArray, signals: FloatArray) -> None:
         """Each fix in the row next to it, or, moved, in the first one where that has gone."""
         half = 0.5 / self.rate_hz
         speed = fixes.get(GROUND)
@@ -205,7 +206,7 @@ class LiveRows:
             if not len(times):
                 continue
             self._used[name] = float(times[-1])
-            v, yaw = (_at(other, times) for other in (speed, course))
+            v, yaw = (_readings_at(other, times) for other in (speed, course))
             if name == "yaw":
                 values = np.where(np.isnan(v) | (v > COURSE_SPEED), values, np.nan)
             elif name in ("latitude", "longitude") and speed is not None and course is not None:
@@ -215,7 +216,7 @@ class LiveRows:
                 )
                 if name == "longitude":
                     along /= math.cos(
-                        math.radians(float(np.mean(_at(fixes.get("latitude"), times))))
+                        math.radians(float(np.mean(_readings_at(fixes.get("latitude"), times))))
                     )
                 values = values + np.degrees(along / EARTH_RADIUS_M)
             rows = np.clip(np.searchsorted(t, times - half), 0, len(t) - 1)
@@ -224,7 +225,7 @@ class LiveRows:
             else:
                 signals[rows, CHANNELS.index(name)] = values
 
-    def _steer(self, signals: FloatArray) -> None:
+    def _fill_steering(self, signals: FloatArray) -> None:
         """As in a log: a front wheel that no profile names is as the other, rear wheels do not
         steer.
         """
@@ -246,7 +247,7 @@ class LiveRows:
         return self._clock.start_ns if self._date_ns is None else self._date_ns
 
 
-def _at(series: Series | None, times: FloatArray) -> FloatArray:
+def _readings_at(series: Series | None, times: FloatArray) -> FloatArray:
     """The readings at just these times, NaN where there are none."""
     found = np.full(len(times), np.nan)
     if series is not None and len(series.t):

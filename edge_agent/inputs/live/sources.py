@@ -68,10 +68,12 @@ def open_sources(
     profile, folder = load_profile(profile_name)
     database = database_of(profile, folder, dbc)
     clock = HostClock()
-    return [_open(source, profile, database, clock) for source in sources], profile, clock
+    return [_open_source(source, profile, database, clock) for source in sources], profile, clock
 
 
-def _open(source: str, profile: Profile, database: Database | None, clock: HostClock) -> Feed:
+def _open_source(
+    source: str, profile: Profile, database: Database | None, clock: HostClock
+) -> Feed:
     kind, _, rest = source.partition(":")
     address, _, query = rest.partition("?")
     try:
@@ -83,20 +85,20 @@ def _open(source: str, profile: Profile, database: Database | None, clock: HostC
     if kind == "can":
         if database is None:
             raise no_database(Path(source))
-        return _can(source, address, options, profile, database, clock)
+        return _open_can(source, address, options, profile, database, clock)
     if kind == "gpsd":
-        return GpsdFeed(source, clock, _host(source, address, PORTS[kind]))
+        return GpsdFeed(source, clock, _parse_host(source, address, PORTS[kind]))
     if kind == "vss":
         return DatabrokerFeed(
             source,
             clock,
             address or f"127.0.0.1:{PORTS[kind]}",
-            sorted(profile.needs()),
+            sorted(profile.needed_signals()),
             options,
             lasting=lasting_signals(profile),
         )
     if kind == "ros2":
-        return _ros2(
+        return _open_ros2(
             source,
             address,
             options,
@@ -111,7 +113,7 @@ def _open(source: str, profile: Profile, database: Database | None, clock: HostC
     )
 
 
-def _can(
+def _open_can(
     source: str,
     address: str,
     options: dict[str, str],
@@ -127,7 +129,7 @@ def _can(
     )  # can1 tells its number, an address does not
     given_bus = options.pop("bus", number[1] if number else "")
     bus = int(given_bus) if given_bus.isdigit() else None
-    given = {name: _typed(value) for name, value in options.items()}
+    given = {name: _parse_option(value) for name, value in options.items()}
     return CanFeed(
         source,
         clock,
@@ -136,7 +138,7 @@ def _can(
     )
 
 
-def _ros2(
+def _open_ros2(
     source: str,
     address: str,
     options: dict[str, str],
@@ -154,14 +156,14 @@ def _ros2(
         clock,
         settings,
         domain=int(domain),
-        signals=sorted(profile.needs()),
+        signals=sorted(profile.needed_signals()),
         decoder=None if database is None else Decoder(profile, database),
         buses=options.get("frames", "").split(),
         types=Path(folder) if folder else None,
     )
 
 
-def _typed(text: str) -> int | float | bool | str:
+def _parse_option(text: str) -> int | float | bool | str:
     """An option as python-can wants it."""
     if text in ("true", "false"):
         return text == "true"
@@ -173,7 +175,7 @@ def _typed(text: str) -> int | float | bool | str:
     return text
 
 
-def _host(source: str, address: str, port: int) -> tuple[str, int]:
+def _parse_host(source: str, address: str, port: int) -> tuple[str, int]:
     host, _, number = (
         address.rpartition(":") if ":" in address else (address or "127.0.0.1", "", str(port))
     )

@@ -17,7 +17,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 
 from edge_agent.inputs.readers.dbc import LONGEST, Bytes, CanMessage, Database
-from edge_agent.inputs.recording import Recording, Series, library
+from edge_agent.inputs.recording import Recording, Series, import_optional
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.thresholds import NS
@@ -44,7 +44,7 @@ class Frames:
         self.shortest = min(self.shortest, len(data))
         self.data += data[:LONGEST].ljust(LONGEST, b"\0")
 
-    def columns(self) -> tuple[FloatArray, Bytes]:
+    def to_columns(self) -> tuple[FloatArray, Bytes]:
         """Times (n,) and bytes (n, LONGEST)."""
         return np.array(self.times), np.frombuffer(bytes(self.data), np.uint8).reshape(-1, LONGEST)
 
@@ -58,7 +58,7 @@ since its start].
 """
 
 
-def decoded(
+def decode_log(
     take: Taker,
     name: str,
     database: Database,
@@ -81,10 +81,10 @@ def decoded(
             messages[message].append(signal)
     log, first = take({database[message].identifier for message in messages})
     recording = Recording(name, {}, round(first * NS) if first > DATED_S else None)
-    for message, key in _placed(
+    for message, key in _find_messages(
         log, [database[message] for message in messages], buses or {}
     ).items():
-        times, data = log[key].columns()
+        times, data = log[key].to_columns()
         how = database[message]
         names = [
             s for s in messages[message] if how.signals[s].last_byte < max(log[key].shortest, 1)
@@ -112,7 +112,7 @@ def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
     logging.getLogger("can").setLevel(
         logging.ERROR
     )  # it reports versions of traces at INFO and WARNING
-    with library("can").LogReader(path) as reader:
+    with import_optional("can").LogReader(path) as reader:
         for message in reader:
             time = message.timestamp
             first = min(first, time)
@@ -135,7 +135,7 @@ def bus_of(channel: Any) -> int:  # noqa: ANN401 python-can gives a number, a na
     return int(digits[-3:]) if digits else 0
 
 
-def _placed(log: Log, messages: list[CanMessage], buses: dict[str, int]) -> dict[str, Key]:
+def _find_messages(log: Log, messages: list[CanMessage], buses: dict[str, int]) -> dict[str, Key]:
     """Which frames are which message."""
     counts: dict[int, int] = defaultdict(int)
     for message in messages:

@@ -53,7 +53,7 @@ class Signal:
 
     def decode(self, data: Bytes) -> FloatArray:
         """Physical values (n,) of the frames (n, LONGEST)."""
-        raw = self._raw(data)
+        raw = self._raw_values(data)
         number: NDArray[np.int64] | NDArray[np.uint64] = (
             raw.view(np.int64) if self.size < 64 or self.signed else raw
         )
@@ -62,7 +62,7 @@ class Signal:
             number = (number ^ top) - top
         return np.asarray(number * self.factor + self.offset, dtype=np.float64)
 
-    def _raw(self, data: Bytes) -> NDArray[np.uint64]:
+    def _raw_values(self, data: Bytes) -> NDArray[np.uint64]:
         raw = np.zeros(len(data), np.uint64)
         if self.little:
             first = self.start // 8
@@ -158,7 +158,7 @@ def parse_dbc(text: str) -> Database:
             )
             database[message.name] = message
         elif message is not None and (found := _SIGNAL.match(line)):
-            signal, mux = _signal(found)
+            signal, mux = _parse_signal(found)
             if signal is None or signal.last_byte >= min(max(message.length, 1), LONGEST):
                 continue
             message.signals[signal.name] = signal
@@ -170,7 +170,7 @@ def parse_dbc(text: str) -> Database:
     return database
 
 
-def _signal(found: re.Match[str]) -> tuple[Signal | None, str]:
+def _parse_signal(found: re.Match[str]) -> tuple[Signal | None, str]:
     """The signal of a line, None if it makes no sense, and its multiplexer mark."""
     words = found["label"].split()
     mux = words.pop() if len(words) > 1 and _MULTIPLEXED.fullmatch(words[-1]) else ""

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from edge_agent.inputs.recording import Recording, Series, foreign
+from edge_agent.inputs.recording import Recording, Series, foreign_errors
 from schemas.errors import InputError
 from schemas.thresholds import NS
 
@@ -61,9 +61,11 @@ def parse_nmea(line: str) -> Fix | None:
     day = parts[9]
     whole = datetime.strptime(day + clock[:6], "%d%m%y%H%M%S").replace(tzinfo=UTC)
     time = int(whole.timestamp()) * NS + round(float(f"0{clock[6:]}") * NS)
-    latitude = _degrees(parts[3], 2) * (-1.0 if parts[4] == "S" else 1.0)
-    longitude = _degrees(parts[5], 3) * (-1.0 if parts[6] == "W" else 1.0)
-    return _sound(Fix(time, latitude, longitude, _number(parts[7]) * KNOT, _number(parts[8])))
+    latitude = _parse_degrees(parts[3], 2) * (-1.0 if parts[4] == "S" else 1.0)
+    longitude = _parse_degrees(parts[5], 3) * (-1.0 if parts[6] == "W" else 1.0)
+    return _check_position(
+        Fix(time, latitude, longitude, _parse_number(parts[7]) * KNOT, _parse_number(parts[8]))
+    )
 
 
 def parse_gpsd(line: str) -> Fix | None:
@@ -84,18 +86,18 @@ def parse_gpsd(line: str) -> Fix | None:
     since = moment - datetime(1970, 1, 1, tzinfo=UTC)
     time = (since.days * 86_400 + since.seconds) * NS + since.microseconds * 1_000
     place = (float(report.get(key, math.nan)) for key in ("lat", "lon", "speed", "track"))
-    return _sound(Fix(time, *place))
+    return _check_position(Fix(time, *place))
 
 
-def _degrees(text: str, whole: int) -> float:
+def _parse_degrees(text: str, whole: int) -> float:
     return float(text[:whole]) + float(text[whole:]) / 60.0
 
 
-def _number(text: str) -> float:
+def _parse_number(text: str) -> float:
     return float(text) if text else math.nan
 
 
-def _sound(fix: Fix) -> Fix:
+def _check_position(fix: Fix) -> Fix:
     if not (abs(fix.latitude) <= 90.0 and abs(fix.longitude) <= 180.0):
         raise ValueError("no place on earth")
     return fix
@@ -109,7 +111,7 @@ def read_gnss(path: Path) -> Recording:
     """
     fixes: list[Fix] = []
     broken = 0
-    with foreign(path, "GNSS"), path.open("rb") as file:
+    with foreign_errors(path, "GNSS"), path.open("rb") as file:
         while line := file.readline(LONGEST_LINE):
             text = line.decode("ascii", errors="replace").strip()
             try:

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, Final, NamedTuple
 import numpy as np
 
 from edge_agent.inputs.readers.can_log import Frames, Log, no_database
-from edge_agent.inputs.recording import Recording, Series, foreign, library
+from edge_agent.inputs.recording import Recording, Series, foreign_errors, import_optional
 from schemas.errors import InputError
 from schemas.thresholds import NS
 
@@ -73,10 +73,10 @@ def check_blocks(path: Path) -> None:
                     "source", f"{path} points beyond its end, to byte {address}", "record it anew"
                 )
             seen.add(address)
-            waiting += _onward(file, address, size, path)
+            waiting += _linked_blocks(file, address, size, path)
 
 
-def _onward(file: BinaryIO, address: int, size: int, path: Path) -> list[int]:
+def _linked_blocks(file: BinaryIO, address: int, size: int, path: Path) -> list[int]:
     file.seek(address)
     kind, _, length, count = struct.unpack("<4sIQQ", file.read(24))
     if not kind.startswith(b"##") or length > size or count > (length - 24) // 8:
@@ -112,21 +112,24 @@ def read_isolated(path: Path, identifiers: set[int] | None, names: set[str] | No
     Raises:
         InputError: the file is broken, or asammdf is missing.
     """
-    with foreign(path, "MDF 4"):
+    with foreign_errors(path, "MDF 4"):
         check_blocks(path)
-    library("asammdf")
-    with foreign(path, "MDF 4"), ProcessPoolExecutor(1, get_context("spawn"), _limited) as pool:
-        return pool.submit(_content, path, identifiers, names).result()
+    import_optional("asammdf")
+    with (
+        foreign_errors(path, "MDF 4"),
+        ProcessPoolExecutor(1, get_context("spawn"), _limit_resources) as pool,
+    ):
+        return pool.submit(_read_content, path, identifiers, names).result()
 
 
-def _limited() -> None:
+def _limit_resources() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY))
     resource.setrlimit(resource.RLIMIT_CPU, (MOST_CPU_S, MOST_CPU_S))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _content(path: Path, identifiers: set[int] | None, names: set[str] | None) -> MdfContent:
-    with library("asammdf").MDF(path) as file:
+def _read_content(path: Path, identifiers: set[int] | None, names: set[str] | None) -> MdfContent:
+    with import_optional("asammdf").MDF(path) as file:
         if not has_frames(file):
             return MdfContent(None, read_mdf(file, path, names))
         if identifiers is None:
@@ -174,7 +177,7 @@ def read_mdf(mdf: Any, path: Path, wanted: set[str] | None) -> Recording:  # noq
     """
     start = mdf.header.start_time.timestamp()
     recording = Recording(path.name, {}, round(start * NS) if start > 0 else None)
-    with foreign(path, "MDF 4"):
+    with foreign_errors(path, "MDF 4"):
         for name, places in mdf.channels_db.items():
             if wanted is not None and name not in wanted:
                 continue

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.inputs.recording import Recording, Series, foreign
+from edge_agent.inputs.recording import Recording, Series, foreign_errors
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
@@ -49,8 +49,8 @@ def read_vbo(path: Path) -> Recording:
     Raises:
         InputError: a section is missing, no row is complete, or the time cannot be read.
     """
-    with foreign(path, "VBO"):
-        sections = _sections(path)
+    with foreign_errors(path, "VBO"):
+        sections = _read_sections(path)
         names = " ".join(sections.get("column names", [])).replace(",", " ").split()
         rows = [line.replace(",", " ").split() for line in sections.get("data", [])]
         numbers = [[float(value) for value in row] for row in rows if len(row) == len(names)]
@@ -99,7 +99,7 @@ def convert_vbo(
     return recording
 
 
-def _sections(path: Path) -> dict[str, list[str]]:
+def _read_sections(path: Path) -> dict[str, list[str]]:
     sections: dict[str, list[str]] = {}
     lines: list[str] = []
     for raw in path.read_bytes().decode("utf-8", errors="replace").splitlines():

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from edge_agent.inputs.readers.can_log import Frames, Log
-from edge_agent.inputs.recording import Recording, Series, foreign, library
+from edge_agent.inputs.recording import Recording, Series, foreign_errors, import_optional
 from schemas.thresholds import NS
 
 SUFFIXES: Final = (".mcap", ".db3", ".bag")
@@ -37,12 +37,12 @@ def open_bag(path: Path) -> Iterator[Any]:
     """A reader, opened and in the end closed; the folder is taken for a database file that lies
     in it.
     """
-    highlevel = library("rosbags.highlevel")
-    typesys = library("rosbags.typesys")
+    highlevel = import_optional("rosbags.highlevel")
+    typesys = import_optional("rosbags.typesys")
     inside = (
         path.parent if path.suffix == ".db3" or (path.parent / "metadata.yaml").is_file() else path
     )
-    with foreign(path, "ROS bag"):
+    with foreign_errors(path, "ROS bag"):
         types = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
         reader = highlevel.AnyReader([inside], default_typestore=types)
         try:
@@ -67,8 +67,8 @@ def bag_frames(reader: Any, path: Path, wanted: set[int]) -> tuple[Log, float]: 
     log: Log = {}
     first = np.inf
     topics = [connection for connection in reader.connections if connection.msgtype == FRAME]
-    with foreign(path, "ROS bag"):
-        for connection, _, time, message in _messages(reader, topics):
+    with foreign_errors(path, "ROS bag"):
+        for connection, _, time, message in _read_messages(reader, topics):
             first = min(first, time)
             if message.id in wanted and not message.is_error and not message.is_rtr:
                 key = topics.index(connection), int(message.id), bool(message.is_extended)
@@ -86,9 +86,9 @@ def read_bag(reader: Any, path: Path, wanted: set[str] | None) -> Recording:  # 
     times: dict[str, list[int]] = {}
     values: dict[str, list[float]] = {}
     first: int | None = None
-    with foreign(path, "ROS bag"):
+    with foreign_errors(path, "ROS bag"):
         leaves: dict[str, list[Leaf]] = {}
-        for connection, stored, time, message in _messages(reader, topics):
+        for connection, stored, time, message in _read_messages(reader, topics):
             first = stored if first is None else min(first, stored)
             topic = connection.topic
             if topic not in leaves:
@@ -105,7 +105,7 @@ def read_bag(reader: Any, path: Path, wanted: set[str] | None) -> Recording:  # 
     return recording
 
 
-def _messages(reader: Any, connections: list[Any]) -> Iterator[tuple[Any, int, int, Any]]:  # noqa: ANN401
+def _read_messages(reader: Any, connections: list[Any]) -> Iterator[tuple[Any, int, int, Any]]:  # noqa: ANN401
     """Connection, time of the recorder, time of the message [ns], message."""
     if not connections:
         return
@@ -133,12 +133,12 @@ def leaves_of(message: Any, prefix: str = "", depth: int = 0) -> Iterator[Leaf]:
         if isinstance(value, bool | int | float | np.number):
             yield path, take
         elif isinstance(value, np.ndarray | list | tuple):
-            yield from _elements(message, path, value, prefix)
+            yield from _array_leaves(message, path, value, prefix)
         elif depth < DEEPEST:
             yield from leaves_of(value, path, depth + 1)
 
 
-def _elements(message: Any, path: str, value: Any, prefix: str) -> Iterator[Leaf]:  # noqa: ANN401
+def _array_leaves(message: Any, path: str, value: Any, prefix: str) -> Iterator[Leaf]:  # noqa: ANN401
     if not 0 < len(value) <= LONGEST_ARRAY or not all(
         isinstance(v, int | float | np.number) for v in value
     ):
@@ -147,12 +147,12 @@ def _elements(message: Any, path: str, value: Any, prefix: str) -> Iterator[Leaf
     named = isinstance(labels, list) and len(labels) == len(value)
     take = attrgetter(path[1:])
     for index in range(len(value)):
-        yield f"{path}[{labels[index] if named else index}]", _at(take, index)  # type: ignore[index]
+        yield f"{path}[{labels[index] if named else index}]", _element_at(take, index)  # type: ignore[index]
 
 
-def _at(take: Callable[[Any], Any], index: int) -> Callable[[Any], Any]:
-    def element(message: Any) -> Any:  # noqa: ANN401
+def _element_at(take: Callable[[Any], Any], index: int) -> Callable[[Any], Any]:
+    def take_element(message: Any) -> Any:  # noqa: ANN401
         values = take(message)
         return values[index] if index < len(values) else float("nan")
 
-    return element
+    return take_element

@@ -17,7 +17,7 @@ import pyarrow.csv as pc_csv
 import pyarrow.parquet as pq
 
 from edge_agent.inputs.readers.racelogic import convert_vbo, has_vbo_columns
-from edge_agent.inputs.recording import Recording, Series, foreign
+from edge_agent.inputs.recording import Recording, Series, foreign_errors
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.thresholds import NS
@@ -55,25 +55,25 @@ def read_table(path: Path, time: str | None = None, time_unit: str | None = None
         InputError: the file is broken or empty, has no time, or its time goes back.
     """
     kind = "Parquet" if path.suffix == ".parquet" else "CSV"
-    with foreign(path, kind):
-        return _recording(path, kind, time, time_unit)
+    with foreign_errors(path, kind):
+        return _read_recording(path, kind, time, time_unit)
 
 
-def _recording(path: Path, kind: str, time: str | None, time_unit: str | None) -> Recording:
-    table = pq.ParquetFile(path).read() if kind == "Parquet" else _csv(path)
+def _read_recording(path: Path, kind: str, time: str | None, time_unit: str | None) -> Recording:
+    table = pq.ParquetFile(path).read() if kind == "Parquet" else _read_csv(path)
     if not table.num_rows:
         raise InputError(
             "source", f"{path} has no rows", "give a recording with at least one sample"
         )
     if has_vbo_columns(table.column_names):
-        found = {name: _numbers(table[name]) for name in table.column_names}
+        found = {name: _parse_numbers(table[name]) for name in table.column_names}
         return convert_vbo(
             path, {name: values for name, values in found.items() if values is not None}, {}
         )
     named = {_UNIT.sub(r"\g<name>", name).strip() or name: name for name in table.column_names}
     column = _time_column(path, named, time)
     unit = _UNIT.match(named[column])
-    t, start_ns = _seconds(
+    t, start_ns = _parse_seconds(
         table[named[column]], column, time_unit or (unit["unit"] if unit else None)
     )
     back = np.flatnonzero(~(np.diff(t) >= 0.0))
@@ -84,19 +84,19 @@ def _recording(path: Path, kind: str, time: str | None, time_unit: str | None) -
         )
     recording = Recording(path.name, {}, start_ns, rows=True)
     for name, whole in named.items():
-        if name != column and (values := _numbers(table[whole])) is not None:
+        if name != column and (values := _parse_numbers(table[whole])) is not None:
             unit = _UNIT.match(whole)
             recording.signals[name] = Series(t, values, unit["unit"] if unit else "")
     return recording
 
 
-def _csv(path: Path) -> pa.Table:
+def _read_csv(path: Path) -> pa.Table:
     with path.open("rb") as file:
         lines = [
             file.readline(65_536).decode("utf-8", errors="replace") for _ in range(LONGEST_PREAMBLE)
         ]
     if RACECHRONO in lines[0].lower():
-        return _racechrono(path, lines)
+        return _read_racechrono(path, lines)
     mark = max(",;\t", key=lines[0].count)
     table = pc_csv.read_csv(path, parse_options=pc_csv.ParseOptions(delimiter=mark))
     if mark == ";":  # decimal commas go with semicolons
@@ -110,7 +110,7 @@ def _csv(path: Path) -> pa.Table:
     return table
 
 
-def _racechrono(path: Path, lines: list[str]) -> pa.Table:
+def _read_racechrono(path: Path, lines: list[str]) -> pa.Table:
     """Return the table of RaceChrono's CSV version 3: a preamble, then names, units and sources, a
     row each.
 
@@ -132,20 +132,20 @@ def _racechrono(path: Path, lines: list[str]) -> pa.Table:
         unit = units[k].strip() if k < len(units) else ""
         title = (
             name
-            if all(_plain(other) != name for other in whole)
+            if all(_plain_title(other) != name for other in whole)
             else f"{name} {sources[k].strip()}"
         )
         whole.append(f"{title} [{unit}]" if unit and unit != "unix time" else title)
-    options = pc_csv.ReadOptions(skip_rows=skipped, column_names=_distinct(whole))
+    options = pc_csv.ReadOptions(skip_rows=skipped, column_names=_make_distinct(whole))
     return pc_csv.read_csv(path, read_options=options)
 
 
-def _distinct(names: list[str]) -> list[str]:
+def _make_distinct(names: list[str]) -> list[str]:
     """Return names of which no two are alike."""
     return [name if name not in names[:k] else f"{name} {k}" for k, name in enumerate(names)]
 
 
-def _plain(title: str) -> str:
+def _plain_title(title: str) -> str:
     return _UNIT.sub(r"\g<name>", title).strip()
 
 
@@ -180,7 +180,7 @@ def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
     )
 
 
-def _seconds(column: Any, name: str, unit: str | None) -> tuple[FloatArray, int | None]:  # noqa: ANN401 Arrow columns are not generic
+def _parse_seconds(column: Any, name: str, unit: str | None) -> tuple[FloatArray, int | None]:  # noqa: ANN401 Arrow columns are not generic
     """Seconds since the first row, and its ns UTC where the time is a date."""
     if pa.types.is_timestamp(column.type):
         ns = pc.cast(pc.cast(column, pa.timestamp("ns", tz=column.type.tz)), pa.int64())
@@ -208,7 +208,7 @@ def _seconds(column: Any, name: str, unit: str | None) -> tuple[FloatArray, int 
     return (t - t[0] if dated else t), start if dated else None
 
 
-def _numbers(column: Any) -> FloatArray | None:  # noqa: ANN401 Arrow columns are not generic
+def _parse_numbers(column: Any) -> FloatArray | None:  # noqa: ANN401 Arrow columns are not generic
     if not (
         pa.types.is_integer(column.type)
         or pa.types.is_floating(column.type)

@@ -23,7 +23,7 @@ from edge_agent.ahead.known import LocalMap
 from edge_agent.ahead.path import GivenRoute, Path, Pose, straight_path
 from edge_agent.ahead.roads import ways_on
 from edge_agent.ahead.warnings import Active, update_warnings
-from edge_agent.lab.ahead.known_town import heard, places_of
+from edge_agent.lab.ahead.known_town import map_of_places, places_of
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.observe.cell_tracker import locate_vehicles, new_tracks
 from schemas.numeric import FloatArray
@@ -80,12 +80,12 @@ class _Track:
     active: tuple[Active, ...] = ()
 
 
-def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
+def approach_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
     """Return shares and rates over drawn towns, with given routes and, for comparison, without."""
     found = {routed: Approaches() for routed in (True, False)}
     for seed in seeds:
         for routed, counts in found.items():
-            drive(seed, seconds, vehicles, counts, routed=routed)
+            drive_town(seed, seconds, vehicles, counts, routed=routed)
     out = []
     for routed, ending in ((True, ""), (False, ".unrouted")):
         counts = found[routed]
@@ -110,10 +110,12 @@ def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Fi
     return out
 
 
-def drive(seed: int, seconds: float, vehicles: int, counts: Approaches, *, routed: bool) -> None:
+def drive_town(
+    seed: int, seconds: float, vehicles: int, counts: Approaches, *, routed: bool
+) -> None:
     """Drive one town and add what happened to the counts."""
     fleet = SimulatedFleet(f"hills-{seed}", vehicles, seed, RATE_HZ, rough=0.5)
-    known = heard(places_of(fleet.scenario, AFTER_S), START_NS)
+    known = map_of_places(places_of(fleet.scenario, AFTER_S), START_NS)
     tracks = [_Track() for _ in range(vehicles)]
     located_tracks = new_tracks(vehicles)
     steps = round(RATE_HZ)
@@ -138,9 +140,9 @@ def drive(seed: int, seconds: float, vehicles: int, counts: Approaches, *, route
             track.mu.append(float(true.mu_wheel[:, k].min()))
             track.beside.append(float(beside[k]))
             if np.isfinite([latitude, longitude, yaw]).all():
-                _look(track, pose, known, _ways(fleet, k, pose, known, routed=routed))
+                _record_look(track, pose, known, _paths_of(fleet, k, pose, known, routed=routed))
     for track in tracks:
-        _judge(track, counts)
+        _count_outcome(track, counts)
 
 
 def _least_beside(fleet: SimulatedFleet, t: float) -> FloatArray:
@@ -162,7 +164,7 @@ def _least_beside(fleet: SimulatedFleet, t: float) -> FloatArray:
     return np.asarray(np.min(found, axis=(0, 1)))
 
 
-def _ways(
+def _paths_of(
     fleet: SimulatedFleet, k: int, pose: Pose, known: LocalMap, *, routed: bool
 ) -> list[Path]:
     length = horizon_length(pose.speed)
@@ -173,7 +175,7 @@ def _ways(
     return ways_on(pose, known.keys(), length) or [straight_path(pose, length)]
 
 
-def _look(track: _Track, pose: Pose, known: LocalMap, ways: list[Path]) -> None:
+def _record_look(track: _Track, pose: Pose, known: LocalMap, ways: list[Path]) -> None:
     track.active, issued = update_warnings(
         track.active, [look_ahead(way, known, pose.time) for way in ways], pose, known
     )
@@ -185,7 +187,7 @@ def _look(track: _Track, pose: Pose, known: LocalMap, ways: list[Path]) -> None:
             track.raised[one.id].ended = look
 
 
-def _judge(track: _Track, counts: Approaches) -> None:
+def _count_outcome(track: _Track, counts: Approaches) -> None:
     metre, speed, mu, beside = (
         np.array(column) for column in (track.metre, track.speed, track.mu, track.beside)
     )
@@ -200,7 +202,10 @@ def _judge(track: _Track, counts: Approaches) -> None:
             metre[look - 1]
         )  # the ice begins after the look before, at the latest by this one
         standing = (one.at for one in track.raised.values() if one.at < look < one.ended)
-        late = min((_short(metre, speed, mu, at, start) for at in standing), default=float("inf"))
+        late = min(
+            (_stopping_shortfall(metre, speed, mu, at, start) for at in standing),
+            default=float("inf"),
+        )
         counts.warned += late <= 0.0
         if late > 0.0:
             counts.short.append(late)
@@ -212,7 +217,9 @@ def _judge(track: _Track, counts: Approaches) -> None:
         counts.false += bool(whole and not (beside[ahead] < NEAR_SLIPPERY).any())
 
 
-def _short(metre: FloatArray, speed: FloatArray, mu: FloatArray, at: int, start: float) -> float:
+def _stopping_shortfall(
+    metre: FloatArray, speed: FloatArray, mu: FloatArray, at: int, start: float
+) -> float:
     """By how much the way to the stretch [m] is too short to stop on it, from look `at`; 0 or
     less: it is not.
     """

@@ -36,7 +36,7 @@ FRAME: Final = 40
 CENTRE: Final = Pose(57.70, 11.97, 0.0, SPEED, 1_800_000_000 * NS)
 
 
-def streets() -> IntArray:
+def street_places() -> IntArray:
     """Every place of the city's streets, sorted."""
     side = np.arange(0.0, BLOCK_M * BLOCKS, 4.0)
     line = np.arange(0.0, BLOCK_M * (BLOCKS + 1), BLOCK_M)
@@ -52,7 +52,7 @@ def streets() -> IntArray:
     return np.unique(np.concatenate(found))
 
 
-def way(rng: np.random.Generator, metres: float) -> FloatArray:
+def draw_way(rng: np.random.Generator, metres: float) -> FloatArray:
     """A drive through the city, corners (n, 2) [m]: at each crossing straight on, left or right,
     never out of it.
     """
@@ -72,14 +72,14 @@ def way(rng: np.random.Generator, metres: float) -> FloatArray:
     return np.array(corners) * BLOCK_M
 
 
-def figures(seed: int, metres: float) -> list[Figure]:
+def cost_figures(seed: int, metres: float) -> list[Figure]:
     """Return megabytes a day and the share of a core, with a given route and, for comparison,
     without.
     """
-    known = streets()
+    known = street_places()
     out = []
     for routed, ending in ((True, ""), (False, ".unrouted")):
-        megabytes, share = drive(np.random.default_rng(seed), known, metres, routed=routed)
+        megabytes, share = drive_way(np.random.default_rng(seed), known, metres, routed=routed)
         out += [
             Figure(
                 f"ahead.mb_per_day{ending}",
@@ -92,11 +92,11 @@ def figures(seed: int, metres: float) -> list[Figure]:
     return out
 
 
-def drive(
+def drive_way(
     rng: np.random.Generator, known: IntArray, metres: float, *, routed: bool
 ) -> tuple[float, float]:
     """Megabytes heard, and processor time over time driven."""
-    corners = way(rng, metres)
+    corners = draw_way(rng, metres)
     run = BLOCK_M * np.arange(len(corners))
     route = GivenRoute(*to_degrees(corners[:, 0], corners[:, 1], CENTRE))
     heard = LocalMap()
@@ -124,10 +124,13 @@ def drive(
             or [straight_path(pose, length)]
         )
         active, _ = update_warnings(
-            active, [look_ahead(path.near(length), heard, now) for path in paths], pose, heard
+            active,
+            [look_ahead(path.first_metres(length), heard, now) for path in paths],
+            pose,
+            heard,
         )
-        tiles.follow([path.near(length) for path in paths], pose)
-        boxes = [box for path in paths for box in asked.wanting(path, pose, length)]
+        tiles.update_subscriptions([path.first_metres(length) for path in paths], pose)
+        boxes = [box for path in paths for box in asked.missing_boxes(path, pose, length)]
         spent += time.process_time() - began
         for box in boxes:
             inside = known[grid.touches(box, grid.bounds(known // grid.SECTORS))]
@@ -137,9 +140,9 @@ def drive(
                 key = keys.map_key(one)
                 total += len(payload) + len(key) + FRAME
                 began = time.process_time()
-                heard.take(*decode_cells(key, payload, now), now)
+                heard.store_cells(*decode_cells(key, payload, now), now)
                 spent += time.process_time() - began
             total += FRAME * len(keys_of(box))
         if second % 2 == 0:
-            total += len(tiles.heard) * STANDING * (ALERT_BYTES + FRAME)
+            total += len(tiles.subscribed_tiles) * STANDING * (ALERT_BYTES + FRAME)
     return total / 1e6, spent / int(metres / SPEED)

@@ -19,8 +19,8 @@ import numpy as np
 from edge_agent.ahead.known import LocalMap
 from edge_agent.ahead.prior import NOWHERE, MapPrior
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.inputs.block import Block, absolute
-from edge_agent.lab.ahead.known_town import KnownPlaces, heard, places_of
+from edge_agent.inputs.block import Block, to_utc_ns
+from edge_agent.lab.ahead.known_town import KnownPlaces, map_of_places, places_of
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.simulation.roads import LanePoint
 from edge_agent.lab.simulation.scenarios import Scenario
@@ -54,25 +54,25 @@ class FilterTrace:
     published: list[bytes]
 
 
-def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
+def entry_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
     """Return ratios over all towns, and the largest change of a published value."""
     errors: list[FloatArray] = []
     delays: dict[str, list[tuple[float, float]]] = {"dry": [], "ice": []}
     nats = 0.0
     for seed in seeds:
         fleet = SimulatedFleet(f"hills-{seed}", vehicles, seed, RATE_HZ, rough=0.5)
-        trace = record(fleet, seconds)
+        trace = record_beliefs(fleet, seconds)
         scenario = fleet.scenario
         now = START_NS
         rng = np.random.default_rng(seed)
-        true_map = heard(places_of(scenario, seconds), now, rng)
-        old_map = heard(places_of(scenario, BEFORE_S), now, rng)
-        fake_map = heard(_with_fake_ice(scenario, seconds, rng), now, rng)
+        true_map = map_of_places(places_of(scenario, seconds), now, rng)
+        old_map = map_of_places(places_of(scenario, BEFORE_S), now, rng)
+        fake_map = map_of_places(_with_fake_ice(scenario, seconds, rng), now, rng)
         errors.append(entry_errors(trace, true_map, now))
         # where the old map says grip and there is ice; where the fake one says ice and there is
         # grip
         for name, wrong in (("ice", old_map), ("dry", fake_map)):
-            delays[name] += arrivals(trace, wrong, true_map, now)
+            delays[name] += arrival_times(trace, wrong, true_map, now)
         nats = max(nats, published_change(fleet, trace, seconds))
     with_, without = np.concatenate(errors).T
     out = [
@@ -81,12 +81,12 @@ def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Fi
         Figure("prior.entry_error.without", float(without.mean()), "mean |error|"),
     ]
     both = np.array([pair for pairs in delays.values() for pair in pairs]).reshape(-1, 2)
-    out.append(Figure("prior.wrong_map_delay_ratio", _ratio(both), "", 1.2))
+    out.append(Figure("prior.wrong_map_delay_ratio", _mean_ratio(both), "", 1.2))
     for name, pairs in delays.items():
         out.append(
             Figure(
                 f"prior.wrong_map_delay_ratio.{name}_there",
-                _ratio(np.array(pairs).reshape(-1, 2)),
+                _mean_ratio(np.array(pairs).reshape(-1, 2)),
                 "",
             )
         )
@@ -94,7 +94,9 @@ def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Fi
     return [*out, Figure("prior.evidence_nats", nats, "nat", 0.5)]
 
 
-def record(fleet: SimulatedFleet, seconds: float, prior: LocalMap | None = None) -> FilterTrace:
+def record_beliefs(
+    fleet: SimulatedFleet, seconds: float, prior: LocalMap | None = None
+) -> FilterTrace:
     """Drive and record the beliefs of the filters; with a `prior`, the car also hears that map."""
     vehicles = len(fleet.vehicles)
     config = AgentConfig()
@@ -104,7 +106,7 @@ def record(fleet: SimulatedFleet, seconds: float, prior: LocalMap | None = None)
     informed = MapPrior(vehicles)
     for _ in range(int(seconds * RATE_HZ / BLOCK)):
         t, signals = fleet.step(BLOCK)
-        _, seen, _ = pipeline.step(Block(t, absolute(t, START_NS), signals))
+        _, seen, _ = pipeline.step(Block(t, to_utc_ns(t, START_NS), signals))
         published += [row.tobytes() for row in seen.columns["log_likelihood"]]
         beliefs = pipeline.beliefs()
         if beliefs is None:
@@ -112,8 +114,8 @@ def record(fleet: SimulatedFleet, seconds: float, prior: LocalMap | None = None)
         if prior is not None:
             now = START_NS
             map_beliefs = {
-                k: _belief(prior, int(pipeline.places[k]), now)
-                for k in informed.enters(pipeline.places)
+                k: _belief_or_none(prior, int(pipeline.places[k]), now)
+                for k in informed.entered_vehicles(pipeline.places)
             }
             informed.step(pipeline.places, *beliefs, map_beliefs)
         columns.append((pipeline.places, *beliefs, fleet.truth.mu_wheel[-1].mean(axis=1)))
@@ -124,22 +126,22 @@ def record(fleet: SimulatedFleet, seconds: float, prior: LocalMap | None = None)
 def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
     """|error| of the median within FIRST_S of entering a cell that the map knows, (n, 2): with the map and without."""
     with_prior = with_map(trace, known, now)
-    alone = _medians(np.exp(trace.own))
+    alone = _median_friction(np.exp(trace.own))
     since = _since_entry(trace.place)
     first = (since * BLOCK / RATE_HZ < FIRST_S) & np.isin(trace.place, known.keys())
     first[: int(RATE_HZ / BLOCK * 5.0)] = False  # the first seconds of a drive are nobody's entry
     return np.column_stack([np.abs(one - trace.truth)[first] for one in (with_prior, alone)])
 
 
-def arrivals(
+def arrival_times(
     trace: FilterTrace, wrong: LocalMap, right: LocalMap, now: int
 ) -> list[tuple[float, float]]:
     """Seconds from where a map is wrong until |μ - truth| <= ARRIVED, with it and without; the
     stay, if never.
     """
-    differ = _differ(trace.place, wrong, right, now)
+    differ = _maps_differ(trace.place, wrong, right, now)
     with_prior = with_map(trace, wrong, now)
-    alone = _medians(np.exp(trace.own))
+    alone = _median_friction(np.exp(trace.own))
     out = []
     for k in range(trace.place.shape[1]):
         edges = np.flatnonzero(
@@ -164,8 +166,8 @@ def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) 
     again = SimulatedFleet(fleet.scenario, len(fleet.vehicles), seed, RATE_HZ, rough=0.5)
     short = min(seconds, 20.0)
     lie = places_of(fleet.scenario, 0.0)
-    heard_lie = heard(lie._replace(mu=np.where(lie.mu < 0.4, 0.9, 0.15)), START_NS)
-    other = record(again, short, heard_lie).published
+    heard_lie = map_of_places(lie._replace(mu=np.where(lie.mu < 0.4, 0.9, 0.15)), START_NS)
+    other = record_beliefs(again, short, heard_lie).published
     count = min(len(other), len(trace.published))
     if not count:
         return float("nan")
@@ -182,16 +184,18 @@ def with_map(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
     prior = MapPrior(trace.place.shape[1])
     out = np.empty(trace.place.shape)
     for t, place in enumerate(trace.place):
-        map_beliefs = {k: _belief(known, int(place[k]), now) for k in prior.enters(place)}
+        map_beliefs = {
+            k: _belief_or_none(known, int(place[k]), now) for k in prior.entered_vehicles(place)
+        }
         out[t] = mugrid.quantiles(prior.step(place, trace.own[t], trace.visit[t], map_beliefs), 0.5)
     return out
 
 
-def _belief(known: LocalMap, place: int, now: int) -> FloatArray | None:
-    return known.belief(place, now) if place != NOWHERE else None
+def _belief_or_none(known: LocalMap, place: int, now: int) -> FloatArray | None:
+    return known.belief_at(place, now) if place != NOWHERE else None
 
 
-def _medians(weights: FloatArray) -> FloatArray:
+def _median_friction(weights: FloatArray) -> FloatArray:
     return mugrid.quantiles(weights, 0.5)
 
 
@@ -202,7 +206,7 @@ def _since_entry(place: IntArray) -> IntArray:
     return out
 
 
-def _differ(place: IntArray, wrong: LocalMap, right: LocalMap, now: int) -> BoolArray:
+def _maps_differ(place: IntArray, wrong: LocalMap, right: LocalMap, now: int) -> BoolArray:
     """Where one map says slippery and the other does not."""
     keys, inverse = np.unique(place, return_inverse=True)
     one, other = (known.look_up(keys, now).mu for known in (wrong, right))
@@ -223,7 +227,7 @@ def _with_fake_ice(scenario: Scenario, t: float, rng: np.random.Generator) -> Kn
     return places._replace(mu=mu)
 
 
-def _ratio(pairs: FloatArray) -> float:
+def _mean_ratio(pairs: FloatArray) -> float:
     return (
         float(pairs[:, 0].sum() / pairs[:, 1].sum())
         if len(pairs) and pairs[:, 1].sum() > 0.0

@@ -41,7 +41,9 @@ def places_of(scenario: Scenario, t: float) -> KnownPlaces:
     return KnownPlaces(key[order][first], mu[order][first])
 
 
-def heard(places: KnownPlaces, now: int, rng: np.random.Generator | None = None) -> LocalMap:
+def map_of_places(
+    places: KnownPlaces, now: int, rng: np.random.Generator | None = None
+) -> LocalMap:
     """Return the local map of a car that has heard of all places, with their true friction or with
     random errors.
     """
@@ -58,5 +60,5 @@ def heard(places: KnownPlaces, now: int, rng: np.random.Generator | None = None)
     )
     tiles = grid.tile_of(places.key // grid.SECTORS)
     for tile in np.unique(tiles).tolist():
-        cache.take(tile, ReceivedCells._make(column[tiles == tile] for column in cells), now)
+        cache.store_cells(tile, ReceivedCells._make(column[tiles == tile] for column in cells), now)
     return cache

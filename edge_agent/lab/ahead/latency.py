@@ -40,7 +40,7 @@ ORIGIN: Final = Pose(57.70, 11.97, 0.0, SPEED, 0)
 
 
 @contextmanager
-def router() -> Iterator[ZenohSettings]:
+def open_router() -> Iterator[ZenohSettings]:
     """A router in this process, on a free port of loopback."""
     config = zenoh.Config()
     chosen = {
@@ -61,9 +61,9 @@ def router() -> Iterator[ZenohSettings]:
         yield ZenohSettings(connect=[json.loads(answer.payload.to_string())["locators"][0]])
 
 
-def figures(seed: int, alerts: int, vehicles: int = VEHICLES) -> list[Figure]:
+def latency_figures(seed: int, alerts: int, vehicles: int = VEHICLES) -> list[Figure]:
     """Quantiles of the time from put to warning, and the processor's share of looking."""
-    waited, share, lost = measure(np.random.default_rng(seed), alerts, vehicles)
+    waited, share, lost = measure_alerts(np.random.default_rng(seed), alerts, vehicles)
     return [
         Figure(
             "ahead.latency_p99_ms",
@@ -81,55 +81,57 @@ def figures(seed: int, alerts: int, vehicles: int = VEHICLES) -> list[Figure]:
     ]
 
 
-def measure(rng: np.random.Generator, alerts: int, vehicles: int) -> tuple[list[float], float, int]:
+def measure_alerts(
+    rng: np.random.Generator, alerts: int, vehicles: int
+) -> tuple[list[float], float, int]:
     """Seconds of each alert, share of a core per car, and alerts that no warning came of."""
     names = [f"car-{k:04d}" for k in range(vehicles)]
     warned: dict[str, queue.Queue[tuple[float, GripWarning]]] = {
         name: queue.Queue() for name in names
     }
 
-    def hear(name: str, warning: GripWarning) -> None:
+    def receive_warning(name: str, warning: GripWarning) -> None:
         warned[name].put((time.perf_counter(), warning))
 
     places = [to_degrees(np.zeros(1), np.array([APART_M * k]), ORIGIN) for k in range(vehicles)]
 
-    def poses() -> list[Pose]:
+    def current_poses() -> list[Pose]:
         now = time.time_ns()
         return [Pose(float(a[0]), float(o[0]), 0.0, SPEED, now) for a, o in places]
 
     waited: list[float] = []
     lost = 0
     with (
-        router() as settings,
+        open_router() as settings,
         MadeUpService(settings, time.time_ns()) as service,
         ExitStack() as stack,
     ):
-        lookout = Lookout(names, hear)
+        lookout = Lookout(names, receive_warning)
         for name in names:
             session = open_session(settings)
             assert session is not None
             stack.callback(session.close)
             lookout.attach(name, session)
-        lookout.see(poses())
+        lookout.see(current_poses())
         lookout.start()
         stack.callback(lookout.close)
         while lookout.counts.looks < 2 * vehicles:  # all have subscribed
             time.sleep(0.05)
-            lookout.see(poses())
+            lookout.see(current_poses())
         time.sleep(SETTLE_S)
         began = time.perf_counter()
         busy = lookout.counts.busy_s
         looks = lookout.counts.looks
         for k in rng.integers(0, vehicles, alerts).tolist():
-            lookout.see(poses())
+            lookout.see(current_poses())
             put = time.perf_counter()
-            service.put(_ice(places[k], raised=True))
+            service.put(_ice_alert(places[k], raised=True))
             try:
                 at, _ = warned[names[k]].get(timeout=PATIENCE_S)
                 waited.append(at - put)
             except queue.Empty:
                 lost += 1
-            service.put(_ice(places[k], raised=False))
+            service.put(_ice_alert(places[k], raised=False))
             try:
                 warned[names[k]].get(timeout=PATIENCE_S)
             except queue.Empty:
@@ -141,7 +143,7 @@ def measure(rng: np.random.Generator, alerts: int, vehicles: int) -> tuple[list[
     return waited, share, lost
 
 
-def _ice(place: tuple[FloatArray, FloatArray], *, raised: bool) -> Alert:
+def _ice_alert(place: tuple[FloatArray, FloatArray], *, raised: bool) -> Alert:
     pose = ORIGIN._replace(latitude=float(place[0][0]), longitude=float(place[1][0]))
     latitude, longitude = to_degrees(np.array([AHEAD_M]), np.zeros(1), pose)
     cell = int(grid.cell_of(latitude, longitude)[0])

@@ -82,10 +82,10 @@ class MadeUpService:
         assert session is not None
         self.session = session
         self._map = session.declare_queryable(
-            f"{keys.ROOT}/map/*/*/*/*", self._answer, complete=True
+            f"{keys.ROOT}/map/*/*/*/*", self._answer_query, complete=True
         )
         self._alerts = session.declare_queryable(
-            f"{keys.ROOT}/alert/*/*/*/*", self._stand, complete=True
+            f"{keys.ROOT}/alert/*/*/*/*", self._answer_standing, complete=True
         )
         return self
 
@@ -99,12 +99,12 @@ class MadeUpService:
             keys.alert_key(tile), wire.encode_alert(alert), encoding=wire.ALERT_ENCODING
         )
 
-    def tile(self, key: IntArray, mu: FloatArray) -> bytes:
+    def tile_answer(self, key: IntArray, mu: FloatArray) -> bytes:
         """Return the answer for places of a tile."""
         age = 1.0 if self.kept else 1.0 + (time.time_ns() - self.now) / NS
         return tile_payload(key, mu, self.now, age_s=np.full(len(key), age))
 
-    def _answer(self, asked: zenoh.Query) -> None:
+    def _answer_query(self, asked: zenoh.Query) -> None:
         with asked:
             self.asked.append(str(asked.selector))
             box = query.parse(dict(asked.parameters)).bbox  # type: ignore[call-overload]
@@ -114,9 +114,11 @@ class MadeUpService:
                 )
                 if len(inside) and asked.key_expr.intersects(zenoh.KeyExpr(keys.map_key(tile))):
                     mu = np.array([self.mu[k] for k in inside.tolist()])
-                    asked.reply(keys.map_key(tile), self.tile(inside, mu), encoding=wire.ARROW)
+                    asked.reply(
+                        keys.map_key(tile), self.tile_answer(inside, mu), encoding=wire.ARROW
+                    )
 
-    def _stand(self, asked: zenoh.Query) -> None:
+    def _answer_standing(self, asked: zenoh.Query) -> None:
         with asked:
             with self.lock:
                 standing = list(self.standing)

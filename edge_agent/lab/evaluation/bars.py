@@ -33,16 +33,16 @@ class EstimatorBar(NamedTuple):
     better: Literal["less", "more"]
 
 
-def of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[Results], float]:
+def mean_of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[Results], float]:
     """Mean over seeds of a measure with ordinary sensors."""
 
-    def read(results: Results) -> float:
+    def read_mean(results: Results) -> float:
         return mean(results.real.get((scenario, estimator), {}).get(measure))
 
-    return read
+    return read_mean
 
 
-def noise(experiment: str, measure: str) -> Callable[[Results], float]:
+def noise_mean(experiment: str, measure: str) -> Callable[[Results], float]:
     """Mean over seeds of a measure of paper 004's own experiments."""
     return lambda results: mean(results.noise.get((experiment, "paper-aco-fckf"), {}).get(measure))
 
@@ -76,7 +76,8 @@ def false_per_hour(results: Results) -> float:
 def both_stops(results: Results) -> float:
     """Coverage over the anti-lock stops on dry road and on snow."""
     return 0.5 * (
-        of("default.abs.dry", "coverage90")(results) + of("default.abs.snow", "coverage90")(results)
+        mean_of("default.abs.dry", "coverage90")(results)
+        + mean_of("default.abs.snow", "coverage90")(results)
     )
 
 
@@ -87,7 +88,7 @@ def on_foreign_tyres(results: Results) -> float:
 
 def width_ratio(results: Results) -> float:
     """Width of the interval over the prior's, straight on at constant speed."""
-    return of("default.straight", "width")(results) / PRIOR_WIDTH
+    return mean_of("default.straight", "width")(results) / PRIOR_WIDTH
 
 
 M_S = "m/s"
@@ -95,38 +96,54 @@ RAD_S = "rad/s"
 SHARE = "1"
 BARS: Final = (
     *(
-        EstimatorBar(f"papers.004.{kind}.mae_{name}", noise(kind, f"mae_{name}"), unit, bar, "less")
+        EstimatorBar(
+            f"papers.004.{kind}.mae_{name}", noise_mean(kind, f"mae_{name}"), unit, bar, "less"
+        )
         for kind in ("constant", "variable")
         for name, unit, bar in (("vx", M_S, 0.002), ("vy", M_S, 0.007), ("yaw_rate", RAD_S, 0.002))
     ),
-    EstimatorBar("default.dlc.mu_error", of("default.dlc", "mu_error"), SHARE, 0.05, "less"),
+    EstimatorBar("default.dlc.mu_error", mean_of("default.dlc", "mu_error"), SHARE, 0.05, "less"),
     EstimatorBar(
-        "default.dlc.coverage90", of("default.dlc", "end_coverage90"), SHARE, 0.85, "more"
+        "default.dlc.coverage90", mean_of("default.dlc", "end_coverage90"), SHARE, 0.85, "more"
     ),
-    EstimatorBar("papers.001.rmse_vx", of("001.dlc", "rmse_vx"), M_S, 0.02, "less"),
-    EstimatorBar("papers.001.rmse_vy", of("001.dlc", "rmse_vy"), M_S, 0.01, "less"),
-    EstimatorBar("papers.001.rmse_beta", of("001.dlc", "rmse_beta"), "rad", 0.001, "less"),
-    EstimatorBar("papers.002.sine.rmse_vx", of("002.sine", "rmse_vx"), M_S, 0.03, "less"),
-    EstimatorBar("papers.002.sine.rmse_vy", of("002.sine", "rmse_vy"), M_S, 0.03, "less"),
-    EstimatorBar("papers.002.jturn.rmse_vx", of("002.jturn", "rmse_vx"), M_S, 0.03, "less"),
-    EstimatorBar("papers.002.jturn.rmse_vy", of("002.jturn", "rmse_vy"), M_S, 0.03, "less"),
-    EstimatorBar("papers.003.accel.mu_error", of("003.accel", "mu_error"), SHARE, 0.08, "less"),
-    EstimatorBar("papers.003.turn.mu_error", of("003.turn", "mu_error"), SHARE, 0.05, "less"),
-    EstimatorBar("papers.003.split.low_error", of("003.split", "low_error"), SHARE, 0.07, "less"),
+    EstimatorBar("papers.001.rmse_vx", mean_of("001.dlc", "rmse_vx"), M_S, 0.02, "less"),
+    EstimatorBar("papers.001.rmse_vy", mean_of("001.dlc", "rmse_vy"), M_S, 0.01, "less"),
+    EstimatorBar("papers.001.rmse_beta", mean_of("001.dlc", "rmse_beta"), "rad", 0.001, "less"),
+    EstimatorBar("papers.002.sine.rmse_vx", mean_of("002.sine", "rmse_vx"), M_S, 0.03, "less"),
+    EstimatorBar("papers.002.sine.rmse_vy", mean_of("002.sine", "rmse_vy"), M_S, 0.03, "less"),
+    EstimatorBar("papers.002.jturn.rmse_vx", mean_of("002.jturn", "rmse_vx"), M_S, 0.03, "less"),
+    EstimatorBar("papers.002.jturn.rmse_vy", mean_of("002.jturn", "rmse_vy"), M_S, 0.03, "less"),
     EstimatorBar(
-        "papers.003.split.high_coverage90", of("003.split", "high_coverage90"), SHARE, 0.85, "more"
+        "papers.003.accel.mu_error", mean_of("003.accel", "mu_error"), SHARE, 0.08, "less"
     ),
-    EstimatorBar("papers.000.coverage90", of("000.jump", "coverage90"), SHARE, 0.87, "more"),
-    EstimatorBar("default.jump.accel_s", of("default.jump.accel", "arrival_s"), "s", 0.1, "less"),
-    EstimatorBar("default.jump.brake_s", of("default.jump.brake", "arrival_s"), "s", 0.25, "less"),
+    EstimatorBar("papers.003.turn.mu_error", mean_of("003.turn", "mu_error"), SHARE, 0.05, "less"),
+    EstimatorBar(
+        "papers.003.split.low_error", mean_of("003.split", "low_error"), SHARE, 0.07, "less"
+    ),
+    EstimatorBar(
+        "papers.003.split.high_coverage90",
+        mean_of("003.split", "high_coverage90"),
+        SHARE,
+        0.85,
+        "more",
+    ),
+    EstimatorBar("papers.000.coverage90", mean_of("000.jump", "coverage90"), SHARE, 0.87, "more"),
+    EstimatorBar(
+        "default.jump.accel_s", mean_of("default.jump.accel", "arrival_s"), "s", 0.1, "less"
+    ),
+    EstimatorBar(
+        "default.jump.brake_s", mean_of("default.jump.brake", "arrival_s"), "s", 0.25, "less"
+    ),
     EstimatorBar("default.jump.false_per_hour", false_per_hour, "1/h", 1.0, "less"),
     EstimatorBar("default.straight.width_ratio", width_ratio, SHARE, 0.8, "more"),
     EstimatorBar(
-        "default.straight.coverage90", of("default.straight", "coverage90"), SHARE, 0.9, "more"
+        "default.straight.coverage90", mean_of("default.straight", "coverage90"), SHARE, 0.9, "more"
     ),
     EstimatorBar("default.foreign_tyres.coverage90", on_foreign_tyres, SHARE, 0.85, "more"),
     EstimatorBar("default.abs.coverage90", both_stops, SHARE, 0.80, "more"),
-    EstimatorBar("default.spin.coverage90", of("default.spin", "coverage90"), SHARE, 0.80, "more"),
+    EstimatorBar(
+        "default.spin.coverage90", mean_of("default.spin", "coverage90"), SHARE, 0.80, "more"
+    ),
     EstimatorBar(
         "real_world.standing_5pct.v_max", in_the_world("standing_5pct.v_max"), M_S, 0.2, "less"
     ),
@@ -191,11 +208,11 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
     listed += worth.figures(results.worth)
     for kind, table in (("ideal", results.ideal), ("real", results.real)):
         for (scenario, estimator), found in table.items():
-            listed += _context(f"{kind}.{scenario}.{estimator}", found)
+            listed += _context_figures(f"{kind}.{scenario}.{estimator}", found)
     for (experiment, estimator), found in results.noise.items():
-        listed += _context(f"noise.004.{experiment}.{estimator}", found)
+        listed += _context_figures(f"noise.004.{experiment}.{estimator}", found)
     for (case, estimator), found in results.faults.items():
-        listed += _context(f"faults.{case}.{estimator}", found)
+        listed += _context_figures(f"faults.{case}.{estimator}", found)
     for name, errors in results.oracle.items():
         listed.append(Figure(f"oracle.{name}", mean(errors), unit_of(name)))
     for estimator, values in results.world.items():
@@ -203,14 +220,14 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
             Figure(f"world.{estimator}.{name}", value, unit_of(name))
             for name, value in values.items()
         ]
-    listed += _consistency(results)
+    listed += _consistency_figures(results)
     return listed + [
         Figure(f"foreign.{kind}.coverage90", mean(value), SHARE)
         for kind, value in results.foreign.items()
     ]
 
 
-def _consistency(results: Results) -> list[Figure]:
+def _consistency_figures(results: Results) -> list[Figure]:
     """Bounds of NEES and NIS, and the reliability of every estimator over all scenarios."""
     listed = []
     for measure in COMPONENTS if results.seeds else ():
@@ -224,7 +241,7 @@ def _consistency(results: Results) -> list[Figure]:
     return listed
 
 
-def _context(prefix: str, found: dict[str, FloatArray]) -> list[Figure]:
+def _context_figures(prefix: str, found: dict[str, FloatArray]) -> list[Figure]:
     listed = []
     for measure, values in found.items():
         listed.append(Figure(f"{prefix}.{measure}", mean(values), unit_of(measure)))

@@ -71,7 +71,7 @@ def realistic(
     scenario: DriveSpec, seeds: Sequence[int], sensors: str | Sensors = USUAL
 ) -> DriveSet:
     """One drive per seed with ordinary sensors, of a vehicle known to a few per cent."""
-    return joined([_drive(scenario, seed, sensors, 1) for seed in seeds])
+    return join_drives([_simulate_drive(scenario, seed, sensors, 1) for seed in seeds])
 
 
 def ideal(scenario: DriveSpec) -> DriveSet:
@@ -79,10 +79,12 @@ def ideal(scenario: DriveSpec) -> DriveSet:
     sampled at the rate.
     """
     step = max(1, round(FINE_HZ / scenario.rate_hz))
-    return joined([_drive(replace(scenario, rate_hz=scenario.rate_hz * step), 0, "ideal", step)])
+    return join_drives(
+        [_simulate_drive(replace(scenario, rate_hz=scenario.rate_hz * step), 0, "ideal", step)]
+    )
 
 
-def _drive(
+def _simulate_drive(
     scenario: DriveSpec, seed: int, sensors: str | Sensors, step: int
 ) -> tuple[pa.Table, Vehicle]:
     log, vehicle = simulate_manoeuvre(
@@ -101,25 +103,25 @@ def _drive(
     return log.take(np.arange(0, len(log), step)), vehicle
 
 
-def joined(drives: Sequence[tuple[pa.Table, Vehicle]]) -> DriveSet:
+def join_drives(drives: Sequence[tuple[pa.Table, Vehicle]]) -> DriveSet:
     """Drives of one length side by side."""
 
-    def column(name: str) -> FloatArray:
+    def stack_column(name: str) -> FloatArray:
         return np.stack(
             [log[name].to_numpy(zero_copy_only=False) for log, _ in drives], axis=1
         ).astype(float)
 
     names = [name for name in drives[0][0].column_names if name.startswith("true_")]
-    signals = np.stack([column(name) for name in CHANNELS], axis=-1)
+    signals = np.stack([stack_column(name) for name in CHANNELS], axis=-1)
     return DriveSet(
-        column("t"),
+        stack_column("t"),
         signals,
-        {name: column(name) for name in names},
+        {name: stack_column(name) for name in names},
         [vehicle for _, vehicle in drives],
     )
 
 
-def repeated(batch: DriveSet, count: int) -> DriveSet:
+def repeat_drive(batch: DriveSet, count: int) -> DriveSet:
     """The one drive of a batch `count` times, for noise to be laid on it."""
     truth = {name: np.repeat(value, count, axis=1) for name, value in batch.truth.items()}
     return DriveSet(

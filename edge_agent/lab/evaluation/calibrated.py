@@ -11,8 +11,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.calibration.learn import learn
-from edge_agent.inputs.correct import corrected
+from edge_agent.calibration.learn import learn_calibration
+from edge_agent.inputs.correct import correct_log
 from edge_agent.lab.evaluation.planted import RATE_HZ, drives
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.simulation.fleet import VEHICLE_STREAM
@@ -33,7 +33,7 @@ SETTLED_S: Final = 10.0  # of it that are left out
 ESTIMATOR: Final = "aco-fckf"
 
 
-def truth(seed: int, car: int) -> dict[str, float]:
+def true_errors(seed: int, car: int) -> dict[str, float]:
     """Return the true device errors of a rough car."""
     error = error_row(ROUGH_FLEET, GOTHENBURG, seed, car)
     mounted = error[ErrorColumn.MOUNTED :]
@@ -53,11 +53,11 @@ def truth(seed: int, car: int) -> dict[str, float]:
         },
         # front and rear tyres of the simulated cars have one stiffness over load
         "understeer": 0.0,
-        "force_gain": float(error[ErrorColumn.GAIN + S.TORQUE]) * _heavier(seed, car),
+        "force_gain": float(error[ErrorColumn.GAIN + S.TORQUE]) * _mass_radius_ratio(seed, car),
     }
 
 
-def _heavier(seed: int, car: int) -> float:
+def _mass_radius_ratio(seed: int, car: int) -> float:
     """True mass times radius over those of the vehicle file."""
     rng = np.random.default_rng([seed, car, VEHICLE_STREAM])
     true = one_of_a_fleet(car, "car", rng)
@@ -76,24 +76,26 @@ class Narrowed(NamedTuple):
     coverage: float
 
 
-def narrowed(cars: int, seed: int, judged_s: int = JUDGED_S) -> Narrowed:
+def learn_and_narrow(cars: int, seed: int, judged_s: int = JUDGED_S) -> Narrowed:
     """Rough cars that learn from DRIVES drives, and are judged on the drive after them."""
     fleet = SimulatedFleet("hills", cars, seed, RATE_HZ, rough=1.0)
-    t, signals = _driven(fleet, DRIVES * DRIVE_S)[:2]
+    t, signals = _drive_fleet(fleet, DRIVES * DRIVE_S)[:2]
     size = len(t) // DRIVES
     parts = [slice(k * size, (k + 1) * size) for k in range(DRIVES)]
     learned = [
         vehicle.model_copy(
-            update={"calibration": learn([(t[p, n], signals[p, n]) for p in parts], vehicle)}
+            update={
+                "calibration": learn_calibration([(t[p, n], signals[p, n]) for p in parts], vehicle)
+            }
         )
         for n, vehicle in enumerate(fleet.vehicles)
     ]
-    t, signals, mu = _driven(fleet, judged_s)
+    t, signals, mu = _drive_fleet(fleet, judged_s)
     judged = slice(round(SETTLED_S * RATE_HZ), None)
     found = []
     for vehicles in (fleet.vehicles, learned):
         mended = np.stack(
-            [corrected(t[:, n], signals[:, n], vehicle) for n, vehicle in enumerate(vehicles)],
+            [correct_log(t[:, n], signals[:, n], vehicle) for n, vehicle in enumerate(vehicles)],
             axis=1,
         )
         estimated = bank_of(ESTIMATOR, vehicles).advance(t, mended)
@@ -105,7 +107,7 @@ def narrowed(cars: int, seed: int, judged_s: int = JUDGED_S) -> Narrowed:
     return Narrowed(*found)
 
 
-def _driven(fleet: SimulatedFleet, seconds: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _drive_fleet(fleet: SimulatedFleet, seconds: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Times (T, N), signals (T, N, 18), and true friction, the mean of the wheels (T, N)."""
     parts = []
     for _ in range(seconds):
@@ -118,7 +120,7 @@ def _driven(fleet: SimulatedFleet, seconds: int) -> tuple[FloatArray, FloatArray
 def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
     """Width with calibration over without, and both coverages."""
     groups = [
-        narrowed(min(CARS_AT_ONCE, cars - k), seed + k, judged_s)
+        learn_and_narrow(min(CARS_AT_ONCE, cars - k), seed + k, judged_s)
         for k in range(0, cars, CARS_AT_ONCE)
     ]
     plain, plain_coverage, width, coverage = (
@@ -144,8 +146,10 @@ def figures(cars: int, seed: int) -> list[Figure]:
         ):
             size = len(drive.t) // DRIVES
             parts = [slice(k * size, (k + 1) * size) for k in range(DRIVES)]
-            learned = learn([(drive.t[part], drive.signals[part]) for part in parts], drive.vehicle)
-            for name, value in truth(at, car).items():
+            learned = learn_calibration(
+                [(drive.t[part], drive.signals[part]) for part in parts], drive.vehicle
+            )
+            for name, value in true_errors(at, car).items():
                 if (estimate := getattr(learned, name)) is not None:
                     key = "radius" if name.startswith("radius") else name
                     away.setdefault(key, []).append((estimate[0] - value) / estimate[1])

@@ -18,11 +18,11 @@ from edge_agent.estimators import (
     compensated_wckf,
 )
 from edge_agent.lab.evaluation import faults, oracle, real_world, worth
-from edge_agent.lab.evaluation.batch import DriveSet, estimates, ideal, realistic, repeated
+from edge_agent.lab.evaluation.batch import DriveSet, estimates, ideal, realistic, repeat_drive
 from edge_agent.lab.evaluation.measures import arrival, consistency, false_changes, measures, sides
 from edge_agent.lab.evaluation.paper_004 import experiments
 from edge_agent.lab.evaluation.real_world import RealWorldResults
-from edge_agent.lab.evaluation.reliability import watched
+from edge_agent.lab.evaluation.reliability import estimate_with_ranks
 from edge_agent.lab.evaluation.scenarios import FOREIGN, OTHERS, PAPERS, VEHICLES, foreign
 from schemas.numeric import FloatArray
 
@@ -74,7 +74,7 @@ class Results:
     drives: dict[tuple[str, str], PlottedDrive] = field(default_factory=dict)
 
 
-def run(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str], None]) -> Results:
+def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str], None]) -> Results:
     """All measurements; `log_line` is given one line of progress at a time."""
     results = Results(seeds=len(seeds))
     names = QUICK_ESTIMATORS if quick else tuple(ESTIMATORS)
@@ -86,16 +86,16 @@ def run(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str], None]) -
         if quick and name not in QUICK_SCENARIOS:
             continue
         batch = realistic(scenario, seeds)
-        exact = repeated(ideal(scenario), 1) if name in PAPERS and not quick else None
+        exact = repeat_drive(ideal(scenario), 1) if name in PAPERS and not quick else None
         for estimator in names if name in PAPERS else (DEFAULT,):
-            reported, ranks = watched(bank_of(estimator, batch.vehicles), batch)
-            results.real[name, estimator] = _all(name, batch, reported) | consistency(
+            reported, ranks = estimate_with_ranks(bank_of(estimator, batch.vehicles), batch)
+            results.real[name, estimator] = _all_measures(name, batch, reported) | consistency(
                 batch, reported
             )
             results.ranks.setdefault(estimator, []).append(ranks.ravel())
             results.drives[name, estimator] = PlottedDrive(batch, reported)
             if exact is not None:
-                results.ideal[name, estimator] = _all(
+                results.ideal[name, estimator] = _all_measures(
                     name, exact, estimates(_as_in_paper(estimator, exact), exact)
                 )
         log_line(f"{name}: {scenario.about or scenario.manoeuvre}, {len(seeds)} drives")
@@ -131,7 +131,7 @@ def _as_in_paper(estimator: str, batch: DriveSet) -> EstimatorBank:
     return bank_of(estimator, batch.vehicles)
 
 
-def _all(name: str, batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
+def _all_measures(name: str, batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     found = measures(batch, reported)
     if "split" in name:
         found |= sides(batch, reported)

@@ -32,7 +32,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_agent.lab.evaluation.detection_drives import RATE_HZ, DetectionDrive, slippery_favoured
-from edge_agent.lab.evaluation.real_world import FALSE_GRIP, SETTLED_S, interval_score, lately
+from edge_agent.lab.evaluation.real_world import (
+    FALSE_GRIP,
+    SETTLED_S,
+    interval_score,
+    recent_maximum,
+)
 from edge_agent.lab.evaluation.slide_oracle import visit_evidence
 from edge_agent.lab.evaluation.slip_flag import FLAGGED_MU
 from schemas.numeric import FloatArray
@@ -77,7 +82,7 @@ class DetectionTally:
         self.total[name] = self.total.get(name, 0.0) + float(np.sum(values, dtype=np.float64))
         self.count[name] = self.count.get(name, 0) + int(np.size(values))
 
-    def note(self, name: str, *, holds: bool) -> None:
+    def add_case(self, name: str, *, holds: bool) -> None:
         """Add one case to a share."""
         self.add(name, np.array([holds]))
 
@@ -174,10 +179,10 @@ def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
     grips = mu > SNOW_MU
     tally.add("false_grip", (drive.lower > mu + FALSE_GRIP)[ice])
     tally.add("false_grip.sure", (drive.lower > SLIPPERY_MU)[ice])
-    excited = lately(drive.used.max(axis=-1)) >= EXCITED_SHARE
+    excited = recent_maximum(drive.used.max(axis=-1)) >= EXCITED_SHARE
     tally.add("warned", called[ice & excited])
     tally.add("false_ice", called[grips])
-    settled = grips & ~lately(~grips, SETTLED_S).astype(bool)
+    settled = grips & ~recent_maximum(~grips, SETTLED_S).astype(bool)
     tally.add("false_ice.settled", called[settled])
     tally.add("km", np.array([float(drive.speed[settled].sum(dtype=np.float64)) / RATE_HZ / 1e3]))
     contradicted = (drive.health & int(Health.CONTRADICTION)) > 0
@@ -198,20 +203,20 @@ def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
             called = drive.upper[first:end, n] < SLIPPERY_MU
             flag = drive.flagged[first:end, n] < FLAGGED_MU
             if drive.stood[first:end, n].any():
-                tally.note(f"passes.{kind}.stood", holds=bool(called.any()))
+                tally.add_case(f"passes.{kind}.stood", holds=bool(called.any()))
                 continue
-            tally.note(f"passes.{kind}", holds=bool(called.any()))
-            tally.note(f"flag.passes.{kind}", holds=bool(flag.any()))
-            tally.note(
+            tally.add_case(f"passes.{kind}", holds=bool(called.any()))
+            tally.add_case(f"flag.passes.{kind}", holds=bool(flag.any()))
+            tally.add_case(
                 f"controller.passes.{kind}", holds=bool(drive.controlled[first:end, n].any())
             )
-            tally.note(f"either.passes.{kind}", holds=bool(flag.any() or called.any()))
+            tally.add_case(f"either.passes.{kind}", holds=bool(flag.any() or called.any()))
             for nats in ROC_NATS:
-                tally.note(
+                tally.add_case(
                     f"roc.{nats:g}.{kind}", holds=bool((drive.favoured[first:end, n] > nats).any())
                 )
             for mu in ROC_FLAG_MU:
-                tally.note(
+                tally.add_case(
                     f"flag.{mu:g}.{kind}", holds=bool((drive.flagged[first:end, n] < mu).any())
                 )
             slid = next(((max(a, first), b) for a, b in slides if b > first and a < end), None)
@@ -219,8 +224,8 @@ def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
                 continue
             activity = activity_of(drive, n, slid[0], min(slid[1], end))
             for among in ("slide", activity):
-                tally.note(f"passes.{kind}.{among}", holds=bool(called.any()))
-                tally.note(f"flag.passes.{kind}.{among}", holds=bool(flag.any()))
+                tally.add_case(f"passes.{kind}.{among}", holds=bool(called.any()))
+                tally.add_case(f"flag.passes.{kind}.{among}", holds=bool(flag.any()))
             for name, found in (("seconds", called), ("flag.seconds", flag)):
                 if found.any():
                     wait = max(0.0, (first + int(np.argmax(found)) - slid[0]) / RATE_HZ)
@@ -238,7 +243,7 @@ def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
         told = bool((drive.upper[first:late, n] < SLIPPERY_MU).any())
         four = bridge_gaps(np.asarray(beyond[first:end].all(axis=1)), BRIDGED_S)
         whole = any(b - a >= round(TOLD_SLIDE_S * RATE_HZ) for a, b in runs_of(four))
-        tally.note("slide.told.all_wheels" if whole else "slide.told.some_wheels", holds=told)
+        tally.add_case("slide.told.all_wheels" if whole else "slide.told.some_wheels", holds=told)
 
 
 def _judge_contradictions(
@@ -257,7 +262,7 @@ def _judge_contradictions(
     onset = np.flatnonzero(flagged[1:] & ~flagged[:-1]) + 1
     # a slide may end on dry road: what counts is that it was on slippery road within the last
     # moment
-    was_low = lately(low[:, None], AFTER_SLIDE_S)[:, 0].astype(bool)
+    was_low = recent_maximum(low[:, None], AFTER_SLIDE_S)[:, 0].astype(bool)
     in_slide = extended[onset]
     tally.add("contradictions.slide", np.array([float((in_slide & was_low[onset]).sum())]))
     tally.add("contradictions.elsewhere", np.array([float((~in_slide).sum())]))
@@ -270,7 +275,7 @@ def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) ->
     flag.
     """
     grips = drive.mu[:, n] > SNOW_MU
-    settled = grips & ~lately(~grips[:, None], SETTLED_S)[:, 0].astype(bool)
+    settled = grips & ~recent_maximum(~grips[:, None], SETTLED_S)[:, 0].astype(bool)
     ways = {
         "false_events": drive.upper[:, n] < SLIPPERY_MU,
         "flag.false_events": drive.flagged[:, n] < FLAGGED_MU,
@@ -293,7 +298,9 @@ def _judge_visits(
             continue
         likelihood = visits.likelihood[v]
         if float(mu.min()) > SNOW_MU:
-            tally.note("false_visits", holds=bool(slippery_favoured(likelihood) >= FAVOURED_NATS))
+            tally.add_case(
+                "false_visits", holds=bool(slippery_favoured(likelihood) >= FAVOURED_NATS)
+            )
         if float(np.ptp(mu)) >= MOVES or float(mu.mean()) > SNOW_MU:
             continue
         kind = "ice" if float(mu.mean()) <= ICE_MU else "snow"
@@ -319,8 +326,8 @@ def _note_visit(
     value = bool(likelihood.max() - likelihood[-1] >= VALUE_NATS)
     favoured = bool(slippery_favoured(likelihood) >= FAVOURED_NATS)
     for among in ("", ".slide") if slid[0] else ("", ".calm"):
-        tally.note(f"{kind}yield{among}{slid[1]}", holds=value)
-        tally.note(f"{kind}favoured{among}{slid[1]}", holds=favoured)
+        tally.add_case(f"{kind}yield{among}{slid[1]}", holds=value)
+        tally.add_case(f"{kind}favoured{among}{slid[1]}", holds=favoured)
 
 
 class TownTally(NamedTuple):

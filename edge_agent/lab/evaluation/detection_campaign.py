@@ -31,7 +31,7 @@ from edge_agent.lab.evaluation.detection_drives import (
 from edge_agent.lab.evaluation.real_world import in_winter
 from edge_agent.lab.evaluation.report import detection_table
 from edge_agent.lab.simulation import SimulatedFleet
-from edge_agent.lab.simulation.scenarios import drawn, winter
+from edge_agent.lab.simulation.scenarios import drawn_town, winter
 from schemas.errors import InputError
 from schemas.runtime.figures import Figure
 
@@ -86,7 +86,7 @@ def towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
 
 def drive_town(town: DetectionTown, make_bank: BankMaker) -> DetectionDrive:
     """Drive and estimate a town."""
-    scenario = winter(town.seed) if town.winter else drawn(town.seed)
+    scenario = winter(town.seed) if town.winter else drawn_town(town.seed)
     rough = float(town.kind == "rough")
     fleet = SimulatedFleet(
         scenario, town.cars, town.seed, RATE_HZ, rough=rough, winter=float(town.winter)

@@ -129,7 +129,7 @@ def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> D
         flagged=flagged,
         controlled=controlled,
         stood=stood,
-        visits=_joined(visits),
+        visits=_join_visits(visits),
     )
 
 
@@ -213,7 +213,7 @@ def _bytes_of(column: NDArray[np.generic]) -> NDArray[np.uint8]:
     return found if found.shape[1] else np.zeros((len(found), mugrid.BINS), np.uint8)
 
 
-def _joined(parts: list[DetectionVisits]) -> DetectionVisits:
+def _join_visits(parts: list[DetectionVisits]) -> DetectionVisits:
     return DetectionVisits(
         np.concatenate([part.vehicle for part in parts]),
         np.concatenate([part.first for part in parts]),

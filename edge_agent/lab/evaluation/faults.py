@@ -15,7 +15,7 @@ import numpy as np
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
 from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, estimates, realistic
-from edge_agent.lab.evaluation.measures import covered, errors
+from edge_agent.lab.evaluation.measures import errors, is_covered
 from edge_agent.lab.evaluation.scenarios import SEDAN
 from edge_agent.lab.simulation import Fault
 from edge_agent.lab.simulation.faults import apply_faults
@@ -40,7 +40,7 @@ def in_order(t: FloatArray) -> FloatArray:
     return t
 
 
-def gap(t: FloatArray) -> FloatArray:
+def kept_samples(t: FloatArray) -> FloatArray:
     """Return the samples that remain after three seconds without samples: a drive with a hole in
     it.
     """
@@ -65,7 +65,7 @@ class Case:
     clock: Callable[[FloatArray], FloatArray] = in_order
 
 
-def during(kind: str, *channels: str, size: float = 0.0) -> tuple[Fault, ...]:
+def fault_on(kind: str, *channels: str, size: float = 0.0) -> tuple[Fault, ...]:
     """The fault on some channels from BEGINS to ENDS."""
     return tuple(Fault(kind, channel, BEGINS, ENDS, size) for channel in channels)
 
@@ -73,25 +73,27 @@ def during(kind: str, *channels: str, size: float = 0.0) -> tuple[Fault, ...]:
 CASES: Final = {
     "none": Case((), Health.OK, "the drives as they are, for comparison"),
     "inertial-dropout": Case(
-        during("dropout", "ax", "ay", "yaw_rate"),
+        fault_on("dropout", "ax", "ay", "yaw_rate"),
         Health.NO_INERTIAL,
         "motion is carried by the wheels with wider spread; nothing is concluded on friction",
     ),
     "steering-dropout": Case(
-        during("dropout", "delta"),
+        fault_on("dropout", "delta"),
         Health.NO_STEERING,
         "the last angle is held; axles say nothing of friction",
     ),
     "wheel-speed-stuck": Case(
-        during("stuck", "omega_fl"), Health.OK, "not told; a wheel that seems to slide is outvoted"
+        fault_on("stuck", "omega_fl"),
+        Health.OK,
+        "not told; a wheel that seems to slide is outvoted",
     ),
     "spikes-beyond-belief": Case(
-        during("spike", "omega_fl", size=900.0) + during("spike", "ay", size=60.0),
+        fault_on("spike", "omega_fl", size=900.0) + fault_on("spike", "ay", size=60.0),
         Health.OUTLIER,
         "refused reading by reading",
     ),
     "believable-spikes": Case(
-        during("spike", "omega_fl", size=8.0) + during("spike", "ax", size=5.0),
+        fault_on("spike", "omega_fl", size=8.0) + fault_on("spike", "ax", size=5.0),
         Health.OK,
         "not told by all; an acceleration that jumps is refused once, a wheel that does is trusted "
         "less",
@@ -122,7 +124,10 @@ CASES: Final = {
         "estimates as before; no visit, so no observation",
     ),
     "time-gap": Case(
-        (), Health.TIME_GAP, "motion begins anew, friction fades over the metres missed", gap
+        (),
+        Health.TIME_GAP,
+        "motion begins anew, friction fades over the metres missed",
+        kept_samples,
     ),
     "sample-out-of-order": Case(
         (), Health.TIME_GAP, "left out, the estimate before is repeated", late_samples
@@ -130,7 +135,7 @@ CASES: Final = {
 }
 
 
-def harmed(batch: DriveSet, case: Case) -> DriveSet:
+def apply_fault(batch: DriveSet, case: Case) -> DriveSet:
     """The drives with the fault in their signals and on their clock."""
     each = [
         apply_faults(batch.t[:, n], batch.signals[:, n], case.faults)
@@ -139,7 +144,7 @@ def harmed(batch: DriveSet, case: Case) -> DriveSet:
     return replace(batch, t=case.clock(batch.t), signals=np.stack(each, axis=1))
 
 
-def outcome(batch: DriveSet, reported: Estimates, case: Case) -> dict[str, FloatArray]:
+def case_measures(batch: DriveSet, reported: Estimates, case: Case) -> dict[str, FloatArray]:
     """Return the measures of a case, per drive: `finite`, `told` (1 or 0), coverage and width from
     BEGINS on, RMSE.
     """
@@ -149,7 +154,7 @@ def outcome(batch: DriveSet, reported: Estimates, case: Case) -> dict[str, Float
     found = {
         "finite": (whole & ordered).all(axis=0).astype(float),
         "told": ((reported.health & int(case.flag)) != 0).any(axis=0).astype(float),
-        "coverage90": covered(batch, reported)[after].mean(axis=0),
+        "coverage90": is_covered(batch, reported)[after].mean(axis=0),
         "width": (reported.mu_upper - reported.mu_lower)[after].mean(axis=0),
     }
     for name in ("vx", "vy"):
@@ -167,9 +172,11 @@ def campaign(
         for estimator in estimators:
             parts = []
             for batch in batches:
-                broken = harmed(batch, case)
+                broken = apply_fault(batch, case)
                 parts.append(
-                    outcome(broken, estimates(bank_of(estimator, broken.vehicles), broken), case)
+                    case_measures(
+                        broken, estimates(bank_of(estimator, broken.vehicles), broken), case
+                    )
                 )
             found[name, estimator] = {
                 key: np.concatenate([part[key] for part in parts]) for key in parts[0]

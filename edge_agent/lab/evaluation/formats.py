@@ -16,13 +16,13 @@ import pyarrow.parquet as pq
 
 from edge_agent.inputs.live.ros2 import CAN_FRAME
 from edge_agent.inputs.readers.rosbag import FRAME
-from edge_agent.inputs.recording import library
+from edge_agent.inputs.recording import import_optional
 from schemas.thresholds import NS
 
 
 def as_log(path: Path, messages: Sequence[Any]) -> Path:
     """A CAN log by python-can; the ending says which."""
-    with library("can").Logger(str(path)) as writer:
+    with import_optional("can").Logger(str(path)) as writer:
         for message in messages:
             writer(message)
     return path
@@ -30,7 +30,7 @@ def as_log(path: Path, messages: Sequence[Any]) -> Path:
 
 def as_mf4(path: Path, messages: Sequence[Any]) -> Path:
     """A bus log by asammdf, in the layout of its standard."""
-    asammdf = library("asammdf")
+    asammdf = import_optional("asammdf")
     types = np.dtype(
         [
             ("CAN_DataFrame.BusChannel", "<u1"),
@@ -64,8 +64,8 @@ def as_mf4(path: Path, messages: Sequence[Any]) -> Path:
 
 def as_bag(folder: Path, messages: Sequence[Any], storage: str = "mcap") -> Path:
     """A bag of can_msgs/Frame by rosbags."""
-    rosbag2 = library("rosbags.rosbag2")
-    typesys = library("rosbags.typesys")
+    rosbag2 = import_optional("rosbags.rosbag2")
+    typesys = import_optional("rosbags.typesys")
     types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     types.register(typesys.get_types_from_msg(CAN_FRAME, FRAME))
     kind, header, time = (

@@ -14,11 +14,11 @@ import numpy as np
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.bring_in import read_source, write_log
-from edge_agent.inputs.merge import merge
-from edge_agent.inputs.profile import Channel, Profile, load_profile, shipped
+from edge_agent.inputs.merge import merge_recordings
+from edge_agent.inputs.profile import Channel, Profile, load_profile, shipped_profiles
 from edge_agent.inputs.readers.can_log import log_frames
 from edge_agent.inputs.readers.dbc import LONGEST, Database, parse_dbc, read_dbc
-from edge_agent.inputs.recording import library
+from edge_agent.inputs.recording import import_optional
 from edge_agent.inputs.signal_log import read_log
 from edge_agent.lab.evaluation.formats import as_bag, as_csv, as_log, as_mf4
 from edge_agent.lab.evaluation.planted import Recorded, drives
@@ -43,12 +43,12 @@ def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
     """
     wrong = compared = 0
     rng = np.random.default_rng(seed)
-    for name in shipped():
+    for name in shipped_profiles():
         profile, folder = load_profile(name)
         if profile.dbc is None:
             continue
         ours = read_dbc(folder / profile.dbc)
-        oracle = library("cantools", "dev").database.load_file(folder / profile.dbc)
+        oracle = import_optional("cantools", "dev").database.load_file(folder / profile.dbc)
         frames = {
             message.name: [rng.bytes(message.length) for _ in range(MADE)]
             for message in oracle.messages
@@ -58,16 +58,16 @@ def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
             for message in oracle.messages:
                 for (_, identifier, extended), heard in log.items():
                     if (identifier, extended) == (message.frame_id, message.is_extended_frame):
-                        data = heard.columns()[1]
+                        data = heard.to_columns()[1]
                         frames[message.name] += [bytes(row[: message.length]) for row in data]
         for message in oracle.messages:
-            errors, values = _against(ours, message, frames[message.name])
+            errors, values = _compare_decoders(ours, message, frames[message.name])
             wrong = wrong + errors
             compared = compared + values
     return wrong, compared
 
 
-def _against(ours: Database, message: Any, frames: Sequence[bytes]) -> tuple[int, int]:  # noqa: ANN401 cantools has no types
+def _compare_decoders(ours: Database, message: Any, frames: Sequence[bytes]) -> tuple[int, int]:  # noqa: ANN401 cantools has no types
     table = np.frombuffer(
         b"".join(frame.ljust(LONGEST, b"\0") for frame in frames), np.uint8
     ).reshape(-1, LONGEST)
@@ -91,13 +91,13 @@ def on_a_bus(drive: Recorded) -> list[Any]:
         for k in range(0, len(row), 2):
             if np.isfinite(row[k : k + 2]).all():
                 data = struct.pack("<ii", *(round(value / STEP) for value in row[k : k + 2]))
-                frames.append(_frame(t + 1e-4 * k, 256 + k // 2, data))
+                frames.append(_make_frame(t + 1e-4 * k, 256 + k // 2, data))
     return frames
 
 
-def _frame(t: float, identifier: int, data: bytes) -> Any:  # noqa: ANN401 python-can has no types
+def _make_frame(t: float, identifier: int, data: bytes) -> Any:  # noqa: ANN401 python-can has no types
     stamp = round(START_S + t, 6)
-    return library("can").Message(
+    return import_optional("can").Message(
         timestamp=stamp, arbitration_id=identifier, is_extended_id=False, data=data, channel=1
     )
 
@@ -112,14 +112,14 @@ def a_minute(path: Path) -> Path:
     rng.shuffle(chosen)
     data = rng.bytes(8)
     return as_log(
-        path, [_frame(60.0 * k / len(chosen), int(one), data) for k, one in enumerate(chosen)]
+        path, [_make_frame(60.0 * k / len(chosen), int(one), data) for k, one in enumerate(chosen)]
     )
 
 
-def imported(path: Path, profile: Profile, out: Path) -> Path:
+def import_file(path: Path, profile: Profile, out: Path) -> Path:
     """A source as a signal log, the way of `edge-agent import`."""
     database = parse_dbc(DBC) if path.suffix != ".csv" else None
-    merged = merge([read_source(path, profile, database)], profile)
+    merged = merge_recordings([read_source(path, profile, database)], profile)
     write_log(out, merged, profile, [path.name])
     return out
 
@@ -131,7 +131,7 @@ def import_s(folder: Path) -> float:
     spent = []
     for _ in range(TRIES):
         began = time.perf_counter()
-        imported(path, profile, folder / "minute.parquet")
+        import_file(path, profile, folder / "minute.parquet")
         spent.append(time.perf_counter() - began)
     return min(spent)
 
@@ -153,16 +153,16 @@ def same_estimates(folder: Path, seed: int, seconds: int = DRIVE_S) -> tuple[flo
     profile = profile_of("can")
     paths = [as_log(folder / f"drive.{kind}", frames) for kind in ("blf", "asc", "log")]
     paths += [as_mf4(folder / "drive.mf4", frames), as_bag(folder / "bag", frames)]
-    logs = [imported(path, profile, folder / f"{path.name}.parquet") for path in paths]
+    logs = [import_file(path, profile, folder / f"{path.name}.parquet") for path in paths]
     csv = as_csv(folder / "drive.csv", logs[0])
     plain = Profile(name="csv", channels={name: Channel(signal=name) for name in CHANNELS})
-    logs.append(imported(csv, plain, folder / "csv.parquet"))
+    logs.append(import_file(csv, plain, folder / "csv.parquet"))
     first, *others = (estimates_of(log, drive) for log in logs)
-    differences = [_largest(first, other) for other in others]
+    differences = [_largest_difference(first, other) for other in others]
     return max(differences), len(logs)
 
 
-def _largest(one: FloatArray, other: FloatArray) -> float:
+def _largest_difference(one: FloatArray, other: FloatArray) -> float:
     if one.shape != other.shape or not np.array_equal(np.isnan(one), np.isnan(other)):
         return float("inf")
     return float(np.nanmax(np.abs(one - other)))

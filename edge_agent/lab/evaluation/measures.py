@@ -36,7 +36,7 @@ def errors(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     }
 
 
-def covered(batch: DriveSet, reported: Estimates) -> BoolArray:
+def is_covered(batch: DriveSet, reported: Estimates) -> BoolArray:
     """Return whether the 90 % interval holds the mean friction, (T, N)."""
     return np.asarray((reported.mu_lower <= batch.mu) & (batch.mu <= reported.mu_upper))
 
@@ -51,8 +51,8 @@ def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     found["rmse_mu"] = np.sqrt(((reported.mu - batch.mu) ** 2).mean(axis=0))
     found["mae_mu"] = np.abs(reported.mu - batch.mu).mean(axis=0)
     found["mu_error"] = np.abs(reported.mu - batch.mu)[end].mean(axis=0)
-    found["coverage90"] = covered(batch, reported).mean(axis=0)
-    found["end_coverage90"] = covered(batch, reported)[end].mean(axis=0)
+    found["coverage90"] = is_covered(batch, reported).mean(axis=0)
+    found["end_coverage90"] = is_covered(batch, reported)[end].mean(axis=0)
     found["width"] = (reported.mu_upper - reported.mu_lower).mean(axis=0)
     found["nis"] = reported.innovation_nis.mean(axis=0)
     found["nees"] = nees(batch, reported).mean(axis=0)

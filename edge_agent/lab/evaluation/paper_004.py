@@ -15,14 +15,14 @@ from dataclasses import replace
 import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.app.tuned_memberships import shipped
+from edge_agent.app.tuned_memberships import shipped_memberships
 from edge_agent.estimators import TUNED, Estimates
 from edge_agent.estimators.paper_aco_fckf import AT_THE_TRUTH, make_bank
-from edge_agent.lab.evaluation.batch import DriveSet, estimates, ideal, repeated
+from edge_agent.lab.evaluation.batch import DriveSet, estimates, ideal, repeat_drive
 from edge_agent.lab.evaluation.measures import measures
 from edge_agent.lab.evaluation.scenarios import MATCHED, PAPERS, SEDAN
 from edge_agent.lab.simulation import PRESETS
-from edge_agent.lab.simulation.white import add_white, scheduled
+from edge_agent.lab.simulation.white import add_white, scheduled_variance
 from schemas.numeric import FloatArray
 
 CONSTANT = 0.05  # variance of all three noises [SI]
@@ -39,7 +39,7 @@ STILL = Memberships(outputs=(0.0,) * 5)  # fuzzy sets that leave R as it is
 
 def noisy(batch: DriveSet, variance: FloatArray, seeds: Sequence[int]) -> DriveSet:
     """One copy of the drive per seed, with white noise of variance (T,) on a_x, a_y and r."""
-    copies = repeated(batch, len(seeds))
+    copies = repeat_drive(batch, len(seeds))
     for n, seed in enumerate(seeds):
         add_white(copies.signals[:, n], variance, np.random.default_rng([seed, 4]))
     return copies
@@ -47,7 +47,7 @@ def noisy(batch: DriveSet, variance: FloatArray, seeds: Sequence[int]) -> DriveS
 
 def variances(t: FloatArray, experiment: str) -> FloatArray:
     """Noise variance at the times t (T,) [s] of the experiment "constant" or "variable"."""
-    return np.full(len(t), CONSTANT) if experiment == "constant" else scheduled(t)
+    return np.full(len(t), CONSTANT) if experiment == "constant" else scheduled_variance(t)
 
 
 def experiments(
@@ -71,7 +71,7 @@ def experiments(
         for estimator, sets in (
             ("paper-ckf", STILL),
             ("paper-fckf", Memberships()),
-            ("paper-aco-fckf", shipped(TUNED["paper-aco-fckf"])),
+            ("paper-aco-fckf", shipped_memberships(TUNED["paper-aco-fckf"])),
         ):
             reported = estimates(make_bank(batch.vehicles, sets, AT_THE_TRUTH), batch)
             found[name, estimator] = measures(batch, reported)

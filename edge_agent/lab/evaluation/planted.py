@@ -55,49 +55,49 @@ class Planted(NamedTuple):
     kind: str
 
 
-def scaled(columns: Sequence[int], factor: float | Callable[[float], float]) -> Spoil:
+def scale_columns(columns: Sequence[int], factor: float | Callable[[float], float]) -> Spoil:
     """Columns times a factor, which may depend on the wheel's radius."""
 
-    def spoil(drive: Recorded) -> Recorded:
+    def scale_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
         signals[:, columns] *= factor(drive.vehicle.wheel_radius) if callable(factor) else factor
         return drive._replace(signals=signals)
 
-    return spoil
+    return scale_drive
 
 
-def moved(columns: Sequence[int], offset: float) -> Spoil:
+def offset_columns(columns: Sequence[int], offset: float) -> Spoil:
     """Columns plus an offset."""
 
-    def spoil(drive: Recorded) -> Recorded:
+    def offset_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
         signals[:, columns] += offset
         return drive._replace(signals=signals)
 
-    return spoil
+    return offset_drive
 
 
-def late(columns: Sequence[int]) -> Spoil:
+def delay_columns(columns: Sequence[int]) -> Spoil:
     """Columns LATE samples late."""
 
-    def spoil(drive: Recorded) -> Recorded:
+    def delay_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
         signals[LATE:, columns] = drive.signals[:-LATE, columns]
         signals[:LATE, columns] = drive.signals[0, columns]
         return drive._replace(signals=signals)
 
-    return spoil
+    return delay_drive
 
 
-def exchanged(one: Sequence[int], other: Sequence[int]) -> Spoil:
+def swap_columns(one: Sequence[int], other: Sequence[int]) -> Spoil:
     """Columns in each other's place."""
 
-    def spoil(drive: Recorded) -> Recorded:
+    def swap_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
         signals[:, [*one, *other]] = drive.signals[:, [*other, *one]]
         return drive._replace(signals=signals)
 
-    return spoil
+    return swap_drive
 
 
 def status_bits(drive: Recorded) -> Recorded:
@@ -107,7 +107,7 @@ def status_bits(drive: Recorded) -> Recorded:
     return drive._replace(signals=signals)
 
 
-def compass(drive: Recorded) -> Recorded:
+def turn_yaw_clockwise(drive: Recorded) -> Recorded:
     """Yaw clockwise from north."""
     signals = drive.signals.copy()
     signals[:, S.YAW] = math.pi / 2.0 - signals[:, S.YAW]
@@ -120,57 +120,61 @@ def other_tyre(drive: Recorded) -> Recorded:
     return drive._replace(vehicle=drive.vehicle.model_copy(update={"wheel_radius": radius}))
 
 
-def rim(unit: str) -> Callable[[float], float]:
+def rim_speed_factor(unit: str) -> Callable[[float], float]:
     """Wheel speeds given as speeds at the rim."""
     return lambda radius: radius / SPEED[unit]
 
 
 PLANTED: Final = {
-    "a_x in g": Planted(scaled([S.AX], 1.0 / GRAVITY), "ax", "g"),
-    "a_y in g": Planted(scaled([S.AY], 1.0 / GRAVITY), "ay", "g"),
-    "both in g": Planted(scaled([S.AX, S.AY], 1.0 / GRAVITY), "ax", "g"),
-    "yaw rate in deg/s": Planted(scaled([S.YAW_RATE], 1.0 / DEG), "yaw_rate", "deg/s"),
-    "steering in deg": Planted(scaled(DELTA, 1.0 / DEG), "delta", "deg"),
-    "steering wheel": Planted(scaled(DELTA, RATIO), "delta", "steering wheel"),
-    "steering wheel in deg": Planted(scaled(DELTA, RATIO / DEG), "delta", "steering wheel, deg"),
-    "wheels in km/h": Planted(scaled(OMEGA, rim("km/h")), "omega", "km/h"),
-    "wheels in m/s": Planted(scaled(OMEGA, rim("m/s")), "omega", "m/s"),
-    "wheels in mph": Planted(scaled(OMEGA, rim("mph")), "omega", "mph"),
-    "wheels in rpm": Planted(scaled(OMEGA, 30.0 / math.pi), "omega", "rpm"),
-    "wheels in deg/s": Planted(scaled(OMEGA, 1.0 / DEG), "omega", "deg/s"),
+    "a_x in g": Planted(scale_columns([S.AX], 1.0 / GRAVITY), "ax", "g"),
+    "a_y in g": Planted(scale_columns([S.AY], 1.0 / GRAVITY), "ay", "g"),
+    "both in g": Planted(scale_columns([S.AX, S.AY], 1.0 / GRAVITY), "ax", "g"),
+    "yaw rate in deg/s": Planted(scale_columns([S.YAW_RATE], 1.0 / DEG), "yaw_rate", "deg/s"),
+    "steering in deg": Planted(scale_columns(DELTA, 1.0 / DEG), "delta", "deg"),
+    "steering wheel": Planted(scale_columns(DELTA, RATIO), "delta", "steering wheel"),
+    "steering wheel in deg": Planted(
+        scale_columns(DELTA, RATIO / DEG), "delta", "steering wheel, deg"
+    ),
+    "wheels in km/h": Planted(scale_columns(OMEGA, rim_speed_factor("km/h")), "omega", "km/h"),
+    "wheels in m/s": Planted(scale_columns(OMEGA, rim_speed_factor("m/s")), "omega", "m/s"),
+    "wheels in mph": Planted(scale_columns(OMEGA, rim_speed_factor("mph")), "omega", "mph"),
+    "wheels in rpm": Planted(scale_columns(OMEGA, 30.0 / math.pi), "omega", "rpm"),
+    "wheels in deg/s": Planted(scale_columns(OMEGA, 1.0 / DEG), "omega", "deg/s"),
     "time in ms": Planted(lambda drive: drive._replace(t=1000.0 * drive.t), "t", "ms"),
-    "a_x flipped": Planted(scaled([S.AX], -1.0), "ax", "sign"),
-    "a_y flipped": Planted(scaled([S.AY], -1.0), "ay", "sign"),
-    "yaw rate flipped": Planted(scaled([S.YAW_RATE], -1.0), "yaw_rate", "sign"),
-    "steering flipped": Planted(scaled(DELTA, -1.0), "delta", "sign"),
-    "a_y and yaw rate flipped": Planted(scaled([S.AY, S.YAW_RATE], -1.0), "ay", "sign"),
-    "a_x and a_y exchanged": Planted(exchanged([S.AX], [S.AY]), "ax", "exchanged with ay"),
-    "a_x offset": Planted(moved([S.AX], 2.0), "ax", "offset"),
-    "a_y offset": Planted(moved([S.AY], 1.2), "ay", "offset"),
-    "yaw rate offset": Planted(moved([S.YAW_RATE], 0.04), "yaw_rate", "offset"),
-    "steering offset": Planted(moved(DELTA, 0.035), "delta", "offset"),
-    "one wheel smaller": Planted(scaled([S.OMEGA], 1.05), "omega_fl", "radius"),
+    "a_x flipped": Planted(scale_columns([S.AX], -1.0), "ax", "sign"),
+    "a_y flipped": Planted(scale_columns([S.AY], -1.0), "ay", "sign"),
+    "yaw rate flipped": Planted(scale_columns([S.YAW_RATE], -1.0), "yaw_rate", "sign"),
+    "steering flipped": Planted(scale_columns(DELTA, -1.0), "delta", "sign"),
+    "a_y and yaw rate flipped": Planted(scale_columns([S.AY, S.YAW_RATE], -1.0), "ay", "sign"),
+    "a_x and a_y exchanged": Planted(swap_columns([S.AX], [S.AY]), "ax", "exchanged with ay"),
+    "a_x offset": Planted(offset_columns([S.AX], 2.0), "ax", "offset"),
+    "a_y offset": Planted(offset_columns([S.AY], 1.2), "ay", "offset"),
+    "yaw rate offset": Planted(offset_columns([S.YAW_RATE], 0.04), "yaw_rate", "offset"),
+    "steering offset": Planted(offset_columns(DELTA, 0.035), "delta", "offset"),
+    "one wheel smaller": Planted(scale_columns([S.OMEGA], 1.05), "omega_fl", "radius"),
     "radius of the file": Planted(other_tyre, "omega", "radius"),
-    "inertial unit late": Planted(late(IMU), "imu", "clock"),
-    "steering late": Planted(late(DELTA), "steering", "clock"),
-    "receiver late": Planted(late(PLACE), "receiver", "clock"),
-    "wheels late": Planted(late(OMEGA), "wheels", "clock"),
+    "inertial unit late": Planted(delay_columns(IMU), "imu", "clock"),
+    "steering late": Planted(delay_columns(DELTA), "steering", "clock"),
+    "receiver late": Planted(delay_columns(PLACE), "receiver", "clock"),
+    "wheels late": Planted(delay_columns(OMEGA), "wheels", "clock"),
     "status bits": Planted(status_bits, "omega_fl", "status bits"),
     "left and right": Planted(
-        exchanged(OMEGA[::2], OMEGA[1::2]), "omega", "left and right exchanged"
+        swap_columns(OMEGA[::2], OMEGA[1::2]), "omega", "left and right exchanged"
     ),
     "front left and right": Planted(
-        exchanged(OMEGA[:1], OMEGA[1:2]), "omega", "front left and right exchanged"
+        swap_columns(OMEGA[:1], OMEGA[1:2]), "omega", "front left and right exchanged"
     ),
     "rear left and right": Planted(
-        exchanged(OMEGA[2:3], OMEGA[3:]), "omega", "rear left and right exchanged"
+        swap_columns(OMEGA[2:3], OMEGA[3:]), "omega", "rear left and right exchanged"
     ),
-    "front and rear": Planted(exchanged(OMEGA[:2], OMEGA[2:]), "omega", "front and rear exchanged"),
+    "front and rear": Planted(
+        swap_columns(OMEGA[:2], OMEGA[2:]), "omega", "front and rear exchanged"
+    ),
     "latitude and longitude": Planted(
-        exchanged([S.LATITUDE], [S.LONGITUDE]), "latitude", "exchanged with longitude"
+        swap_columns([S.LATITUDE], [S.LONGITUDE]), "latitude", "exchanged with longitude"
     ),
-    "compass for yaw": Planted(compass, "yaw", "compass"),
-    "yaw in deg": Planted(scaled([S.YAW], 1.0 / DEG), "yaw", "deg"),
+    "compass for yaw": Planted(turn_yaw_clockwise, "yaw", "compass"),
+    "yaw in deg": Planted(scale_columns([S.YAW], 1.0 / DEG), "yaw", "deg"),
 }
 RADII_ALIKE: Final = (
     {"km/h", "radius", "mph", "kn"},
@@ -191,7 +195,7 @@ def drives(
     return [Recorded(t[:, n], signals[:, n], fleet.vehicles[n]) for n in range(count)]
 
 
-def icy(count: int, seed: int, *, seconds: int = DRIVE_S) -> list[Recorded]:
+def winter_drives(count: int, seed: int, *, seconds: int = DRIVE_S) -> list[Recorded]:
     """Return drives through the town in winter: ice where it was wet or snow, snow elsewhere but
     in one quarter.
     """
@@ -205,12 +209,12 @@ def icy(count: int, seed: int, *, seconds: int = DRIVE_S) -> list[Recorded]:
     return [Recorded(t[:, n], signals[:, n], fleet.vehicles[n]) for n in range(count)]
 
 
-def named(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
+def doctor_verdict(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
     """Return whether the doctor names the mistake, and whether it accepts the drive."""
     diagnosis = diagnose(*planted.spoil(drive))
     found = {(finding.channel, finding.kind) for finding in diagnosis.findings}
     same = next((kinds for kinds in RADII_ALIKE if planted.kind in kinds), {planted.kind})
-    return any((planted.channel, kind) in found for kind in same), diagnosis.passed
+    return any((planted.channel, kind) in found for kind in same), diagnosis.is_passed
 
 
 def figures(count: int, seed: int) -> list[Figure]:
@@ -224,20 +228,22 @@ def figures(count: int, seed: int) -> list[Figure]:
         *drives(count, seed + 2, rough=False, winter=True),
         *drives(count, seed + 3, rough=True, winter=True),
     ]
-    tries = [named(planted, drive) for planted in PLANTED.values() for drive in cars]
-    cold_tries = [named(planted, drive) for planted in PLANTED.values() for drive in cold]
+    tries = [doctor_verdict(planted, drive) for planted in PLANTED.values() for drive in cars]
+    cold_tries = [doctor_verdict(planted, drive) for planted in PLANTED.values() for drive in cold]
     clean = [diagnose(*drive) for drive in cars]
     cold_clean = [diagnose(*drive) for drive in cold]
     return [
-        Figure("doctor.faults_named", _share(hit for hit, _ in tries), "1", 0.95, "more"),
+        Figure("doctor.faults_named", _share_of(hit for hit, _ in tries), "1", 0.95, "more"),
         Figure(
-            "doctor.faults_named.winter", _share(hit for hit, _ in cold_tries), "1", 0.95, "more"
+            "doctor.faults_named.winter", _share_of(hit for hit, _ in cold_tries), "1", 0.95, "more"
         ),
-        Figure("doctor.false_accusations", _accusations(clean), "1", 0.01),
-        Figure("doctor.false_accusations.winter", _accusations(cold_clean), "1", 0.0),
-        Figure("doctor.clean_passed", _share(diagnosis.passed for diagnosis in clean), "1"),
+        Figure("doctor.false_accusations", _accused_share(clean), "1", 0.01),
+        Figure("doctor.false_accusations.winter", _accused_share(cold_clean), "1", 0.0),
+        Figure("doctor.clean_passed", _share_of(diagnosis.is_passed for diagnosis in clean), "1"),
         Figure(
-            "doctor.clean_passed.winter", _share(diagnosis.passed for diagnosis in cold_clean), "1"
+            "doctor.clean_passed.winter",
+            _share_of(diagnosis.is_passed for diagnosis in cold_clean),
+            "1",
         ),
         Figure("doctor.published_wrong", float(sum(passed for _, passed in tries)), "drives", 0.0),
         Figure(
@@ -250,12 +256,12 @@ def figures(count: int, seed: int) -> list[Figure]:
     ]
 
 
-def _share(held: Iterable[bool]) -> float:
+def _share_of(held: Iterable[bool]) -> float:
     every = list(held)
     return sum(every) / len(every)
 
 
-def _accusations(clean: Sequence[Diagnosis]) -> float:
+def _accused_share(clean: Sequence[Diagnosis]) -> float:
     """Return the share of channels of sound drives that the doctor accuses."""
     channels = sum(
         len(diagnosis.sound) + len(diagnosis.unknown) + len(diagnosis.findings)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.app.tuned_memberships import shipped
+from edge_agent.app.tuned_memberships import shipped_memberships
 from edge_agent.estimators import TUNED
 from edge_agent.lab.evaluation.campaign import DEFAULT, PlottedDrive, Results
 from edge_agent.lab.evaluation.detection import KINDS, ROC_FLAG_MU, ROC_NATS
@@ -245,7 +245,7 @@ def _memberships(path: Path) -> Path:
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(3, 2, figsize=(9, 7), layout="constrained")
-    tuned = ((f"after, {name}", shipped(file)) for name, file in TUNED.items())
+    tuned = ((f"after, {name}", shipped_memberships(file)) for name, file in TUNED.items())
     for row, (name, sets) in enumerate((("before", Memberships()), *tuned)):
         _triangles(
             axes[row, 0],

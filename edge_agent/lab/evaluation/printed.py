@@ -34,7 +34,7 @@ PRINTED_001: Final = {"MAE": (".0009", ".0024", ".0002"), "RMSE": (".0012", ".00
 PRINTED_002: Final = {"sine": (".1008", ".0779"), "jturn": (".0825", ".0117")}
 
 
-def printed(
+def printed_row(
     paper: str, scenario: str, estimator: str, measure: str, what: str, value: str
 ) -> Printed:
     """A row whose own figure comes from sensors without error."""
@@ -74,7 +74,7 @@ PRINTED: Final = (
         "real.004.dlc.ESTIMATOR.mae_vy",
     ),
     *(
-        printed(
+        printed_row(
             "001",
             "001.dlc",
             "adaptive-federated-ckf",
@@ -86,16 +86,16 @@ PRINTED: Final = (
         for (name, key), value in zip((*SPEEDS, ("β [rad]", "beta")), values, strict=True)
     ),
     *(
-        printed(
+        printed_row(
             "002", f"002.{drive}", "compensated-wckf", f"rmse_{key}", f"{drive}, RMSE {name}", value
         )
         for drive, values in PRINTED_002.items()
         for (name, key), value in zip(SPEEDS, values, strict=True)
     ),
-    printed("003", "003.accel", "sr-ukf", "mu_error", "acceleration, MAE μ", ".0031"),
-    printed("003", "003.turn", "sr-ukf", "mu_error", "turn on snow, MAE μ", ".0011"),
-    printed("003", "003.split", "sr-ukf", "low_error", "split, MAE μ of the low side", ".0037"),
-    printed(
+    printed_row("003", "003.accel", "sr-ukf", "mu_error", "acceleration, MAE μ", ".0031"),
+    printed_row("003", "003.turn", "sr-ukf", "mu_error", "turn on snow, MAE μ", ".0011"),
+    printed_row("003", "003.split", "sr-ukf", "low_error", "split, MAE μ of the low side", ".0037"),
+    printed_row(
         "003",
         "003.straight.split",
         "sr-ukf",
@@ -103,12 +103,12 @@ PRINTED: Final = (
         "split at constant speed, MAE μ, low side",
         ".0037",
     ),
-    printed(
+    printed_row(
         "003", "003.straight.low", "sr-ukf", "mu_error", "snow at constant speed, MAE μ", "small"
     ),
-    printed("003", "003.jump", "sr-ukf", "mae_mu", ".85 to .5, MAE μ", ".0059"),
-    printed("003", "003.jump", "sr-ukf", "arrival_s", ".85 to .5, s to within .1", "about .2"),
-    printed(
+    printed_row("003", "003.jump", "sr-ukf", "mae_mu", ".85 to .5, MAE μ", ".0059"),
+    printed_row("003", "003.jump", "sr-ukf", "arrival_s", ".85 to .5, s to within .1", "about .2"),
+    printed_row(
         "000",
         "000.jump",
         "federated-ckf",

@@ -29,7 +29,7 @@ import pyarrow.parquet as pq
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators.estimates import Column
 from edge_agent.inputs.doctor.adopt import Adopted, prepare_log
-from edge_agent.inputs.doctor.drive import RATE_HZ, even, smooth
+from edge_agent.inputs.doctor.drive import RATE_HZ, interpolate_near, smooth_twice
 from edge_agent.inputs.signal_log import SignalLog, read_log
 from edge_agent.observe.pipeline import Pipeline
 from schemas.config import AgentConfig
@@ -164,7 +164,9 @@ def read_truth(path: Path, t: FloatArray) -> dict[str, FloatArray]:
     found: dict[str, FloatArray] = {}
     for name in TRUTH:
         if name in table.column_names:
-            found[name] = even(at, np.asarray(table[name].to_numpy(zero_copy_only=False), float), t)
+            found[name] = interpolate_near(
+                at, np.asarray(table[name].to_numpy(zero_copy_only=False), float), t
+            )
         else:
             found[name] = np.full(len(t), np.nan)
     return found
@@ -210,7 +212,7 @@ def judge_estimates(
     return LogFigures(
         name=name,
         seconds=float(t[-1] - t[0]),
-        passed=adopted.diagnosis.passed,
+        passed=adopted.diagnosis.is_passed,
         informative=share_of(told, moving),
         right=share_of(right, told),
         ice=share_of(slippery > ICE, moving & grips),
@@ -234,7 +236,10 @@ def known_friction(
     used.
     """
     at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
-    along, across = (smooth(even(t, signals[:, channel], at), SMOOTH_S) for channel in (S.AX, S.AY))
+    along, across = (
+        smooth_twice(interpolate_near(t, signals[:, channel], at), SMOOTH_S)
+        for channel in (S.AX, S.AY)
+    )
     used = np.hypot(along, across)[np.interp(at, t, moving.astype(float)) > 0.5] / GRAVITY
     used = used[np.isfinite(used)]
     felt = float(np.percentile(used, USED_SHARE)) if len(used) else 0.0

@@ -32,9 +32,9 @@ import numpy as np
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
 from edge_agent.lab.evaluation.batch import USUAL, DriveSet, DriveSpec, estimates, realistic
-from edge_agent.lab.evaluation.measures import covered, errors
+from edge_agent.lab.evaluation.measures import errors, is_covered
 from edge_agent.lab.simulation import PRESETS, SimulatedFleet
-from edge_agent.lab.simulation.scenarios import drawn, winter
+from edge_agent.lab.simulation.scenarios import drawn_town, winter
 from schemas.errors import InputError
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import BoolArray, FloatArray
@@ -106,7 +106,12 @@ def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
     """
     cold = in_winter(seed)
     fleet = SimulatedFleet(
-        winter(seed) if cold else drawn(seed), cars, seed, RATE_HZ, rough=1.0, winter=float(cold)
+        winter(seed) if cold else drawn_town(seed),
+        cars,
+        seed,
+        RATE_HZ,
+        rough=1.0,
+        winter=float(cold),
     )
     t, signals = fleet.step(round(seconds * RATE_HZ))
     true = fleet.truth
@@ -126,7 +131,7 @@ def in_use(batch: DriveSet) -> FloatArray:
     return np.asarray((summed[width:] - summed[:-width]) / width - NOISE)
 
 
-def lately(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDOW_S) -> FloatArray:
+def recent_maximum(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDOW_S) -> FloatArray:
     """Largest value of the last `seconds`, (T, N)."""
     samples = round(seconds * RATE_HZ)
     padded = np.concatenate([np.zeros((samples - 1, used.shape[1])), used])
@@ -144,12 +149,12 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
     )
 
 
-def count(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) -> None:
+def tally_town(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) -> None:
     """Add one town to the tally of an estimator."""
     mu = batch.mu
-    inside = covered(batch, reported)
+    inside = is_covered(batch, reported)
     width = reported.mu_upper - reported.mu_lower
-    excited = lately(used) >= EXCITED_SHARE
+    excited = recent_maximum(used) >= EXCITED_SHARE
     tally.add("coverage90", inside)
     for name, (above, most) in SURFACES.items():
         tally.add(f"coverage90.{name}", inside, (mu > above) & (mu <= most))
@@ -173,7 +178,7 @@ def count(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) 
     tally.add("false_grip", reported.mu_lower > mu + FALSE_GRIP, ice)
     tally.add("false_ice", icy, grips)
     tally.add("false_ice.of_all", icy & (mu > SURE_GRIP))
-    tally.add("false_ice.settled", icy, grips & ~lately(~grips, SETTLED_S).astype(bool))
+    tally.add("false_ice.settled", icy, grips & ~recent_maximum(~grips, SETTLED_S).astype(bool))
     tally.add("below", reported.mu_upper < in_use(batch))
     tally.add("width", width / (PRIOR[1] - PRIOR[0]), excited)
     tally.add("width.all", width / (PRIOR[1] - PRIOR[0]))
@@ -242,7 +247,7 @@ def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) ->
         world = world or RealWorldResults({}, batch, {})
         for name in estimators:
             reported = estimates(bank_of(name, batch.vehicles), batch)
-            count(tallies[name], batch, reported, used)
+            tally_town(tallies[name], batch, reported, used)
             world.reported.setdefault(name, reported)
     if world is None:
         raise InputError("seeds", "are none", "give at least one")

@@ -26,7 +26,7 @@ PRIOR_WIDTH: Final = 0.9 * (UPPER - LOWER)  # of its 90 % interval
 EDGES: Final = np.linspace(LOWER, UPPER, BINS + 1)
 
 
-def watched(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates, FloatArray]:
+def estimate_with_ranks(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates, FloatArray]:
     """Return the bank's estimates of the drives, and the rank of the truth in its posterior once
     every EVERY_S, (K, N).
     """
@@ -37,16 +37,18 @@ def watched(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates, FloatArray
     for first, end in pairwise([*range(0, samples, step), samples]):
         parts.append(bank.advance(batch.t[first:end], batch.signals[first:end]))
         if end < samples:
-            ranks.append(_rank(bank, batch, end, parts[-1]))
-    return joined(parts), np.array(ranks).reshape(-1, batch.t.shape[1])
+            ranks.append(_rank_of_truth(bank, batch, end, parts[-1]))
+    return join_estimates(parts), np.array(ranks).reshape(-1, batch.t.shape[1])
 
 
-def joined(parts: list[Estimates]) -> Estimates:
+def join_estimates(parts: list[Estimates]) -> Estimates:
     """Estimates of one drive, one stretch after the other; evidence is left out."""
     return Estimates(np.concatenate([part.values for part in parts]))
 
 
-def _rank(bank: EstimatorBank, batch: DriveSet, now: int, reported: Estimates) -> FloatArray:
+def _rank_of_truth(
+    bank: EstimatorBank, batch: DriveSet, now: int, reported: Estimates
+) -> FloatArray:
     """Share of the posterior below the true friction of the sample before `now`, (N,)."""
     truth = batch.mu[now - 1]
     closes = np.ones((1, len(truth)), np.bool_)

@@ -13,7 +13,7 @@ from typing import Final
 
 from edge_agent.lab.evaluation.batch import DriveSpec
 from edge_agent.lab.simulation.manoeuvres import jump, kmh, split
-from edge_agent.lab.simulation.presets import PRESETS, TrueVehicle, car, matched
+from edge_agent.lab.simulation.presets import PRESETS, TrueVehicle, car, matched_to_papers
 
 SLOPES: Final = ("longitudinal_stiffness", "cornering_stiffness")
 SEDAN: Final = PRESETS["sedan"]  # paper 004, table 1
@@ -48,7 +48,7 @@ SMALL: Final = TrueVehicle(
 STRONG: Final = replace(SEDAN, power=400e3)  # .6 g at 25 m/s
 LOOSE: Final = replace(STRONG, slip_limit=math.inf)  # no slip control: wheels spin
 
-MATCHED: Final = matched(
+MATCHED: Final = matched_to_papers(
     SEDAN
 )  # the vehicle of 004, whose tyres are not given, as its model has it
 

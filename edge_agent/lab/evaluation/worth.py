@@ -25,11 +25,11 @@ import numpy as np
 
 from edge_agent.adaptation.memberships import SETS, Memberships
 from edge_agent.adaptation.rule_base import plain_rules
-from edge_agent.app.tuned_memberships import search_results, shipped
+from edge_agent.app.tuned_memberships import search_results, shipped_memberships
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.design import MixtureDesign, design_of
-from edge_agent.lab.evaluation.batch import DriveSet, joined
+from edge_agent.lab.evaluation.batch import DriveSet, join_drives
 from edge_agent.lab.evaluation.real_world import interval_score, town
 from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
 from edge_agent.lab.simulation.relief import ROADS
@@ -79,7 +79,7 @@ def campaign(
     for seed in chosen:
         batches = [town(seed, cars, seconds)[0], manoeuvres(seed, 2.0 if quick else DRIVE_S)]
         for way, designs in found.items():
-            parts = [_scored(batches, design) for design in designs]
+            parts = [_score_drives(batches, design) for design in designs]
             for name in parts[0]:
                 scores[way].setdefault(name, []).append(
                     float(np.mean([part[name] for part in parts]))
@@ -98,7 +98,7 @@ def ways() -> dict[str, list[MixtureDesign]]:
     """Return the filters of each way."""
     untuned = Memberships()
     found = {
-        "fuzzy": [design_of(shipped(ESTIMATOR), adaptive=True)],
+        "fuzzy": [design_of(shipped_memberships(ESTIMATOR), adaptive=True)],
         "sets_off": [without_sets()],
         "none": [design_of(untuned, adaptive=False)],
         "default": [design_of(untuned, adaptive=True)],
@@ -135,10 +135,10 @@ def manoeuvres(seed: int, seconds: float) -> DriveSet:
                 road=list(ROADS)[int(rng.integers(1, len(ROADS)))],
             )
         )
-    return joined(drives)
+    return join_drives(drives)
 
 
-def _scored(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[str, float]:
+def _score_drives(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[str, float]:
     """Mean interval score over the drives, and over all samples of each surface (NaN where none
     is met).
     """
@@ -185,13 +185,13 @@ def figures(scores: Scores) -> list[Figure]:
         listed += [
             Figure(f"{name}.{key}", float(np.nanmean(found)), "1")
             for key, found in ratios.items()
-            if key != "all" and _met(found)
+            if key != "all" and _has_value(found)
         ]
     for way, found in scores.items():
         listed += [
             Figure(f"worth.{way}.{key}", float(np.nanmean(v)), "1")
             for key, v in found.items()
-            if _met(v)
+            if _has_value(v)
         ]
     return listed
 
@@ -223,5 +223,5 @@ def comparison_table(values: dict[str, float]) -> str:
     return "\n".join(lines)
 
 
-def _met(values: FloatArray) -> bool:
+def _has_value(values: FloatArray) -> bool:
     return bool(np.isfinite(values).any())

@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self
 
 from edge_agent.inputs.live.kuksa import broker_pb2 as messages
-from edge_agent.inputs.recording import library
+from edge_agent.inputs.recording import import_optional
 from schemas.thresholds import NS
 
 LONGEST_BUFFER = 1000
@@ -25,7 +25,7 @@ class Databroker:
     """A server at host:port with some paths, without a value at first."""
 
     def __init__(self, address: str, paths: Sequence[str]) -> None:
-        self._grpc = library("grpc")
+        self._grpc = import_optional("grpc")
         self._values = {path: messages.Datapoint() for path in paths}
         self._changed = threading.Condition()
         self._subscribers: list[deque[Any]] = []

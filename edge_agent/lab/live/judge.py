@@ -42,14 +42,14 @@ class Peer:
 
     process: subprocess.Popen[str]
 
-    def until(self, word: str) -> None:
+    def wait_for(self, word: str) -> None:
         """Wait for a line."""
-        for line in _lines(self.process.stdout):
+        for line in _read_lines(self.process.stdout):
             if line == word:
                 return
         raise RuntimeError(f"the peer ended before it was {word}")
 
-    def go(self) -> None:
+    def send_go(self) -> None:
         """Tell it to begin, or to leave."""
         assert self.process.stdin is not None
         self.process.stdin.write("\n")
@@ -61,14 +61,14 @@ class Peer:
         self.process.wait()
 
 
-def _lines(stream: IO[str] | None) -> Iterator[str]:
+def _read_lines(stream: IO[str] | None) -> Iterator[str]:
     assert stream is not None
     for line in stream:
         yield line.strip()
 
 
 @contextmanager
-def peer(kind: str, address: str, samples: int, rate: float = RATE_HZ) -> Iterator[Peer]:
+def run_peer(kind: str, address: str, samples: int, rate: float = RATE_HZ) -> Iterator[Peer]:
     """A peer in a process of its own, ended at the end."""
     words = [
         sys.executable,
@@ -97,7 +97,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def addresses(kind: str) -> tuple[str, str]:
+def peer_addresses(kind: str) -> tuple[str, str]:
     """Where the peer is, and the source that listens to it."""
     port = free_port()
     if kind == "can":
@@ -107,37 +107,37 @@ def addresses(kind: str) -> tuple[str, str]:
     return f"127.0.0.1:{port}", f"{kind}:127.0.0.1:{port}"
 
 
-def written(kind: str, folder: Path) -> tuple[str, Path | None]:
+def write_profile(kind: str, folder: Path) -> tuple[str, Path | None]:
     """The peer's profile and database as files."""
     if kind == "vss":
         return "vss", None
     profile = folder / f"{kind}.json"
     dbc = folder / "peer.dbc"
-    profile.write_text(profile_of(kind).text(), encoding="utf-8")
+    profile.write_text(profile_of(kind).to_json(), encoding="utf-8")
     dbc.write_text(DBC, encoding="utf-8")
     return str(profile), dbc
 
 
-def lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
+def count_lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
     """Samples lost between a source and the rows, and how many were sent.
 
     Lost are messages that were not heard, and readings that came after their row.
     """
     samples = round(seconds * RATE_HZ)
-    place, source = addresses(kind)
-    name, dbc = written(kind, folder)
+    place, source = peer_addresses(kind)
+    name, dbc = write_profile(kind, folder)
     vehicle = PRESETS["sedan"].vehicle
     feeds, profile, clock = open_sources([source], name, dbc)
     rows = LiveRows(feeds, profile, vehicle, clock)
     parts = []
     sent = 0
     quiet_since = float("inf")
-    with peer(kind, place, samples) as running:
-        running.until("ready")
+    with run_peer(kind, place, samples) as running:
+        running.wait_for("ready")
         blocks = rows.blocks()
         while not feeds[0].openings:
             next(blocks)
-        running.go()
+        running.send_go()
         began = time.monotonic()
         heard = 0
         for block in blocks:
@@ -151,8 +151,8 @@ def lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
             ):
                 break
         blocks.close()
-        running.go()
-        for line in _lines(running.process.stdout):
+        running.send_go()
+        for line in _read_lines(running.process.stdout):
             if line.startswith("{"):
                 sent = json.loads(line)["sent"]
                 break
@@ -163,7 +163,7 @@ def lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
     return max(missing, 0) + feeds[0].lost + rows.late, samples
 
 
-def crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
+def count_crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
     """Agents that did not notice a loss or a return of their source, or did not end as they
     should: why; losses.
     """
@@ -174,8 +174,8 @@ def crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
     bad: list[str] = []
     losses = 0
     for kind in (*COUNTED, "gpsd"):
-        place, source = addresses(kind)
-        name, dbc = written("can" if kind == "gpsd" else kind, folder)
+        place, source = peer_addresses(kind)
+        name, dbc = write_profile("can" if kind == "gpsd" else kind, folder)
         config = folder / f"{kind}.agent.json"
         port = free_port()
         settings = {
@@ -199,25 +199,25 @@ def crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
         ]
         words += ["--config", str(config), "--trust", *(["--dbc", str(dbc)] if dbc else [])]
         if kind == "gpsd":  # positions beside a bus
-            words += ["--source", addresses("can")[1]]
+            words += ["--source", peer_addresses("can")[1]]
         command = [sys.executable, "-m", "edge_agent.cli"]
         agent = subprocess.Popen(
             [*command, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
         )
         missed = (
             []
-            if _shows(agent, port, source, silent=True, patience_s=START_S)
+            if _shows_silence(agent, port, source, silent=True, patience_s=START_S)
             else ["no source at the start"]
         )
         for kill in range(kills):
-            with peer(kind, place, 100_000) as running:
-                running.go()
-                running.until("ready")
-                running.go()
-                if not _shows(agent, port, source, silent=False):
+            with run_peer(kind, place, 100_000) as running:
+                running.send_go()
+                running.wait_for("ready")
+                running.send_go()
+                if not _shows_silence(agent, port, source, silent=False):
                     missed.append(f"return {kill + 1}")
             losses += 1
-            if not _shows(agent, port, source, silent=True):
+            if not _shows_silence(agent, port, source, silent=True):
                 missed.append(f"loss {kill + 1}")
         agent.terminate()
         output, _ = agent.communicate(timeout=PATIENCE_S)
@@ -230,7 +230,7 @@ def crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
     return bad, losses
 
 
-def _shows(
+def _shows_silence(
     agent: subprocess.Popen[str],
     port: int,
     source: str,
@@ -243,7 +243,7 @@ def _shows(
     """
     deadline = time.monotonic() + patience_s
     while agent.poll() is None and time.monotonic() < deadline:
-        troubles = _troubles(port)
+        troubles = _health_problems(port)
         if (
             "the agent is starting" not in troubles
             and troubles
@@ -254,7 +254,7 @@ def _shows(
     return False
 
 
-def _troubles(port: int) -> list[str]:
+def _health_problems(port: int) -> list[str]:
     """Return the problems in an agent's `/healthz`; none while it does not answer."""
     try:
         with urllib.request.urlopen(
@@ -271,12 +271,12 @@ def figures(folder: Path, seconds: float, kills: int = KILLS) -> list[Figure]:
     """Samples lost by kind, and crashes."""
     found = []
     for kind in COUNTED:
-        missing, sent = lost(kind, folder, seconds)
+        missing, sent = count_lost(kind, folder, seconds)
         found += [
             Figure(f"live.{kind}.samples_lost", float(missing), "samples", 0.0),
             Figure(f"live.{kind}.samples", float(sent), "samples", 6_000.0, "more"),
         ]
-    bad, tries = crashes(folder, kills)
+    bad, tries = count_crashes(folder, kills)
     for reason in bad:
         print(reason, file=sys.stderr)
     return [

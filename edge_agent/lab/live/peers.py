@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from edge_agent.inputs.profile import Channel, Profile
-from edge_agent.inputs.recording import library
+from edge_agent.inputs.recording import import_optional
 from edge_agent.inputs.units import DEG
 from edge_agent.lab.live.databroker import Databroker
 from schemas.config import ZenohSettings
@@ -76,7 +76,7 @@ def profile_of(kind: str) -> Profile:
     )
 
 
-def paced(samples: int, rate: float) -> Iterator[float]:
+def pace_samples(samples: int, rate: float) -> Iterator[float]:
     """Times of samples [s], each when it is due."""
     began = time.monotonic()
     for k in range(samples):
@@ -84,13 +84,13 @@ def paced(samples: int, rate: float) -> Iterator[float]:
         yield k / rate
 
 
-def can(address: str, samples: int, rate: float) -> int:
+def send_can(address: str, samples: int, rate: float) -> int:
     """Four messages a sample onto a bus; the address is interface/channel/port."""
     interface, channel, port = address.split("/")
-    made = library("can")
+    made = import_optional("can")
     with made.Bus(interface=interface, channel=channel, port=int(port)) as bus:
-        ready()
-        for t in paced(samples, rate):
+        report_ready()
+        for t in pace_samples(samples, rate):
             values = [round(value / STEP) for value in drive_at(t).values()]
             for k in range(0, len(values), 2):
                 data = struct.pack("<ii", *values[k : k + 2])
@@ -98,7 +98,7 @@ def can(address: str, samples: int, rate: float) -> int:
     return samples * len(CHANNELS) // 2
 
 
-def ros2(address: str, samples: int, rate: float) -> int:
+def send_ros2(address: str, samples: int, rate: float) -> int:
     """An Imu and a JointState a sample, as rmw_zenoh publishes them; the address is where a
     router is opened.
     """
@@ -106,7 +106,7 @@ def ros2(address: str, samples: int, rate: float) -> int:
         ZenohSettings(connect=[], config={"mode": "router", "listen/endpoints": [address]})
     )
     assert session is not None
-    typesys = library("rosbags.typesys")
+    typesys = import_optional("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
     of = store.types
     header, stamp, vector, turned, imu, joints = (
@@ -126,15 +126,15 @@ def ros2(address: str, samples: int, rate: float) -> int:
         put = [
             session.declare_publisher(
                 f"0/{topic}/sensor_msgs::msg::dds_::{kind}_/{HASH}",
-                congestion_control=library("zenoh").CongestionControl.BLOCK,
+                congestion_control=import_optional("zenoh").CongestionControl.BLOCK,
             )
             for topic, kind in (("car/imu", "Imu"), ("car/joints", "JointState"))
         ]
-        ready()
+        report_ready()
         # the stubs call a matching status a bool
         while not all(publisher.matching_status.matching for publisher in put):  # type: ignore[attr-defined]
             time.sleep(0.01)
-        for k, t in enumerate(paced(samples, rate)):
+        for k, t in enumerate(pace_samples(samples, rate)):
             now = time.time_ns()
             values = drive_at(t)
             head = header(stamp(now // NS, now % NS), "")
@@ -150,11 +150,11 @@ def ros2(address: str, samples: int, rate: float) -> int:
                 publisher.put(
                     bytes(store.serialize_cdr(message, message.__msgtype__)), attachment=attachment
                 )
-        wait()  # what is under way arrives before the session closes
+        wait_for_line()  # what is under way arrives before the session closes
     return 2 * samples
 
 
-def vss(address: str, samples: int, rate: float) -> int:
+def send_vss(address: str, samples: int, rate: float) -> int:
     """A databroker, and its provider; the address is host:port."""
     from edge_agent.inputs.live.sources import VSS_PROFILE
     from edge_agent.inputs.profile import load_profile
@@ -165,18 +165,18 @@ def vss(address: str, samples: int, rate: float) -> int:
     published = [name for name in CHANNELS if name in paths]
     degrees = [name for name in published if name not in ("ax", "ay")]
     with Databroker(address, [paths[name] for name in published]) as broker:
-        ready()
-        for t in paced(samples, rate):
+        report_ready()
+        for t in pace_samples(samples, rate):
             now = time.time_ns()
             values = drive_at(t)
             broker.publish(
                 {paths[n]: values[n] / (DEG if n in degrees else 1.0) for n in published}, now
             )
-        wait()
+        wait_for_line()
     return samples * len(published)
 
 
-def gpsd(address: str, samples: int, rate: float) -> int:
+def send_gpsd(address: str, samples: int, rate: float) -> int:
     """Fixes of a car that goes east; the address is host:port."""
     import socket
 
@@ -185,8 +185,8 @@ def gpsd(address: str, samples: int, rate: float) -> int:
         print("listening", flush=True)
         connection, _ = server.accept()
         with connection:
-            ready()
-            for t in paced(samples, rate):
+            report_ready()
+            for t in pace_samples(samples, rate):
                 place = {
                     "lat": 57.7,
                     "lon": 11.9 + t * SPEED / 59_500.0,
@@ -195,26 +195,26 @@ def gpsd(address: str, samples: int, rate: float) -> int:
                 }
                 report = {"class": "TPV", "mode": 3, "time": datetime.now(UTC).isoformat(), **place}
                 connection.sendall(json.dumps(report).encode() + b"\n")
-            wait()
+            wait_for_line()
     return samples
 
 
-def ready() -> None:
+def report_ready() -> None:
     """Say that it is, and wait to be told to begin."""
     print("ready", flush=True)
-    wait()
+    wait_for_line()
 
 
-def wait() -> None:
+def wait_for_line() -> None:
     """Until a line comes, or the input ends."""
     sys.stdin.readline()
 
 
 PEERS: Final[dict[str, Callable[[str, int, float], int]]] = {
-    "can": can,
-    "ros2": ros2,
-    "vss": vss,
-    "gpsd": gpsd,
+    "can": send_can,
+    "ros2": send_ros2,
+    "vss": send_vss,
+    "gpsd": send_gpsd,
 }
 
 
@@ -222,7 +222,7 @@ def main(words: Any) -> None:  # noqa: ANN401
     """Be a peer."""
     kind, address, samples, rate = words
     print(json.dumps({"sent": PEERS[kind](address, int(samples), float(rate))}), flush=True)
-    wait()
+    wait_for_line()
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
-from edge_agent.inputs.block import Block, absolute
+from edge_agent.inputs.block import Block, to_utc_ns
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.truth_file import TruthRecorder
 
@@ -23,7 +23,7 @@ def blocks(
     while True:
         t, signals = fleet.step(steps)
         start_ns = start_ns or time.time_ns()  # after the first step, which may have to compile
-        block = Block(t, absolute(t, start_ns), signals)
+        block = Block(t, to_utc_ns(t, start_ns), signals)
         if recorder is not None:
             truth = fleet.truth
             position = fleet.scenario.origin.to_latlon(truth.x, truth.y)

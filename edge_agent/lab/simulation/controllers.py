@@ -74,7 +74,7 @@ def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt:
     traction_active = cut_drive(x, p, u, w, dt)
     for i in range(4):
         target = wanted * unit if i == wheel else 0.0
-        if traction_active and spins(x, p, w, i) > MUCH and u[Control.DRIVE, i] > 0.0:
+        if traction_active and spin_excess(x, p, w, i) > MUCH and u[Control.DRIVE, i] > 0.0:
             target = max(target, TCS_BRAKE * unit)
         step = HELD_RATE * unit * dt
         x[Motion.HELD + i] += min(max(target - x[Motion.HELD + i], -step), step)
@@ -110,7 +110,7 @@ def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int,
 
 
 @compiled
-def spins(x: FloatArray, p: FloatArray, w: FloatArray, i: int) -> float:
+def spin_excess(x: FloatArray, p: FloatArray, w: FloatArray, i: int) -> float:
     """Return how much faster than the ground wheel `i` turns, over the limit of traction
     control.
     """
@@ -126,7 +126,7 @@ def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: fl
     """
     acts = drags = False
     for i in range(4):
-        spin = spins(x, p, w, i)
+        spin = spin_excess(x, p, w, i)
         if (u[Control.DRIVE, i] > 0.0 and spin > 1.0) or (
             u[Control.DRIVE, i] < 0.0 and spin < -1.0
         ):

@@ -48,7 +48,7 @@ def key_of(*seeds: int) -> np.uint64:
 
 
 @compiled
-def mixed(key: np.uint64, counter: np.uint64) -> np.uint64:
+def mix_bits(key: np.uint64, counter: np.uint64) -> np.uint64:
     """Return 64 random bits of `counter` in the stream `key`."""
     z = key + (counter + ONE) * STEP
     z = (z ^ (z >> SHIFTS[0])) * MULTIPLY_1
@@ -59,7 +59,7 @@ def mixed(key: np.uint64, counter: np.uint64) -> np.uint64:
 @compiled
 def uniform(key: np.uint64, counter: int) -> float:
     """Return a number strictly between 0 and 1."""
-    return (float(mixed(key, np.uint64(counter)) >> DROP) + 0.5) * UNIT
+    return (float(mix_bits(key, np.uint64(counter)) >> DROP) + 0.5) * UNIT
 
 
 @compiled
@@ -68,6 +68,6 @@ def normal(key: np.uint64, counter: int) -> float:
     2·counter + 1 of the stream.
     """
     first = TWO * np.uint64(counter)
-    u = (float(mixed(key, first) >> DROP) + 0.5) * UNIT
-    angle = 2.0 * math.pi * float(mixed(key, first + ONE) >> DROP) * UNIT
+    u = (float(mix_bits(key, first) >> DROP) + 0.5) * UNIT
+    angle = 2.0 * math.pi * float(mix_bits(key, first + ONE) >> DROP) * UNIT
     return math.sqrt(-2.0 * math.log(u)) * math.cos(angle)

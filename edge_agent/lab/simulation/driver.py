@@ -135,7 +135,7 @@ def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
 
 
 @compiled
-def ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[int, float]:
+def place_ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[int, float]:
     """Return the place `distance` [m] further along the route: the row of a point, and metres
     beyond it.
 
@@ -158,7 +158,9 @@ def ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[in
 @compiled
 def budget(d: FloatArray) -> float:
     """Return q [m/s^2], the acceleration that the driver is ready to demand from the tyres."""
-    style = d[Driver.STYLE] * (CAREFUL if heeds(d) and d[Driver.WARNED_START] <= 0.0 else 1.0)
+    style = d[Driver.STYLE] * (
+        CAREFUL if heeds_warning(d) and d[Driver.WARNED_START] <= 0.0 else 1.0
+    )
     return float(min(style * d[Driver.BELIEF] * GRAVITY, d[Driver.COMFORT]))
 
 
@@ -169,7 +171,7 @@ def cruise(d: FloatArray) -> float:
 
 
 @compiled
-def believe(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None:
+def update_belief(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None:
     """Update the driver's belief with the looks of the road ahead, and with sliding wheels."""
     lag = WORSE_S if looks < d[Driver.BELIEF] else BETTER_S
     d[Driver.BELIEF] += (looks - d[Driver.BELIEF]) * -math.expm1(-dt / lag)
@@ -181,7 +183,7 @@ def believe(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None:
 
 
 @compiled
-def heed(d: FloatArray, vx: float, dt: float) -> None:
+def advance_warning(d: FloatArray, vx: float, dt: float) -> None:
     """Advance the warned stretch: it comes nearer, and is passed."""
     if d[Driver.WARNED_END] > 0.0:
         d[Driver.WARNED_IN] -= dt
@@ -190,13 +192,13 @@ def heed(d: FloatArray, vx: float, dt: float) -> None:
 
 
 @compiled
-def heeds(d: FloatArray) -> bool:
+def heeds_warning(d: FloatArray) -> bool:
     """Return True if the driver acts on a warning now."""
     return bool(d[Driver.WARNED_END] > 0.0 and d[Driver.WARNED_IN] <= 0.0)
 
 
 @compiled
-def alerted(t: float, key: Key) -> float:
+def traffic_braking(t: float, key: Key) -> float:
     """Return how hard traffic ahead makes the driver brake now, as a share of the budget; 0 most of
     the time.
     """
@@ -207,7 +209,7 @@ def alerted(t: float, key: Key) -> float:
 
 
 @compiled
-def stops(t: float, share: float, key: Key) -> bool:
+def is_stopping(t: float, share: float, key: Key) -> bool:
     """Return True if the driver is stopping or waiting now, which is so in this share of the
     ALERT_S.
     """
@@ -227,7 +229,7 @@ def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
     It is the advised speed, limited so that later points of the route need no more braking on the
     stretch than its expected grip allows.
     """
-    row, _ = ahead(d, g, lanes, max(d[Driver.WARNED_START], 0.0))
+    row, _ = place_ahead(d, g, lanes, max(d[Driver.WARNED_START], 0.0))
     lane = g[Route.LANE]
     stays = lanes[1][lane] <= row < lanes[1][lane] + lanes[2][lane]
     profile = lanes[0][row, LanePoint.PROFILE + (g[Route.WAY] if stays else 0)]
@@ -247,7 +249,7 @@ def wished_acceleration(
     q = budget(d)
     reach = max(2.0, 0.5 * vx)
     lane = g[Route.LANE]
-    row, beyond = ahead(d, g, lanes, reach)
+    row, beyond = place_ahead(d, g, lanes, reach)
     last = lanes[1][lane] + lanes[2][lane] - 1
     stays = lanes[1][lane] <= row <= last
     here = lanes[0][lanes[1][lane] + g[Route.POINT], LanePoint.PROFILE + g[Route.WAY]]
@@ -261,7 +263,7 @@ def wished_acceleration(
             (lanes[0][row + 1, LanePoint.PROFILE + g[Route.WAY]] - there) * beyond / lanes[3][lane]
         )
     aim = min(q * there, cruise(d) ** 2)
-    if heeds(d):
+    if heeds_warning(d):
         aim = min(
             aim,
             warned_square(d, g, lanes)
@@ -278,10 +280,10 @@ def wished_acceleration(
         0.8 * q,
         strongest_pull(p, vx) / p[Parameter.MASS],
     )
-    alarm = alerted(t, key)
+    alarm = traffic_braking(t, key)
     if alarm > 0.0 and vx > SLOWEST + 1.0:
         wish = min(wish, -alarm * q)
-    if stops(t, d[Driver.STOPS], key):
+    if is_stopping(t, d[Driver.STOPS], key):
         wish = -STOPPING * q
     hardest = max(q, FRIGHT) if vx * vx > TOO_FAST * aim else q
     return float(min(max(wish, -max(longitudinal, LEAST_BRAKING) * hardest), longitudinal * gas))
@@ -311,7 +313,7 @@ def wished_steer(
     """
     vx = max(x[Motion.VX], SLOWEST)
     base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
-    number, beyond = ahead(d, g, lanes, 2.5 + 0.45 * vx)
+    number, beyond = place_ahead(d, g, lanes, 2.5 + 0.45 * vx)
     row = lanes[0][number]
     offset = d[Driver.WOBBLE] * math.sin(2.0 * math.pi * WOBBLE_HZ * t + 1e3 * d[Driver.WOBBLE])
     dx = row[LanePoint.X] + row[LanePoint.COS] * beyond - row[LanePoint.SIN] * offset - x[Motion.X]
@@ -349,16 +351,16 @@ def drive(
     lanes, friction = world
     t, dt, along = now
     d[Driver.SHORT] = follow(x, g, lanes, keys[0])
-    number, _ = ahead(d, g, lanes, max(LOOKING_S * x[Motion.VX], 0.0))
+    number, _ = place_ahead(d, g, lanes, max(LOOKING_S * x[Motion.VX], 0.0))
     point = lanes[0][number]
     looks = look_up(friction, PatchColumn.LOOKS, t, point[LanePoint.X], point[LanePoint.Y])
-    heed(d, x[Motion.VX], dt)
-    if heeds(d) and d[Driver.WARNED_START] <= PREPARED_S * x[Motion.VX]:
+    advance_warning(d, x[Motion.VX], dt)
+    if heeds_warning(d) and d[Driver.WARNED_START] <= PREPARED_S * x[Motion.VX]:
         looks = min(looks, d[Driver.WARNED_MU])
-    believe(d, looks, w, dt)
+    update_belief(d, looks, w, dt)
     acceleration = wished_acceleration(x, d, g, lanes, p, t, keys[1])
     force = wished_force(p, d, x[Motion.VX], acceleration, along)
-    if x[Motion.VX] < RESTING and stops(t, d[Driver.STOPS], keys[1]):
+    if x[Motion.VX] < RESTING and is_stopping(t, d[Driver.STOPS], keys[1]):
         force = -p[Parameter.MASS] * (STOPPING * budget(d) + abs(along))
     d[Driver.FORCE] += (force - d[Driver.FORCE]) * -math.expm1(-dt / FOOT_S)
     d[Driver.STEER] += (wished_steer(x, d, g, lanes, p, t) - d[Driver.STEER]) * -math.expm1(

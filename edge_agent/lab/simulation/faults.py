@@ -52,34 +52,34 @@ Effect = Callable[[FloatArray, BoolArray, float], None]
 """(values (T,) of one channel, changed in place; when (T,); size)."""
 
 
-def silent(values: FloatArray, when: BoolArray, _size: float) -> None:
+def drop_readings(values: FloatArray, when: BoolArray, _size: float) -> None:
     """Return no readings."""
     values[when] = np.nan
 
 
-def stuck(values: FloatArray, when: BoolArray, _size: float) -> None:
+def hold_reading(values: FloatArray, when: BoolArray, _size: float) -> None:
     """Repeat the last reading before the fault."""
     if when.any():
         first = int(np.argmax(when))
         values[when] = values[max(first - 1, 0)]
 
 
-def spike(values: FloatArray, when: BoolArray, size: float) -> None:
+def add_spikes(values: FloatArray, when: BoolArray, size: float) -> None:
     """Add `size` to every tenth reading."""
     values[np.flatnonzero(when)[::10]] += size
 
 
-def bias(values: FloatArray, when: BoolArray, size: float) -> None:
+def add_bias(values: FloatArray, when: BoolArray, size: float) -> None:
     """Add a step of `size` to the offset."""
     values[when] += size
 
 
 FAULTS: Final[dict[str, Effect]] = {
-    "dropout": silent,
-    "missing": silent,  # for a whole drive: the vehicle does not have the channel
-    "stuck": stuck,
-    "spike": spike,
-    "bias": bias,
+    "dropout": drop_readings,
+    "missing": drop_readings,  # for a whole drive: the vehicle does not have the channel
+    "stuck": hold_reading,
+    "spike": add_spikes,
+    "bias": add_bias,
 }
 
 

@@ -31,7 +31,7 @@ from edge_agent.lab.simulation.plant import (
 )
 from edge_agent.lab.simulation.presets import nominal, one_of_a_fleet, winter_equipped
 from edge_agent.lab.simulation.record import RECORD, RecordColumn, observe
-from edge_agent.lab.simulation.relief import cross_slope, gradient, tilt
+from edge_agent.lab.simulation.relief import cross_slope, gradient, slope_in_body
 from edge_agent.lab.simulation.roads import LanePoint, Network
 from edge_agent.lab.simulation.scenarios import Scenario, scenario_named
 from edge_agent.lab.simulation.sensors import (
@@ -128,7 +128,7 @@ def run(
             east, north = gradient(
                 relief, (x[Motion.X], x[Motion.Y]), heading, d[Driver.CROSS_SLOPE]
             )
-            u[Control.TILT, 0], u[Control.TILT, 1] = tilt(east, north, x[Motion.YAW])
+            u[Control.TILT, 0], u[Control.TILT, 1] = slope_in_body(east, north, x[Motion.YAW])
             now = (t, period, gravity(u)[0])
             drive(x, (d, g), (lanes, friction), p, w, now, (keys[0][n], keys[1][n]))
             command(p, u, d[Driver.STEER], d[Driver.FORCE])

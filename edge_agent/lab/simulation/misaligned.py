@@ -111,7 +111,7 @@ def memory_of(rows: FloatArray, rate_hz: float) -> int:
 
 
 @compiled
-def late(records: FloatArray, now: int, samples: float, record: FloatArray) -> None:
+def delayed_record(records: FloatArray, now: int, samples: float, record: FloatArray) -> None:
     """Fill `record` from the records (T, 32) `samples` before row `now`, linear between them;
     earlier times get the first record.
     """
@@ -140,7 +140,7 @@ def misalign(mounted: FloatArray, signals: FloatArray) -> None:
 
 
 @compiled
-def counted(record: FloatArray, mounted: FloatArray, signals: FloatArray) -> None:
+def quantise_speeds(record: FloatArray, mounted: FloatArray, signals: FloatArray) -> None:
     """Quantise wheel speeds into steps, with zero for a wheel that stands; remove torque where the
     car has none.
     """

@@ -38,10 +38,10 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from edge_agent.dynamics.body import accelerations
+from edge_agent.dynamics.body import planar_accelerations
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import Parameter, body
-from edge_agent.dynamics.slip import SLOWEST_M_S, slips, wheel_position, wheel_velocity
+from edge_agent.dynamics.parameters import Parameter, body_of
+from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position, wheel_slips, wheel_velocity
 from edge_agent.dynamics.tyres import TINY, brush, dugoff, magic_formula
 from edge_agent.lab.simulation.controllers import control_slip, slip_limit
 from edge_agent.lab.simulation.state import STATES, Control, Motion, TrueParameter, Wheel
@@ -83,7 +83,7 @@ def stiffness_per_load(slope: float, degression: float, load: float, at_rest: fl
 
 
 @compiled
-def allowed(slip: float, limit: float) -> float:
+def allowed_share(slip: float, limit: float) -> float:
     """Return the share of the torque that slip control allows: all up to `limit`, nothing from
     twice the limit.
     """
@@ -108,16 +108,16 @@ def wheel_torques(
             faster = p[Parameter.RADIUS] * x[Motion.OMEGA + i] - abs(x[Motion.VX])
             drive *= min(max((FREE_SPIN[1] - faster) / (FREE_SPIN[1] - FREE_SPIN[0]), 0.0), 1.0)
     elif slip > 0.0:
-        drive *= allowed(slip, slip_limit(p, i))
+        drive *= allowed_share(slip, slip_limit(p, i))
     else:
-        brake *= allowed(slip, slip_limit(p, i))
+        brake *= allowed_share(slip, slip_limit(p, i))
     if drive < 0.0:
         drive *= min(max(x[Motion.OMEGA + i] / STANDING, 0.0), 1.0)
     return drive, brake
 
 
 @compiled
-def relax(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
+def relax_slip(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
     """Let the slip of the tyres build up for `dt` [s] over their relaxation length, after the
     wheels have turned.
     """
@@ -125,7 +125,7 @@ def relax(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
         along, across = wheel_velocity(
             p, i, x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE], u[Control.STEER, i]
         )
-        slip_x, slip_y = slips(p[Parameter.RADIUS], x[Motion.OMEGA + i], along, across)
+        slip_x, slip_y = wheel_slips(p[Parameter.RADIUS], x[Motion.OMEGA + i], along, across)
         rolled = max(abs(along), abs(p[Parameter.RADIUS] * x[Motion.OMEGA + i]), SLOWEST_M_S)
         share = -math.expm1(-dt * rolled / p[TrueParameter.RELAXATION])
         x[Motion.SLIP_X + i] += share * (slip_x - x[Motion.SLIP_X + i])
@@ -135,8 +135,8 @@ def relax(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
 @compiled
 def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> None:
     """Fill `w` (8, 4) for the state `x`, parameters `p` and inputs `u` (5, 4)."""
-    loads = wheel_loads(body(p), x[Motion.AX_LAGGED], x[Motion.AY_LAGGED])
-    at_rest = wheel_loads(body(p), 0.0, 0.0)
+    loads = wheel_loads(body_of(p), x[Motion.AX_LAGGED], x[Motion.AY_LAGGED])
+    at_rest = wheel_loads(body_of(p), 0.0, 0.0)
     _, _, share = gravity(u)
     for i in range(4):
         load = share * loads[i]
@@ -144,7 +144,7 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
         along, across = wheel_velocity(
             p, i, x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE], u[Control.STEER, i]
         )
-        slip_x, slip_y = slips(p[Parameter.RADIUS], omega, along, across)
+        slip_x, slip_y = wheel_slips(p[Parameter.RADIUS], omega, along, across)
         raw_slip = slip_x
         if p[TrueParameter.RELAXATION] > 0.0:
             slip_x = DIRECT * slip_x + (1.0 - DIRECT) * x[Motion.SLIP_X + i]
@@ -192,7 +192,7 @@ def body_accelerations(
 
     `w` is filled.
     """
-    ax, ay, yaw_acceleration = accelerations(p, w[Wheel.FX], w[Wheel.FY], u[Control.STEER])
+    ax, ay, yaw_acceleration = planar_accelerations(p, w[Wheel.FX], w[Wheel.FY], u[Control.STEER])
     return (
         ax - p[TrueParameter.DRAG] * x[Motion.VX] * abs(x[Motion.VX]) / p[Parameter.MASS],
         ay,
@@ -242,7 +242,7 @@ def turn_wheels(
 
 
 @compiled
-def held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
+def is_held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
     """Return True if the brakes hold a vehicle that stands: brakes and tyres are stronger than
     engine and slope.
     """
@@ -261,9 +261,9 @@ def held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
 
 
 @compiled
-def stand(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
-    """Apply one step to a vehicle that is `held`: only the suspension still moves, to its balance
-    on the slope.
+def settle_standing(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
+    """Apply one step to a vehicle for which `is_held`: only the suspension still moves, to its
+    balance on the slope.
     """
     along, across, _ = gravity(u)
     x[Motion.VX] = x[Motion.VY] = x[Motion.YAW_RATE] = 0.0
@@ -283,8 +283,8 @@ def advance(
     """
     along, across, _ = gravity(u)
     for _ in range(substeps):
-        if held(x, p, u):
-            stand(x, p, u, dt)
+        if is_held(x, p, u):
+            settle_standing(x, p, u, dt)
             continue
         wheel_forces(x, p, u, w)
         ax, ay, yaw_acceleration = body_accelerations(x, p, u, w)
@@ -293,7 +293,7 @@ def advance(
         r = x[Motion.YAW_RATE]
         turn_wheels(x, p, u, w, dt, ax + r * vy + along, yaw_acceleration)
         if p[TrueParameter.RELAXATION] > 0.0:
-            relax(x, p, u, dt)
+            relax_slip(x, p, u, dt)
         if p[TrueParameter.ABS_HZ] > 0.0:
             control_slip(x, p, u, w, dt)
         c = math.cos(x[Motion.YAW] + 0.5 * dt * r)

@@ -220,7 +220,7 @@ def true_vehicle(vehicle: str | Vehicle | TrueVehicle) -> TrueVehicle:
     return PRESETS[vehicle]
 
 
-def matched(vehicle: TrueVehicle) -> TrueVehicle:
+def matched_to_papers(vehicle: TrueVehicle) -> TrueVehicle:
     """Return the vehicle without effects that the papers' model leaves out: drag, rolling
     resistance, lagging loads, degressive tyres.
 
@@ -232,11 +232,11 @@ def matched(vehicle: TrueVehicle) -> TrueVehicle:
 
 
 def as_printed(vehicle: TrueVehicle, *, proportional: bool = False) -> TrueVehicle:
-    """Return the `matched` vehicle with Dugoff tyres; proportional: stiffness is proportional to
-    friction.
+    """Return the `matched_to_papers` vehicle with Dugoff tyres; proportional: stiffness is
+    proportional to friction.
     """
     stiffness = "proportional-to-friction" if proportional else "similarity"
-    return replace(matched(vehicle), curve="dugoff", stiffness=stiffness)
+    return replace(matched_to_papers(vehicle), curve="dugoff", stiffness=stiffness)
 
 
 def nominal(truth: TrueVehicle, rng: np.random.Generator) -> Vehicle:

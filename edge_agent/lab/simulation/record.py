@@ -9,7 +9,7 @@ from enum import IntEnum
 from typing import Final
 
 from edge_agent.dynamics.parameters import Parameter
-from edge_agent.lab.simulation.plant import body_accelerations, gravity, held, wheel_forces
+from edge_agent.lab.simulation.plant import body_accelerations, gravity, is_held, wheel_forces
 from edge_agent.lab.simulation.state import Control, Motion, TrueParameter, Wheel
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -84,7 +84,7 @@ def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: 
     record[RecordColumn.TCS] = 1.0 if x[Motion.TCS_LEFT] > 0.0 else 0.0
     record[RecordColumn.ESC] = 1.0 if x[Motion.ESC_LEFT] > 0.0 else 0.0
     record[RecordColumn.SLOPE], record[RecordColumn.BANK] = u[Control.TILT, 0], u[Control.TILT, 1]
-    if held(x, p, u):
+    if is_held(x, p, u):
         _observe_held(x, p, u, record)
 
 

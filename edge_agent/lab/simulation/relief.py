@@ -126,7 +126,7 @@ def gradient(
 
 
 @compiled
-def tilt(east: float, north: float, yaw: float) -> tuple[float, float]:
+def slope_in_body(east: float, north: float, yaw: float) -> tuple[float, float]:
     """Return the rise per metre ahead of a vehicle of that heading [rad], and to its left."""
     c = math.cos(yaw)
     s = math.sin(yaw)
@@ -136,49 +136,53 @@ def tilt(east: float, north: float, yaw: float) -> tuple[float, float]:
 LEVEL: Final = Relief()
 
 
-def level(_seed: int) -> Relief:
+def level_relief(_seed: int) -> Relief:
     """Return a relief without slope or crossfall."""
     return LEVEL
 
 
-def rolling(seed: int) -> Relief:
+def rolling_relief(seed: int) -> Relief:
     """Return waves of 3 % along the road, 300 and 120 m long."""
     key = key_of(seed, RELIEF_STREAM)
     return Relief(
-        tuple(Wave(0.03, length, 0.0, _turn(key, k)) for k, length in enumerate((300.0, 120.0)))
+        tuple(
+            Wave(0.03, length, 0.0, _random_turn(key, k)) for k, length in enumerate((300.0, 120.0))
+        )
     )
 
 
-def stepped(seed: int) -> Relief:
+def stepped_relief(seed: int) -> Relief:
     """Return slopes of 4 % up and down in turn, 60 m each, with kinks between."""
-    return Relief((Wave(0.04, 120.0, 0.0, _turn(key_of(seed, RELIEF_STREAM), 0), stepped=True),))
+    return Relief(
+        (Wave(0.04, 120.0, 0.0, _random_turn(key_of(seed, RELIEF_STREAM), 0), stepped=True),)
+    )
 
 
-def banked(_seed: int) -> Relief:
+def banked_relief(_seed: int) -> Relief:
     """Return a crossfall of 4 % without longitudinal slope."""
     return Relief(crossfall=0.04)
 
 
-def hilly(seed: int) -> Relief:
+def hilly_relief(seed: int) -> Relief:
     """Return everything at once, each drawn: a lasting slope (2 %), waves (to 3 %) that also lean,
     steps, crossfall.
     """
     key = key_of(seed, RELIEF_STREAM)
     waves = [
-        Wave(0.03 * uniform(key, 10 + k), length, 0.5 * normal(key, 20 + k), _turn(key, k))
+        Wave(0.03 * uniform(key, 10 + k), length, 0.5 * normal(key, 20 + k), _random_turn(key, k))
         for k, length in enumerate((400.0, 150.0))
     ]
-    steps = Wave(0.02 * uniform(key, 12), 200.0, 0.0, _turn(key, 2), stepped=True)
+    steps = Wave(0.02 * uniform(key, 12), 200.0, 0.0, _random_turn(key, 2), stepped=True)
     lasting = Wave(min(max(0.02 * normal(key, 30), -STEEPEST), STEEPEST))
     return Relief((lasting, *waves, steps), crossfall=0.025 * uniform(key, 13))
 
 
 ROADS: Final[dict[str, Callable[[int], Relief]]] = {
-    "level": level,
-    "rolling": rolling,
-    "stepped": stepped,
-    "banked": banked,
-    "hilly": hilly,
+    "level": level_relief,
+    "rolling": rolling_relief,
+    "stepped": stepped_relief,
+    "banked": banked_relief,
+    "hilly": hilly_relief,
 }
 """Test tracks by name; each is drawn by a seed."""
 
@@ -198,5 +202,5 @@ def road_named(name: str | Relief, seed: int, slope: float = 0.0) -> Relief:
     return replace(name, waves=(*name.waves, Wave(slope))) if slope else name
 
 
-def _turn(key: np.uint64, number: int) -> float:
+def _random_turn(key: np.uint64, number: int) -> float:
     return 2.0 * math.pi * uniform(key, number)

@@ -103,13 +103,15 @@ def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, 
                     f"road {number} leads to {name!r}",
                     f"use one of {', '.join(junctions)}",
                 )
-        centre = rounded([junctions[road.start], *road.bends, junctions[road.end]], road.radius)
-        centre = centre[_within(centre, SETBACK_M)]
+        centre = round_corners(
+            [junctions[road.start], *road.bends, junctions[road.end]], road.radius
+        )
+        centre = centre[_inner_points(centre, SETBACK_M)]
         for line, start, end in (
             (centre, road.start, road.end),
             (centre[::-1], road.end, road.start),
         ):
-            lanes.append(resampled(shifted_right(line, LANE_OFFSET_M)))
+            lanes.append(resample_line(shifted_right(line, LANE_OFFSET_M)))
             leaves.append((start, number))
             arrives.append(end)
     count = len(lanes)
@@ -118,7 +120,7 @@ def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, 
         for j, (junction, number) in enumerate(leaves[:count]):
             if junction == arrives[k] and number != k // 2:
                 ways[k].append(len(lanes))
-                lanes.append(connector(lanes[k], lanes[j]))
+                lanes.append(connect_lanes(lanes[k], lanes[j]))
                 ways.append([j])
         if not 1 <= len(ways[k]) <= MOST_WAYS:
             raise InputError(
@@ -129,17 +131,17 @@ def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, 
     return network_of(lanes, ways, count)
 
 
-def rounded(corners: list[tuple[float, float]], radius: float) -> FloatArray:
+def round_corners(corners: list[tuple[float, float]], radius: float) -> FloatArray:
     """Return a line through the corners whose inner ones are arcs of `radius`, points a quarter of
     a metre apart, (n, 2).
     """
     line = [np.array(corners[0])]
     for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
         p = np.array(corner)
-        a = _unit(np.array(before) - p)
-        b = _unit(np.array(after) - p)
+        a = _unit_vectors(np.array(before) - p)
+        b = _unit_vectors(np.array(after) - p)
         half = math.acos(float(np.clip(a @ b, -1.0, 1.0))) / 2.0  # half the angle between the legs
-        centre = p + _unit(a + b) * radius / math.sin(half)
+        centre = p + _unit_vectors(a + b) * radius / math.sin(half)
         start = p + a * radius / math.tan(half)
         end = p + b * radius / math.tan(half)
         swept = math.pi - 2.0 * half
@@ -153,14 +155,14 @@ def rounded(corners: list[tuple[float, float]], radius: float) -> FloatArray:
             )
         line[-1] = end
     line.append(np.array(corners[-1]))
-    return resampled(np.array(line), 0.25)
+    return resample_line(np.array(line), 0.25)
 
 
-def resampled(line: FloatArray, spacing: float = SPACING_M) -> FloatArray:
+def resample_line(line: FloatArray, spacing: float = SPACING_M) -> FloatArray:
     """Return the same line with equally spaced points, about `spacing` [m] apart, with its ends
     kept.
     """
-    run = _run(line)
+    run = _distance_along(line)
     even = np.linspace(0.0, run[-1], max(2, round(run[-1] / spacing) + 1))
     return np.column_stack([np.interp(even, run, line[:, 0]), np.interp(even, run, line[:, 1])])
 
@@ -172,34 +174,34 @@ def shifted_right(line: FloatArray, offset: float) -> FloatArray:
     return line + offset * np.column_stack([direction[:, 1], -direction[:, 0]])
 
 
-def connector(arriving: FloatArray, leaving: FloatArray) -> FloatArray:
+def connect_lanes(arriving: FloatArray, leaving: FloatArray) -> FloatArray:
     """Return the way through a junction: a cubic Bezier curve that leaves one lane and joins the
     other without a kink.
     """
     p0 = arriving[-1]
     p3 = leaving[0]
     handle = HANDLE * float(np.linalg.norm(p3 - p0))
-    p1 = p0 + handle * _unit(arriving[-1] - arriving[-2])
-    p2 = p3 - handle * _unit(leaving[1] - leaving[0])
+    p1 = p0 + handle * _unit_vectors(arriving[-1] - arriving[-2])
+    p2 = p3 - handle * _unit_vectors(leaving[1] - leaving[0])
     u = np.linspace(0.0, 1.0, 200)[:, None]
-    return resampled(
+    return resample_line(
         (1 - u) ** 3 * p0 + 3 * (1 - u) ** 2 * u * p1 + 3 * (1 - u) * u**2 * p2 + u**3 * p3
     )
 
 
-def _unit(v: FloatArray) -> FloatArray:
+def _unit_vectors(v: FloatArray) -> FloatArray:
     unit: FloatArray = v / np.linalg.norm(v)
     return unit
 
 
-def _run(line: FloatArray) -> FloatArray:
+def _distance_along(line: FloatArray) -> FloatArray:
     """Return the distance along a line at each of its points."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
 
 
-def _within(line: FloatArray, setback: float) -> IntArray:
+def _inner_points(line: FloatArray, setback: float) -> IntArray:
     """Return the indices of the points that are at least `setback` from both ends."""
-    run = _run(line)
+    run = _distance_along(line)
     return np.flatnonzero((run >= setback) & (run <= run[-1] - setback))
 
 
@@ -219,7 +221,7 @@ def network_of(
             junctions allow.
     """
     size = np.array([len(lane) for lane in lanes])
-    spacing = np.array([_run(lane)[-1] / (len(lane) - 1) for lane in lanes])
+    spacing = np.array([_distance_along(lane)[-1] / (len(lane) - 1) for lane in lanes])
     onward = np.full((len(lanes), MOST_WAYS), -1)
     for k, targets in enumerate(ways):
         onward[k, : len(targets)] = targets
@@ -231,7 +233,7 @@ def network_of(
         limits[k] = np.minimum(limits[k], YIELD_M)
     if allowed is not None:
         limits = [np.minimum(own, given) for own, given in zip(limits, allowed, strict=True)]
-    _plan(tables, limits, ways, spacing)
+    _plan_speeds(tables, limits, ways, spacing)
     return Network(np.concatenate(tables), np.cumsum(size) - size, size, spacing, onward, roads)
 
 
@@ -248,7 +250,7 @@ def _lane_table(lane: FloatArray) -> FloatArray:
     return np.column_stack([lane, np.cos(heading), np.sin(heading), curvature, empty])
 
 
-def _plan(
+def _plan_speeds(
     tables: list[FloatArray], limits: list[FloatArray], ways: list[list[int]], spacing: FloatArray
 ) -> None:
     """Fill the profiles from their ends backwards until nothing changes.

@@ -202,7 +202,7 @@ def frost() -> Scenario:
     )
 
 
-def drawn(seed: int) -> Scenario:
+def drawn_town(seed: int) -> Scenario:
     """Return the demonstration's town with other frictions and other hills, drawn by the seed, for
     evaluations.
 
@@ -243,13 +243,13 @@ def drawn(seed: int) -> Scenario:
 
 
 def winter(seed: int) -> Scenario:
-    """Return the town `drawn` by the seed with winter on its lanes.
+    """Return the `drawn_town` of the seed with winter on its lanes.
 
     Each lane has one of these: black ice where drivers brake before a junction, or in a bend; ice
     under the left or under the right wheels alone; two ruts of slush; or nothing. Drivers do not
     see ice; slush looks wet.
     """
-    town = drawn(seed)
+    town = drawn_town(seed)
     key = key_of(checked_seed(seed), WINTER_STREAM)
     network = town.network
     order = sorted(range(len(ON_LANES)), key=lambda k: uniform(key, k))
@@ -342,7 +342,7 @@ SCENARIOS: Final = {scenario.name: scenario for scenario in (demo(), hills(), fr
 
 
 def scenario_named(name: str | Scenario) -> Scenario:
-    """Return the scenario of that name; "hills-7" is the one `drawn` by the seed 7, "winter-7" the
+    """Return the scenario of that name; "hills-7" is the `drawn_town` of the seed 7, "winter-7" the
     same in winter.
 
     Raises:
@@ -351,7 +351,7 @@ def scenario_named(name: str | Scenario) -> Scenario:
     if isinstance(name, Scenario):
         return name
     if name.startswith(DRAWN) and name[len(DRAWN) :].isdecimal():
-        return drawn(int(name[len(DRAWN) :]))
+        return drawn_town(int(name[len(DRAWN) :]))
     if name.startswith(WINTER) and name[len(WINTER) :].isdecimal():
         return winter(int(name[len(WINTER) :]))
     if name not in SCENARIOS:

@@ -26,10 +26,10 @@ from edge_agent.lab.simulation.misaligned import (
     MISALIGNED,
     Misaligned,
     Misalignment,
-    counted,
-    late,
+    delayed_record,
     misalign,
     misalignment_row,
+    quantise_speeds,
 )
 from edge_agent.lab.simulation.place import Origin
 from edge_agent.lab.simulation.record import RecordColumn
@@ -229,7 +229,9 @@ def read_late(
     record = np.empty(records.shape[1])
     readings = np.empty(signals.size)
     for device in range(DEVICES):
-        late(records, lead, error[ErrorColumn.MOUNTED + Misaligned.LAG + device] * rate_hz, record)
+        delayed_record(
+            records, lead, error[ErrorColumn.MOUNTED + Misaligned.LAG + device] * rate_hz, record
+        )
         read_out(record, error, place, readings)
         for c in range(signals.size):
             if DEVICE_OF[c] == device:
@@ -293,7 +295,7 @@ def sense(
                 if c >= S.LATITUDE:
                     row[c] += wander[n, c - S.LATITUDE]
             if rough:
-                counted(records[lead + k, n], error[ErrorColumn.MOUNTED :], row)
+                quantise_speeds(records[lead + k, n], error[ErrorColumn.MOUNTED :], row)
             if error[ErrorColumn.DROPOUTS] > 0.0:
                 window = sample // per_silence
                 for c in range(len(CHANNELS)):

@@ -36,7 +36,13 @@ from edge_agent.lab.simulation.plant import (
 )
 from edge_agent.lab.simulation.presets import TrueVehicle, nominal, true_vehicle
 from edge_agent.lab.simulation.record import RECORD, RecordColumn, observe
-from edge_agent.lab.simulation.relief import Relief, cross_slope, gradient, road_named, tilt
+from edge_agent.lab.simulation.relief import (
+    Relief,
+    cross_slope,
+    gradient,
+    road_named,
+    slope_in_body,
+)
 from edge_agent.lab.simulation.sensors import (
     SENSORS,
     Sensors,
@@ -106,18 +112,21 @@ def simulate_manoeuvre(
     Raises:
         InputError: an argument is out of range or unknown.
     """
-    manoeuvre = _named(name)
+    manoeuvre = _manoeuvre_of(name)
     chosen = sensors_named(sensors)
     truth = true_vehicle(vehicle)
     seed = checked_seed(seed)
-    _check(speed=speed, rate_hz=rate_hz, duration_s=duration_s)
+    _check_positive(speed=speed, rate_hz=rate_hz, duration_s=duration_s)
     speed = manoeuvre.speed if speed is None else speed
     duration = manoeuvre.duration if duration_s is None else duration_s
     world = ProvingGround(
-        _friction(manoeuvre.friction if mu is None else mu), road_named(road, seed, slope).table
+        _friction_field(manoeuvre.friction if mu is None else mu),
+        road_named(road, seed, slope).table,
     )
-    records = _drive(manoeuvre, truth, world, speed, rate_hz, max(1, round(duration * rate_hz)))
-    signals = _sensed(records, chosen, origin, seed, rate_hz)
+    records = _drive_manoeuvre(
+        manoeuvre, truth, world, speed, rate_hz, max(1, round(duration * rate_hz))
+    )
+    signals = _sense_records(records, chosen, origin, seed, rate_hz)
     t = np.arange(len(records)) / rate_hz
     signals = apply_faults(t, signals, faults)
     file = (
@@ -125,10 +134,10 @@ def simulate_manoeuvre(
         if chosen == SENSORS["ideal"]
         else nominal(truth, np.random.default_rng([seed, 0]))
     )
-    return _table(t, signals, records), file
+    return _log_table(t, signals, records), file
 
 
-def _named(name: str) -> Manoeuvre:
+def _manoeuvre_of(name: str) -> Manoeuvre:
     if name not in MANOEUVRES:
         raise InputError(
             "manoeuvre", f"there is no manoeuvre {name!r}", f"choose one of {', '.join(MANOEUVRES)}"
@@ -136,13 +145,13 @@ def _named(name: str) -> Manoeuvre:
     return MANOEUVRES[name]
 
 
-def _check(**positive: float | None) -> None:
+def _check_positive(**positive: float | None) -> None:
     for name, value in positive.items():
         if value is not None and not (math.isfinite(value) and value > 0.0):
             raise InputError(name, f"{value} is not possible", "give a positive number")
 
 
-def _friction(mu: Friction) -> Callable[[float, float, float], float]:
+def _friction_field(mu: Friction) -> Callable[[float, float, float], float]:
     if isinstance(mu, TimedFriction):
         return lambda t, _x, _y: mu.value(t)
     if callable(mu):
@@ -159,7 +168,7 @@ class ProvingGround(NamedTuple):
     relief: FloatArray
 
 
-def _drive(
+def _drive_manoeuvre(
     manoeuvre: Manoeuvre,
     truth: TrueVehicle,
     world: ProvingGround,
@@ -183,8 +192,8 @@ def _drive(
     currents = at_rest()
     for k in range(samples):
         east, north = gradient(world.relief, (x[Motion.X], x[Motion.Y]), (1.0, 0.0), across)
-        u[Control.TILT, :2] = tilt(east, north, x[Motion.YAW])
-        now = replace(_moment(k * dt, x, speed), lost=lost, motors=truth.motors)
+        u[Control.TILT, :2] = slope_in_body(east, north, x[Motion.YAW])
+        now = replace(_moment_of(k * dt, x, speed), lost=lost, motors=truth.motors)
         now = replace(now, gain=float(records[k - 1, RecordColumn.AX]) if k else 0.0)
         lost += dt * (speed - now.vx)
         wish, acceleration = manoeuvre.control(now)
@@ -214,13 +223,13 @@ def _drive(
     return records
 
 
-def _moment(t: float, x: FloatArray, speed: float) -> Moment:
+def _moment_of(t: float, x: FloatArray, speed: float) -> Moment:
     return Moment(
         t, float(x[Motion.X]), float(x[Motion.Y]), float(x[Motion.YAW]), float(x[Motion.VX]), speed
     )
 
 
-def _sensed(
+def _sense_records(
     records: FloatArray, sensors: Sensors, origin: Origin, seed: int, rate_hz: float
 ) -> FloatArray:
     """Return the signals (T, 18) of the records of one vehicle."""
@@ -232,7 +241,7 @@ def _sensed(
     )[:, 0]
 
 
-def _table(t: FloatArray, signals: FloatArray, records: FloatArray) -> pa.Table:
+def _log_table(t: FloatArray, signals: FloatArray, records: FloatArray) -> pa.Table:
     """Return the log: NaN readings become nulls, truth has none."""
     columns = {"t": pa.array(t)}
     columns |= {name: pa.array(signals[:, i], from_pandas=True) for i, name in enumerate(CHANNELS)}

@@ -17,7 +17,7 @@ SCHEDULE: Final = (0.04, 0.01, 0.05)  # variances of its table 2 [SI], in turn,
 SCHEDULE_S: Final = 2.0  # each for two seconds: a period of six
 
 
-def scheduled(t: FloatArray) -> FloatArray:
+def scheduled_variance(t: FloatArray) -> FloatArray:
     """Return the variance at the times t (T,) [s] by the SCHEDULE."""
     return np.asarray(np.array(SCHEDULE)[(t / SCHEDULE_S).astype(int) % len(SCHEDULE)])
 
@@ -27,7 +27,7 @@ def on_ay(t: FloatArray, others: float) -> FloatArray:
     constant.
     """
     variance = np.full((len(t), 3), others)
-    variance[:, 1] = scheduled(t)
+    variance[:, 1] = scheduled_variance(t)
     return variance
 
 

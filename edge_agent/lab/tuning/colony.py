@@ -109,7 +109,7 @@ def renew(
     return np.where(reachable, np.clip(renewed, lowest_pheromone(reachable, retrace), HIGHEST), 0.0)
 
 
-def _walk(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
+def _walk_ant(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
     """One ant's path (V,): a draw from each row of (31)."""
     reached = np.cumsum(probabilities, axis=1)
     drawn = rng.random((len(probabilities), 1)) * reached[:, -1:]
@@ -117,7 +117,7 @@ def _walk(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
     return path
 
 
-def _weights(ants: int, habits: Habits) -> FloatArray:
+def _rank_weights(ants: int, habits: Habits) -> FloatArray:
     """Deposits (P,) of the best ants of an iteration by rank; with the best path so far they sum
     to ρ.
     """
@@ -144,29 +144,29 @@ def optimise(
     no ants or no iterations.
     """
     habits = habits or Habits()
-    graph = Graph.of(problem.choices)
+    graph = Graph.from_choices(problem.choices)
     reachable = graph.reachable
     ledger = Ledger(problem.objective, graph, problem.admissible)
     eta = (
         np.ones(reachable.shape)
         if visibility is None
-        else np.nan_to_num(Graph.of(visibility).positions, nan=1.0)
+        else np.nan_to_num(Graph.from_choices(visibility).positions, nan=1.0)
     )
     pheromone = np.where(reachable, HIGHEST, 0.0)
-    weights = _weights(ants, habits)
+    weights = _rank_weights(ants, habits)
 
     for iteration in range(iterations):
         odds = transition_probabilities(
             pheromone, eta, reachable, alpha=habits.alpha, theta=habits.theta
         )
-        paths = [ledger.draw(lambda odds=odds: _walk(odds, rng)) for _ in range(ants)]  # type: ignore[misc]
+        paths = [ledger.draw(lambda odds=odds: _walk_ant(odds, rng)) for _ in range(ants)]  # type: ignore[misc]
         if iteration == 0 and problem.start is not None:
             paths[0] = nearest(graph, problem.start)
         values = [ledger.evaluate(path) for path in paths]
         ledger.record(values, progress)
         pheromone = renew(
             pheromone,
-            _laid(paths, values, weights, ledger, habits),
+            _laid_pheromone(paths, values, weights, ledger, habits),
             reachable,
             evaporation=habits.evaporation,
             retrace=habits.retrace,
@@ -176,7 +176,7 @@ def optimise(
     return ledger.result()
 
 
-def _laid(
+def _laid_pheromone(
     paths: list[IntArray], values: list[float], weights: FloatArray, ledger: Ledger, habits: Habits
 ) -> FloatArray:
     """Δτ of one iteration: its best ants by rank, and the best path so far."""

@@ -33,7 +33,7 @@ def optimise(
     for _ in range(iterations):
         found = []
         for _one in range(ants):
-            child = parent if tally.count == 0 else _mutated(tally, parent, step, rng)
+            child = parent if tally.count == 0 else _mutate_vector(tally, parent, step, rng)
             got = tally.evaluate(child)
             found.append(got)
             success = got >= value
@@ -46,7 +46,7 @@ def optimise(
     return tally.result()
 
 
-def _mutated(
+def _mutate_vector(
     tally: SearchTally, parent: FloatArray, step: float, rng: np.random.Generator
 ) -> FloatArray:
     """An admissible child; the parent where none is found."""

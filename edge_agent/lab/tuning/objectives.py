@@ -29,7 +29,7 @@ import numpy as np
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.estimators import create
 from edge_agent.lab.simulation import SimulatedFleet, simulate_manoeuvre
-from edge_agent.lab.simulation.scenarios import drawn
+from edge_agent.lab.simulation.scenarios import drawn_town
 from edge_agent.lab.tuning.search import Objective
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray
@@ -200,7 +200,7 @@ def record_all(name: str, duration_s: float) -> TuningSet:
 
 def record_town(seed: int, cars: int, duration_s: float) -> TuningSet:
     """Cars in the town that the seed draws, from WARM_S on; a share of them is rough."""
-    fleet = SimulatedFleet(drawn(seed), cars, seed, RATE_HZ, rough=ROUGH_SHARE)
+    fleet = SimulatedFleet(drawn_town(seed), cars, seed, RATE_HZ, rough=ROUGH_SHARE)
     fleet.step(round(WARM_S * RATE_HZ))
     t, signals = fleet.step(round(duration_s * RATE_HZ))
     truth = fleet.truth

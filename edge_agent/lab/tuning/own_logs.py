@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.inputs.correct import corrected
+from edge_agent.inputs.correct import correct_log
 from edge_agent.inputs.signal_log import SignalLog
 from edge_agent.lab.tuning.objectives import TuningSet
 from schemas.errors import InputError
@@ -54,7 +54,7 @@ def _side_by_side(parts: Sequence[tuple[SignalLog, Vehicle, int]], samples: int)
     t = np.stack([log.t[first : first + samples] - log.t[first] for log, _, first in parts], axis=1)
     signals = np.stack(
         [
-            corrected(t[:, n], log.signals[first : first + samples], vehicle)
+            correct_log(t[:, n], log.signals[first : first + samples], vehicle)
             for n, (log, vehicle, first) in enumerate(parts)
         ],
         axis=1,

@@ -24,7 +24,7 @@ from edge_agent.adaptation.lower_vertices import LowerVertices
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.estimators import Estimates
 from edge_agent.estimators.paper_aco_fckf import AS_PRINTED, Setting, make_bank
-from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal, repeated
+from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal, repeat_drive
 from edge_agent.lab.simulation.white import add_white
 from edge_agent.lab.tuning.colony import Habits, optimise
 from edge_agent.lab.tuning.search import Problem, Result
@@ -57,7 +57,7 @@ def record_levels(
     exact = ideal(spec)
     levels = []
     for level in LEVELS:
-        batch = repeated(exact, len(seeds))
+        batch = repeat_drive(exact, len(seeds))
         variance = np.full(len(batch.t), level)
         for n, seed in enumerate(seeds):
             add_white(batch.signals[:, n], variance, np.random.default_rng([seed, 6]))
@@ -67,7 +67,7 @@ def record_levels(
 
 def likelihood(sets: Sets, drive: LevelDrive) -> float:
     """Mean log-likelihood of the innovations [nat per sample]."""
-    reported = _reported(sets, drive)
+    reported = _run_filter(sets, drive)
     value = np.nan_to_num(
         reported.innovation_log_likelihood[1:], nan=WORST, neginf=WORST, posinf=WORST
     )
@@ -88,7 +88,7 @@ def mismatch(sets: Sets, drive: LevelDrive) -> float:
 
 def accuracy(sets: Sets, drive: LevelDrive) -> float:
     """Less the mean of RMSE over the printed RMSE."""
-    reported = _reported(sets, drive)
+    reported = _run_filter(sets, drive)
     batch = drive.batch
     truth = {name: batch.truth[f"true_{name}"] for name in ("vx", "vy", "yaw_rate")} | {
         "mu": batch.mu
@@ -107,7 +107,7 @@ OBJECTIVES: Final[dict[str, Callable[[Sets, LevelDrive], float]]] = {
 }
 
 
-def _reported(sets: Sets, drive: LevelDrive) -> Estimates:
+def _run_filter(sets: Sets, drive: LevelDrive) -> Estimates:
     return make_bank(drive.batch.vehicles, sets, drive.setting).advance(
         drive.batch.t, drive.batch.signals
     )

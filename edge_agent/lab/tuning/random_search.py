@@ -15,7 +15,7 @@ def optimise(
     progress: Progress | None = None,
 ) -> Result:
     """Best of `ants`·`iterations` uniform draws; arguments and result as those of the colony."""
-    graph = Graph.of(problem.choices)
+    graph = Graph.from_choices(problem.choices)
     ledger = Ledger(problem.objective, graph, problem.admissible)
     counts = graph.reachable.sum(axis=1)
 

@@ -17,7 +17,7 @@ Objective = Callable[[FloatArray], float]
 Admissible = Callable[[FloatArray], bool]
 
 
-def everything(_vector: FloatArray) -> bool:
+def is_always_allowed(_vector: FloatArray) -> bool:
     """The admissible set without limits."""
     return True
 
@@ -52,7 +52,7 @@ class Problem:
     objective: Objective
     choices: Sequence[FloatArray]
     start: FloatArray | None = None
-    admissible: Admissible = everything
+    admissible: Admissible = is_always_allowed
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Graph:
     reachable: BoolArray
 
     @classmethod
-    def of(cls, choices: Sequence[FloatArray]) -> "Graph":
+    def from_choices(cls, choices: Sequence[FloatArray]) -> "Graph":
         """Build from one array of positions per vertex; raises InputError where a vertex has
         none.
         """

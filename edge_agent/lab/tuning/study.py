@@ -20,8 +20,8 @@ from edge_agent.adaptation.memberships import CHANNELS, SETS, Memberships
 from edge_agent.estimators.paper_aco_fckf import AT_THE_TRUTH, Setting, make_bank
 from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
 from edge_agent.lab.simulation.manoeuvres import kmh
-from edge_agent.lab.simulation.presets import matched
-from edge_agent.lab.simulation.white import add_white, scheduled
+from edge_agent.lab.simulation.presets import matched_to_papers
+from edge_agent.lab.simulation.white import add_white, scheduled_variance
 from edge_agent.lab.tuning import colony, random_search
 from edge_agent.lab.tuning.objectives import choices, interval_score
 from edge_agent.lab.tuning.search import Objective, Problem, Progress, Result
@@ -118,7 +118,7 @@ def record(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> Stud
             speed=drive.speed,
             rate_hz=FINE * RATE_HZ,
             duration_s=duration_s,
-            vehicle=matched(PRESETS[drive.vehicle]),
+            vehicle=matched_to_papers(PRESETS[drive.vehicle]),
             sensors="ideal",
         )
         log = log.take(np.arange(0, len(log), FINE))
@@ -142,7 +142,7 @@ def _noisy(
     exact: FloatArray, t: FloatArray, seeds: Sequence[int], condition: Condition
 ) -> FloatArray:
     """A copy with white noise on a_x, a_y and r."""
-    variance = scheduled(t) if condition.schedule else np.full(len(t), VARIANCE)
+    variance = scheduled_variance(t) if condition.schedule else np.full(len(t), VARIANCE)
     noisy = exact.copy()
     for n, seed in enumerate(seeds):
         add_white(noisy[:, n], variance, np.random.default_rng([seed, 5]))

@@ -17,8 +17,8 @@ from edge_agent.lab.simulation import Scenario
 from edge_agent.lab.simulation.driver import SLOWEST
 from edge_agent.lab.simulation.friction import DRY, ICE, SNOW, WET, Patch
 from edge_agent.lab.simulation.place import Origin
-from edge_agent.lab.simulation.roads import Network, network_of, resampled
-from edge_agent.lab.simulation.scenarios import drawn
+from edge_agent.lab.simulation.roads import Network, network_of, resample_line
+from edge_agent.lab.simulation.scenarios import drawn_town
 from schemas.numeric import FloatArray
 from tests.benchmarks.sumo import Sumo
 
@@ -90,7 +90,7 @@ def _make_drive(rows: pd.DataFrame) -> Drive | None:
         )
         for one in (*line.T, speed)
     ]
-    path = resampled(np.column_stack(smooth[:2]))
+    path = resample_line(np.column_stack(smooth[:2]))
     return Drive(
         path,
         np.interp(np.linspace(0.0, 1.0, len(path)), np.linspace(0.0, 1.0, len(even)), smooth[2]),
@@ -105,7 +105,7 @@ def make_streets(found: list[Drive], seed: int) -> Streets:
     lanes = network_of(
         [one.line for one in found], [[k] for k in range(len(found))], len(found), allowed
     )
-    usual = drawn(seed)
+    usual = drawn_town(seed)
     rng = np.random.default_rng(seed)
     points = np.concatenate([one.line for one in found])
     patches = []

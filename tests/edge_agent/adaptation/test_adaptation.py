@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge_agent.adaptation.fuzzy import LARGEST_FACTOR, LEAST_FACTOR, adapted, infer
+from edge_agent.adaptation.fuzzy import LARGEST_FACTOR, LEAST_FACTOR, adapted_factor, infer_step
 from edge_agent.adaptation.memberships import Memberships
 from schemas.errors import InputError
 
@@ -21,31 +21,31 @@ OUTPUTS = np.array(SETS.outputs)
 
 def test_at_the_peak_of_a_set_its_output_alone_speaks() -> None:
     for peak, output in zip(INPUTS, OUTPUTS, strict=True):
-        assert infer(float(peak), INPUTS, OUTPUTS) == pytest.approx(float(output))
+        assert infer_step(float(peak), INPUTS, OUTPUTS) == pytest.approx(float(output))
 
 
 def test_inference_rises_with_the_mismatch_and_covers_its_whole_range() -> None:
-    reported = [infer(float(x), INPUTS, OUTPUTS) for x in np.linspace(-1.0, 50.0, 2000)]
+    reported = [infer_step(float(x), INPUTS, OUTPUTS) for x in np.linspace(-1.0, 50.0, 2000)]
     assert (np.diff(reported) >= 0).all()
 
 
 def test_noise_grows_where_innovations_exceed_their_theory() -> None:
-    assert adapted(1.0, 3.0, 1.0, INPUTS, OUTPUTS) > 1.0
-    assert adapted(1.0, 1.0, 1.0, INPUTS, OUTPUTS) == 1.0
-    assert adapted(2.0, 0.2, 1.0, INPUTS, OUTPUTS) < 2.0
+    assert adapted_factor(1.0, 3.0, 1.0, INPUTS, OUTPUTS) > 1.0
+    assert adapted_factor(1.0, 1.0, 1.0, INPUTS, OUTPUTS) == 1.0
+    assert adapted_factor(2.0, 0.2, 1.0, INPUTS, OUTPUTS) < 2.0
 
 
 def test_noise_factor_stays_in_bounds_during_a_long_mismatch() -> None:
     high = low = 1.0
     for _ in range(1000):
-        high = adapted(high, 100.0, 1.0, INPUTS, OUTPUTS)
-        low = adapted(low, 0.0, 1.0, INPUTS, OUTPUTS)
+        high = adapted_factor(high, 100.0, 1.0, INPUTS, OUTPUTS)
+        low = adapted_factor(low, 0.0, 1.0, INPUTS, OUTPUTS)
     assert high == LARGEST_FACTOR
     assert low == LEAST_FACTOR
 
 
 def test_without_a_theoretical_variance_nothing_is_concluded() -> None:
-    assert adapted(2.0, 1.0, 0.0, INPUTS, OUTPUTS) == 2.0
+    assert adapted_factor(2.0, 1.0, 0.0, INPUTS, OUTPUTS) == 2.0
 
 
 def test_memberships_survive_vector_and_json() -> None:

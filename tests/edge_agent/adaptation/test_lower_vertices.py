@@ -11,7 +11,7 @@ from schemas.errors import InputError
 
 def test_untuned_sets_give_the_centroid_of_the_set_at_its_peak() -> None:
     sets = LowerVertices()
-    _, outputs = sets.triangles()
+    _, outputs = sets.triangle_sets()
     for peak, triangle in zip(sets.peaks, outputs, strict=True):
         assert sets.step(peak) == pytest.approx(triangle.mean())
 
@@ -34,7 +34,7 @@ def test_a_lower_vertex_changes_the_step_between_two_peaks_alone() -> None:
 
 def test_table_is_the_step_at_its_knots() -> None:
     sets = LowerVertices(feet=(0.7, 0.9) * 4, out_feet=(1.5, 0.4) * 4)
-    at, steps = sets.table(48)
+    at, steps = sets.knot_table(48)
     assert at.shape == steps.shape == (48,)
     assert (np.diff(at) >= 0.0).all()
     assert steps == pytest.approx([sets.step(float(value)) for value in at])

@@ -12,7 +12,7 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.adaptation.rule_base import (
     WIDE,
     evidence_share,
-    hurry,
+    forgetting_rate,
     is_high,
     plain_rules,
     rule_base,
@@ -36,9 +36,9 @@ def test_membership_is_none_at_the_foot_full_at_the_peak_and_even_between() -> N
 
 
 def test_offsets_adapt_fast_for_far_wheels_only_where_grip_is_used() -> None:
-    assert hurry(TUNED, TUNED.far[1]) == 0.3
-    assert hurry(TUNED, TUNED.far[0]) == 0.0
-    assert hurry(IDLE, 100.0) == 0.0
+    assert forgetting_rate(TUNED, TUNED.far[1]) == 0.3
+    assert forgetting_rate(TUNED, TUNED.far[0]) == 0.0
+    assert forgetting_rate(IDLE, 100.0) == 0.0
 
 
 def test_noise_grows_with_the_angle_of_steering_either_way() -> None:
@@ -53,5 +53,5 @@ def test_plain_rules_give_the_product_of_ramps_whatever_slides_or_strains() -> N
         asked = evidence_share(plain, slides, 0.2, 0.5, strain)
         assert asked == pytest.approx(math.log(share))
     assert evidence_share(TUNED, 1.0, 0.2, 0.5, 9.0) != evidence_share(TUNED, 0.0, 0.2, 0.5, 1.0)
-    assert hurry(plain, 100.0) == 0.0
+    assert forgetting_rate(plain, 100.0) == 0.0
     assert wide_noise(plain, 1.0) == 1.0

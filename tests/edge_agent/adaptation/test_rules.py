@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from edge_agent.adaptation.fuzzy import adapted, adapted_within
+from edge_agent.adaptation.fuzzy import adapted_factor, adapted_within
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.adaptation.rules import ALPHA, PRINTED, RATE, infer_two, rule_table
-from edge_agent.adaptation.windows import push, weighted_noise
+from edge_agent.adaptation.windows import push_innovation, weighted_noise
 from schemas.errors import InputError
 
 TABLE = rule_table()
@@ -47,7 +47,7 @@ def test_bounds_and_pace_of_the_adaptation_matter() -> None:
     inputs = np.array(sets.inputs)
     outputs = np.array(sets.outputs)
     one = adapted_within(1.0, 3.0, 1.0, inputs, outputs, 1.0, (0.1, 20.0))
-    assert one == adapted(1.0, 3.0, 1.0, inputs, outputs)
+    assert one == adapted_factor(1.0, 3.0, 1.0, inputs, outputs)
     assert adapted_within(1.0, 3.0, 1.0, inputs, outputs, 2.0, (0.1, 20.0)) == pytest.approx(one**2)
     assert adapted_within(1.0, 3.0, 1.0, inputs, outputs, 1.0, (0.1, 1.01)) == 1.01
     assert adapted_within(1.0, 0.1, 1.0, inputs, outputs, 1.0, (0.99, 20.0)) == 0.99
@@ -62,12 +62,12 @@ def test_the_weighted_window_finds_the_variance_of_white_noise() -> None:
 def test_the_window_speaks_when_it_is_full_and_within_its_bounds() -> None:
     window = np.full(3, np.nan)
     for error in (5.0, 5.0):
-        push(window, error)
+        push_innovation(window, error)
     assert weighted_noise(window, 0.0, 1.0, 0.5, 4.0) == 1.0
-    push(window, 5.0)
+    push_innovation(window, 5.0)
     assert weighted_noise(window, 0.0, 1.0, 0.5, 4.0) == 4.0
     for _ in range(3):
-        push(window, 0.0)
+        push_innovation(window, 0.0)
     assert weighted_noise(window, 0.0, 1.0, 0.5, 4.0) == 0.5
 
 

@@ -55,7 +55,7 @@ def make_local_map(parts: list[ReceivedCells]) -> LocalMap:
     for part in parts:
         for tile in np.unique(grid.tile_of(part.key // grid.SECTORS)).tolist():
             inside = grid.tile_of(part.key // grid.SECTORS) == tile
-            cache.take(tile, ReceivedCells._make(column[inside] for column in part), NOW)
+            cache.store_cells(tile, ReceivedCells._make(column[inside] for column in part), NOW)
     return cache
 
 

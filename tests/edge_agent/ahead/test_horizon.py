@@ -160,7 +160,7 @@ def test_a_warning_fades_in_half_an_hour_and_an_alert_in_ten_minutes() -> None:
     assert look_ahead(path, cache, NOW + 1500 * NS).slippery.any()
     assert not look_ahead(path, cache, NOW + 2400 * NS).slippery.any()
     alone = LocalMap()
-    alone.alert(alert(keys_on()[3]), NOW)
+    alone.store_alert(alert(keys_on()[3]), NOW)
     assert look_ahead(path, alone, NOW + NS).alerted.any()
     assert not look_ahead(path, alone, NOW + round((ALERT_HELD_S + 1) * NS)).alerted.any()
 
@@ -169,8 +169,8 @@ def test_the_cache_is_bounded_and_gives_up_what_was_heard_longest_ago() -> None:
     cache = LocalMap(most_cells=50)
     first = cells(keys_on(), 0.5)
     far = cells(keys_on(3000.0, start=2500.0), 0.5)
-    cache.take(1, first, NOW)
-    cache.take(2, far, NOW)
+    cache.store_cells(1, first, NOW)
+    cache.store_cells(2, far, NOW)
     assert cache.cells == len(far.key)
     assert np.isin(cache.keys(), far.key).all()
 
@@ -178,8 +178,8 @@ def test_the_cache_is_bounded_and_gives_up_what_was_heard_longest_ago() -> None:
 def test_a_part_of_a_tile_replaces_only_what_it_speaks_of() -> None:
     keys = keys_on(100.0)
     cache = LocalMap()
-    cache.take(1, cells(keys, 0.8), NOW)
-    cache.take(1, cells(keys[:3], 0.2), NOW + NS)
+    cache.store_cells(1, cells(keys, 0.8), NOW)
+    cache.store_cells(1, cells(keys[:3], 0.2), NOW + NS)
     found = cache.look_up(keys, NOW + NS)
     assert found.mu[:3] == pytest.approx(0.2, abs=0.03)
     assert found.mu[3:] == pytest.approx(0.8, abs=0.03)
@@ -188,13 +188,13 @@ def test_a_part_of_a_tile_replaces_only_what_it_speaks_of() -> None:
 def test_an_older_tile_takes_nothing_from_a_newer_one() -> None:
     keys = keys_on(100.0)
     cache = LocalMap()
-    cache.take(1, cells(keys[:3], 0.2, at=NOW + NS), NOW + NS)
-    cache.take(1, cells(keys, 0.8), NOW + NS)
+    cache.store_cells(1, cells(keys[:3], 0.2, at=NOW + NS), NOW + NS)
+    cache.store_cells(1, cells(keys, 0.8), NOW + NS)
     found = cache.look_up(keys, NOW + NS)
     assert found.mu[:3] == pytest.approx(0.2, abs=0.03)
     assert found.mu[3:] == pytest.approx(0.8, abs=0.03)
-    cache.take(2, cells(keys[:0], 0.8), NOW)
-    cache.forget(NOW + NS)
+    cache.store_cells(2, cells(keys[:0], 0.8), NOW)
+    cache.drop_old(NOW + NS)
     assert cache.cells == len(keys), "a tile without cells is none"
 
 
@@ -202,12 +202,12 @@ def test_alerts_missing_from_a_tiles_standing_list_are_dropped() -> None:
     cache = LocalMap()
     keys = keys_on()
     tile = int(grid.tile_of(keys[3] // grid.SECTORS))
-    assert cache.alert(alert(keys[3]), NOW)
-    assert not cache.alert(alert(keys[3]), NOW + NS), "put again, it is no news"
-    assert cache.standing(tile, [], NOW)
+    assert cache.store_alert(alert(keys[3]), NOW)
+    assert not cache.store_alert(alert(keys[3]), NOW + NS), "put again, it is no news"
+    assert cache.store_standing_alerts(tile, [], NOW)
     assert not cache.alerts
-    assert cache.alert(alert(keys[3]), NOW)
-    assert cache.alert(alert(keys[3], raised=False), NOW)
+    assert cache.store_alert(alert(keys[3]), NOW)
+    assert cache.store_alert(alert(keys[3], raised=False), NOW)
 
 
 def test_the_map_shows_the_road_around_a_bend_and_both_ways_at_a_fork() -> None:
@@ -241,13 +241,13 @@ def test_a_car_without_a_route_knows_the_road_some_way_ahead_all_the_time() -> N
             float(latitude[k]), float(longitude[k]), HOME.yaw, HOME.speed, NOW + second * NS
         )
         ways = ways_on(pose, cache.keys(), length + FURTHER_M) or [straight_path(pose, length)]
-        horizon = look_ahead(ways[0].near(length), cache, pose.time)
+        horizon = look_ahead(ways[0].first_metres(length), cache, pose.time)
         known_m.append(int((horizon.basis == known.MEASURED).sum()))
-        for box in asked.wanting(ways[0], pose, length):
+        for box in asked.missing_boxes(ways[0], pose, length):
             heard = cells(
                 road[grid.touches(box, grid.bounds(road // grid.SECTORS))], 0.8, at=pose.time
             )
-            cache.take(1, heard, pose.time)
+            cache.store_cells(1, heard, pose.time)
     assert min(known_m[1:]) > 100
 
 
@@ -292,26 +292,26 @@ def test_opposite_alert_warns_until_grip_is_found_on_this_side() -> None:
     other = [int(key) ^ OTHER_WAY for key in road[2:4]]
     cache = LocalMap()
     for key in other:
-        assert cache.alert(alert(key), NOW)
+        assert cache.store_alert(alert(key), NOW)
     seen = look_ahead(path, cache, NOW + NS)
     assert set(seen.key[seen.alerted].tolist()) == set(road[2:4].tolist())
     assert (seen.basis[seen.alerted] == BORROWED).all(), "nobody has measured this side"
     assert (seen.mu_upper[seen.alerted] < 0.4).all()
     assert np.isfinite(seen.safe_speed[seen.alerted]).all()
     tile = int(grid.tile_of(road[2] // grid.SECTORS))
-    cache.take(tile, cells(road[2:3], 0.8, at=NOW - NS), NOW)
+    cache.store_cells(tile, cells(road[2:3], 0.8, at=NOW - NS), NOW)
     assert look_ahead(path, cache, NOW + NS).slippery.sum() == seen.slippery.sum(), (
         "grip that was found before"
     )
-    cache.take(tile, cells(road[2:3], 0.3, basis=known.BOUND, at=NOW + NS), NOW)
+    cache.store_cells(tile, cells(road[2:3], 0.3, basis=known.BOUND, at=NOW + NS), NOW)
     assert look_ahead(path, cache, NOW + NS).slippery.sum() == seen.slippery.sum(), (
         "who rolled over it found none"
     )
-    cache.take(tile, cells(road[2:3], 0.6, basis=known.BOUND, at=NOW + NS), NOW)
+    cache.store_cells(tile, cells(road[2:3], 0.6, basis=known.BOUND, at=NOW + NS), NOW)
     assert look_ahead(path, cache, NOW + NS).slippery.sum() < seen.slippery.sum(), (
         "who braked there found enough"
     )
-    cache.take(tile, cells(road[2:3], 0.8, at=NOW + NS), NOW)
+    cache.store_cells(tile, cells(road[2:3], 0.8, at=NOW + NS), NOW)
     assert set((found := look_ahead(path, cache, NOW + NS)).key[found.alerted].tolist()) == {
         int(road[3])
     }

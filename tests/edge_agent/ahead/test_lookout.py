@@ -251,8 +251,10 @@ def test_a_map_of_yesterday_neither_warns_nor_replaces_that_of_today(router: Rou
         now = time.time_ns()
         key = keys.map_key(TILE)
         for when, mu in ((now, 0.15), (now - DAY, 0.85)):
-            with subscriber.looking():
-                subscriber.known.take(*decode_cells(key, tile_payload(HERE, mu, when), now), now)
+            with subscriber.map_lock():
+                subscriber.local_map.store_cells(
+                    *decode_cells(key, tile_payload(HERE, mu, when), now), now
+                )
         assert car.next_warning().mu == pytest.approx(0.15, abs=0.03)
 
 
@@ -347,7 +349,7 @@ class Liar(MadeUpService):
 
     said = 0
 
-    def tile(self, key: IntArray, mu: FloatArray) -> bytes:
+    def tile_answer(self, key: IntArray, mu: FloatArray) -> bytes:
         self.said += 1
         lies = [tile_payload(HERE, 0.2, NOW, **lie) for lie in LIES.values()]
         return [*lies, *NOISE, tile_payload(HERE[:0], 0.2, NOW)][
@@ -411,7 +413,7 @@ def test_pieces_of_the_way_are_asked_for_once_and_again_when_they_are_old() -> N
     asked = RequestLog()
     pose = _at(0, 0)
     path = straight_path(pose, 150.0)
-    boxes = asked.wanting(path, pose, 100.0)
+    boxes = asked.missing_boxes(path, pose, 100.0)
     assert 1 <= len(boxes) <= 6
     latitude, longitude = line(150.0)
     covered = np.zeros(150, bool)
@@ -423,10 +425,12 @@ def test_pieces_of_the_way_are_asked_for_once_and_again_when_they_are_old() -> N
             & (longitude <= box.east)
         )
     assert covered.all()
-    assert asked.wanting(path, pose, 100.0) == []
-    assert asked.wanting(path, pose._replace(time=pose.time + round((REFRESH_S + 1) * NS)), 100.0)
-    asked.forget()
-    assert asked.wanting(path, pose, 100.0), "the session has come back"
+    assert asked.missing_boxes(path, pose, 100.0) == []
+    assert asked.missing_boxes(
+        path, pose._replace(time=pose.time + round((REFRESH_S + 1) * NS)), 100.0
+    )
+    asked.request_again()
+    assert asked.missing_boxes(path, pose, 100.0), "the session has come back"
 
 
 def test_few_tiles_are_subscribed_and_a_border_causes_no_flicker() -> None:
@@ -437,11 +441,11 @@ def test_few_tiles_are_subscribed_and_a_border_causes_no_flicker() -> None:
         metre = 40.0 * second
         pose = _at(metre, second)
         here: list[Path] = [straight_path(pose, 150.0)]
-        fresh, gone = tiles.follow(here, pose)
+        fresh, gone = tiles.update_subscriptions(here, pose)
         begun = begun + len(fresh)
         ceased = ceased + len(gone)
-        assert len(tiles.heard) <= MOST_TILES
-        assert len(tiles.heard) == begun - ceased
+        assert len(tiles.subscribed_tiles) <= MOST_TILES
+        assert len(tiles.subscribed_tiles) == begun - ceased
     assert 15 < begun < 60, "24 km over tiles of 1.3 km"
     border = Tiles()
     flickers = 0
@@ -450,6 +454,6 @@ def test_few_tiles_are_subscribed_and_a_border_causes_no_flicker() -> None:
         pose = HOME._replace(
             longitude=west + 2e-6 * (-1) ** second, yaw=np.pi / 2, time=NOW + second * NS
         )
-        flickers += sum(map(len, border.follow([straight_path(pose, 150.0)], pose)))
+        flickers += sum(map(len, border.update_subscriptions([straight_path(pose, 150.0)], pose)))
     assert flickers <= 4
     assert LEAVE_S > 2.0

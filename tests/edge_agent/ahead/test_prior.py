@@ -53,9 +53,9 @@ def test_without_a_map_the_vehicle_believes_what_its_filter_believes() -> None:
 def test_at_the_border_of_a_cell_that_the_map_knows_its_belief_is_expected() -> None:
     prior = MapPrior(1)
     prior.step(key(4), saying(0.9), FLAT, {0: sharp(0.9)})
-    assert prior.enters(key(5)) == [0]
+    assert prior.entered_vehicles(key(5)) == [0]
     out = prior.step(key(5), saying(0.9), FLAT, {0: sharp(0.2)})
-    assert prior.enters(key(5)) == []
+    assert prior.entered_vehicles(key(5)) == []
     assert out[0, mugrid.CENTRES < 0.4].sum() > 0.7
     assert mugrid.quantiles(out, 0.95)[0] > 0.8, "what no map can take away"
 
@@ -66,15 +66,18 @@ def test_of_an_old_cell_the_map_says_less_and_of_a_bound_nothing() -> None:
     shares = []
     for age_s in (0.0, 1800.0, 4 * 3600.0):
         said = cells(road, 0.2, at=NOW - round(age_s * NS))
-        belief = make_local_map([said._replace(heard=np.full(len(road), NOW))]).belief(place, NOW)
+        belief = make_local_map([said._replace(heard=np.full(len(road), NOW))]).belief_at(
+            place, NOW
+        )
         assert belief is not None
         shares.append(float(belief[mugrid.CENTRES < 0.4].sum()))
     assert shares[0] > shares[1] + 0.05 > shares[2] + 0.2
     assert (
-        make_local_map([cells(road, 0.2)]).belief(place, NOW + round((HELD_S + 1.0) * NS)) is None
+        make_local_map([cells(road, 0.2)]).belief_at(place, NOW + round((HELD_S + 1.0) * NS))
+        is None
     )
-    assert make_local_map([cells(road, 0.2, basis=BOUND)]).belief(place, NOW) is None
-    assert make_local_map([]).belief(place, NOW) is None
+    assert make_local_map([cells(road, 0.2, basis=BOUND)]).belief_at(place, NOW) is None
+    assert make_local_map([]).belief_at(place, NOW) is None
 
 
 def test_a_wrong_map_is_abandoned_quickly_and_trusted_less_in_next_cells() -> None:
@@ -124,7 +127,10 @@ def test_what_is_published_is_the_same_bit_for_bit_whatever_the_map_says() -> No
             assert beliefs is not None
             own, visit = beliefs
             out = prior.step(
-                pipeline.places, own, visit, dict.fromkeys(prior.enters(pipeline.places), lie)
+                pipeline.places,
+                own,
+                visit,
+                dict.fromkeys(prior.entered_vehicles(pipeline.places), lie),
             )
             alone = np.exp(own) / np.exp(own).sum(axis=1, keepdims=True)
             helped = max(helped, float(np.abs(out - alone).max()))

@@ -82,7 +82,7 @@ def test_one_warning_in_time_to_stop_ends_when_the_stretch_is_passed() -> None:
 def test_on_an_unknown_road_the_warning_comes_as_early_as_that_may_need() -> None:
     cache = LocalMap()
     for key in icy():
-        cache.alert(alert(key), NOW)
+        cache.store_alert(alert(key), NOW)
     car = Car(cache)
     raised = car.drive(250.0)[0]
     assert raised.distance_m >= 14.0 * REACTION_S + 14.0**2 / (2 * UNKNOWN_LOWER * GRAVITY)
@@ -116,7 +116,7 @@ def test_alert_over_a_mere_bound_is_exported_with_its_own_grip() -> None:
     """Ice fades on the map before its alert ends: the former value is only a bound then."""
     cache = make_local_map([cells(icy(), 0.1, basis=BOUND)])
     for key in icy():
-        cache.alert(alert(key, time=NOW - NS), NOW)
+        cache.store_alert(alert(key, time=NOW - NS), NOW)
     raised = Car(cache).drive(290.0)[0]
     assert raised.mu == pytest.approx(0.15, abs=0.03)
     assert raised.reason == "an alert stands"
@@ -126,19 +126,19 @@ def test_a_stretch_that_grows_is_an_update_and_one_that_is_cleared_an_end() -> N
     cache = LocalMap()
     keys = icy(200.0, 80.0)
     for key in keys[:3]:
-        cache.alert(alert(key), NOW)
+        cache.store_alert(alert(key), NOW)
     car = Car(cache)
     raised = car.drive(90.0)
     assert [one.state for one in raised] == ["raised"]
     for key in keys[3:]:
-        cache.alert(alert(key, time=NOW + NS), NOW + NS)
+        cache.store_alert(alert(key, time=NOW + NS), NOW + NS)
     updated = car.look()
     assert [one.state for one in updated] == ["updated"]
     assert updated[0].id == raised[0].id
     assert updated[0].length_m > raised[0].length_m + 20.0
     assert car.look() == [], "told once"
     for key in keys:
-        cache.alert(alert(key, raised=False, time=NOW + 2 * NS), NOW + 2 * NS)
+        cache.store_alert(alert(key, raised=False, time=NOW + 2 * NS), NOW + 2 * NS)
     car.metre += 1.0
     ended = car.look()
     assert [one.state for one in ended] == ["ended"]

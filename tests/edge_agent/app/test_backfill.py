@@ -9,7 +9,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from edge_agent.app.backfill import Outcome, Task, backfill, estimate_atomically, tasks_of
+from edge_agent.app.backfill import Outcome, Task, estimate_atomically, estimate_drives, tasks_of
 from edge_agent.cli import main
 from schemas.errors import InputError
 from tests.waiting import until
@@ -82,7 +82,7 @@ def test_so_many_drives_are_under_way_at_once(drives: Path, tmp_path: Path, jobs
         os.mkfifo(task.vehicle)
     watcher = threading.Thread(target=watch)
     watcher.start()
-    outcomes = list(backfill(tasks, "ckf", jobs))
+    outcomes = list(estimate_drives(tasks, "ckf", jobs))
     watcher.join()
     assert under_way == [jobs]
     assert all(outcome.error is not None for outcome in outcomes)
@@ -125,7 +125,7 @@ def test_logs_of_one_name_and_estimates_over_their_log_are_refused(
         Task(log, drives / "d0.json", tmp_path / "d0.parquet")
     ]
     with pytest.raises(InputError, match="jobs: 0 is below 1"):
-        list(backfill([], "ckf", 0))
+        list(estimate_drives([], "ckf", 0))
 
 
 def test_several_logs_are_not_published(

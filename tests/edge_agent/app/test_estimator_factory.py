@@ -7,7 +7,7 @@ import pytest
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.app.tuned_memberships import shipped
+from edge_agent.app.tuned_memberships import shipped_memberships
 from edge_agent.estimators import ESTIMATORS, TUNED, create
 from schemas.errors import InputError
 from tests.edge_agent.estimators.drives import drive
@@ -19,10 +19,14 @@ def test_tuned_estimator_runs_with_the_memberships_of_its_file(name: str) -> Non
     t = t[:, None]
     signals = signals[:, None]
     reported = bank_of(name, [vehicle]).advance(t, signals)
-    tuned = create(name, [vehicle], memberships=shipped(TUNED[name])).advance(t, signals)
+    tuned = create(name, [vehicle], memberships=shipped_memberships(TUNED[name])).advance(
+        t, signals
+    )
     untuned = create(name, [vehicle], memberships=Memberships()).advance(t, signals)
     assert np.array_equal(reported.vx, tuned.vx)
-    if shipped(TUNED[name]) != Memberships():  # the default's hand-set vertices did best
+    if (
+        shipped_memberships(TUNED[name]) != Memberships()
+    ):  # the default's hand-set vertices did best
         assert not np.array_equal(reported.vx, untuned.vx)
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_agent.app.live_loop import STATUS_EVERY_S, Progress, drive
+from edge_agent.app.live_loop import STATUS_EVERY_S, Progress, run_live_loop
 from edge_agent.estimators import create
 from edge_agent.inputs.block import Block
 from edge_agent.inputs.context import context_block
@@ -36,7 +36,7 @@ RATE = 50.0
 class Basket:
     """A receiver of everything that the loop offers."""
 
-    broken = False
+    is_broken = False
 
     def __init__(self) -> None:
         self.taken: list[RecordBlock] = []
@@ -117,7 +117,7 @@ def run(
     basket = Basket()
     reported = []
     report = lambda progress: reported.append(progress.signals_s)  # noqa: E731
-    progress = drive(parts, pipeline_of(fleet), basket, stop, report, **options)  # type: ignore[arg-type]
+    progress = run_live_loop(parts, pipeline_of(fleet), basket, stop, report, **options)  # type: ignore[arg-type]
     return progress, basket, reported
 
 
@@ -209,7 +209,7 @@ def test_the_loop_ends_after_its_duration() -> None:
 def test_systemd_gets_signs_of_life_unless_the_thread_that_sends_has_died(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: bool
 ) -> None:
-    monkeypatch.setattr(Basket, "broken", broken)
+    monkeypatch.setattr(Basket, "is_broken", broken)
     with closing(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)) as manager:
         manager.bind(str(tmp_path / "notify"))
         manager.setblocking(False)

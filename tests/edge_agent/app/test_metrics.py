@@ -28,9 +28,9 @@ def test_an_agent_shows_what_was_settled_and_what_waits(
     publisher.offer(observations)
 
     def read_metric(name: str, kind: str = "") -> float:
-        return {metric.name: metric.values for metric in metrics.metrics(publisher, progress)}[
-            name
-        ][kind]
+        return {
+            metric.name: metric.values for metric in metrics.agent_metrics(publisher, progress)
+        }[name][kind]
 
     until(lambda: service.batches and read_metric("published_records", "observation") == sent)
     assert read_metric("unsettled_records") == sent
@@ -62,7 +62,7 @@ def test_what_nobody_can_send_is_dropped_and_counted_and_the_rest_goes_on(
         Kind.STATE: len(states.vehicle),
     }
     assert publisher.counts.failures > 1
-    assert not publisher.broken
+    assert not publisher.is_broken
     assert publisher.close(within_s=5.0)
 
 
@@ -81,7 +81,7 @@ def test_agent_without_answers_or_with_full_outbox_reports_problems(
     publisher.start()
     for seed in range(6):
         publisher.offer(*drive(seed))
-    until(lambda: publisher.fill > metrics.FULL)
+    until(lambda: publisher.fill_share > metrics.FULL)
     until(lambda: publisher.unanswered_s > 0.0)
     late.append(metrics.UNANSWERED_S)
     found = metrics.health_problems(publisher, Progress())

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from edge_agent.app.publishing_reasons import ReasonReporter, SignalWatch, reasons
+from edge_agent.app.publishing_reasons import ReasonReporter, SignalWatch, reasons_not_publishing
 from edge_agent.inputs.block import Block
 from edge_agent.publish.publisher import Counts
 from schemas.signals import CHANNELS, S
@@ -75,7 +75,7 @@ def told_within(
     reporter = ReasonReporter(lambda: find(watch), lines.append, clock)
     for _ in range(round(seconds / 0.1)):
         watch.add(source)
-        reporter.look()
+        reporter.print_if_due()
         clock.now += 0.1
     return lines
 
@@ -83,14 +83,21 @@ def told_within(
 @pytest.mark.parametrize("cause", CAUSES)
 def test_a_planted_cause_is_named_within_five_seconds(cause: str) -> None:
     source, state, troubles, words = CAUSES[cause]
-    lines = told_within(source, lambda watch: reasons(watch, state, ENDPOINTS, troubles), NAMED_S)
+    lines = told_within(
+        source, lambda watch: reasons_not_publishing(watch, state, ENDPOINTS, troubles), NAMED_S
+    )
     assert len(lines) == 1
     assert lines[0].startswith("not published: ")
     assert words in lines[0]
 
 
 def test_nothing_is_printed_while_records_are_published() -> None:
-    assert told_within(block(), lambda watch: reasons(watch, State(), ENDPOINTS, []), 30.0) == []
+    assert (
+        told_within(
+            block(), lambda watch: reasons_not_publishing(watch, State(), ENDPOINTS, []), 30.0
+        )
+        == []
+    )
 
 
 def test_a_reason_is_printed_again_only_when_it_changes() -> None:

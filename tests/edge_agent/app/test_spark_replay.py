@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from edge_agent.app.backfill import backfill, estimate_atomically, tasks_of
+from edge_agent.app.backfill import estimate_atomically, estimate_drives, tasks_of
 from edge_agent.cli import main
 from schemas.runtime import spark
 from tests import spark_sessions
@@ -86,5 +86,5 @@ def test_a_task_whose_process_is_killed_after_it_wrote_counts_once(
         path.name for path in drives
     ], "all died"
     assert [outcome.samples for outcome in told] == [200] * DRIVES
-    list(backfill(tasks_of(drives, None, tmp_path / "local"), ESTIMATOR, 1))
+    list(estimate_drives(tasks_of(drives, None, tmp_path / "local"), ESTIMATOR, 1))
     assert contents(tmp_path / "spark") == contents(tmp_path / "local")

@@ -15,7 +15,7 @@ import pytest
 from edge_agent.app.trip import LEAST_S, LOOK_S, Trip, state_path_for
 from edge_agent.inputs.block import Block
 from edge_agent.inputs.profile import Profile
-from edge_agent.lab.evaluation.planted import Recorded, drives, moved, scaled
+from edge_agent.lab.evaluation.planted import Recorded, drives, offset_columns, scale_columns
 from schemas.numeric import FloatArray
 from schemas.signals import S
 from tests.waiting import until
@@ -39,12 +39,12 @@ def drive_trip(trip: Trip, drive: Recorded) -> tuple[list[bool], list[Block]]:
     """Return whether each block was admitted, and the estimator's input; wait for the doctor."""
     admitted = []
     blocks = []
-    for block in trip.blocks(source(drive), lambda: np.full(ROWS, np.nan)):
+    for block in trip.corrected_blocks(source(drive), lambda: np.full(ROWS, np.nan)):
         if trip._looking is not None:
             trip._looking.result()
-        admitted.append(trip.admitted())
+        admitted.append(trip.is_admitted())
         blocks.append(block)
-    trip.end()
+    trip.learn_rest()
     if trip._looking is not None:
         trip._looking.result()
     trip.close()
@@ -57,12 +57,12 @@ def delayed_by(rows: int, late: FloatArray, raw: FloatArray) -> bool:
 
 def test_nothing_is_admitted_before_the_doctor_has_passed(smooth: Recorded, tmp_path: Path) -> None:
     trip = Trip(smooth.vehicle, PROFILE, tmp_path / "car.json")
-    assert trip.troubles()
+    assert trip.health_problems()
     admitted, blocks = drive_trip(trip, smooth)
     first = admitted.index(True)
     assert LOOK_S - 1.0 <= blocks[first].t[0, 0] <= 4.0 * LOOK_S
     assert all(admitted[first:])
-    assert not trip.troubles()
+    assert not trip.health_problems()
 
 
 def test_a_fault_is_never_admitted_and_teaches_nothing(
@@ -70,22 +70,22 @@ def test_a_fault_is_never_admitted_and_teaches_nothing(
 ) -> None:
     path = tmp_path / "car.json"
     trip = Trip(smooth.vehicle, PROFILE, path)
-    admitted, _ = drive_trip(trip, scaled([S.AY], -1.0)(smooth))
+    admitted, _ = drive_trip(trip, scale_columns([S.AY], -1.0)(smooth))
     assert not any(admitted)
-    assert "ay sign" in trip.troubles()[0]
+    assert "ay sign" in trip.health_problems()[0]
     assert "ay sign" in caplog.text
     assert not path.exists()
     trusted = Trip(smooth.vehicle, PROFILE, path, trusted=True)
-    assert all(drive_trip(trusted, scaled([S.AY], -1.0)(smooth))[0])
+    assert all(drive_trip(trusted, scale_columns([S.AY], -1.0)(smooth))[0])
     assert not path.exists(), "what is trusted is not for that reason learned from"
 
 
 def test_what_trips_teach_holds_from_the_next_one_on(smooth: Recorded, tmp_path: Path) -> None:
     path = tmp_path / "car.json"
-    bad = moved([S.YAW_RATE], 0.012)(smooth)
+    bad = offset_columns([S.YAW_RATE], 0.012)(smooth)
     for count in range(1, 4):
         trip = Trip(bad.vehicle, PROFILE, path)
-        assert trip.admitted() == (count > 1), "the doctor's word is remembered"
+        assert trip.is_admitted() == (count > 1), "the doctor's word is remembered"
         known = trip.vehicle.calibration
         assert (0 if known is None else known.drives) == count - 1
         _, blocks = drive_trip(trip, bad)
@@ -106,9 +106,9 @@ def test_a_fault_that_comes_up_takes_the_doctors_word_back(
     path = tmp_path / "car.json"
     drive_trip(Trip(smooth.vehicle, PROFILE, path), smooth)
     broken = Trip(smooth.vehicle, PROFILE, path)
-    assert broken.admitted()
-    drive_trip(broken, scaled([S.AY], -1.0)(smooth))
-    assert not Trip(smooth.vehicle, PROFILE, path).admitted()
+    assert broken.is_admitted()
+    drive_trip(broken, scale_columns([S.AY], -1.0)(smooth))
+    assert not Trip(smooth.vehicle, PROFILE, path).is_admitted()
 
 
 def test_another_car_or_a_broken_file_begins_anew(
@@ -116,14 +116,14 @@ def test_another_car_or_a_broken_file_begins_anew(
 ) -> None:
     path = tmp_path / "car.json"
     drive_trip(Trip(smooth.vehicle, PROFILE, path), smooth)
-    assert Trip(smooth.vehicle, PROFILE, path).admitted()
+    assert Trip(smooth.vehicle, PROFILE, path).is_admitted()
     heavier = smooth.vehicle.model_copy(update={"mass": 2.0 * smooth.vehicle.mass})
-    assert not Trip(heavier, PROFILE, path).admitted()
-    assert not Trip(smooth.vehicle, PROFILE.model_copy(update={"name": "q"}), path).admitted()
+    assert not Trip(heavier, PROFILE, path).is_admitted()
+    assert not Trip(smooth.vehicle, PROFILE.model_copy(update={"name": "q"}), path).is_admitted()
     for text in ("", "{}", "[" * 100_000, '{"version": 9}', path.read_text()[:-20]):
         path.write_text(text)
         caplog.clear()
-        assert not Trip(smooth.vehicle, PROFILE, path).admitted()
+        assert not Trip(smooth.vehicle, PROFILE, path).is_admitted()
         assert "learned anew" in caplog.text
 
 
@@ -145,10 +145,10 @@ def replace_rows(drive: Recorded, rows: int) -> Recorded:
 
 def test_the_doctor_looks_beside_the_loop(smooth: Recorded, tmp_path: Path) -> None:
     trip = Trip(smooth.vehicle, PROFILE, tmp_path / "car.json")
-    for block in trip.blocks(source(smooth), lambda: np.full(ROWS, np.nan)):
+    for block in trip.corrected_blocks(source(smooth), lambda: np.full(ROWS, np.nan)):
         replace(block)  # the loop does not wait
     until(lambda: trip._looking is not None and trip._looking.done())
-    assert trip.admitted()
+    assert trip.is_admitted()
     trip.close()
 
 

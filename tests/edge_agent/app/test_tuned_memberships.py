@@ -11,7 +11,15 @@ import numpy as np
 import pytest
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.app.tuned_memberships import FOLDER, WAYS, Document, load, parse, save, shipped
+from edge_agent.app.tuned_memberships import (
+    FOLDER,
+    WAYS,
+    Document,
+    load_tuned,
+    parse_tuned,
+    save_tuned,
+    shipped_memberships,
+)
 from edge_agent.cli.tune import DURATION_S
 from edge_agent.lab.tuning import study
 from edge_agent.lab.tuning.objectives import TuningScores, detection_cost, record_all, scores_of
@@ -43,8 +51,8 @@ def document(memberships: Memberships | None = None) -> dict[str, Any]:
 def test_memberships_and_provenance_survive_the_way_through_a_file(tmp_path: Path) -> None:
     path = tmp_path / "new" / "tuned.json"
     written = Document.model_validate(document(Memberships(ln_scales=(0.3, -0.2))))
-    save(path, written)
-    read = load(path)
+    save_tuned(path, written)
+    read = load_tuned(path)
     assert read.document == written
     assert read.memberships == Memberships(ln_scales=(0.3, -0.2))
 
@@ -84,7 +92,7 @@ def broken(change: Change) -> str:
 )
 def test_a_broken_document_is_refused_by_the_name_of_its_field(change: Change, field: str) -> None:
     with pytest.raises(InputError) as refused:
-        parse(broken(change), "tuned file")
+        parse_tuned(broken(change), "tuned file")
     assert refused.value.field == field
     assert "\n" not in str(refused.value)
 
@@ -93,26 +101,26 @@ def test_a_broken_document_is_refused_by_the_name_of_its_field(change: Change, f
 def test_numbers_that_are_not_finite_are_refused(number: str) -> None:
     text = json.dumps(document()).replace('"nis_ratio": 0.9', f'"nis_ratio": {number}', 1)
     with pytest.raises(InputError, match="nis_ratio"):
-        parse(text, "tuned file")
+        parse_tuned(text, "tuned file")
 
 
 def test_text_that_is_not_json_and_a_missing_file_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError):
-        parse("{", "tuned file")
+        parse_tuned("{", "tuned file")
     with pytest.raises(InputError, match="cannot read"):
-        load(tmp_path / "none.json")
+        load_tuned(tmp_path / "none.json")
     with pytest.raises(InputError, match="cannot read"):
-        shipped("ckf")
+        shipped_memberships("ckf")
 
 
 def test_a_file_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="out"):
-        save(tmp_path, Document.model_validate(document()))
+        save_tuned(tmp_path, Document.model_validate(document()))
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.json")), ids=lambda path: path.stem)
 def test_shipped_memberships_load_cover_the_range_and_state_origin(path: Path) -> None:
-    tuned = load(path)
+    tuned = load_tuned(path)
     assert tuned.document.estimator == path.stem
     lower, upper = Memberships.bounds()
     vector = tuned.memberships.to_vector()
@@ -123,11 +131,11 @@ def test_shipped_memberships_load_cover_the_range_and_state_origin(path: Path) -
 
 
 def test_the_default_estimator_has_a_shipped_file() -> None:
-    assert load(FOLDER / "aco-fckf.json").document.estimator == "aco-fckf"
+    assert load_tuned(FOLDER / "aco-fckf.json").document.estimator == "aco-fckf"
 
 
 def test_shipped_memberships_are_those_that_do_best_held_out() -> None:
-    document = load(FOLDER / "aco-fckf.json").document
+    document = load_tuned(FOLDER / "aco-fckf.json").document
     held_out = {
         way: detection_cost(TuningScores(**document.scores[way].held_out.model_dump()))
         for way in WAYS
@@ -135,22 +143,24 @@ def test_shipped_memberships_are_those_that_do_best_held_out() -> None:
     best = min(WAYS, key=held_out.__getitem__)
     assert document.winner == best
     kept = [Memberships.from_json(one) for one in document.candidates.get(best, [])]
-    assert shipped("aco-fckf") in (kept or [Memberships()])
+    assert shipped_memberships("aco-fckf") in (kept or [Memberships()])
 
 
 def test_memberships_of_the_papers_filter_gain_on_held_out_drives() -> None:
-    scores = load(FOLDER / "paper-aco-fckf.json").document.scores
+    scores = load_tuned(FOLDER / "paper-aco-fckf.json").document.scores
     default = scores["default"].held_out.log_likelihood
     colony = scores["colony"].held_out.log_likelihood
     assert colony > default + 1.0
-    found = study.overall(shipped("paper-aco-fckf"), study.record(study.HELD_OUT))
+    found = study.overall(shipped_memberships("paper-aco-fckf"), study.record(study.HELD_OUT))
     assert found == pytest.approx(colony, rel=0.02)
 
 
 def test_scores_in_the_shipped_file_are_those_of_the_filter_as_it_is() -> None:
     """Fails when the filter changed after the tuning: run the command in the file again."""
-    document = load(FOLDER / "aco-fckf.json").document
-    found = scores_of(shipped("aco-fckf"), record_all("held_out", DURATION_S), "aco-fckf")
+    document = load_tuned(FOLDER / "aco-fckf.json").document
+    found = scores_of(
+        shipped_memberships("aco-fckf"), record_all("held_out", DURATION_S), "aco-fckf"
+    )
     assert found.interval_score == pytest.approx(
         document.scores[document.winner].held_out.interval_score, rel=0.02
     )

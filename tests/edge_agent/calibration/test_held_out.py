@@ -10,12 +10,12 @@ from edge_agent.calibration.held_out import (
     Prediction,
     is_worse,
     learn_validated,
-    restrict,
+    restrict_groups,
     split_folds,
 )
 from edge_agent.calibration.learn import trace_steering
-from edge_agent.inputs.doctor.drive import prepare
-from edge_agent.lab.evaluation.planted import Recorded, drives, moved
+from edge_agent.inputs.doctor.drive import prepare_drive
+from edge_agent.lab.evaluation.planted import Recorded, drives, offset_columns
 from schemas.errors import InputError
 from schemas.signals import S
 from schemas.vehicle import Calibration, Vehicle
@@ -24,7 +24,7 @@ from schemas.vehicle import Calibration, Vehicle
 @pytest.fixture(scope="module")
 def drive() -> Recorded:
     """Two minutes of a car whose accelerometer is tilted."""
-    return moved([S.AX], 0.5)(drives(1, 31, rough=False, seconds=120)[0])
+    return offset_columns([S.AX], 0.5)(drives(1, 31, rough=False, seconds=120)[0])
 
 
 def offset_judge(vehicle: Vehicle, drive: Drive) -> Prediction:
@@ -72,16 +72,16 @@ def test_longer_contradiction_is_worse_whatever_the_likelihood() -> None:
 
 def test_restriction_keeps_the_groups_that_are_named() -> None:
     known = Calibration(drives=2, ax=(0.1, 0.1), radius_fl=(0.01, 0.001), steer_gain=(1.0, 0.1))
-    assert restrict(known, ["radii"]) == Calibration(drives=2, radius_fl=(0.01, 0.001))
+    assert restrict_groups(known, ["radii"]) == Calibration(drives=2, radius_fl=(0.01, 0.001))
 
 
 def test_understeer_and_gain_of_the_steering_are_traced_together(drive: Recorded) -> None:
     signals = drive.signals.copy()
-    plain = trace_steering(prepare(drive.t, signals, drive.vehicle))
+    plain = trace_steering(prepare_drive(drive.t, signals, drive.vehicle))
     v = drive.vehicle.wheel_radius * np.nanmean(signals[:, S.OMEGA : S.OMEGA + 4], axis=1)
     compliance = 0.002 * np.where(np.isfinite(v), v, 0.0) * signals[:, S.YAW_RATE]
     signals[:, S.DELTA : S.DELTA + 2] += compliance[:, None]
-    soft = trace_steering(prepare(drive.t, signals, drive.vehicle))
+    soft = trace_steering(prepare_drive(drive.t, signals, drive.vehicle))
     assert soft["understeer"] - plain["understeer"] == pytest.approx(
         0.002, abs=2.0 * soft["understeer_std"]
     )

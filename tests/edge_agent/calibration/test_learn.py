@@ -11,10 +11,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from edge_agent.calibration.learn import USUAL, learn, one_drive, surer, weighed
+from edge_agent.calibration.learn import (
+    USUAL,
+    learn_calibration,
+    one_drive,
+    surer_values,
+    weigh_estimates,
+)
 from edge_agent.cli import main
-from edge_agent.inputs.correct import Corrector, corrected
-from edge_agent.lab.evaluation.planted import Recorded, drives, moved, scaled
+from edge_agent.inputs.correct import Corrector, correct_log
+from edge_agent.lab.evaluation.planted import Recorded, drives, offset_columns, scale_columns
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
@@ -32,10 +38,10 @@ def smooth() -> Recorded:
 
 def spoil_drive(drive: Recorded) -> Recorded:
     for spoil in (
-        moved([S.AX], OFF["ax"]),
-        moved([S.YAW_RATE], OFF["yaw_rate"]),
-        moved([S.DELTA, S.DELTA + 1], OFF["steer_offset"]),
-        scaled([S.OMEGA], 1.0 + 4.0 / 3.0 * OFF["radius_fl"]),
+        offset_columns([S.AX], OFF["ax"]),
+        offset_columns([S.YAW_RATE], OFF["yaw_rate"]),
+        offset_columns([S.DELTA, S.DELTA + 1], OFF["steer_offset"]),
+        scale_columns([S.OMEGA], 1.0 + 4.0 / 3.0 * OFF["radius_fl"]),
     ):
         drive = spoil(drive)
     return drive
@@ -47,8 +53,8 @@ def parts(drive: Recorded, count: int) -> list[tuple[FloatArray, FloatArray]]:
 
 
 def test_what_is_put_in_comes_out_beside_its_standard_deviation(smooth: Recorded) -> None:
-    before = learn(parts(smooth, 3), smooth.vehicle)
-    after = learn(parts(spoil_drive(smooth), 3), smooth.vehicle)
+    before = learn_calibration(parts(smooth, 3), smooth.vehicle)
+    after = learn_calibration(parts(spoil_drive(smooth), 3), smooth.vehicle)
     assert after.drives == 3
     for name, off in OFF.items():
         one = getattr(before, name)
@@ -59,7 +65,7 @@ def test_what_is_put_in_comes_out_beside_its_standard_deviation(smooth: Recorded
 
 
 def test_more_drives_are_surer(smooth: Recorded) -> None:
-    few, many = (learn(parts(smooth, count), smooth.vehicle) for count in (1, 3))
+    few, many = (learn_calibration(parts(smooth, count), smooth.vehicle) for count in (1, 3))
     assert few.ax is not None
     assert many.ax is not None
     assert many.ax[1] < few.ax[1]
@@ -67,8 +73,8 @@ def test_more_drives_are_surer(smooth: Recorded) -> None:
 
 def test_a_correction_takes_off_what_was_learned(smooth: Recorded) -> None:
     bad = spoil_drive(smooth)
-    calibration = learn(parts(bad, 3), bad.vehicle)
-    mended = corrected(
+    calibration = learn_calibration(parts(bad, 3), bad.vehicle)
+    mended = correct_log(
         bad.t, bad.signals, bad.vehicle.model_copy(update={"calibration": calibration})
     )
     for channel, off in (
@@ -78,11 +84,13 @@ def test_a_correction_takes_off_what_was_learned(smooth: Recorded) -> None:
     ):
         left = np.nanmedian(mended[:, channel] - smooth.signals[:, channel])
         assert abs(left) < 0.35 * off
-    assert corrected(bad.t, bad.signals, bad.vehicle) is bad.signals
+    assert correct_log(bad.t, bad.signals, bad.vehicle) is bad.signals
 
 
 def test_what_is_hardly_known_is_drawn_to_what_cars_usually_have(smooth: Recorded) -> None:
-    few, many = (weighed([{"steer_gain": 1.2}] * count, smooth.vehicle) for count in (1, 30))
+    few, many = (
+        weigh_estimates([{"steer_gain": 1.2}] * count, smooth.vehicle) for count in (1, 30)
+    )
     assert few is not None
     assert many is not None
     assert few.steer_gain is not None
@@ -102,8 +110,8 @@ def test_the_driven_axle_is_not_taken_for_a_smaller_one() -> None:
         [one_drive(*part, vehicle) for part in parts(drive, 3)]
         for vehicle in (drive.vehicle, unsaid)
     )
-    ours = weighed(known, drive.vehicle)
-    theirs = weighed(blind, unsaid)
+    ours = weigh_estimates(known, drive.vehicle)
+    theirs = weigh_estimates(blind, unsaid)
     for name in ("radius_fl", "radius_fr", "radius_rl", "radius_rr"):
         right, wrong = (
             abs(float(np.median([part[name] for part in estimates])))
@@ -120,10 +128,10 @@ def test_torque_tells_its_gain_times_the_mass() -> None:
     torques = [S.TORQUE + wheel for wheel in range(4)]
     laden = drive.vehicle.model_copy(update={"mass": drive.vehicle.mass / 1.1})
     plain, more, heavy = (
-        learn(parts(one, 3), vehicle).force_gain
+        learn_calibration(parts(one, 3), vehicle).force_gain
         for one, vehicle in (
             (drive, drive.vehicle),
-            (scaled(torques, 1.1)(drive), drive.vehicle),
+            (scale_columns(torques, 1.1)(drive), drive.vehicle),
             (drive, laden),
         )
     )
@@ -136,11 +144,11 @@ def test_torque_tells_its_gain_times_the_mass() -> None:
     vehicle = drive.vehicle.model_copy(
         update={"calibration": Calibration(drives=1, force_gain=(1.1, 0.01))}
     )
-    mended = corrected(drive.t, scaled(torques, 1.1)(drive).signals, vehicle)
+    mended = correct_log(drive.t, scale_columns(torques, 1.1)(drive).signals, vehicle)
     assert np.allclose(mended[:, torques], drive.signals[:, torques], equal_nan=True)
     unsaid = drive.signals.copy()
     unsaid[:, torques] = np.nan
-    assert learn([(drive.t, unsaid)], drive.vehicle).force_gain is None
+    assert learn_calibration([(drive.t, unsaid)], drive.vehicle).force_gain is None
 
 
 WHEELS_AND_STEERING = {
@@ -162,14 +170,14 @@ def test_a_late_device_is_known_by_its_turns_and_the_others_wait_for_it(
 ) -> None:
     seconds = float(smooth.t[LATE] - smooth.t[0])
     bad = late(smooth, WHEELS_AND_STEERING[name])
-    before, after = (learn(parts(one, 3), smooth.vehicle) for one in (smooth, bad))
+    before, after = (learn_calibration(parts(one, 3), smooth.vehicle) for one in (smooth, bad))
     one = getattr(before, name)
     other = getattr(after, name)
     assert other[0] - one[0] == pytest.approx(seconds, abs=2.0 * other[1])
     assert abs(one[0]) < 3.0 * one[1]
     known = Calibration.model_validate({"drives": 1, name: (seconds, 0.001)})
     vehicle = bad.vehicle.model_copy(update={"calibration": known})
-    mended = corrected(bad.t, bad.signals, vehicle)
+    mended = correct_log(bad.t, bad.signals, vehicle)
     both = [
         *WHEELS_AND_STEERING["wheel_lag"],
         *WHEELS_AND_STEERING["steer_lag"],
@@ -187,9 +195,9 @@ def test_waiting_is_causal_and_blocks_may_be_cut_anywhere(smooth: Recorded) -> N
     vehicle = smooth.vehicle.model_copy(update={"calibration": known})
     t = smooth.t[:300]
     signals = smooth.signals[:300]
-    whole = corrected(t, signals, vehicle)
+    whole = correct_log(t, signals, vehicle)
     assert not np.array_equal(whole[50:, S.AX], signals[50:, S.AX] - 0.2)
-    assert np.array_equal(corrected(t[:150], signals[:150], vehicle), whole[:150], equal_nan=True)
+    assert np.array_equal(correct_log(t[:150], signals[:150], vehicle), whole[:150], equal_nan=True)
     corrector = Corrector(vehicle)
     cuts = [0, 1, 2, 9, 10, 150, 300]
     parted = [corrector.advance(t[a:b], signals[a:b]) for a, b in itertools.pairwise(cuts)]
@@ -199,16 +207,16 @@ def test_waiting_is_causal_and_blocks_may_be_cut_anywhere(smooth: Recorded) -> N
 def test_of_two_calibrations_the_surer_value_holds() -> None:
     one = Calibration(drives=3, ax=(0.3, 0.05), ay=(0.1, 0.2))
     other = Calibration(drives=9, ax=(0.2, 0.1), yaw_rate=(0.01, 0.001))
-    both = surer(one, other)
+    both = surer_values(one, other)
     assert both == Calibration(drives=9, ax=(0.3, 0.05), ay=(0.1, 0.2), yaw_rate=(0.01, 0.001))
-    assert surer(None, other) == other
-    assert surer(one, None) == one
+    assert surer_values(None, other) == other
+    assert surer_values(one, None) == one
 
 
 def test_a_car_that_stands_teaches_nothing(smooth: Recorded) -> None:
     still = np.zeros_like(smooth.signals[:3000])
     with pytest.raises(InputError, match="excited"):
-        learn([(smooth.t[:3000], still)], smooth.vehicle)
+        learn_calibration([(smooth.t[:3000], still)], smooth.vehicle)
 
 
 def write(path: Path, drive: Recorded) -> str:
@@ -241,7 +249,7 @@ def test_a_calibrated_file_is_written_read_and_heeded(
         ) in (0, 3)
         said.append(pq.read_table(out))
     assert not said[0].equals(said[1])
-    wrong = write(tmp_path / "b.parquet", scaled([S.AY], -1.0)(smooth))
+    wrong = write(tmp_path / "b.parquet", scale_columns([S.AY], -1.0)(smooth))
     assert main(["calibrate", wrong, "--vehicle", str(car), "--out", str(better)]) == 2
     assert "ay sign" in capsys.readouterr().err
     assert main(["calibrate", wrong, "--vehicle", str(car), "--out", str(better), "--trust"]) == 0

@@ -7,18 +7,24 @@ import math
 import numpy as np
 import pytest
 
-from edge_agent.dynamics.body import accelerations
+from edge_agent.dynamics.body import planar_accelerations
 from edge_agent.dynamics.chassis import (
     DUGOFF,
     PlanarMotion,
     WheelInputs,
-    response,
+    planar_response,
     tyre_forces,
     wheel_inputs,
 )
-from edge_agent.dynamics.drive_wheel import ELECTRIC_S, WheelState, blended, drive_wheel, slip_share
+from edge_agent.dynamics.drive_wheel import (
+    ELECTRIC_S,
+    WheelState,
+    blend_forces,
+    drive_wheel,
+    slip_share,
+)
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import Parameter, body, four, parameter_row
+from edge_agent.dynamics.parameters import Parameter, as_four, body_of, parameter_row
 from edge_agent.dynamics.tyres import brush
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.numeric import FloatArray
@@ -38,7 +44,7 @@ def forces(shape: float, mu: float, omega: FloatArray) -> tuple[FloatArray, Floa
 
 @pytest.mark.parametrize("shape", [DUGOFF, 1.4])
 def test_no_wheel_has_more_than_its_friction_and_stiff_ones_have_it_almost(shape: float) -> None:
-    loads = np.array(wheel_loads(body(ROW), MOTION[3], MOTION[4]))
+    loads = np.array(wheel_loads(body_of(ROW), MOTION[3], MOTION[4]))
     x, y = forces(shape, 0.1, np.full(4, 80.0))
     used = np.hypot(x, y) / (0.1 * loads)
     assert (used <= 1.0).all()
@@ -60,21 +66,23 @@ def test_the_response_is_that_of_the_tyres_unless_a_force_is_known() -> None:
     inputs = wheel_inputs(DELTA, omega)
 
     def compute_response(known: FloatArray) -> tuple[float, float, float]:
-        cos = four(inputs[:, 0])
-        sin = four(inputs[:, 1])
+        cos = as_four(inputs[:, 0])
+        sin = as_four(inputs[:, 1])
         mu = (0.8, 0.8, 0.8, 0.8)
-        return response(
-            body(ROW), PlanarMotion(*MOTION), WheelInputs(cos, sin, four(omega), four(known), mu)
+        return planar_response(
+            body_of(ROW),
+            PlanarMotion(*MOTION),
+            WheelInputs(cos, sin, as_four(omega), as_four(known), mu),
         )
 
     tyre_x, tyre_y = forces(DUGOFF, 0.8, omega)
     assert compute_response(UNKNOWN) == pytest.approx(
-        accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12
+        planar_accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12
     )
     tyre_x[:2] = 100.0, 200.0
     known = np.array([100.0, 200.0, np.nan, np.nan])
     assert compute_response(known) == pytest.approx(
-        accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12
+        planar_accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12
     )
 
 
@@ -106,5 +114,5 @@ def test_compensation_is_even_at_ordinary_slip_and_model_only_when_sliding() -> 
     assert slip_share(0.3, 0.9 * 20.0 / 0.3, 20.0) == pytest.approx(0.5, abs=1e-2)
     assert slip_share(0.3, 0.0, 20.0) == 1.0
     out = np.empty(4)
-    blended(np.array([0.0, 1.0, 0.5, 0.5]), np.full(4, 10.0), np.full(4, 20.0), out)
+    blend_forces(np.array([0.0, 1.0, 0.5, 0.5]), np.full(4, 10.0), np.full(4, 20.0), out)
     assert out.tolist() == [20.0, 10.0, 15.0, 15.0]

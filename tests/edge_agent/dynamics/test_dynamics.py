@@ -77,7 +77,7 @@ def test_no_combination_of_slips_gives_more_than_the_friction_circle() -> None:
 
 
 def test_wheel_loads_carry_the_weight_and_a_left_turn_loads_the_right() -> None:
-    fl, fr, rl, rr = loads.wheel_loads(parameters.body(ROW), 2.0, 3.0)
+    fl, fr, rl, rr = loads.wheel_loads(parameters.body_of(ROW), 2.0, 3.0)
     assert fl + fr + rl + rr == pytest.approx(CAR.mass * GRAVITY)
     assert fr > fl
     assert rr > rl
@@ -88,7 +88,7 @@ def test_rolling_wheel_has_no_slip_and_a_left_turn_speeds_outer_wheel() -> None:
     along, across = slip.wheel_velocity(ROW, 3, 10.0, 0.0, 0.2, 0.0)
     assert along == pytest.approx(10.0 + 0.2 * 0.74)
     assert across == pytest.approx(-1.5 * 0.2)
-    slip_x, slip_y = slip.slips(CAR.wheel_radius, along / CAR.wheel_radius, along, across)
+    slip_x, slip_y = slip.wheel_slips(CAR.wheel_radius, along / CAR.wheel_radius, along, across)
     assert slip_x == pytest.approx(0.0, abs=1e-12)
     assert slip_y == pytest.approx(0.3 / along)
 
@@ -96,7 +96,7 @@ def test_rolling_wheel_has_no_slip_and_a_left_turn_speeds_outer_wheel() -> None:
 def test_axle_forces_and_accelerations_are_inverse() -> None:
     force_x = np.array([100.0, 300.0, -50.0, 80.0])
     force_y = np.array([500.0, 700.0, 400.0, 450.0])
-    _, ay, turn = body.accelerations(ROW, force_x, force_y, np.zeros(4))
+    _, ay, turn = body.planar_accelerations(ROW, force_x, force_y, np.zeros(4))
     moment = 0.5 * CAR.track_front * (300.0 - 100.0) + 0.5 * CAR.track_rear * (80.0 + 50.0)
     assert body.axle_lateral_forces(ROW, ay, turn, moment) == pytest.approx((1200.0, 850.0))
 

@@ -7,11 +7,11 @@ import pytest
 
 from edge_agent.filters import columns, householder
 from edge_agent.filters.points import sigma_points
-from edge_agent.filters.sigma import cubature
+from edge_agent.filters.sigma import cubature_rule
 from schemas.numeric import FloatArray
 
 N = 6
-RULE = cubature(N)
+RULE = cubature_rule(N)
 
 
 def belief(seed: int) -> tuple[FloatArray, FloatArray]:
@@ -24,7 +24,7 @@ def test_columns_are_the_points_of_the_rule() -> None:
     mean, root = belief(0)
     points = np.empty((N, 2 * N))
     rows = np.empty((2 * N, N))
-    columns.spread(mean, root, points)
+    columns.spread_points(mean, root, points)
     sigma_points(mean, root, RULE.xi, rows)
     assert points == pytest.approx(rows.T, abs=1e-12)
 
@@ -46,7 +46,7 @@ def test_gathering_is_the_square_root_prediction(offset: float) -> None:
         expected_root,
         np.empty((N, 3 * N)),
     )
-    columns.gather(points, std, 0.5, mean, root)
+    columns.gather_points(points, std, 0.5, mean, root)
     assert mean == pytest.approx(expected, rel=1e-14, abs=1e-12)
     assert root == pytest.approx(expected_root, abs=1e-8 if offset else 1e-12)
 
@@ -55,7 +55,7 @@ def test_points_that_all_agree_leave_the_noise_alone() -> None:
     mean = np.empty(N)
     root = np.empty((N, N))
     std = np.linspace(1e-9, 1e-3, N)
-    columns.gather(np.full((N, 2 * N), 3.7), std, 1.0, mean, root)
+    columns.gather_points(np.full((N, 2 * N), 3.7), std, 1.0, mean, root)
     assert root == pytest.approx(np.diag(std), rel=1e-12)
 
 
@@ -64,6 +64,6 @@ def test_a_pivot_is_never_less_than_its_noise_however_alike_the_states_are() -> 
     mean = np.empty(N)
     root = np.empty((N, N))
     std = np.full(N, 1e-9)
-    columns.gather(points, std, 1.0, mean, root)
+    columns.gather_points(points, std, 1.0, mean, root)
     assert (np.diag(root) >= std).all()
     assert np.isfinite(root).all()

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from edge_agent.filters.downdate import downdate, update_by_downdate
-from edge_agent.filters.federated import fuse, share
+from edge_agent.filters.federated import fuse_estimates, share_information
 from edge_agent.filters.householder import predict, update
 from edge_agent.filters.points import axis_points, sigma_points
-from edge_agent.filters.sigma import cubature
+from edge_agent.filters.sigma import cubature_rule
 from schemas.numeric import FloatArray
 
 
@@ -46,10 +46,10 @@ def test_share_then_fuse_is_the_identity(beta: float) -> None:
     first = np.empty((5, 5))
     second = np.empty((5, 5))
     work = np.empty((10, 10))
-    share(root, beta, first)
-    share(root, 1.0 - beta, second)
+    share_information(root, beta, first)
+    share_information(root, 1.0 - beta, second)
     fused = mean.copy()
-    fuse(fused, first, mean, second, work)
+    fuse_estimates(fused, first, mean, second, work)
     assert first @ first.T == pytest.approx(root @ root.T, abs=1e-12)
     assert fused == pytest.approx(mean, abs=1e-12)
 
@@ -61,7 +61,7 @@ def test_fusing_adds_information() -> None:
     y = np.array([1.5, 1.0, 3.0, 5.0])
     mean = x.copy()
     root = root_of(p)
-    fuse(mean, root, y, root_of(q), np.empty((8, 8)))
+    fuse_estimates(mean, root, y, root_of(q), np.empty((8, 8)))
     information = np.linalg.inv(p) + np.linalg.inv(q)
     assert root @ root.T == pytest.approx(np.linalg.inv(information), abs=1e-12)
     expected = np.linalg.solve(information, np.linalg.solve(p, x) + np.linalg.solve(q, y))
@@ -82,7 +82,7 @@ def test_federated_filter_with_halved_shared_rows_is_the_kalman_filter() -> None
     cov = covariance(n, 5)
     x = mean.copy()
     root = root_of(cov)
-    rule = cubature(n)
+    rule = cubature_rule(n)
     for _ in range(10):
         z = rng.normal(size=2)
         mean, cov = textbook(mean, cov, (f, q, h, noise), z)
@@ -108,7 +108,7 @@ def _federated_turn(
         own = np.empty(n)
         own_root = np.empty((n, n))
         points = np.empty((2 * n, n))
-        share(root, part, own_root)
+        share_information(root, part, own_root)
         axis_points(mean, own_root, xi, points)
         predict(
             np.ascontiguousarray(points @ f.T),
@@ -133,12 +133,12 @@ def _federated_turn(
             work,
         )
         parts.append((own, own_root))
-    fuse(parts[0][0], parts[0][1], parts[1][0], parts[1][1], work)
+    fuse_estimates(parts[0][0], parts[0][1], parts[1][0], parts[1][1], work)
     return parts[0]
 
 
 def test_points_by_singular_values_have_the_moments_of_the_state() -> None:
-    rule = cubature(4)
+    rule = cubature_rule(4)
     root = root_of(covariance(4, 6))
     mean = np.arange(4.0)
     points = np.empty((8, 4))
@@ -151,7 +151,7 @@ def test_points_by_singular_values_have_the_moments_of_the_state() -> None:
 def test_points_by_singular_values_lie_on_the_axes_of_the_ellipsoid() -> None:
     root = root_of(covariance(3, 7))
     points = np.empty((6, 3))
-    axis_points(np.zeros(3), root, cubature(3).xi, points)
+    axis_points(np.zeros(3), root, cubature_rule(3).xi, points)
     gram = points[:3] @ points[:3].T
     assert gram - np.diag(np.diag(gram)) == pytest.approx(np.zeros((3, 3)), abs=1e-12)
 
@@ -210,7 +210,7 @@ def test_downdate_filter_is_the_textbook_filter_on_a_linear_system() -> None:
     h = rng.normal(size=(3, n))
     q = 0.01 * covariance(n, 22)
     noise = np.array([0.2, 0.3, 0.4])
-    rule = cubature(n)
+    rule = cubature_rule(n)
     mean = np.ones(n)
     cov = covariance(n, 23)
     x = mean.copy()

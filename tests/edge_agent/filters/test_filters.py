@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from edge_agent.filters import householder
-from edge_agent.filters.points import deviations, sigma_points
-from edge_agent.filters.sigma import SigmaRule, cubature, unscented
+from edge_agent.filters.points import centred_deviations, sigma_points
+from edge_agent.filters.sigma import SigmaRule, cubature_rule, unscented_rule
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
 RULES = [
-    cubature(4),
-    unscented(4, 1.0, 0.0, 0.0),
-    unscented(4, 1.0, 2.0, 0.5),
-    unscented(4, 0.9, 2.0, 1.0),
+    cubature_rule(4),
+    unscented_rule(4, 1.0, 0.0, 0.0),
+    unscented_rule(4, 1.0, 2.0, 0.5),
+    unscented_rule(4, 0.9, 2.0, 1.0),
 ]
 
 
@@ -32,8 +32,8 @@ def test_a_rule_integrates_a_random_quadratic_exactly(rule: SigmaRule) -> None:
 
 def test_cubature_is_unscented_with_alpha_one_and_beta_and_kappa_zero() -> None:
     for n in range(1, 9):
-        left = cubature(n)
-        right = unscented(n, 1.0, 0.0, 0.0)
+        left = cubature_rule(n)
+        right = unscented_rule(n, 1.0, 0.0, 0.0)
         assert np.array_equal(left.xi, right.xi)
         assert np.array_equal(left.w_mean, right.w_mean)
         assert np.array_equal(left.w_cov, right.w_cov)
@@ -41,7 +41,7 @@ def test_cubature_is_unscented_with_alpha_one_and_beta_and_kappa_zero() -> None:
 
 @pytest.mark.parametrize("place", ["xi", "w_mean", "w_cov"])
 def test_a_rule_with_one_corrupted_constant_is_refused(place: str) -> None:
-    rule = cubature(3)
+    rule = cubature_rule(3)
     parts = {name: getattr(rule, name).copy() for name in ("xi", "w_mean", "w_cov")}
     parts[place].flat[0] += 1e-6
     with pytest.raises(InputError, match="moment"):
@@ -50,7 +50,7 @@ def test_a_rule_with_one_corrupted_constant_is_refused(place: str) -> None:
 
 def test_a_negative_covariance_weight_is_refused() -> None:
     with pytest.raises(InputError, match="negative"):
-        unscented(4, 1.0, 0.0, -2.0)
+        unscented_rule(4, 1.0, 0.0, -2.0)
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (3, 7), (6, 20)])
@@ -67,7 +67,7 @@ def test_triangularizing_keeps_the_product_and_makes_a_cholesky_factor(
 
 
 @pytest.mark.parametrize(
-    "rule", [cubature(2), unscented(2, 1.0, 2.0, 0.5)], ids=lambda rule: rule.name
+    "rule", [cubature_rule(2), unscented_rule(2, 1.0, 2.0, 0.5)], ids=lambda rule: rule.name
 )
 def test_a_covariance_keeps_a_centimetre_at_an_offset_of_5400_kilometres(rule: SigmaRule) -> None:
     points = np.empty((len(rule.xi), 2))
@@ -115,9 +115,9 @@ def _update_moments(
     sigma_points(mean, root, rule.xi, points)
     x = np.empty((n, count))
     y = np.empty((rows, count))
-    deviations(points, mean, rule.w_cov, x, 0)
+    centred_deviations(points, mean, rule.w_cov, x, 0)
     seen = points @ h.T
-    deviations(seen, rule.w_mean @ seen, rule.w_cov, y, 0)
+    centred_deviations(seen, rule.w_mean @ seen, rule.w_cov, y, 0)
     new = mean.copy()
     factor = root.copy()
     work = np.zeros((rows + n, count + rows))
@@ -156,7 +156,7 @@ def test_on_a_linear_system_the_core_is_the_kalman_filter(rule: SigmaRule) -> No
 
 
 def test_square_root_filter_is_textbook_for_a_nonlinear_measurement() -> None:
-    rule = cubature(3)
+    rule = cubature_rule(3)
     rng = np.random.default_rng(4)
     a = rng.normal(size=(3, 3))
     mean = rng.normal(size=3)
@@ -212,7 +212,7 @@ def look(x: FloatArray) -> FloatArray:
 
 
 def test_square_root_filter_is_textbook_for_a_nonlinear_system() -> None:
-    rule = cubature(2)
+    rule = cubature_rule(2)
     rng = np.random.default_rng(8)
     q = 1e-3 * np.array([[1.0, 0.3], [0.3, 2.0]])
     r = np.array([0.1, 0.2])
@@ -231,15 +231,15 @@ def test_square_root_filter_is_textbook_for_a_nonlinear_system() -> None:
         seen = look(points)
         x = np.empty((2, 4))
         y = np.empty((2, 4))
-        deviations(points, ours, rule.w_cov, x, 0)
-        deviations(seen, rule.w_mean @ seen, rule.w_cov, y, 0)
+        centred_deviations(points, ours, rule.w_cov, x, 0)
+        centred_deviations(seen, rule.w_mean @ seen, rule.w_cov, y, 0)
         householder.update(ours, root, x, y, z - rule.w_mean @ seen, r, work)
         assert np.allclose(ours, mean, rtol=0, atol=1e-9)
         assert np.allclose(root @ root.T, cov, rtol=0, atol=1e-9)
 
 
 def test_a_missing_row_is_as_if_it_had_never_been_asked_for() -> None:
-    rule = cubature(2)
+    rule = cubature_rule(2)
     mean = np.array([1.0, 2.0])
     root = np.array([[1.0, 0.0], [0.3, 0.5]])
     h = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])

@@ -9,9 +9,9 @@ import math
 import numpy as np
 import pytest
 
-from edge_agent.filters.cholesky import factorize, multiply, variance
+from edge_agent.filters.cholesky import covariance_of_factor, factorize, variance
 from edge_agent.filters.householder import update
-from edge_agent.filters.sequential import carlson, potter, project
+from edge_agent.filters.sequential import apply_projection, carlson_update, potter_factors
 from schemas.numeric import FloatArray
 
 N = 6
@@ -36,7 +36,7 @@ def test_a_covariance_is_its_factor_times_itself_turned(seed: int) -> None:
     again = np.empty((N, N))
     factorize(covariance(seed), root, 1e-18)
     assert root == pytest.approx(np.linalg.cholesky(covariance(seed)), abs=1e-12)
-    multiply(root, np.zeros(N), again)
+    covariance_of_factor(root, np.zeros(N), again)
     assert again == pytest.approx(covariance(seed), abs=1e-12)
     assert [variance(root, i) for i in range(N)] == pytest.approx(
         np.diag(covariance(seed)), abs=1e-12
@@ -47,8 +47,8 @@ def test_noise_is_added_to_the_diagonal_of_a_product() -> None:
     mean, root = belief(1)
     plain = np.empty((N, N))
     noisy = np.empty((N, N))
-    multiply(root, np.zeros(N), plain)
-    multiply(root, mean**2, noisy)
+    covariance_of_factor(root, np.zeros(N), plain)
+    covariance_of_factor(root, mean**2, noisy)
     assert noisy - plain == pytest.approx(np.diag(mean**2), abs=1e-12)
 
 
@@ -73,12 +73,12 @@ def test_rows_taken_in_one_by_one_by_potter_are_the_textbook_s_update(seed: int,
     square = nu @ np.linalg.solve(spread, nu)
     log_det = np.linalg.slogdet(spread)[1]
     for row in range(ROWS):
-        a, gain = potter(f[row], r[row])
+        a, gain = potter_factors(f[row], r[row])
         step = nu[row] / a
         square = square - nu[row] * step
         log_det = log_det - math.log(a)
-        project(mean, root, f[row], step, gain)
-        project(nu[row + 1 :], f[row + 1 :], f[row], -step, gain)
+        apply_projection(mean, root, f[row], step, gain)
+        apply_projection(nu[row + 1 :], f[row + 1 :], f[row], -step, gain)
     assert mean == pytest.approx(expected, abs=1e-9)
     assert root @ root.T == pytest.approx(left, abs=1e-9)
     assert (square, log_det) == pytest.approx((0.0, 0.0), abs=1e-9)
@@ -90,7 +90,7 @@ def test_carlson_s_update_by_a_state_is_the_orthogonal_one(state: int) -> None:
     ours = mean.copy()
     ours_root = root.copy()
     gain = np.empty(N)
-    far, expected = carlson(ours, ours_root, state, mean[state] + 0.7, 0.04, gain)
+    far, expected = carlson_update(ours, ours_root, state, mean[state] + 0.7, 0.04, gain)
     used, log_likelihood, square = update(
         mean,
         root,

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_agent.inputs.correct import corrected
+from edge_agent.inputs.correct import correct_log
 from edge_agent.inputs.doctor.adopt import adopt_measured, align_devices
 from edge_agent.inputs.signal_log import SignalLog
 from edge_agent.lab.evaluation.planted import DELTA, IMU, OMEGA, Recorded, drives
@@ -53,7 +53,7 @@ def test_late_device_is_measured_and_corrected(
     wrong = replace(log_of(drive), signals=late(drive.signals, columns, 0.15))
     adopted = adopt_measured(wrong, drive.vehicle)
     assert [note.split()[1] for note in adopted.notes] == [device]
-    assert adopted.diagnosis.passed
+    assert adopted.diagnosis.is_passed
     rows = slice(1000, -1000)
     before = np.nanmean(np.abs(wrong.signals[rows][:, columns] - drive.signals[rows][:, columns]))
     after = np.nanmean(
@@ -84,7 +84,7 @@ def test_radius_of_an_axle_scales_its_wheels_and_torques(drive: Recorded) -> Non
     vehicle = drive.vehicle.model_copy(
         update={"wheel_radius_rear": 1.04 * drive.vehicle.wheel_radius}
     )
-    scaled = corrected(drive.t, drive.signals, vehicle)
+    scaled = correct_log(drive.t, drive.signals, vehicle)
     assert np.allclose(scaled[:, OMEGA[2:]], 1.04 * drive.signals[:, OMEGA[2:]], equal_nan=True)
     assert np.array_equal(scaled[:, OMEGA[:2]], drive.signals[:, OMEGA[:2]], equal_nan=True)
     torques = slice(S.TORQUE + 2, S.TORQUE + 4)

@@ -20,9 +20,9 @@ from edge_agent.inputs.context import HELD_S, context_block, context_values, hel
 from edge_agent.inputs.live.databroker import DatabrokerFeed
 from edge_agent.inputs.live.rows import LiveRows
 from edge_agent.inputs.live.sources import open_sources
-from edge_agent.inputs.merge import merge
-from edge_agent.inputs.names import draft
-from edge_agent.inputs.profile import FOLDER, Channel, Profile, load_profile, shipped
+from edge_agent.inputs.merge import merge_recordings
+from edge_agent.inputs.names import draft_profile
+from edge_agent.inputs.profile import FOLDER, Channel, Profile, load_profile, shipped_profiles
 from edge_agent.inputs.readers.dbc import read_dbc
 from edge_agent.inputs.recording import Series
 from edge_agent.inputs.signal_log import SignalLog, read_log
@@ -104,7 +104,7 @@ def frames_of(name: str) -> list[can.Message]:
 def import_log(path: Path, profile: Profile, out: Path) -> SignalLog:
     """Import a source as a log, without checking the signals that an estimator needs."""
     database = None if profile.dbc is None else read_dbc(FOLDER / profile.dbc)
-    merged = merge(
+    merged = merge_recordings(
         [read_source(path, profile, database)], profile, wheel_radius=0.3, steering_ratio=16.0
     )
     write_log(out, merged, profile, [path.name])
@@ -335,7 +335,7 @@ def test_context_changes_no_other_column_of_a_log(tmp_path: Path) -> None:
     path = formats.as_log(tmp_path / "a.blf", frames)
     tables = []
     for one in (profile, bare):
-        merged = merge(
+        merged = merge_recordings(
             [read_source(path, one, read_dbc(FOLDER / f"{name}.dbc"))], one, wheel_radius=0.3
         )
         tables.append(merged)
@@ -390,13 +390,17 @@ def test_context_alone_is_no_drive(tmp_path: Path) -> None:
     pq.write_table(pa.table({"t": [0.0, 0.1], "abs_active": [0.0, 1.0]}), tmp_path / "a.parquet")
     profile = plain_profile({"abs_active": "abs_active"})
     with pytest.raises(InputError, match="context alone"):
-        merge([read_source(tmp_path / "a.parquet", profile, None)], profile)
+        merge_recordings([read_source(tmp_path / "a.parquet", profile, None)], profile)
 
 
 def test_shipped_profiles_with_controllers_read_all_context() -> None:
-    found = {name: set(CONTEXT) & set(load_profile(name)[0].channels) for name in shipped()}
+    found = {
+        name: set(CONTEXT) & set(load_profile(name)[0].channels) for name in shipped_profiles()
+    }
     carried = {"hyundai-can", "vw-mqb", "vss"}
-    assert found == {name: set(CONTEXT) if name in carried else set() for name in shipped()}
+    assert found == {
+        name: set(CONTEXT) if name in carried else set() for name in shipped_profiles()
+    }
 
 
 def test_names_of_context_signals_are_drafted() -> None:
@@ -414,8 +418,8 @@ def test_names_of_context_signals_are_drafted() -> None:
         "EMS12.TEMP_ENG",
         "Vehicle.ADAS.ABS.IsEnabled",
     ]
-    drafted = draft(dict.fromkeys([*names, *others], ""), "p")
-    assert {c.whole(str(c.signal)): name for name, c in drafted.channels.items()} == names
+    drafted = draft_profile(dict.fromkeys([*names, *others], ""), "p")
+    assert {c.full_name(str(c.signal)): name for name, c in drafted.channels.items()} == names
 
 
 def test_check_names_a_flag_that_is_always_on(

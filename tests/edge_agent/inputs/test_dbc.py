@@ -8,7 +8,7 @@ import cantools
 import numpy as np
 import pytest
 
-from edge_agent.inputs.profile import FOLDER, load_profile, shipped
+from edge_agent.inputs.profile import FOLDER, load_profile, shipped_profiles
 from edge_agent.inputs.readers.dbc import LONGEST, Bytes, parse_dbc, read_dbc
 from schemas.errors import InputError
 from tests.edge_agent.inputs.formats import frames
@@ -32,7 +32,7 @@ def columns(data: list[bytes]) -> Bytes:
     )
 
 
-@pytest.mark.parametrize("name", [name for name in shipped() if load_profile(name)[0].dbc])
+@pytest.mark.parametrize("name", [name for name in shipped_profiles() if load_profile(name)[0].dbc])
 def test_frames_of_shipped_profiles_decode_exactly_like_cantools(name: str) -> None:
     profile, folder = load_profile(name)
     assert profile.dbc is not None
@@ -47,8 +47,8 @@ def test_frames_of_shipped_profiles_decode_exactly_like_cantools(name: str) -> N
         for signal, values in ours_of.decode(columns(data), list(ours_of.signals)).items():
             assert [float(row[signal]) for row in decoded] == values.tolist(), signal
             compared += 1
-    assert compared >= len(profile.needs())
-    assert profile.needs() <= {f"{m.name}.{s.name}" for m in oracle for s in m.signals}
+    assert compared >= len(profile.needed_signals())
+    assert profile.needed_signals() <= {f"{m.name}.{s.name}" for m in oracle for s in m.signals}
 
 
 def test_recorded_frames_decode_as_by_cantools() -> None:

@@ -14,7 +14,13 @@ import pytest
 
 from edge_agent.cli import main
 from edge_agent.inputs.doctor.findings import diagnose
-from edge_agent.lab.evaluation.planted import PLANTED, Recorded, drives, icy, named
+from edge_agent.lab.evaluation.planted import (
+    PLANTED,
+    Recorded,
+    doctor_verdict,
+    drives,
+    winter_drives,
+)
 from edge_agent.lab.simulation import simulate_manoeuvre
 from schemas.signals import CHANNELS, S
 from tests.edge_agent.inputs.formats import BLF, NMEA, VEHICLE
@@ -41,14 +47,14 @@ def write(path: Path, drive: Recorded) -> list[str]:
 
 @pytest.mark.parametrize("name", PLANTED)
 def test_a_planted_mistake_is_named_and_does_not_pass(rough: Recorded, name: str) -> None:
-    found, passed = named(PLANTED[name], rough)
+    found, passed = doctor_verdict(PLANTED[name], rough)
     assert found
     assert not passed
 
 
 def test_a_sound_drive_passes_with_its_tilts_offsets_and_lags(rough: Recorded) -> None:
     said = diagnose(*rough)
-    assert said.passed
+    assert said.is_passed
     assert set(said.sound) == {"ax", "ay", "yaw_rate", "delta", "omega", "latitude"}
 
 
@@ -59,7 +65,7 @@ def test_a_standing_car_tells_nothing_and_does_not_pass(rough: Recorded) -> None
     said = diagnose(rough.t[:3000], still, rough.vehicle)
     assert not said.findings
     assert set(said.unknown) == {"ax", "ay", "yaw_rate", "delta", "omega"}
-    assert not said.passed
+    assert not said.is_passed
 
 
 @pytest.mark.parametrize(
@@ -109,7 +115,7 @@ def test_slides_and_constant_speed_accuse_no_sensor(manoeuvre: str, mu: float | 
 @pytest.fixture(scope="module")
 def winter() -> Recorded:
     """Two minutes and a half on ice and snow."""
-    return icy(1, 23)[0]
+    return winter_drives(1, 23)[0]
 
 
 def test_a_drive_on_ice_and_snow_accuses_no_sensor(winter: Recorded) -> None:
@@ -120,7 +126,7 @@ def test_a_drive_on_ice_and_snow_accuses_no_sensor(winter: Recorded) -> None:
     "name", ["yaw rate in deg/s", "a_y flipped", "steering in deg", "status bits", "wheels in mph"]
 )
 def test_a_mistake_is_named_on_ice_too(winter: Recorded, name: str) -> None:
-    found, passed = named(PLANTED[name], winter)
+    found, passed = doctor_verdict(PLANTED[name], winter)
     assert found
     assert not passed
 

@@ -18,7 +18,7 @@ import pytest
 
 from edge_agent.cli import main
 from edge_agent.inputs.bring_in import PROVENANCE, read_source
-from edge_agent.inputs.profile import FOLDER, Profile, load_profile, shipped
+from edge_agent.inputs.profile import FOLDER, Profile, load_profile, shipped_profiles
 from edge_agent.inputs.readers.dbc import read_dbc
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -267,9 +267,11 @@ def test_a_rim_speed_without_a_radius_is_an_error(
 
 def test_the_shipped_profiles_are_listed(capsys: Output) -> None:
     assert main(["import", "--list"]) == 0
-    assert {line.split()[0] for line in capsys.readouterr().out.splitlines()} == set(shipped())
+    assert {line.split()[0] for line in capsys.readouterr().out.splitlines()} == set(
+        shipped_profiles()
+    )
     assert main(["import", "--list", "--json"]) == 0
-    assert set(json.loads(capsys.readouterr().out)) == set(shipped())
+    assert set(json.loads(capsys.readouterr().out)) == set(shipped_profiles())
 
 
 def test_another_database_and_a_named_draft(tmp_path: Path, some: list[can.Message]) -> None:

@@ -25,7 +25,14 @@ from edge_agent.inputs.live.rows import LiveRows
 from edge_agent.inputs.live.sources import is_live, open_sources
 from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.lab.live.databroker import Databroker
-from edge_agent.lab.live.judge import COUNTED, addresses, free_port, lost, peer, written
+from edge_agent.lab.live.judge import (
+    COUNTED,
+    count_lost,
+    free_port,
+    peer_addresses,
+    run_peer,
+    write_profile,
+)
 from edge_agent.lab.live.peers import CHANNELS, RADIUS, SPEED
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.errors import InputError
@@ -41,21 +48,21 @@ CAR = PRESETS["sedan"].vehicle
 
 @pytest.mark.parametrize("kind", COUNTED)
 def test_what_a_peer_sends_comes_in_without_a_sample_lost(kind: str, tmp_path: Path) -> None:
-    assert lost(kind, tmp_path, 1.0) == (0, 100)
+    assert count_lost(kind, tmp_path, 1.0) == (0, 100)
 
 
 @pytest.mark.campaign
 def test_the_values_of_every_peer_are_those_that_were_sent(tmp_path: Path) -> None:
     for kind in COUNTED:
-        place, source = addresses(kind)
-        name, dbc = written(kind, tmp_path)
+        place, source = peer_addresses(kind)
+        name, dbc = write_profile(kind, tmp_path)
         feeds, profile, clock = open_sources([source], name, dbc)
         rows = LiveRows(feeds, profile, CAR, clock)
-        with peer(kind, place, 100_000) as running:
-            running.until("ready")
+        with run_peer(kind, place, 100_000) as running:
+            running.wait_for("ready")
             blocks = rows.blocks()
             got = next(blocks).signals
-            running.go()
+            running.send_go()
             patience = iter(range(200))
             while not np.isfinite(got[..., [ALL.index(name) for name in CHANNELS]]).all():
                 got = next(blocks).signals
@@ -71,17 +78,17 @@ def test_the_values_of_every_peer_are_those_that_were_sent(tmp_path: Path) -> No
 @pytest.mark.parametrize("kind", [*COUNTED, "gpsd"])
 @pytest.mark.campaign
 def test_a_source_that_was_killed_is_heard_again_when_it_is_back(kind: str, tmp_path: Path) -> None:
-    place, source = addresses(kind)
-    name, dbc = written("can" if kind == "gpsd" else kind, tmp_path)
+    place, source = peer_addresses(kind)
+    name, dbc = write_profile("can" if kind == "gpsd" else kind, tmp_path)
     feeds, _, _ = open_sources([source], name, dbc)
     feed = feeds[0]
     feed.start()
     try:
         for _ in range(2):
-            with peer(kind, place, 100_000) as running:
-                running.go()
-                running.until("ready")
-                running.go()
+            with run_peer(kind, place, 100_000) as running:
+                running.send_go()
+                running.wait_for("ready")
+                running.send_go()
                 before = feed.heard
                 until(lambda: feed.heard > before + 20)  # noqa: B023 waited for here
             until(lambda: feed.trouble is not None)
@@ -204,9 +211,9 @@ def test_a_bus_tells_its_number_and_the_profile_which_it_reads() -> None:
 
 @pytest.mark.timeout(600)  # kernels may have to be compiled
 def test_a_live_car_is_driven_by_its_bus_and_its_receiver(service: Service, tmp_path: Path) -> None:
-    (bus, can) = addresses("can")
-    (receiver, gpsd) = addresses("gpsd")
-    name, dbc = written("can", tmp_path)
+    (bus, can) = peer_addresses("can")
+    (receiver, gpsd) = peer_addresses("gpsd")
+    name, dbc = write_profile("can", tmp_path)
     (tmp_path / "car.json").write_text(CAR.model_dump_json(exclude_none=True))
     config = {
         "zenoh": service.router.settings.model_dump(),
@@ -238,10 +245,10 @@ def test_a_live_car_is_driven_by_its_bus_and_its_receiver(service: Service, tmp_
     agent = subprocess.Popen(
         [*command, *words, "--name", "car-one"], stdout=subprocess.PIPE, text=True
     )
-    with peer("can", bus, 100_000) as one, peer("gpsd", receiver, 100_000, 5.0) as other:
+    with run_peer("can", bus, 100_000) as one, run_peer("gpsd", receiver, 100_000, 5.0) as other:
         for running in (one, other):
-            running.until("ready")
-            running.go()
+            running.wait_for("ready")
+            running.send_go()
         service.wait(lambda batches: sum(batch.kind == Kind.OBSERVATION for batch in batches) >= 2)
         agent.terminate()
         said, _ = agent.communicate(timeout=60)

@@ -71,16 +71,16 @@ def test_foreign_time_stamps_are_moved_by_the_least_delay() -> None:
     own = Stamps()
     other = Stamps()
     delays = [0.3, 0.05, 0.2, 0.11]
-    assert [own.place(10.0 + k, 10.0 + k + delay) for k, delay in enumerate(delays)] == [
+    assert [own.host_time(10.0 + k, 10.0 + k + delay) for k, delay in enumerate(delays)] == [
         10.0,
         11.0,
         12.0,
         13.0,
     ]
-    places = [other.place(k - 5000.0, k + delay) for k, delay in enumerate(delays)]
+    places = [other.host_time(k - 5000.0, k + delay) for k, delay in enumerate(delays)]
     assert places[1:] == pytest.approx([1.05, 2.05, 3.05])
     early = Stamps()
-    assert early.place(10.5, 10.1) == pytest.approx(10.1), "from the future: another clock"
+    assert early.host_time(10.5, 10.1) == pytest.approx(10.1), "from the future: another clock"
     assert own.lead == 0.0
     assert max(delays) < BELIEVED_S
 
@@ -88,9 +88,9 @@ def test_foreign_time_stamps_are_moved_by_the_least_delay() -> None:
 def test_a_clock_that_is_set_under_way_is_followed() -> None:
     stamps = Stamps()
     for k in range(20):
-        stamps.place(k * 1.0, k + 0.02)
+        stamps.host_time(k * 1.0, k + 0.02)
     for k in range(20, 20 + round(2.5 * WHILE_S)):
-        placed = stamps.place(k - 3600.0, k + 0.02)
+        placed = stamps.host_time(k - 3600.0, k + 0.02)
     assert placed == pytest.approx(k + 0.02)
 
 
@@ -123,7 +123,7 @@ def test_rows_interpolate_readings_and_are_empty_for_a_silent_source(
     assert (signals[:, S.DELTA + 2] == 0.0).all(), "rear wheels do not steer"
     assert np.allclose(np.diff(t), 0.01)
     assert (got[0].time[0] - clock.start_ns) / NS == pytest.approx(t[0], abs=1e-8)
-    assert rows.troubles() == ["bus is silent for 2 s"]
+    assert rows.health_problems() == ["bus is silent for 2 s"]
     assert clock.now() == pytest.approx(t[-1] + 0.01 + DELAY_S)
     blocks.close()
     assert not feed._thread.is_alive()

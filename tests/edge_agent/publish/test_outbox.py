@@ -83,9 +83,9 @@ def test_each_start_draws_another_boot_of_63_bits(tmp_path: Path) -> None:
 def test_settled_ranges_leave_and_first_held_moves_on(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT)
     outbox.store([draft(records=2) for _ in range(6)], now=0.0)
-    assert outbox.settle(stream(), [(1, 2), (4, 4)]) == 6
+    assert outbox.settle_ranges(stream(), [(1, 2), (4, 4)]) == 6
     assert outbox.store([draft()], now=0.0)[0].payload == b"7/3"
-    assert outbox.settle(stream(), [(1, 7)]) == 7
+    assert outbox.settle_ranges(stream(), [(1, 7)]) == 7
     assert outbox.store([draft()], now=0.0)[0].payload == b"8/8"
     assert outbox.batches == 1
     outbox.close()
@@ -94,8 +94,8 @@ def test_settled_ranges_leave_and_first_held_moves_on(path: Path) -> None:
 def test_an_acknowledgement_of_what_is_not_held_changes_nothing(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT)
     outbox.store([draft()], now=0.0)
-    assert outbox.settle(stream(boot=BOOT + 1), [(1, 1)]) == 0
-    assert outbox.settle(stream(), [(2, 2**62)]) == 0
+    assert outbox.settle_ranges(stream(boot=BOOT + 1), [(1, 1)]) == 0
+    assert outbox.settle_ranges(stream(), [(2, 2**62)]) == 0
     assert outbox.batches == 1
     outbox.close()
 
@@ -109,20 +109,21 @@ from edge_agent.publish.outbox import Outbox
 from schemas.wire import Kind
 outbox = Outbox(pathlib.Path({str(path)!r}), boot={BOOT})
 outbox.store([Draft("car-a", Kind.OBSERVATION, {REGION}, 3, lambda s, f: b"kept %d" % s) for _ in range(4)], 0.0)
-outbox.settle(outbox.store([Draft("car-a", Kind.STATE, {REGION}, 3, lambda s, f: b"gone")], 0.0)[0].stream, [(1, 1)])
+gone = outbox.store([Draft("car-a", Kind.STATE, {REGION}, 3, lambda s, f: b"gone")], 0.0)
+outbox.settle_ranges(gone[0].stream, [(1, 1)])
 outbox.delete_settled()
 os.kill(os.getpid(), signal.SIGKILL)
 """
     child = subprocess.run([sys.executable, "-c", script], check=False)
     assert child.returncode == -9
     outbox = Outbox(path, boot=BOOT + 1)
-    assert outbox.records({"car-a"}) == 12
-    left = outbox.due(now=0.0, limit=10)
+    assert outbox.count_records({"car-a"}) == 12
+    left = outbox.due_batches(now=0.0, limit=10)
     assert [(b.stream.boot, b.seq, b.payload) for b in left] == [
         (BOOT, s, b"kept %d" % s) for s in (1, 2, 3, 4)
     ]
     assert outbox.store([draft()], now=0.0)[0].seq == 1
-    assert outbox.settle(stream(), [(1, 4)]) == 12
+    assert outbox.settle_ranges(stream(), [(1, 4)]) == 12
     assert outbox.batches == 1
     outbox.close()
 
@@ -130,12 +131,12 @@ os.kill(os.getpid(), signal.SIGKILL)
 def test_unsettled_batches_are_resent_oldest_first_at_growing_intervals(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT, first_resend_s=1.0)
     outbox.store([draft() for _ in range(5)], now=0.0)
-    assert outbox.due(now=1.0 - JITTER - 0.01, limit=9) == []
-    assert seqs(outbox.due(now=1.0 + JITTER, limit=3)) == [1, 2, 3]
-    assert seqs(outbox.due(now=1.0 + JITTER, limit=3)) == [4, 5]
+    assert outbox.due_batches(now=1.0 - JITTER - 0.01, limit=9) == []
+    assert seqs(outbox.due_batches(now=1.0 + JITTER, limit=3)) == [1, 2, 3]
+    assert seqs(outbox.due_batches(now=1.0 + JITTER, limit=3)) == [4, 5]
     second = 1.0 + JITTER
-    assert outbox.due(now=second + 2 * (1 - JITTER) - 0.01, limit=9) == []
-    assert seqs(outbox.due(now=second + 2 * (1 + JITTER), limit=9)) == [1, 2, 3, 4, 5]
+    assert outbox.due_batches(now=second + 2 * (1 - JITTER) - 0.01, limit=9) == []
+    assert seqs(outbox.due_batches(now=second + 2 * (1 + JITTER), limit=9)) == [1, 2, 3, 4, 5]
     outbox.close()
 
 
@@ -144,7 +145,7 @@ def silence_route(outbox: Outbox, now: float = 0.0) -> float:
     outbox.store([draft()], now)
     while outbox.store([draft()], now)[0].fresh:
         now += 0.5
-        outbox.due(now, limit=99)
+        outbox.due_batches(now, limit=99)
         assert now < 60.0
     return now
 
@@ -158,7 +159,7 @@ def test_silent_route_keeps_batches_on_disk_and_probes_every_two_minutes(
     put = []
     for second in range(0, 3600, 5):
         assert not any(batch.fresh for batch in outbox.store([draft()], began + second))
-        put += [(second, batch.seq) for batch in outbox.due(began + second, limit=64)]
+        put += [(second, batch.seq) for batch in outbox.due_batches(began + second, limit=64)]
     assert 20 <= len(put) <= 50
     assert put[-1][0] - put[-2][0] <= LONGEST_PROBE_S * (1 + JITTER) + 5
     assert (
@@ -172,17 +173,17 @@ def test_first_answer_releases_batches_oldest_first_and_ever_faster(path: Path) 
     now = silence_route(outbox)
     for _ in range(300):
         outbox.store([draft()], now)
-    while not (probe := outbox.due(now, limit=64)):
+    while not (probe := outbox.due_batches(now, limit=64)):
         now += 1.0
-    outbox.settle(stream(), [(probe[0].seq, probe[0].seq)])
+    outbox.settle_ranges(stream(), [(probe[0].seq, probe[0].seq)])
     rounds = []
-    out = outbox.due(now, limit=10**6)
+    out = outbox.due_batches(now, limit=10**6)
     assert seqs(out) == sorted(seqs(out))
     while out:
         rounds.append(len(out))
         now += 1.0
-        outbox.settle(stream(), [(batch.seq, batch.seq) for batch in out])
-        out = outbox.due(now, limit=10**6)
+        outbox.settle_ranges(stream(), [(batch.seq, batch.seq) for batch in out])
+        out = outbox.due_batches(now, limit=10**6)
     assert outbox.batches == 0
     assert FIRST_WINDOW <= rounds[0] <= FIRST_WINDOW + 1
     assert max(rounds) >= 2 * FIRST_WINDOW
@@ -195,8 +196,8 @@ def test_a_region_that_nobody_serves_does_not_silence_the_others(path: Path) -> 
     now = 0.0
     for _ in range(60):
         batches = outbox.store([draft(), draft(region=9)], now)
-        outbox.settle(stream(), [(batches[0].seq, batches[0].seq)])
-        outbox.due(now, limit=64)
+        outbox.settle_ranges(stream(), [(batches[0].seq, batches[0].seq)])
+        outbox.due_batches(now, limit=64)
         now += 1.0
     assert [batch.fresh for batch in outbox.store([draft(), draft(region=9)], now)] == [True, False]
     outbox.close()
@@ -205,11 +206,13 @@ def test_a_region_that_nobody_serves_does_not_silence_the_others(path: Path) -> 
 def test_reconnect_sends_everything_again_oldest_first_and_once(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT, first_resend_s=4.0)
     outbox.store([draft() for _ in range(5)] + [draft("car-b")], now=0.0)
-    outbox.reoffer("car-a", now=1.0)
-    assert seqs(outbox.due(now=1.0, limit=9)) == [1, 2, 3, 4, 5]
-    assert outbox.due(now=1.0, limit=9) == []
+    outbox.reset_in_flight("car-a", now=1.0)
+    assert seqs(outbox.due_batches(now=1.0, limit=9)) == [1, 2, 3, 4, 5]
+    assert outbox.due_batches(now=1.0, limit=9) == []
     assert [
-        b.stream.vehicle for b in outbox.due(now=4.0 * (1 + JITTER) - 0.01, limit=9) if b.seq == 1
+        b.stream.vehicle
+        for b in outbox.due_batches(now=4.0 * (1 + JITTER) - 0.01, limit=9)
+        if b.seq == 1
     ].count("car-a") <= 1
     outbox.close()
 
@@ -219,9 +222,9 @@ def test_reconnect_probes_a_silent_route_at_once_with_one_batch(path: Path) -> N
     now = silence_route(outbox)
     for _ in range(12):
         now += LONGEST_PROBE_S
-        outbox.due(now, limit=9)
-    outbox.reoffer("car-a", now)
-    assert len(outbox.due(now, limit=9)) == 1
+        outbox.due_batches(now, limit=9)
+    outbox.reset_in_flight("car-a", now)
+    assert len(outbox.due_batches(now, limit=9)) == 1
     outbox.close()
 
 
@@ -230,8 +233,8 @@ def test_batches_of_a_former_name_are_not_put_and_are_told(path: Path) -> None:
     outbox.store([draft("car-old", records=3), draft("car-new")], now=0.0)
     outbox.close()
     again = Outbox(path, boot=BOOT + 1)
-    assert [batch.stream.vehicle for batch in again.due(0.0, 9, {"car-new"})] == ["car-new"]
-    assert again.stranded({"car-new"}) == 3
+    assert [batch.stream.vehicle for batch in again.due_batches(0.0, 9, {"car-new"})] == ["car-new"]
+    assert again.count_stranded({"car-new"}) == 3
     again.close()
 
 
@@ -259,7 +262,7 @@ def test_full_outbox_drops_oldest_states_then_observations_and_counts(path: Path
     outbox.store([draft(size=1_000), draft(size=1_000)], now=0.0)
     assert outbox.counts.evicted == {Kind.STATE: 14, Kind.OBSERVATION: 1}
     assert outbox.bytes <= 4_500
-    assert seqs(outbox.due(now=2.0 * (1 + JITTER), limit=9)) == [2, 3, 4, 5]
+    assert seqs(outbox.due_batches(now=2.0 * (1 + JITTER), limit=9)) == [2, 3, 4, 5]
     assert outbox.store([draft()], now=0.0)[0].payload == b"6/2"
     outbox.close()
 
@@ -269,7 +272,7 @@ def test_what_was_given_up_does_not_come_back_after_a_restart(path: Path) -> Non
     outbox.store([draft(size=1_000) for _ in range(4)], now=0.0)
     outbox.close()
     again = Outbox(path, boot=BOOT + 1)
-    assert seqs(again.due(now=0.0, limit=9)) == [3, 4]
+    assert seqs(again.due_batches(now=0.0, limit=9)) == [3, 4]
     again.close()
 
 
@@ -282,12 +285,12 @@ from edge_agent.publish.outbox import Outbox, Stream
 from schemas.wire import Kind
 outbox = Outbox(pathlib.Path({str(path)!r}), boot={BOOT})
 held = outbox.store([Draft("car-a", Kind.STATE, {REGION}, 3, lambda s, f: b"seen") for _ in range(2)], 0.0)
-outbox.settle(held[0].stream, [(1, 1)])
+outbox.settle_ranges(held[0].stream, [(1, 1)])
 os.kill(os.getpid(), signal.SIGKILL)
 """
     subprocess.run([sys.executable, "-c", script], check=False)
     outbox = Outbox(path)
-    assert seqs(outbox.due(now=0.0, limit=9)) == [1, 2]
+    assert seqs(outbox.due_batches(now=0.0, limit=9)) == [1, 2]
     outbox.close()
 
 
@@ -335,10 +338,10 @@ def test_an_unanswered_batch_is_given_up_before_it_blocks_its_stream(
     for turn in range(60):
         now += 1.0
         fresh = outbox.store([draft(records=2)], now)
-        outbox.due(now, 64)
+        outbox.due_batches(now, 64)
         for batch in fresh:
             if batch.seq != 3:  # which no service can read
-                outbox.settle(stream(), [(batch.seq, batch.seq)])
+                outbox.settle_ranges(stream(), [(batch.seq, batch.seq)])
         assert outbox.counts.unanswered == 0 or turn >= 42
     assert outbox.batches == 0
     assert outbox.counts.unanswered == 2
@@ -361,13 +364,13 @@ def test_waiting_batches_take_little_memory_and_leave_none_behind(path: Path) ->
         assert again.batches == count
         assert tracemalloc.get_traced_memory()[0] < 320 * count
         for kind in Kind:
-            again.settle(stream(kind=kind), [(1, count)])
+            again.settle_ranges(stream(kind=kind), [(1, count)])
         again.delete_settled()
         held = []
         for turn in range(40):
             again.store([draft(size=200) for _ in range(500)], now=10.0 * turn)
-            again.settle(stream(boot=BOOT + 1), [(1, 500 * (turn + 1))])
-            assert again.due(10.0 * turn, 100) == []
+            again.settle_ranges(stream(boot=BOOT + 1), [(1, 500 * (turn + 1))])
+            assert again.due_batches(10.0 * turn, 100) == []
             held.append(tracemalloc.get_traced_memory()[0])
         assert max(held[30:]) < 1.5 * max(held[10:20]), "what is gone takes nothing"
     finally:

@@ -66,7 +66,7 @@ def test_every_record_arrives_once_under_its_vehicles_key_and_is_settled(
     publisher.offer(observations, states)
     until(lambda: publisher.counts.acknowledged[Kind.STATE] == len(states.vehicle))
     assert publisher.close(within_s=5.0)
-    assert publisher.unsettled() == 0
+    assert publisher.count_unsettled() == 0
     assert rows(service.batches, Kind.OBSERVATION) == len(observations.vehicle)
     assert rows(service.batches, Kind.STATE) == len(states.vehicle)
     for key, batch in zip(service.keys, service.batches, strict=True):
@@ -108,7 +108,7 @@ def test_what_the_service_does_not_answer_is_sent_again_until_it_does(
     service.wait(lambda batches: len(batches) > len({b.seq for b in batches}) + 6)
     service.answer = True
     assert publisher.close(within_s=20.0)
-    assert publisher.unsettled() == 0
+    assert publisher.count_unsettled() == 0
     assert publisher.counts.resent_batches >= 3
     assert publisher.counts.acknowledged[Kind.OBSERVATION] == len(observations.vehicle)
     assert rows(service.batches, Kind.OBSERVATION) == len(observations.vehicle)
@@ -124,10 +124,10 @@ def test_a_lost_router_is_waited_for_and_nothing_is_lost(router: Router, tmp_pat
     until(lambda: publisher.links == len(NAMES))
     router.stop()
     publisher.offer(after)
-    until(lambda: publisher.unsettled() >= len(after.vehicle))
+    until(lambda: publisher.count_unsettled() >= len(after.vehicle))
     router.start()
     with Service(router) as service:
-        until(lambda: publisher.unsettled() == 0)
+        until(lambda: publisher.count_unsettled() == 0)
         assert rows(service.batches, Kind.OBSERVATION) >= len(after.vehicle)
     assert publisher.close(within_s=2.0)
 
@@ -138,11 +138,11 @@ def test_an_agent_may_start_before_the_router(tmp_path: Path) -> None:
     publisher = publisher_of(settings(router, tmp_path))
     observations, _ = drive()
     publisher.offer(observations)
-    until(lambda: publisher.unsettled() == len(observations.vehicle))
+    until(lambda: publisher.count_unsettled() == len(observations.vehicle))
     assert publisher.links == 0
     router.start()
     with Service(router) as service:
-        until(lambda: publisher.unsettled() == 0)
+        until(lambda: publisher.count_unsettled() == 0)
         assert rows(service.batches, Kind.OBSERVATION) == len(observations.vehicle)
     assert publisher.close(within_s=2.0)
     router.stop()
@@ -155,9 +155,9 @@ def test_without_a_router_it_exits_in_time_and_keeps_everything(tmp_path: Path) 
     observations, _ = drive()
     publisher.offer(observations)
     assert publisher.close(within_s=0.5)
-    assert publisher.unsettled() == len(observations.vehicle)
+    assert publisher.count_unsettled() == len(observations.vehicle)
     again = Outbox(config.spool)
-    assert again.records(set(NAMES)) == len(observations.vehicle)
+    assert again.count_records(set(NAMES)) == len(observations.vehicle)
     again.close()
 
 
@@ -176,7 +176,7 @@ def test_batches_of_an_earlier_start_are_sent_under_their_old_identity(
     second = publisher_of(config)
     assert second.close(within_s=20.0)
     assert set(service.identities()) == earlier
-    assert second.unsettled() == 0
+    assert second.count_unsettled() == 0
 
 
 def test_a_rejected_batch_is_settled_counted_and_logged(
@@ -189,7 +189,7 @@ def test_a_rejected_batch_is_settled_counted_and_logged(
     with caplog.at_level(logging.WARNING):
         publisher.offer(observations)
         assert publisher.close(within_s=20.0)
-    assert publisher.unsettled() == 0
+    assert publisher.count_unsettled() == 0
     assert publisher.counts.rejected[Kind.OBSERVATION] == theirs
     assert publisher.counts.acknowledged[Kind.OBSERVATION] == len(observations.vehicle) - theirs
     assert "of car-b was rejected at row 0: speed" in caplog.text
@@ -208,7 +208,7 @@ def test_unreadable_or_foreign_acknowledgements_settle_nothing(
     forged = StreamAck(mine.boot, mine.kind, mine.region, ((1, 99),))
     service.put_ack("car-a", encode_ack("car-b", [forged]))
     until(lambda: publisher.counts.bad_acks == 2)
-    assert publisher.unsettled() == len(observations.vehicle)
+    assert publisher.count_unsettled() == len(observations.vehicle)
     publisher.close(within_s=0.1)
 
 
@@ -253,10 +253,10 @@ def test_a_full_disk_is_waited_for(
     observations, states = drive(samples=1000)
     publisher.offer(observations, states)
     until(lambda: "the outbox refuses" in caplog.text)
-    assert publisher.unsettled() == len(observations.vehicle) + len(states.vehicle)
+    assert publisher.count_unsettled() == len(observations.vehicle) + len(states.vehicle)
     database.execute("PRAGMA max_page_count = 1000000")
     assert publisher.close(within_s=20.0)
-    assert publisher.unsettled() == publisher.dropped == 0
+    assert publisher.count_unsettled() == publisher.dropped_records == 0
     assert rows(service.batches, Kind.OBSERVATION) == len(observations.vehicle)
     for stream in {(b.vehicle, b.kind, b.region) for b in service.batches}:
         seqs = {b.seq for b in service.batches if (b.vehicle, b.kind, b.region) == stream}
@@ -287,7 +287,7 @@ def test_many_sessions_open_together(router: Router, tmp_path: Path) -> None:
 
 
 def batches_of(batcher: Batcher, now: float, everything: bool = False) -> list[tuple[str, int]]:
-    return sorted((d.vehicle, d.records) for d in batcher.due(now, everything=everything))
+    return sorted((d.vehicle, d.records) for d in batcher.take_due(now, everything=everything))
 
 
 def one_vehicle(records: int, urgent: bool = False) -> RecordBlock:
@@ -324,7 +324,7 @@ def test_a_batch_never_spans_regions() -> None:
     records.columns["cell"][2:] += 1 << (2 * (grid.CELL_ZOOM - grid.REGION_ZOOM))
     batcher = Batcher(NAMES, 1, "test", flush_s=1.0, rows=50)
     batcher.add(records, now=0.0)
-    drafts = batcher.due(now=0.0, everything=True)
+    drafts = batcher.take_due(now=0.0, everything=True)
     assert sorted(d.records for d in drafts) == [2, 2]
     assert len({d.region for d in drafts}) == 2
     assert batcher.records == 0

@@ -97,9 +97,9 @@ def test_damage_while_it_is_in_use_is_mended_and_names_go_on(tmp_path: Path) -> 
     outbox = Outbox(path, boot=6)
     draft = Draft("car-a", Kind.OBSERVATION, 77, 2, lambda s, f: b"mine")
     first = outbox.store([draft, draft], 0.0)
-    outbox.settle(first[0].stream, [(1, 2)])
+    outbox.settle_ranges(first[0].stream, [(1, 2)])
     outbox.delete_settled()
-    outbox.recover()
+    outbox.recover_file()
     assert outbox.counts.damages == 1
     assert outbox.store([draft], 1.0)[0].seq == 3
     assert outbox.batches == BATCHES + 1

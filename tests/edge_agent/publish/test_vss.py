@@ -74,9 +74,9 @@ def test_what_is_unknown_is_absent() -> None:
 def test_it_is_told_at_its_rate() -> None:
     lines: list[str] = []
     output = RoadFrictionOutput(["car-one"], lines.append, 2.0)
-    output.tell(None)
+    output.report_grip(None)
     for k in range(21):
-        output.tell(grip(0.3, 0.2, 0.4, 0.3, 0.1 * k))
+        output.report_grip(grip(0.3, 0.2, 0.4, 0.3, 0.1 * k))
     assert len(lines) == 5
     assert json.loads(lines[1])["time"] == "2027-01-15T08:00:00.500Z"
 
@@ -90,12 +90,12 @@ def test_it_is_put_where_somebody_listens_as_it_is_printed(router: Router) -> No
         zenoh.open(configuration(router.settings, "dashboard")) as dashboard,
     ):
         output.attach("car-one", car)
-        output.tell(grip(0.3, 0.2, 0.4, 0.3))
+        output.report_grip(grip(0.3, 0.2, 0.4, 0.3))
         dashboard.declare_subscriber(
             keys.vss_key("car-one"), lambda sample: heard.append(sample.payload.to_string())
         )
         matched(output.publishers["car-one"])
-        output.tell(grip(0.3, 0.2, 0.4, 0.3, 1.0))
+        output.report_grip(grip(0.3, 0.2, 0.4, 0.3, 1.0))
         until(lambda: heard)
     assert heard == lines[1:]
     assert names(json.loads(heard[0]))["MostProbable"] == 30.0

@@ -19,7 +19,7 @@ from fleet_service.app.precompile import warm_up
 from schemas import keys, wire
 from schemas.config import ServiceConfig
 from schemas.query import MapQuery
-from tests.faults.load import visits
+from tests.faults.load import make_visits
 import numpy as np
 
 def kernels():
@@ -29,7 +29,7 @@ def kernels():
 
 def drive(root):
     engine = Engine(ServiceConfig(), root)
-    columns = visits(np.random.default_rng(0), np.zeros(8000, np.int64), time.time_ns(), 256).columns
+    columns = make_visits(np.random.default_rng(0), np.zeros(8000, np.int64), time.time_ns(), 256).columns
     home = columns["cell"] >> 22
     mine = np.flatnonzero(home == home[0])
     messages = []

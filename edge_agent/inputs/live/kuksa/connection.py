@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from edge_agent.inputs.recording import library
+from edge_agent.inputs.recording import import_optional
 from schemas.errors import InputError
 
 SERVICE: Final = "/kuksa.val.v2.VAL/"
@@ -37,9 +37,9 @@ class BrokerConnection:
     """
 
     def __init__(self, option: str, address: str, files: Mapping[str, str]) -> None:
-        self.grpc = library("grpc")
+        self.grpc = import_optional("grpc")
         # protobuf's runtime is there with the core; the messages are made only for a broker
-        self.messages = library("edge_agent.inputs.live.kuksa.broker_pb2")
+        self.messages = import_optional("edge_agent.inputs.live.kuksa.broker_pb2")
         self._address = address
         try:
             read = {name: Path(file).read_bytes() for name, file in files.items()}
@@ -65,7 +65,7 @@ class BrokerConnection:
             self._address, self.grpc.ssl_channel_credentials(self._authority)
         )
 
-    def method(self, kind: Any, name: str, answer: Any) -> Any:  # noqa: ANN401
+    def make_call(self, kind: Any, name: str, answer: Any) -> Any:  # noqa: ANN401
         """Return a call of the service.
 
         Args:

@@ -16,7 +16,7 @@ from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec
 from edge_agent.lab.evaluation.scenarios import LIGHT, PAPERS, SEDAN, SMALL, STRONG, steered_behind
 from edge_agent.lab.simulation.manoeuvres import TimedFriction, kmh, split
 from edge_agent.lab.simulation.motor import Pmsm
-from edge_agent.lab.simulation.presets import TrueVehicle, as_printed, matched
+from edge_agent.lab.simulation.presets import TrueVehicle, as_printed, matched_to_papers
 from schemas.thresholds import GRAVITY
 
 ROLLING: Final = 0.008  # of drives at constant speed
@@ -71,13 +71,14 @@ MATCHED: Final[dict[str, DriveSpec]] = {
     "001.dlc.front": replace(PAPERS["001.dlc"], vehicle=as_printed(LIGHT)),
     **{
         name: replace(
-            PAPERS[name], vehicle=replace(matched(IN_WHEEL), shape=SHAPE_002, curvature=0.0)
+            PAPERS[name],
+            vehicle=replace(matched_to_papers(IN_WHEEL), shape=SHAPE_002, curvature=0.0),
         )
         for name in ("002.sine", "002.jturn")
     },
     "002.sine.drag": replace(
         PAPERS["002.sine"],
-        vehicle=replace(matched(IN_WHEEL), shape=SHAPE_002, curvature=0.0, drag=DRAG),
+        vehicle=replace(matched_to_papers(IN_WHEEL), shape=SHAPE_002, curvature=0.0, drag=DRAG),
     ),
     "003.accel": DriveSpec("throttle", as_printed(MOTORED, proportional=True), 0.85, kmh(20)),
     "003.turn": replace(

@@ -128,7 +128,7 @@ def _lower_vertices(tuned: LowerVertices) -> PaperPlot:
     panels = []
     for title, sets in (("before", LowerVertices()), ("after", tuned)):
         for label, triangles in zip(
-            ("mismatch [1]", "step of ln R [1]"), sets.triangles(), strict=True
+            ("mismatch [1]", "step of ln R [1]"), sets.triangle_sets(), strict=True
         ):
             curves = tuple(
                 Curve(

@@ -133,7 +133,7 @@ class Reproduction:
         return [row for table in self.tables for row in table.rows]
 
     @property
-    def missed(self) -> list[str]:
+    def missed_rows(self) -> list[str]:
         """Names of the matched rows that miss their bars."""
         return [row.name for row in self.rows if not row.holds]
 

@@ -51,8 +51,8 @@ def limit_text(row: PaperRow) -> str:
 def summary(done: Reproduction) -> str:
     """Return one sentence about the bars."""
     barred = [row for row in done.rows if row.limit is not None]
-    text = f"{len(barred) - len(done.missed)} of {len(barred)} matched numbers hold their bar."
-    return text if not done.missed else f"{text} Missed: {', '.join(done.missed)}."
+    text = f"{len(barred) - len(done.missed_rows)} of {len(barred)} matched numbers hold their bar."
+    return text if not done.missed_rows else f"{text} Missed: {', '.join(done.missed_rows)}."
 
 
 def markdown_tables(tables: Sequence[PaperTable]) -> str:

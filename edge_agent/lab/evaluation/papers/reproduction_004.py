@@ -11,11 +11,11 @@ import numpy as np
 
 from edge_agent.adaptation.lower_vertices import LowerVertices
 from edge_agent.adaptation.memberships import SETS, Memberships
-from edge_agent.app.tuned_memberships import shipped
+from edge_agent.app.tuned_memberships import shipped_memberships
 from edge_agent.estimators import Estimates, paper_aco_fckf
 from edge_agent.estimators.common.tyre_option import PROPORTIONAL
 from edge_agent.estimators.paper_aco_fckf import AS_PRINTED, AT_THE_TRUTH, Setting, make_bank
-from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, estimates, ideal, repeated
+from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, estimates, ideal, repeat_drive
 from edge_agent.lab.evaluation.papers.columns import with_sensors
 from edge_agent.lab.evaluation.papers.conditions import MATCHED
 from edge_agent.lab.evaluation.papers.figures_004 import plots
@@ -86,7 +86,7 @@ def run_noise(
     seeds: Sequence[int],
 ) -> NoisyRun:
     """Drive without error, add one noise per seed, and run the filters."""
-    batch = repeated(ideal(spec), len(seeds))
+    batch = repeat_drive(ideal(spec), len(seeds))
     variance = noise_of(batch.t[:, 0], noise)
     for n, seed in enumerate(seeds):
         add_white(batch.signals[:, n], variance, np.random.default_rng([seed, 4]))
@@ -102,7 +102,7 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
     done = Reproduction(
         "004", "Fuzzy cubature filter tuned by an ant colony", paper_aco_fckf.ELEMENTS
     )
-    tuned = shipped(ESTIMATOR)
+    tuned = shipped_memberships(ESTIMATOR)
     filters = {"FCKF": (Memberships(), AT_THE_TRUTH), "ACOFCKF": (tuned, AT_THE_TRUTH)}
     both = {noise: run_noise(MATCHED[SCENARIO], noise, filters, seeds) for noise in NOISES}
     own = {noise: run_noise(PAPERS[SCENARIO], noise, filters, seeds) for noise in NOISES}
@@ -211,7 +211,7 @@ def _peak_rows(run: NoisyRun) -> tuple[PaperRow, ...]:
 
 
 def _option_rows(seeds: Sequence[int]) -> tuple[PaperRow, ...]:
-    tuned = shipped(ESTIMATOR)
+    tuned = shipped_memberships(ESTIMATOR)
     proportional = {"it": (tuned, AT_THE_TRUTH._replace(tyre=PROPORTIONAL))}
     motors = {"it": (tuned, AT_THE_TRUTH._replace(dual_motor=True))}
     runs = {

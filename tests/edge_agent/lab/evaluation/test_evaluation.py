@@ -16,7 +16,7 @@ from edge_agent.estimators import ESTIMATORS, Estimates
 from edge_agent.estimators.estimates import ONE_FRICTION, Column
 from edge_agent.lab.evaluation import measures
 from edge_agent.lab.evaluation.bars import BARS, figures
-from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal, realistic, repeated
+from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal, realistic, repeat_drive
 from edge_agent.lab.evaluation.campaign import DEFAULT, Results
 from edge_agent.lab.evaluation.faults import CASES
 from edge_agent.lab.evaluation.paper_004 import noisy, variances
@@ -160,7 +160,7 @@ def test_sides_are_told_apart() -> None:
 
 
 def test_noise_of_paper_004_affects_three_signals_by_its_schedule() -> None:
-    exact = repeated(ideal(replace(PAPERS["004.dlc"], duration_s=10.0)), 1)
+    exact = repeat_drive(ideal(replace(PAPERS["004.dlc"], duration_s=10.0)), 1)
     variance = variances(exact.t[:, 0], "variable")
     assert [variance[k] for k in (0, 150, 250, 350, 450)] == [0.04, 0.01, 0.05, 0.04, 0.01]
     batch = noisy(exact, variance, [0, 1])

@@ -11,7 +11,7 @@ from edge_agent.estimators import ESTIMATORS
 from edge_agent.lab.evaluation import faults
 from edge_agent.lab.evaluation.batch import DriveSet, realistic
 from edge_agent.lab.evaluation.campaign import DEFAULT
-from edge_agent.lab.evaluation.faults import BEGINS, CASES, DRIVES, ENDS, harmed
+from edge_agent.lab.evaluation.faults import BEGINS, CASES, DRIVES, ENDS, apply_fault
 from schemas.signals import Health, S
 
 # what the issue asks for -> the row that shows it
@@ -58,7 +58,7 @@ def test_under_a_fault_the_interval_of_the_default_stays_honest() -> None:
 
 @pytest.mark.parametrize("name", [name for name in CASES if name != "none"])
 def test_every_case_harms_signals_or_clock_only_where_it_says(name: str, slalom: DriveSet) -> None:
-    broken = harmed(slalom, CASES[name])
+    broken = apply_fault(slalom, CASES[name])
     same = (broken.signals == slalom.signals) | (
         np.isnan(broken.signals) & np.isnan(slalom.signals)
     )
@@ -68,9 +68,9 @@ def test_every_case_harms_signals_or_clock_only_where_it_says(name: str, slalom:
 
 
 def test_a_gap_and_late_samples_are_on_the_clock_alone(slalom: DriveSet) -> None:
-    steps = np.diff(harmed(slalom, CASES["time-gap"]).t[:, 0])
+    steps = np.diff(apply_fault(slalom, CASES["time-gap"]).t[:, 0])
     assert steps.max() == pytest.approx(3.01)
-    late = np.diff(harmed(slalom, CASES["sample-out-of-order"]).t[:, 0])
+    late = np.diff(apply_fault(slalom, CASES["sample-out-of-order"]).t[:, 0])
     assert (late < 0.0).sum() == pytest.approx((ENDS - BEGINS) * 10, abs=1)
 
 

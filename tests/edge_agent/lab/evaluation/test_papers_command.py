@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_agent.app.tuned_memberships import shipped
+from edge_agent.app.tuned_memberships import shipped_memberships
 from edge_agent.cli import main
 from edge_agent.estimators.paper_aco_fckf import AS_PRINTED, AT_THE_TRUTH
 from edge_agent.lab.evaluation.papers import reproductions
@@ -121,8 +121,8 @@ def test_plot_of_numbers_and_a_map_is_drawn() -> None:
 
 def test_dugoff_tyres_in_the_plant_reach_the_printed_friction_error() -> None:
     filters = {
-        "it": (shipped("paper-aco-fckf"), AT_THE_TRUTH),
-        "printed": (shipped("paper-aco-fckf"), AS_PRINTED),
+        "it": (shipped_memberships("paper-aco-fckf"), AT_THE_TRUTH),
+        "printed": (shipped_memberships("paper-aco-fckf"), AS_PRINTED),
     }
     run = run_noise(MATCHED["004.dlc"], "constant", filters, range(20))
     assert run.values("it")["mae_mu"] <= 0.0095

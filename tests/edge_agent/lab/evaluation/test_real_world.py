@@ -40,7 +40,7 @@ def saying(batch: DriveSet, lower: float, upper: float) -> Estimates:
 
 def figures(driven: tuple[DriveSet, FloatArray], reported: Estimates) -> dict[str, float]:
     tally = Tally()
-    real_world.count(tally, driven[0], reported, driven[1])
+    real_world.tally_town(tally, driven[0], reported, driven[1])
     return tally.means()
 
 
@@ -61,7 +61,7 @@ def test_contradiction_is_counted_by_surface_and_by_whether_grip_is_used(
     driven: tuple[DriveSet, FloatArray],
 ) -> None:
     reported = saying(driven[0], *PRIOR)
-    excited = real_world.lately(driven[1]) >= 0.6
+    excited = real_world.recent_maximum(driven[1]) >= 0.6
     assert figures(driven, reported)["contradiction_share"] == 0.0
     reported.values[..., Column.HEALTH] = np.where(
         excited & (driven[0].mu > 0.75), Health.CONTRADICTION, Health.OK
@@ -115,8 +115,8 @@ def test_each_surface_and_cars_without_torque_are_met_in_a_town(
     assert not silent.all()
     assert np.abs(batch.truth["true_slope"]).max() > 0.03
     assert (batch.truth["true_vx"] == 0.0).any()
-    assert (real_world.lately(used) >= used).all()
-    assert 0.0 < (real_world.lately(used) >= 0.6).mean() < 1.0
+    assert (real_world.recent_maximum(used) >= used).all()
+    assert 0.0 < (real_world.recent_maximum(used) >= 0.6).mean() < 1.0
 
 
 def test_the_grip_in_use_never_exceeds_the_friction_where_it_is_one(

@@ -22,9 +22,9 @@ from edge_agent.lab.evaluation.measures import bounds, consistency
 from edge_agent.lab.evaluation.reliability import (
     LEVELS,
     between_quantiles,
+    estimate_with_ranks,
     on_the_grid,
     shares,
-    watched,
 )
 from edge_agent.lab.evaluation.scenarios import PAPERS
 from schemas.mugrid import BINS, CENTRES
@@ -75,7 +75,7 @@ def test_watching_a_drive_changes_nothing_that_is_said_of_it(
     estimator: str, turning: DriveSet
 ) -> None:
     plain = estimates(bank_of(estimator, turning.vehicles), turning)
-    reported, ranks = watched(bank_of(estimator, turning.vehicles), turning)
+    reported, ranks = estimate_with_ranks(bank_of(estimator, turning.vehicles), turning)
     assert np.array_equal(plain.values, reported.values)
     assert ranks.shape == (3, 3)
     assert ((ranks >= 0.0) & (ranks <= 1.0)).all()
@@ -87,7 +87,7 @@ def test_posterior_of_the_default_has_its_reported_quantiles(
     """The ends are told at the levels at which they hold, and patches of ice lower the lower
     one.
     """
-    reported, _ = watched(bank_of("aco-fckf", turning.vehicles), turning)
+    reported, _ = estimate_with_ranks(bank_of("aco-fckf", turning.vehicles), turning)
     for least, most, output in (
         (0.0, LOWER_END, reported.mu_lower),
         (0.5, 0.5, reported.mu),
@@ -98,7 +98,7 @@ def test_posterior_of_the_default_has_its_reported_quantiles(
             moved = replace(
                 turning, truth={f"true_mu_{w}": beside for w in ("fl", "fr", "rl", "rr")}
             )
-            _, ranks = watched(bank_of("aco-fckf", turning.vehicles), moved)
+            _, ranks = estimate_with_ranks(bank_of("aco-fckf", turning.vehicles), moved)
             assert (side * (ranks - level) > 0.0).all()
 
 

@@ -16,7 +16,7 @@ from edge_agent.lab.simulation.roads import (
     Road,
     build_network,
     network_of,
-    rounded,
+    round_corners,
 )
 from schemas.errors import InputError
 
@@ -28,7 +28,7 @@ def onward(network: Network, lane: int) -> list[int]:
 
 
 def test_a_bend_is_an_arc_of_its_radius() -> None:
-    line = rounded([(0.0, 0.0), (100.0, 0.0), (100.0, 100.0)], 30.0)
+    line = round_corners([(0.0, 0.0), (100.0, 0.0), (100.0, 100.0)], 30.0)
     np.testing.assert_allclose(line[[0, -1]], [[0, 0], [100, 100]])
     bend = line[(line[:, 0] > 71) & (line[:, 1] < 29)]
     np.testing.assert_allclose(np.hypot(bend[:, 0] - 70.0, bend[:, 1] - 30.0), 30.0, atol=0.01)

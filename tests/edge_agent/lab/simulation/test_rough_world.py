@@ -29,8 +29,8 @@ from edge_agent.lab.simulation.misaligned import (
     Misalignment,
     misalignment_row,
 )
-from edge_agent.lab.simulation.plant import advance, command, held, start_at, wheel_forces
-from edge_agent.lab.simulation.relief import STEEPEST, cross_slope, gradient, tilt
+from edge_agent.lab.simulation.plant import advance, command, is_held, start_at, wheel_forces
+from edge_agent.lab.simulation.relief import STEEPEST, cross_slope, gradient, slope_in_body
 from edge_agent.lab.simulation.roads import LanePoint
 from edge_agent.lab.simulation.scenarios import scenario_named
 from edge_agent.lab.simulation.sensors import ROUGH_FLEET, Sensors
@@ -154,7 +154,7 @@ def test_brakes_hold_what_they_can_and_tyres_what_the_road_allows() -> None:
     ):
         x, p, u, w = still(0.08, mu=mu)
         command(p, u, 0.0, force)
-        assert held(x, p, u) == stays
+        assert is_held(x, p, u) == stays
         advance(x, p, u, w, 1e-3, 2000)
         assert (x[Motion.VX] == 0.0) == stays
         assert (x[Motion.X] < -0.1) == (not stays)
@@ -192,8 +192,8 @@ def test_every_road_is_the_gradient_of_a_height_and_public(name: str) -> None:
         assert np.hypot(*slopes.T).max() <= STEEPEST * (1 + 1e-12)
         assert slopes.any() == (name != "level")
         east, north = slopes[7].tolist()
-        there = tilt(east, north, 0.3)
-        back = tilt(east, north, 0.3 + np.pi)
+        there = slope_in_body(east, north, 0.3)
+        back = slope_in_body(east, north, 0.3 + np.pi)
         np.testing.assert_allclose(
             there, np.negative(back), atol=1e-15
         )  # up one way is down the other
@@ -223,7 +223,7 @@ def test_lanes_fall_to_their_right_and_bends_to_their_inside() -> None:
         falls = []
         for curvature in (0.0, 0.02, -0.02):
             east, north = gradient(table, (0.0, 0.0), lane, cross_slope(table, curvature))
-            falls.append(tilt(east, north, heading))
+            falls.append(slope_in_body(east, north, heading))
         np.testing.assert_allclose([left for _, left in falls], [0.025, 0.015, 0.035], atol=1e-12)
         np.testing.assert_allclose([ahead for ahead, _ in falls], 0.0, atol=1e-12)
 

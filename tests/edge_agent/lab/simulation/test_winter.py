@@ -12,7 +12,7 @@ from edge_agent.lab.simulation import PRESETS, SimulatedFleet, simulate_manoeuvr
 from edge_agent.lab.simulation.fleet import rough_ones, winter_ones
 from edge_agent.lab.simulation.friction import SNOW
 from edge_agent.lab.simulation.presets import TrueVehicle, winter_equipped
-from edge_agent.lab.simulation.scenarios import drawn, scenario_named, winter
+from edge_agent.lab.simulation.scenarios import drawn_town, scenario_named, winter
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.thresholds import GRAVITY
@@ -154,7 +154,7 @@ def test_blocks_of_a_winter_fleet_do_not_depend_on_how_they_are_cut() -> None:
 
 def test_a_winter_town_has_ice_in_each_place_and_ruts_of_slush() -> None:
     town = winter(50_001)
-    own = town.patches[len(drawn(50_001).patches) :]
+    own = town.patches[len(drawn_town(50_001).patches) :]
     assert town.name == "winter-50001" == scenario_named("winter-50001").name
     for word, count in (
         ("ice before", 3),

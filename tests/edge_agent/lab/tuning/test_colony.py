@@ -86,7 +86,7 @@ def test_colony_reaches_the_optimum_where_random_search_does_not() -> None:
 
 
 def test_transition_probabilities_sum_to_one_over_valid_positions() -> None:
-    reachable = Graph.of([np.arange(3.0), np.arange(5.0), np.arange(1.0)]).reachable
+    reachable = Graph.from_choices([np.arange(3.0), np.arange(5.0), np.arange(1.0)]).reachable
     rng = np.random.default_rng(4)
     pheromone, visibility = rng.random((2, 3, 5)) + 0.01
     odds = transition_probabilities(pheromone, visibility, reachable, alpha=1.3, theta=0.7)
@@ -113,7 +113,7 @@ def test_evaporation_takes_its_share_and_the_deposit_is_added() -> None:
 
 
 def test_pheromone_stays_in_bounds_when_one_path_always_wins() -> None:
-    reachable = Graph.of([np.arange(4.0)] * 3).reachable
+    reachable = Graph.from_choices([np.arange(4.0)] * 3).reachable
     lowest = lowest_pheromone(reachable, 0.3)
     pheromone = np.ones(reachable.shape)
     for _ in range(200):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.app.tuned_memberships import WAYS, Score, SplitScores, load
+from edge_agent.app.tuned_memberships import WAYS, Score, SplitScores, load_tuned
 from edge_agent.cli import main, tune
 from edge_agent.lab.tuning.objectives import (
     HELD_OUT,
@@ -192,7 +192,7 @@ def test_quick_tuning_writes_a_valid_file_and_says_what_it_does(
     assert reported.count("elapsed") == 2 * tune.QUICK_ITERATIONS
     for way in WAYS:
         assert f"\n{way} " in reported
-    tuned = load(out)
+    tuned = load_tuned(out)
     scores = tuned.document.scores
     provenance = tuned.document.provenance
     for way in ("random", "colony"):
@@ -204,7 +204,7 @@ def test_quick_tuning_writes_a_valid_file_and_says_what_it_does(
         "--quick"
     )
     assert (
-        max(scores, key=lambda way: tune._worth(scores[way].held_out, objective))
+        max(scores, key=lambda way: tune._search_worth(scores[way].held_out, objective))
         == tuned.document.winner
     )
     assert {way: len(found) for way, found in tuned.document.candidates.items()} == {
@@ -226,7 +226,7 @@ def test_options_out_of_range_are_refused_by_name(option: str, value: str) -> No
 def test_progress_line_has_iteration_best_mean_elapsed_and_remaining() -> None:
     lines: list[str] = []
     now = iter([100.0, 102.0])
-    tell = tune.reporter("colony", 5, lambda: next(now), lines.append)
+    tell = tune.progress_printer("colony", 5, lambda: next(now), lines.append)
     tell(Iteration(1, -1.25, -2.5, 12))
     words = " ".join(lines[0].split())
     assert words == "colony 1/5 best -1.2500 mean -2.5000 evaluations 12 elapsed 2 s left 8 s"
@@ -234,9 +234,9 @@ def test_progress_line_has_iteration_best_mean_elapsed_and_remaining() -> None:
 
 def test_table_has_a_row_per_way_and_set_of_drives() -> None:
     score = Score(interval_score=0.5, coverage=0.9, log_likelihood=1.0, nis_ratio=1.1)
-    rows = tune.table({way: SplitScores(train=score, held_out=score) for way in WAYS}).splitlines()[
-        1:
-    ]
+    rows = tune.comparison_table(
+        {way: SplitScores(train=score, held_out=score) for way in WAYS}
+    ).splitlines()[1:]
     assert [row.split()[0] for row in rows] == [way for way in WAYS for _ in range(2)]
 
 
@@ -270,7 +270,7 @@ def test_drives_of_one_s_own_are_searched_on(tmp_path: Path) -> None:
     for given in (logs[:1], logs):
         out = tmp_path / f"{len(given)}.json"
         assert main(["tune", *given, *car, "--quick", "--out", str(out)]) == 0
-        found.append(load(out).document)
+        found.append(load_tuned(out).document)
         assert found[-1].objective == "predictive"
         assert found[-1].scores["default"].held_out.interval_score is None
         assert str(tmp_path) not in out.read_text()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.app.tuned_memberships import WAYS, load
+from edge_agent.app.tuned_memberships import WAYS, load_tuned
 from edge_agent.cli import main
 from edge_agent.lab.simulation.white import SCHEDULE
 from edge_agent.lab.tuning import study, study_report
@@ -114,7 +114,7 @@ def test_the_quick_study_writes_figures_table_plot_and_a_tuned_file(
     for name in CONDITIONS:
         assert {f"tuning.{name}.{way}.log_likelihood" for way in study_report.SHOWN} <= names
     assert (tmp_path / "convergence.png").stat().st_size > 1000
-    tuned = load(tmp_path / "paper-aco-fckf.json")
+    tuned = load_tuned(tmp_path / "paper-aco-fckf.json")
     assert tuned.document.provenance.budget.evaluations == {"random": 8, "colony": 8}
     assert set(tuned.document.scores) == set(WAYS)
 
