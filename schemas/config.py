@@ -239,7 +239,7 @@ class ServiceConfig(MonitoringSettings):
 
     @field_validator("archive", mode="before")
     @classmethod
-    def _folder(cls, given: object) -> object:
+    def _check_folder(cls, given: object) -> object:
         return {"path": given} if isinstance(given, str | Path) else given
 
 

@@ -49,13 +49,13 @@ _SPREAD: Final = (
 _BASE_4: Final = {ord(f"{digit:x}"): f"{digit >> 2}{digit & 3}" for digit in range(16)}
 
 
-def _spread(v: IntArray) -> IntArray:
+def _spread_bits(v: IntArray) -> IntArray:
     for shift, mask in _SPREAD:
         v = (v | (v << shift)) & mask
     return v
 
 
-def _gather(v: IntArray) -> IntArray:
+def _gather_bits(v: IntArray) -> IntArray:
     v = v & 0x5555555555555555
     for (shift, _), mask in zip(
         reversed(_SPREAD), (*(m for _, m in reversed(_SPREAD[:-1])), 0xFFFFFFFF), strict=True
@@ -66,13 +66,13 @@ def _gather(v: IntArray) -> IntArray:
 
 def interleave(x: IntArray, y: IntArray) -> IntArray:
     """Return tile column and row as a quadint of the same zoom."""
-    return _spread(x) | (_spread(y) << 1)
+    return _spread_bits(x) | (_spread_bits(y) << 1)
 
 
 def deinterleave(cell: ArrayLike) -> tuple[IntArray, IntArray]:
     """Return column and row of a quadint."""
     c = np.asarray(cell, dtype=np.int64)
-    return _gather(c), _gather(c >> 1)
+    return _gather_bits(c), _gather_bits(c >> 1)
 
 
 def cell_of(latitude: ArrayLike, longitude: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:

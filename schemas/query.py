@@ -62,7 +62,7 @@ class MapQuery(BaseModel):
 
     @field_validator("bbox")
     @classmethod
-    def _ordered(
+    def _check_order(
         cls, value: tuple[float, float, float, float] | None
     ) -> tuple[float, float, float, float] | None:
         if value is not None and not (value[0] < value[2] and value[1] < value[3]):
@@ -81,7 +81,7 @@ class MapQuery(BaseModel):
 
     @field_validator("at")
     @classmethod
-    def _zoned(cls, value: datetime | None) -> datetime | None:
+    def _check_zone(cls, value: datetime | None) -> datetime | None:
         if value is None:
             return None
         if value.year < FIRST_YEAR:

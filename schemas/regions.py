@@ -42,7 +42,7 @@ def region_of(tile: int) -> str:
     return keys.chunks(int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM)), grid.REGION_ZOOM)
 
 
-def unserved(asked: MapQuery, served: Collection[str]) -> list[str]:
+def unserved_expressions(asked: MapQuery, served: Collection[str]) -> list[str]:
     """Return the fewest expressions that cover the unserved part of a question. For a question
     without a place, that is the area outside every service's region.
 
@@ -53,10 +53,10 @@ def unserved(asked: MapQuery, served: Collection[str]) -> list[str]:
         ahead = grid.region_of(keys_along(asked.route) // grid.SECTORS)
         found = dict.fromkeys(keys.chunks(int(region), grid.REGION_ZOOM) for region in ahead)
         return [region for region in found if not any(covers(wide, region) for wide in served)]
-    return list(_without(asked.bbox, served, (), 0))
+    return list(_regions_without(asked.bbox, served, (), 0))
 
 
-def _without(
+def _regions_without(
     box: Box | None, served: Collection[str], above: tuple[str, ...], parent: int
 ) -> Iterator[str]:
     depth = len(above)
@@ -71,7 +71,7 @@ def _without(
         if not near:
             yield region
         elif not any(covers(wide, region) for wide in near):
-            yield from _without(box, near, chunks, one)
+            yield from _regions_without(box, near, chunks, one)
 
 
 class Rank:

@@ -358,7 +358,7 @@ def arrow_schema(*fields: Field) -> pa.Schema:
 CELL_HOUR_SCHEMA: Final = arrow_schema(*CELL_HOUR)
 
 
-def kept(*fields: Field) -> tuple[Field, ...]:
+def stored_columns(*fields: Field) -> tuple[Field, ...]:
     """Columns as they lie on disk: times in microseconds."""
     return tuple(
         f._replace(type=US, unit="us since 1970, UTC") if f.type == NS else f for f in fields
@@ -367,10 +367,12 @@ def kept(*fields: Field) -> tuple[Field, ...]:
 
 MAP_SCHEMA: Final = arrow_schema(*MAP_CELL)
 ESTIMATES_SCHEMA: Final = arrow_schema(*ESTIMATES)
-MAP_KEPT: Final = kept(*MAP_CELL, Field("snapshot_time", NS, "", "when the map was so"))
+MAP_KEPT: Final = stored_columns(*MAP_CELL, Field("snapshot_time", NS, "", "when the map was so"))
 MAP_ARCHIVE: Final = arrow_schema(*MAP_KEPT)
-OBSERVATION_KEPT: Final = kept(*OBSERVATION, *IDENTITY, *BOOKKEEPING, VALUE)
+OBSERVATION_KEPT: Final = stored_columns(*OBSERVATION, *IDENTITY, *BOOKKEEPING, VALUE)
 OBSERVATION_ARCHIVE: Final = arrow_schema(*OBSERVATION_KEPT)
-WEATHER_ARCHIVE: Final = arrow_schema(*kept(*WEATHER))
+WEATHER_ARCHIVE: Final = arrow_schema(*stored_columns(*WEATHER))
 STATE_CELL: Final = Field("cell", I64, "quadint z21", "cell of the position")
-STATE_ARCHIVE: Final = arrow_schema(*kept(*STATE, *IDENTITY, STATE_CELL, *BOOKKEEPING[:1]))
+STATE_ARCHIVE: Final = arrow_schema(
+    *stored_columns(*STATE, *IDENTITY, STATE_CELL, *BOOKKEEPING[:1])
+)

@@ -119,7 +119,7 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
     }
     whole |= {one for one in tiles if not any(regions.overlap(one, region) for region in withdrawn)}
     somewhere = asked.bbox is not None or asked.route is not None
-    missing = regions.unserved(asked, whole) if somewhere else sorted(withdrawn)
+    missing = regions.unserved_expressions(asked, whole) if somewhere else sorted(withdrawn)
     found = tuple(sorted({token.region for token in after}))
     return replace(answer, missing=tuple(missing), regions=found)
 

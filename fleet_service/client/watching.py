@@ -89,7 +89,7 @@ def watch_map(
         nonlocal away
         here = {token.region for token in services.active}
         left = {token.region for token in services.lost} - here
-        now = set(regions.unserved(asked, here)) if asked.bbox else left
+        now = set(regions.unserved_expressions(asked, here)) if asked.bbox else left
         if now != away and (here or services.lost):
             _say_regions(say, now - away, away - now, as_json=wishes.as_json)
             away = now

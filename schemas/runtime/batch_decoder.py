@@ -40,7 +40,7 @@ def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
         payload if encoding in usual and len(payload) <= MAX_BYTES else b""
         for payload, encoding in payloads
     ]
-    data, walked = _walked(kind, plain, True)
+    data, walked = _scan_messages(kind, plain, True)
     indices = list(range(len(plain)))
     if not walked.understood.all():
         for index in np.flatnonzero(~walked.understood).tolist():
@@ -50,13 +50,15 @@ def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
                 errors.append((index, error))
         wrong = {index for index, _ in errors}
         indices = [index for index in indices if index not in wrong]
-        data, walked = _walked(kind, [plain[index] for index in indices], False)
+        data, walked = _scan_messages(kind, [plain[index] for index in indices], False)
         assert walked.understood.all(), "the protobuf library writes what we do not read"
     fields = _Fields(kind, data, walked)
-    return complete(Decoded(indices, fields.heads(), *fields.columns(), errors), fields.sent())
+    return complete(
+        Decoded(indices, fields.heads(), *fields.columns(), errors), fields.present_columns()
+    )
 
 
-def _walked(
+def _scan_messages(
     kind: Kind, messages: list[bytes], strict: bool
 ) -> tuple[NDArray[np.uint8], ScannedFields]:
     data = np.frombuffer(b"".join(messages), np.uint8)
@@ -89,7 +91,7 @@ class _Fields(NamedTuple):
         """Return the number of records of each message, (k,)."""
         return self.walked.sizes
 
-    def sent(self) -> PresentColumns:
+    def present_columns(self) -> PresentColumns:
         """Return which messages contain which column."""
         given = self.walked.counts > 0
         return PresentColumns(

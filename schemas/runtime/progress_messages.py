@@ -74,7 +74,7 @@ def show_status(words: str) -> Iterator[None]:
         yield
         return
     set_status(words)
-    _voice.timer = threading.Timer(PATIENCE_S, _show)
+    _voice.timer = threading.Timer(PATIENCE_S, _show_status)
     _voice.timer.daemon = True
     _voice.timer.start()
     try:
@@ -97,7 +97,7 @@ def stop_status() -> None:
         shown.stop()
 
 
-def _show() -> None:
+def _show_status() -> None:
     began = time.monotonic()
     loading = threading.Thread(target=_load_drawing, daemon=True)
     loading.start()

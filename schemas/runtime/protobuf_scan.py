@@ -119,7 +119,7 @@ def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> Sc
         np.zeros(k, np.int64),
     )
     first = list(column_types(kind)).index(NEEDED[kind][0])
-    _walk(_Scan(data, layout, strict, out), ends, first)
+    _scan_fields(_Scan(data, layout, strict, out), ends, first)
     return out
 
 
@@ -162,7 +162,7 @@ def _varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
 
 
 @refcount_free
-def _walk(scan: _Scan, ends: IntArray, first: int) -> None:
+def _scan_fields(scan: _Scan, ends: IntArray, first: int) -> None:
     """Fill the result for all messages; `first` is the column whose length is the number of
     records.
     """
@@ -186,7 +186,7 @@ def _walk(scan: _Scan, ends: IntArray, first: int) -> None:
             )
             if fine:
                 seen |= 1 << number
-                at = _field(scan, k, at, end, layout.roles[number], wire)
+                at = _scan_field(scan, k, at, end, layout.roles[number], wire)
                 fine = at >= 0
         n = out.counts[k, first]
         fine = fine and 1 <= n <= MAX_ROWS
@@ -199,7 +199,7 @@ def _walk(scan: _Scan, ends: IntArray, first: int) -> None:
 
 
 @refcount_free
-def _field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
+def _scan_field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
     """Record one field of message k; return its end, or -1 if it is not as our encoder writes
     it.
     """

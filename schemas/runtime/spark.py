@@ -80,9 +80,9 @@ def spread(
     if not tasks:
         return []
 
-    def done(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
+    def run_batches(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
         for batch in batches:
-            for number, task in _unpacked(batch["task"]):
+            for number, task in _unpack_column(batch["task"]):
                 try:
                     outcome: object = work(task)
                 except InputError as error:
@@ -97,19 +97,19 @@ def spread(
         len(tasks)
     )  # out of one partition they go around: one in each
     try:
-        answers: pa.Table = each.mapInArrow(done, from_arrow_schema(_TASK)).toArrow()
+        answers: pa.Table = each.mapInArrow(run_batches, from_arrow_schema(_TASK)).toArrow()
     except (PySparkException, Py4JError) as error:
         problem = str(error).strip().partition("\n")[0][:200]
         raise InputError(
             "engine", f"Spark gave up: {problem}", "its log says why; what is done is done"
         ) from error
-    outcomes = dict(_unpacked(answers["task"]))
+    outcomes = dict(_unpack_column(answers["task"]))
     for outcome in outcomes.values():
         if isinstance(outcome, InputError):
             raise outcome
     return [outcomes[number] for number in range(len(tasks))]
 
 
-def _unpacked(column: Any) -> Iterator[tuple[int, Any]]:  # noqa: ANN401 an array of Arrow's
+def _unpack_column(column: Any) -> Iterator[tuple[int, Any]]:  # noqa: ANN401 an array of Arrow's
     """Yield numbers with their tasks or outcomes."""
     return (pickle.loads(one) for one in column.to_pylist())

@@ -22,7 +22,7 @@ def notify_alive() -> None:
     service manager.
     """
     _at_work.set()
-    _tell()
+    _notify_systemd()
 
 
 def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
@@ -43,14 +43,14 @@ def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
 
     def keep() -> None:
         while not _at_work.wait(every_s) and time.monotonic() - last < most_s:
-            _tell()
+            _notify_systemd()
 
     _at_work.clear()
     threading.Thread(target=keep, name="patience", daemon=True).start()
     return beat
 
 
-def _tell() -> None:
+def _notify_systemd() -> None:
     address = os.environ.get(_ADDRESS)
     if address:
         with (

@@ -154,7 +154,9 @@ def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
     n = len(getattr(message, NEEDED[kind][0]))
     given = {name: np.array([len(getattr(message, name)) > 0]) for name in column_types(kind)}
     sent = PresentColumns(kind, np.array([n]), given)
-    columns = {name: _column(message, name, dtype, n) for name, dtype in column_types(kind).items()}
+    columns = {
+        name: _read_column(message, name, dtype, n) for name, dtype in column_types(kind).items()
+    }
     numbers = (
         np.array([getattr(message, name)], np.int64)
         for name in ("boot", "region", "seq", "first_held")
@@ -178,7 +180,7 @@ def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
     return Batch(kind, *found.heads.at(0)[1:-1], found.columns, message.estimator)
 
 
-def _column(message: Any, name: str, dtype: np.dtype[Any], n: int) -> NDArray[Any]:  # noqa: ANN401
+def _read_column(message: Any, name: str, dtype: np.dtype[Any], n: int) -> NDArray[Any]:  # noqa: ANN401
     """A column of a message as it was sent (integers wide), or filled."""
     values = getattr(message, name)
     if name == LIKELIHOOD:

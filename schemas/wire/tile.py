@@ -41,7 +41,7 @@ def decode_tile(payload: bytes) -> pa.Table:
                     "has other columns than the map",
                     "use the schema of `tables.MAP_SCHEMA`",
                 )
-            table = _rows(stream)
+            table = _read_rows(stream)
         table.validate(full=True)
     except (pa.ArrowException, OSError, struct.error, IndexError, UnicodeDecodeError) as error:
         raise WireError(
@@ -50,7 +50,7 @@ def decode_tile(payload: bytes) -> pa.Table:
     return table
 
 
-def _rows(stream: pa.RecordBatchStreamReader) -> pa.Table:
+def _read_rows(stream: pa.RecordBatchStreamReader) -> pa.Table:
     batches: list[pa.RecordBatch] = []
     for batch in stream:
         batches.append(batch)
@@ -63,11 +63,11 @@ def _refuse_compressed(payload: bytes) -> None:
     for message in pa.ipc.MessageReader.open_stream(payload):
         head = message.metadata.to_pybytes()
         root = struct.unpack_from("<I", head, 0)[0]
-        kind = _field(head, root, _TYPE)
-        body = _field(head, root, _HEAD)
+        kind = _field_offset(head, root, _TYPE)
+        body = _field_offset(head, root, _HEAD)
         if kind and body and head[kind] == _BATCH:
             batch = body + struct.unpack_from("<I", head, body)[0]
-            if _field(head, batch, _COMPRESSION):
+            if _field_offset(head, batch, _COMPRESSION):
                 raise WireError(
                     "tile",
                     "is compressed",
@@ -75,7 +75,7 @@ def _refuse_compressed(payload: bytes) -> None:
                 )
 
 
-def _field(data: bytes, table: int, index: int) -> int:
+def _field_offset(data: bytes, table: int, index: int) -> int:
     """Where a field of a FlatBuffers table lies; 0 where it is absent."""
     layout = table - int(struct.unpack_from("<i", data, table)[0])
     if 4 + 2 * index >= int(struct.unpack_from("<H", data, layout)[0]):

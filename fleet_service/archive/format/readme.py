@@ -48,7 +48,9 @@ _TABLES: Final[tuple[tuple[str, tuple[Field, ...]], ...]] = (
     ("observations", tables.OBSERVATION_KEPT),
     (
         "states",
-        tables.kept(*tables.STATE, *tables.IDENTITY, tables.STATE_CELL, *tables.BOOKKEEPING[:1]),
+        tables.stored_columns(
+            *tables.STATE, *tables.IDENTITY, tables.STATE_CELL, *tables.BOOKKEEPING[:1]
+        ),
     ),
     ("map", tables.MAP_KEPT),
     ("rollup/cell_hour", tables.CELL_HOUR),

@@ -336,16 +336,21 @@ def zenoh_session(router: ZenohSettings) -> Iterator[zenoh.Session]:
 def test_what_nobody_serves_is_said_in_as_few_regions_as_there_are() -> None:
     box = query.parse({"bbox": f"{WEST + 0.01},{SOUTH + 0.01},{EAST + 0.02},{NORTH - 0.01}"})
     first = NAMES[1].split("/")
-    assert regions.unserved(box, ["*/*/*"]) == []
-    assert regions.unserved(box, NAMES) == []
-    assert regions.unserved(box, NAMES[:2]) == [NAMES[2]] or regions.unserved(box, NAMES[:2])[
-        0
-    ].endswith("*")
-    assert set(regions.unserved(box, [])) == {f"{name.split('/')[0]}/*/*" for name in NAMES[1:]}
-    assert regions.unserved(query.parse({}), [f"{first[0]}/*/*"]) == [
+    assert regions.unserved_expressions(box, ["*/*/*"]) == []
+    assert regions.unserved_expressions(box, NAMES) == []
+    assert regions.unserved_expressions(box, NAMES[:2]) == [
+        NAMES[2]
+    ] or regions.unserved_expressions(box, NAMES[:2])[0].endswith("*")
+    assert set(regions.unserved_expressions(box, [])) == {
+        f"{name.split('/')[0]}/*/*" for name in NAMES[1:]
+    }
+    assert regions.unserved_expressions(query.parse({}), [f"{first[0]}/*/*"]) == [
         f"{grid.quadkey(one, 4)}/*/*" for one in range(256) if grid.quadkey(one, 4) != first[0]
     ]
-    assert regions.unserved(query.parse({"route": ROUTE}), [NAMES[2]]) == [NAMES[1], NAMES[0]]
+    assert regions.unserved_expressions(query.parse({"route": ROUTE}), [NAMES[2]]) == [
+        NAMES[1],
+        NAMES[0],
+    ]
 
 
 def test_a_token_says_its_region_and_a_stranger_says_none() -> None:
