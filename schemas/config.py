@@ -234,7 +234,9 @@ class ServiceConfig(MonitoringSettings):
         "`fleet-service cits`: they have no path",
     )
     fleet: Path | None = Field(
-        default=None, description="enrolment file; reports of other vehicles are ignored"
+        default=None,
+        description="enrolment file; reports of other vehicles are ignored, and an unknown one of "
+        "these has its whole weight",
     )
 
     @field_validator("archive", mode="before")

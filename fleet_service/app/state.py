@@ -140,6 +140,7 @@ def load_state(
     """
     begin = load_restart(root, config.lateness_s, (VISITORS,))
     fusion = begin.fusion
+    fusion.enrolled = config.fleet is not None
     streams = begin.streams
     public = None
     if (

@@ -26,6 +26,7 @@ from fleet_service.fusion import constants as c
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, FloatArray
 from schemas.runtime.jit import compiled, refcount_free_inlined
+from schemas.thresholds import SLIPPERY_MU
 
 PackedArray = NDArray[np.uint16]
 Bins = NDArray[np.floating[Any]]
@@ -43,7 +44,7 @@ _STEPS: Final = 64  # one day; by then the change hazard has levelled everything
 _LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT).astype(np.float32)  # of steps
 _CENTRES: Final = mugrid.CENTRES
 _PLACES: Final[Float32Array] = mugrid.CENTRES.astype(np.float32)
-_EDGE: Final = (c.SLIPPERY - mugrid.LOWER) / c.BIN_WIDTH
+_EDGE: Final = (SLIPPERY_MU - mugrid.LOWER) / c.BIN_WIDTH
 SLIPPERY_SHARE: Final[FloatArray] = np.clip(
     _EDGE - np.arange(_BINS), 0.0, 1.0
 )  # of each bin that lies below SLIPPERY

@@ -7,7 +7,7 @@ from __future__ import annotations
 from typing import Final
 
 from schemas import mugrid
-from schemas.thresholds import EXCITED_SHARE, NS, SLIPPERY_MU
+from schemas.thresholds import NS
 
 BIN_WIDTH: Final = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
 
@@ -88,11 +88,14 @@ FORGET_S: Final = 10.0
 # drift as by change; so that no vehicle can hold a cell by driving over it all day.
 VOTE_RENEWAL_S: Final = 3600.0
 
-# ... or at once, if it says something else: its own bias cancels in the difference to its own last
-# vote. From two standard deviations (noise) to four (certainly new); no sender's own spread is
-# believed to be below NOVELTY_STD.
+# Values so many standard deviations apart are certainly of two roads, or one of them is wrong.
+PEERS_DISAGREE: Final = 4.0
+
+# A vote counts again at once, if it says something else: its own bias cancels in the difference to
+# its own last vote. From two standard deviations (noise) to PEERS_DISAGREE (certainly new); no
+# sender's own spread is believed to be below NOVELTY_STD.
 NOVELTY_FROM: Final = 2.0
-NOVELTY_FULL: Final = 4.0
+NOVELTY_FULL: Final = PEERS_DISAGREE
 NOVELTY_STD: Final = 0.05
 # So many whole votes a vehicle has in a cell per VOTE_RENEWAL_S, however often it changes its mind:
 # one and one change. With one and a half, ice takes four passes to be seen instead of three.
@@ -106,9 +109,18 @@ REVISIT_S: Final = 20.0
 WAITING_MOST: Final = 32
 # So long a vehicle's visits to a cell are remembered, to the hour: by then 95 % of its vote count
 # again (1 - e⁻³), and memory is the vehicles of an eighth of a day and not of a year.
-FORGOTTEN_S: Final = 3 * 3600.0
+FORGOTTEN_S: Final = 3.0 * VOTE_RENEWAL_S
 # For a lower bound, "something else" is this much more grip used.
 NOVELTY_UTILISED: Final = 0.10
+
+# A visit without a value is evidence against slippery road where visitors gave values before: this
+# share of the cell's own rate of values, since a driver who was warned uses less grip. At 20
+# vehicles an hour .883 of the alerts of four tuning towns were right without it, .914 with it,
+# and the same share of ice was found (.906).
+SILENCE: Final = 0.4
+FIRST_VISITS: Final = 4.0  # that are too few to know the rate of values
+# P(slippery) down to which that may lead: no longer probable, and not improbable either
+UNSURE: Final = 0.45
 
 # An unexcited visit should be flat above the grip it used; senders agree within half a nat
 # (contract of the log-likelihood), so a fall towards the upper end of less than twice that is taken
@@ -125,12 +137,10 @@ SPREAD_CELLS: Final = 2  # to each side; who is further off has no position
 # more probably here than elsewhere: counts as a visit, and is held against others'
 HERE_SHARE: Final = 0.5
 
-# A posterior (μ, interval) is a value only where this share of μ was used (contract), else a lower
-# bound.
-VALUE_UTILISATION: Final = EXCITED_SHARE
 # error of the grip used: accelerometer and load transfer, about 5 % of g ...
 UTILISED_STD: Final = 0.05
-UTILISED_RELATIVE: Final = 0.05  # ... and 5 % of itself: mass over the wheels, roll, gain
+# ... and of itself as much as a value: mass over the wheels, roll, gain
+UTILISED_RELATIVE: Final = BIAS_RELATIVE
 # ... and is not believed beyond: of what was above, 29 % was too much by more than .05
 UTILISED_MOST: Final = 0.9
 # Share of bounds that are of another road, or are no bound: on two rough ways 2 to 6 % were too
@@ -139,14 +149,10 @@ BOUND_CONTAMINATION: Final = 0.3
 POSTERIOR_STD: Final = 0.15  # of a posterior without an interval: as wide as wet is from dry
 POSTERIOR_STD_LEAST: Final = 0.02  # half a bin: the grid cannot hold less
 
-# Slippery is μ below this (contract of p_slippery).
-SLIPPERY: Final = SLIPPERY_MU
-
 # Trust: two values agree up to 2.5 standard deviations of their difference (bias included) and
-# disagree from 4 on. Honest vehicles then agree in 95 % of their meetings (fixes in the wrong cell,
-# roads that change), whatever the road.
+# disagree from PEERS_DISAGREE on. Honest vehicles then agree in 95 % of their meetings (fixes in
+# the wrong cell, roads that change), whatever the road.
 PEERS_AGREE: Final = 2.5
-PEERS_DISAGREE: Final = 4.0
 PEER_S: Final = 900  # values further apart in time may both be right
 PEER_STD: Final = 0.25  # wider ones agree with everything
 # Meetings with one vehicle after which the old count half: who was honest and begins to lie is seen
@@ -178,10 +184,5 @@ SOURCE_SHARE: Final = 0.6
 # road .6 % and .2 %, to dry road .08 % and .04 %. With two instead of one, alerts of three ways
 # found .13 of the snow instead of .17, and as much ice (.80).
 WITNESS_NATS: Final = 1.0
-# A bound is a source of grip from this much grip used on: only a dry road gives it. On the best
-# roads values lie at the grid's end and are bounds, and without them nobody would clear an alert
-# there.
-SOURCE_USED: Final = EXCITED_SHARE
-
 # Trust acts from the next epoch on, so that it depends on the order of time and not of arrival.
 EPOCH_NS: Final = 60 * NS

@@ -70,14 +70,18 @@ class Fusion:
     Args:
         lateness_s: L [s]; an observation older than the checkpoint is late, and is fused with aged
             evidence.
+        enrolled: only vehicles of an enrolment file are fused; a vehicle that nobody met yet then
+            has its whole weight.
 
     Attributes:
+        enrolled: as above.
         store: cells, windows, pairs and vehicles.
         standings: of the vehicles, the oldest first.
         reports: the weather that a later update may still need.
     """
 
-    def __init__(self, lateness_s: float) -> None:
+    def __init__(self, lateness_s: float, *, enrolled: bool = False) -> None:
+        self.enrolled = enrolled
         self._lateness_ns = int(lateness_s * NS)
         self._kept_epochs = (
             self._lateness_ns // c.EPOCH_NS + 2
@@ -301,7 +305,9 @@ class Fusion:
             last = self.standings[-1]
             joined = store.vehicles - len(last.weight)
             weight = np.append(last.weight, np.full(joined, initial_trust(False), np.float32))
-            standing = compute_standing(store.peers, last._replace(weight=weight), self._epoch)
+            standing = compute_standing(
+                store.peers, last._replace(weight=weight), self._epoch, enrolled=self.enrolled
+            )
             self.standings = [
                 self.standings[0],
                 *self.standings[1:][-self._kept_epochs :],

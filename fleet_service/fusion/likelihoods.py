@@ -24,7 +24,7 @@ from fleet_service.fusion.reported import Evidence, as_reported
 from schemas import mugrid
 from schemas.numeric import BoolArray, ByteArray, FloatArray
 from schemas.runtime.jit import compiled
-from schemas.thresholds import Z_95
+from schemas.thresholds import EXCITED_SHARE, Z_95
 
 _LESS: Final = 0.5 * c.UTILISED_STD
 # of the grip used where its bound is looked up, rounded down: a seventh of a bin
@@ -53,7 +53,7 @@ def make_evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArra
             columns[n][rest].astype(np.float64)
             for n in ("mu", "mu_lower", "mu_upper", "mu_utilised")
         )
-        value = used >= c.VALUE_UTILISATION * mu  # False where either is NaN
+        value = used >= EXCITED_SHARE * mu  # False where either is NaN
         log_likelihood = np.where(
             value[:, None], interval_likelihood(mu, lower, upper), at_least(used)
         )

@@ -18,6 +18,7 @@ from fleet_service.fusion.space import other_cells
 from schemas import grid
 from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
 from schemas.signals import FLAGS
+from schemas.thresholds import SLIPPERY_MU
 
 SmallArray = NDArray[np.int8]
 # more than a batch has rows: seq and row become one number that keeps their order
@@ -122,4 +123,4 @@ def find_limited(columns: Mapping[str, NDArray[Any]], used: NDArray[Any]) -> Boo
         if name in columns:
             active |= columns[name] == 1
     most = used + np.hypot(c.UTILISED_STD, c.UTILISED_RELATIVE * used)
-    return np.asarray(active & (most < c.SLIPPERY))
+    return np.asarray(active & (most < SLIPPERY_MU))

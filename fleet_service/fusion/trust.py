@@ -35,7 +35,7 @@ from schemas import mugrid
 from schemas.numeric import BoolArray, Float32Array
 from schemas.runtime.jit import compiled, refcount_free
 from schemas.runtime.records import RecordArray
-from schemas.thresholds import NS
+from schemas.thresholds import NS, SLIPPERY_MU
 
 _LEAST_VARIANCE: Final = 1e-4  # nobody reads to a hundredth
 
@@ -127,7 +127,7 @@ def judge_flag(
         if other == NOBODY or other == vehicle or now - time > c.PEER_S or time <= newest:  # noqa: SIM109 as above
             continue
         newest = time
-        away = (c.SLIPPERY - here.mean[k]) / max(float(here.std[k]), c.NOVELTY_STD)
+        away = (SLIPPERY_MU - here.mean[k]) / max(float(here.std[k]), c.NOVELTY_STD)
     this = peers[vehicle]
     if away >= 1.0:
         this.flags_confirmed += np.float32(1.0)
@@ -195,21 +195,26 @@ def _record_meeting(
         this.met[place] *= 0.5
 
 
-def compute_standing(peers: RecordArray, before: Standing, epoch: int) -> Standing:
+def compute_standing(
+    peers: RecordArray, before: Standing, epoch: int, *, enrolled: bool
+) -> Standing:
     """Return the standing of the vehicles (V,) from an epoch on, from their meetings and the
     standing of the vehicles they met, `before`.
 
-    In an established service, a vehicle that has met few trusted vehicles is a newcomer.
+    In an established service, a vehicle that has met few trusted vehicles is a newcomer. Where only
+    `enrolled` vehicles are fused nobody can take a new name, and there are no newcomers.
     """
     weight = np.empty(len(before.weight), np.float32)
-    established = _update_weights(peers, before.weight, weight)
+    established = _update_weights(peers, before.weight, weight, enrolled)
     return Standing(epoch, weight, initial_trust(established), heeded_flags(peers[: len(weight)]))
 
 
 @compiled
-def _update_weights(peers: RecordArray, before: Float32Array, out: Float32Array) -> bool:
-    """Fill the weights of vehicles (V,), from those `before`; returns whether the service is
-    established.
+def _update_weights(
+    peers: RecordArray, before: Float32Array, out: Float32Array, enrolled: bool
+) -> bool:
+    """Fill the weights of vehicles (V,), from those `before`; return True if the service is
+    established, so that newcomers weigh less.
     """
     known = np.empty(len(out), np.bool_)
     trusted = 0
@@ -230,7 +235,7 @@ def _update_weights(peers: RecordArray, before: Float32Array, out: Float32Array)
             trusted += trust >= c.SOURCE_TRUST
             trust *= max(min(mean, 1.0 - c.CONTAMINATION_LEAST) / (1.0 - c.CONTAMINATION), 1.0)
         out[v] = trust
-    if trusted < c.ESTABLISHED_VEHICLES:
+    if enrolled or trusted < c.ESTABLISHED_VEHICLES:
         return False
     for v in range(len(out)):
         if not known[v]:

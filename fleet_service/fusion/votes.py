@@ -11,6 +11,7 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import (
     BOUND,
     REACH,
+    SLIPPERY_SHARE,
     VALUE,
     Bins,
     apply_vote,
@@ -43,7 +44,7 @@ from schemas import mugrid
 from schemas.numeric import Float32Array
 from schemas.runtime.jit import refcount_free, refcount_free_inlined
 from schemas.runtime.records import RecordArray
-from schemas.thresholds import NS
+from schemas.thresholds import EXCITED_SHARE, NS, SLIPPERY_MU
 
 # Rows of scratch, (3, SCRATCH) single precision: the belief, padding for `forget` and
 # `convolve_bias`, the likelihood.
@@ -52,10 +53,11 @@ PADDED = 1
 LIKELIHOOD = 2
 SCRATCH: Final = mugrid.BINS + 2 * REACH
 _HOUR: Final = 3600
-_GRIP_MEAN: Final = 0.5 * (
-    c.SOURCE_USED + mugrid.UPPER
-)  # of "at least u" against the uniform prior
-_GRIP_BIN: Final = int(np.searchsorted(mugrid.CENTRES, c.SLIPPERY))  # first that is no ice
+# Mean of "at least EXCITED_SHARE" against the uniform prior. A bound of so much grip used is a
+# source of grip: only dry road gives it. On the best roads values lie at the grid's end and are
+# bounds.
+_GRIP_MEAN: Final = 0.5 * (EXCITED_SHARE + mugrid.UPPER)
+_GRIP_BIN: Final = int(np.searchsorted(mugrid.CENTRES, SLIPPERY_MU))  # first that is no ice
 _NEITHER: Final = 0.5  # P(slippery) that is neither ice nor grip
 _FORGOTTEN: Final = int(c.FORGOTTEN_S)
 _WITNESS_SLOPE: Final = UNKNOWN_SHAPE.alarm
@@ -235,6 +237,9 @@ def update(
         )
     else:
         apply_vote(p, scratch[LIKELIHOOD], (1.0 - c.BOUND_CONTAMINATION) * min(strength, 1.0))
+        if entries[entry].limited == 0:
+            noticed = float(cells[row].values) / (float(cells[row].visits) + c.FIRST_VISITS)
+            note_silence(p, c.SILENCE * min(noticed * strength, 1.0), weather.prior[prior])
     pack_belief(p, belief, row)
     cells[row].time = time
     _count_visit(cells, row, entries, entry)
@@ -247,6 +252,33 @@ def update(
             _note_source(rows.reporters, sources, ICE, entries[entry].vehicle, time)
         elif entries[entry].slippery <= 1.0 - c.SOURCE_SHARE:
             _note_source(rows.reporters, sources, GRIP, entries[entry].vehicle, time)
+
+
+@refcount_free_inlined
+def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
+    """Lower P(slippery) of a belief by a visit that gave no value and in which no slip controller
+    worked, where visitors of the slippery road give a value with probability `noticed`.
+
+    P(slippery) falls to UNSURE or that of the prior at most: silence ends the knowledge of ice, but
+    shows no grip.
+    """
+    if noticed <= 0.0:
+        return
+    whole = 0.0
+    slippery = 0.0
+    least = 0.0
+    for i in range(mugrid.BINS):
+        whole += p[i]
+        slippery += SLIPPERY_SHARE[i] * p[i]
+        least += SLIPPERY_SHARE[i] * prior[i]
+    least = max(least, c.UNSURE)
+    share = slippery / whole
+    if share <= least:
+        return
+    kept = max(1.0 - noticed, least * (1.0 - share) / (share * (1.0 - least)))
+    scale = whole / (whole - (1.0 - kept) * slippery)
+    for i in range(mugrid.BINS):
+        p[i] *= scale * (1.0 - (1.0 - kept) * SLIPPERY_SHARE[i])
 
 
 @refcount_free_inlined

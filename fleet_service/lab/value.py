@@ -2,8 +2,8 @@
 unnoticed ice. Pure.
 
 Drivers use the grip that a place demands, so that slippery road excites every vehicle and dry road
-hardly any. The service knows its fleet for an hour and a half before it counts. Half of the roads
-get another surface once.
+hardly any. All vehicles are enrolled. The service runs for an hour and a half before it counts.
+Half of the roads get another surface once.
 
     d      demand of a pass [g]: log-normal about DEMAND of the kind of place, DEMAND_SPREAD
     s      share of the grip used, min(d/μ, 1); a slip controller works where it is 1
@@ -131,7 +131,7 @@ def slippery_median(traffic: TownTraffic, seconds: float) -> BoolArray:
 def read_map(place: Town, traffic: TownTraffic) -> Readings:
     """Fuse the visits minute by minute and read the map every STEP minutes from BEGIN on."""
     o = make_observations(traffic)
-    fusion = Fusion(LATENESS_S)
+    fusion = Fusion(LATENESS_S, enrolled=True)
     alerts = Alerts(fusion)
     read: list[tuple[FloatArray | BoolArray, ...]] = []
     ends = np.searchsorted(traffic.visits.seconds, 60.0 * np.arange(MINUTES + 1))

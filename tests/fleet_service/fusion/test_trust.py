@@ -15,12 +15,12 @@ HONEST = np.arange(20)
 LIARS = np.arange(100, 108)
 
 
-def drive_liars(private: int = 0) -> Fusion:
+def drive_liars(private: int = 0, *, enrolled: bool = False) -> Fusion:
     """Twenty honest vehicles and eight that agree on .25, in four cells; the eight also in
     `private` others.
     """
     rng = np.random.default_rng(4)
-    fusion = Fusion(120.0)
+    fusion = Fusion(120.0, enrolled=enrolled)
     for minute in range(30):
         who = np.concatenate([rng.choice(HONEST, 12), LIARS, np.repeat(LIARS, private)])
         cells = np.concatenate(
@@ -46,6 +46,25 @@ def test_a_newcomer_is_believed_less_once_others_are_known() -> None:
     assert initial_trust(False) == pytest.approx(0.75)
     assert Fusion(120.0).trust(7) == pytest.approx(initial_trust(False))
     assert drive_liars().trust(999) == pytest.approx(c.NEWCOMER)
+
+
+def test_two_enrolled_vehicles_that_nobody_met_raise_an_alert() -> None:
+    raised = []
+    for enrolled in (False, True):
+        fusion = drive_liars(enrolled=enrolled)
+        seconds = 1900.0 + 60.0 * np.arange(2)
+        updated = fusion.update(
+            observations(seconds, np.array([998, 999]), value(np.full(2, 0.15)), cell=50)
+        )
+        alerts = Alerts(fusion).update(updated.slots)
+        raised.append([alert.vehicles for alert in alerts])
+    assert raised == [[], [2]]
+
+
+def test_enrolled_liars_still_lose_their_vote() -> None:
+    fusion = drive_liars(enrolled=True)
+    assert max(fusion.trust(int(v)) for v in LIARS) < 0.1
+    assert min(fusion.trust(int(v)) for v in HONEST) > 0.8
 
 
 def test_any_number_of_newcomers_together_has_less_than_two_votes() -> None:

@@ -1,0 +1,62 @@
+"""Silence: visits without a value end the knowledge of ice, and never show grip."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from fleet_service.fusion import Fusion
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.belief import SLIPPERY_SHARE
+from schemas import mugrid
+from schemas.numeric import FloatArray
+from tests.fleet_service.examples import at_least, belief, interval, observations, slippery, value
+
+QUIET = 40
+UNKNOWN = float(SLIPPERY_SHARE @ mugrid.PRIOR)
+
+
+def visited(noticed: FloatArray, *, limited: bool = False) -> Fusion:
+    """Return a fusion of one cell: vehicles with values of the frictions `noticed`, a minute apart,
+    then QUIET others that use .05.
+    """
+    fusion = Fusion(120.0)
+    n = len(noticed)
+    if n:
+        fusion.update(observations(60.0 * np.arange(n), np.arange(n), value(noticed, 0.03)))
+    quiet = observations(
+        60.0 * (n + np.arange(QUIET)), 100 + np.arange(QUIET), at_least(np.full(QUIET, 0.05))
+    )
+    fusion.update(dataclasses.replace(quiet, limited=np.full(QUIET, limited)))
+    return fusion
+
+
+def test_many_quiet_visits_after_ice_leave_it_undecided() -> None:
+    before = Fusion(120.0)
+    before.update(observations(60.0 * np.arange(8), np.arange(8), value(np.full(8, 0.15), 0.03)))
+    assert slippery(belief(before)) > 0.95
+    assert c.UNSURE < slippery(belief(visited(np.full(8, 0.15)))) < 0.65
+
+
+def test_quiet_visits_raise_no_lower_bound_above_their_use() -> None:
+    lower, upper = interval(belief(visited(np.full(8, 0.15))))
+    assert lower < 0.15
+    assert upper > 0.9
+
+
+def test_few_quiet_visits_do_not_end_ice_that_most_visitors_noticed() -> None:
+    fusion = Fusion(120.0)
+    fusion.update(observations(60.0 * np.arange(8), np.arange(8), value(np.full(8, 0.15), 0.03)))
+    fusion.update(observations([500.0, 560.0], [100, 101], at_least(np.full(2, 0.05))))
+    assert slippery(belief(fusion)) > 0.9
+
+
+def test_a_working_controller_is_no_silence() -> None:
+    assert slippery(belief(visited(np.full(8, 0.15), limited=True))) > 0.8
+
+
+@pytest.mark.parametrize("noticed", [np.zeros(0), np.full(8, 0.8)], ids=["nobody", "grip"])
+def test_road_without_ice_is_not_called_slippery_by_silence(noticed: FloatArray) -> None:
+    assert slippery(belief(visited(noticed))) <= UNKNOWN + 1e-6 < c.UNSURE
