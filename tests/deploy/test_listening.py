@@ -14,6 +14,7 @@ from deploy.listening import Drive, ListeningTown, measure
 from edge_agent.lab.simulation.listeners import WarnedDrivers
 
 
+@pytest.mark.campaign
 def test_a_town_that_hears_its_own_map_makes_the_same_map_bit_for_bit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

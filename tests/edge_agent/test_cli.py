@@ -169,6 +169,7 @@ IMPATIENT = (
 )
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("well", [True, False])
 def test_replay_with_a_hanging_session_keeps_its_estimates(
     drive: Path, tmp_path: Path, well: bool
@@ -348,6 +349,7 @@ def test_a_signalled_agent_flushes_hears_the_answer_and_leaves(
     assert reported["observations_published"] >= 1
 
 
+@pytest.mark.campaign
 def test_what_a_killed_agent_had_stored_is_sent_by_the_next(
     tmp_path: Path, router: Router, service: Service, capsys: Output
 ) -> None:

@@ -315,6 +315,7 @@ def record_arguments(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: 
     return seen, sorted(path.name for path in folder.iterdir())
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(("command", "option"), [pair for pair in CHANGED if pair[0] != "tune"])
 def test_every_option_of_a_live_command_changes_what_is_driven(
     command: str, option: str, given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -205,6 +205,7 @@ sys.exit(main(sys.argv[1:]))
 BREAKS = "service.Service._shut_down = lambda self, *_: [][0]"
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(("more", "code"), [("", 0), (BREAKS, 1)])
 def test_exit_code_of_a_forced_end_tells_whether_all_was_well(
     tmp_path: Path, router: ZenohSettings, more: str, code: int
@@ -223,6 +224,7 @@ def test_exit_code_of_a_forced_end_tells_whether_all_was_well(
         service.kill()
 
 
+@pytest.mark.campaign
 def test_a_service_that_has_to_be_ended_gives_its_lease_free(
     tmp_path: Path, router: ZenohSettings, bucket: BucketServer
 ) -> None:

@@ -305,6 +305,7 @@ def test_the_tests_that_show_an_option_give_it_to_the_command(command: str) -> N
     assert all(option in text for option in named if option[0] != "-")
 
 
+@pytest.mark.campaign
 def test_a_standby_without_a_copy_to_follow_is_refused(
     tmp_path: Path, router: ZenohSettings
 ) -> None:
@@ -382,6 +383,7 @@ def test_certificates_that_end_within_so_many_days_are_renewed(
     assert capsys.readouterr().out.startswith("issued 7: ") == renewed
 
 
+@pytest.mark.campaign
 def test_service_weather_archive_and_configuration_are_those_given(
     tmp_path: Path, router: ZenohSettings
 ) -> None:
@@ -422,6 +424,7 @@ def fed(service: Running, session: zenoh.Session) -> Fleet:
     return fleet
 
 
+@pytest.mark.campaign
 @pytest.mark.usefixtures("fed")
 def test_every_option_of_a_query_changes_the_answer(
     router: ZenohSettings, tmp_path: Path, capsys: Capture

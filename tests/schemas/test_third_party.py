@@ -54,6 +54,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
             service.communicate(timeout=30)
 
 
+@pytest.mark.campaign
 def test_it_loads_nothing_but_the_contract_and_its_libraries(found: dict[str, Any]) -> None:
     assert not found["loaded"]
     assert found["blocked"] == [

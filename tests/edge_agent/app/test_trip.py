@@ -80,6 +80,7 @@ def test_a_fault_is_never_admitted_and_teaches_nothing(
     assert not path.exists(), "what is trusted is not for that reason learned from"
 
 
+@pytest.mark.campaign
 def test_what_trips_teach_holds_from_the_next_one_on(smooth: Recorded, tmp_path: Path) -> None:
     path = tmp_path / "car.json"
     bad = offset_columns([S.YAW_RATE], 0.012)(smooth)

@@ -155,6 +155,7 @@ def test_memberships_of_the_papers_filter_gain_on_held_out_drives() -> None:
     assert found == pytest.approx(colony, rel=0.02)
 
 
+@pytest.mark.campaign
 def test_scores_in_the_shipped_file_are_those_of_the_filter_as_it_is() -> None:
     """Fails when the filter changed after the tuning: run the command in the file again."""
     document = load_tuned(FOLDER / "aco-fckf.json").document

@@ -228,6 +228,7 @@ def write(path: Path, drive: Recorded) -> str:
     return str(path)
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(600)  # kernels may have to be compiled
 def test_a_calibrated_file_is_written_read_and_heeded(
     smooth: Recorded, tmp_path: Path, capsys: Output

@@ -40,6 +40,7 @@ def run(name: str, t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> Esti
     return bank_of(name, [vehicle]).advance(t[:, None], signals[:, None])
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("name", PAPERS)
 def test_on_a_slalom_the_motion_is_found(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.8, seconds=6.0)
@@ -105,6 +106,7 @@ def test_slow_sampling_and_standing_still_are_survived(name: str, rate: int) -> 
     assert np.abs(reported.vx).max() < 40.0
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("name", PAPERS)
 def test_without_evidence_the_observer_tells_friction_with_its_interval(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.8, seconds=6.0)

@@ -7,6 +7,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 WORDS = """
 import numpy as np
 from edge_agent.estimators import sr_ukf
@@ -18,6 +20,7 @@ print(sum(sr_ukf.KERNEL.stats.cache_hits.values()))
 """
 
 
+@pytest.mark.campaign
 def test_a_new_process_finds_the_kernel_that_another_has_compiled() -> None:
     for process in range(2):
         out = subprocess.run(

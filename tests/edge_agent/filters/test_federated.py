@@ -196,6 +196,7 @@ def _make_update(
     return (mean, other, root @ root.T, other_root @ other_root.T), told
 
 
+@pytest.mark.campaign
 def test_an_update_by_downdates_is_the_orthogonal_update() -> None:
     (mean, other, cov, other_cov), told = _make_update(11, 0.5)
     assert not told[3]

@@ -46,6 +46,7 @@ from tests.waiting import until
 CAR = PRESETS["sedan"].vehicle
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("kind", COUNTED)
 def test_what_a_peer_sends_comes_in_without_a_sample_lost(kind: str, tmp_path: Path) -> None:
     assert count_lost(kind, tmp_path, 1.0) == (0, 100)
@@ -209,6 +210,7 @@ def test_a_bus_tells_its_number_and_the_profile_which_it_reads() -> None:
     assert [len(Decoder(on, database, bus).identifiers) for bus in (None, 0, 1)] == [1, 0, 1]
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(600)  # kernels may have to be compiled
 def test_a_live_car_is_driven_by_its_bus_and_its_receiver(service: Service, tmp_path: Path) -> None:
     (bus, can) = peer_addresses("can")

@@ -102,6 +102,7 @@ def test_the_bound_of_a_share_is_wilson_s() -> None:
         assert (hits / of - lower) ** 2 == pytest.approx(z**2 * lower * (1 - lower) / of, abs=1e-12)
 
 
+@pytest.mark.campaign
 def test_spells_are_the_runs_of_slippery_values(asked: Ask, rows: pd.DataFrame) -> None:
     expected = []
     told = rows[rows["value"]].sort_values(["time", "vehicle", "boot", "seq", "row"])
@@ -142,6 +143,7 @@ def test_planted_change_lies_in_the_before_after_interval(
     assert found["vehicles"] <= WORLD.vehicles
 
 
+@pytest.mark.campaign
 def test_the_interval_of_before_and_after_covers_as_often_as_it_says() -> None:
     import ibis
 

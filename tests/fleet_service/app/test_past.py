@@ -171,6 +171,7 @@ def test_a_process_that_died_while_nobody_asked_is_begun_anew(
     assert len(begun) == 2
 
 
+@pytest.mark.campaign
 def test_an_answer_that_nobody_reads_to_its_end_is_not_read_by_the_next(
     asker: past.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
 ) -> None:

@@ -333,6 +333,7 @@ def test_a_changed_name_in_a_footer_is_damage_and_no_other_version(
     assert read_content(path) is None
 
 
+@pytest.mark.campaign
 def test_who_only_reads_passes_over_damage_and_renames_nothing(
     old: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:

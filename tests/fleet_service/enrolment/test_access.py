@@ -57,11 +57,13 @@ def running(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Network]
         yield found
 
 
+@pytest.mark.campaign
 def test_nobody_gets_further_than_the_list_lets_him(running: Network) -> None:
     with open_ground(running) as found:
         assert breaches(found) == set()
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("protocol", ["quic", "tls"])
 def test_every_attack_gets_through_where_nobody_looks(tmp_path: Path, protocol: str) -> None:
     with (

@@ -51,6 +51,7 @@ def test_no_seq_however_far_ahead_takes_more_room_than_one_batch(
     assert stream.low == 1
 
 
+@pytest.mark.campaign
 @given(st.lists(st.tuples(st.integers(0, 1), st.integers(1, 30), st.integers(1, 30)), max_size=60))
 def test_rows_of_an_archive_restore_the_streams_that_wrote_them(
     rows: list[tuple[int, int, int]],

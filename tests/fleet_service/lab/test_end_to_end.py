@@ -18,6 +18,7 @@ from schemas.wire import Alert
 from tests.fleet_service.examples import CELL, START, observations, value
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(600)  # compiles the estimator where nobody did before
 def test_what_the_vehicles_write_is_joined_with_their_truth(tmp_path: Path) -> None:
     def drive(folder: Path) -> None:

@@ -106,6 +106,7 @@ def test_tiles_of_a_file_are_served_and_one_that_is_not_there_is_no_error(
         assert ask(address, "/base/x/y/z")[0] == 404
 
 
+@pytest.mark.campaign
 def test_a_person_sees_the_file_below_the_map_without_any_network(
     router: ZenohSettings, tmp_path: Path
 ) -> None:

@@ -256,6 +256,7 @@ def test_what_happens_is_pushed_and_an_alert_appears_with_its_reason(
         look(seen, "alerts")
 
 
+@pytest.mark.campaign
 def test_a_service_that_went_is_said_and_its_region_is_not_emptiness(
     page: RunningPage, drive: Drive
 ) -> None:

@@ -56,6 +56,7 @@ def write(path: Path, kind: int = 1) -> Path:
     return path
 
 
+@pytest.mark.campaign
 def test_every_tile_of_a_pmtiles_file_is_found_and_no_other(tmp_path: Path) -> None:
     file = PmtilesFile(write(tmp_path / "map.pmtiles"))
     assert file.zooms == (0, 6)

@@ -6,6 +6,8 @@ import time
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
 from fleet_service.archive.identity import vehicle_ids
 from fleet_service.archive.identity.vehicle_ids import VehicleIds
 from fleet_service.fusion import Fusion
@@ -17,6 +19,7 @@ from tests.fleet_service.replication.test_lease import Machine
 from tests.standbys import restore_archive
 
 
+@pytest.mark.campaign
 def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(
     bucket: BucketServer, tmp_path: Path
 ) -> None:

@@ -137,6 +137,7 @@ def test_a_region_stays_where_nobody_stands_by_for_it(
         one.end()
 
 
+@pytest.mark.campaign
 def test_what_is_given_free_for_one_is_left_alone_by_others_for_a_while(
     bucket: BucketServer,
 ) -> None:

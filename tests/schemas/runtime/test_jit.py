@@ -45,6 +45,7 @@ def run_outer(folder: Path, factor: str, before: str = "") -> str:
     ).stdout.strip()
 
 
+@pytest.mark.campaign
 def test_a_change_in_a_called_kernel_is_seen_by_its_callers(tmp_path: Path) -> None:
     (tmp_path / "kernels").mkdir()
     (tmp_path / "kernels" / "__init__.py").touch()

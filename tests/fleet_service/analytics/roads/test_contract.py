@@ -85,6 +85,7 @@ def test_the_interval_of_a_slot_covers_the_truth_as_often_as_it_says() -> None:
     assert min(hits) > 0.88, hits
 
 
+@pytest.mark.campaign
 def test_each_link_that_froze_is_told_and_no_other(
     asked: Ask, links: Path, rows: pd.DataFrame
 ) -> None:
