@@ -1,4 +1,4 @@
-"""The fuzzy sets of the adaptation as numbers that can be stored, tuned and refused.
+"""Parameters of the adaptation's fuzzy sets, with conversions for files and optimisers.
 
 Legend
     mismatch    actual over theoretical innovation variance, minus 1 [1]; 0 when R is right, -1 is
@@ -17,8 +17,8 @@ rules:
     shares      ln of the share of a block's evidence on friction that is taken, by whether a wheel
                 slides (no, yes), then demand (low, middle, high), then forces (as before, new)
                 [nat] (12,)
-    strained    term added to it where beliefs about the car are strained, by whether a wheel
-                slides [nat] (2,)
+    strained    term added to `shares` where beliefs about the car are strained, by whether a
+                wheel slides [nat] (2,)
 
 Neighbouring triangles meet at each other's peaks, so memberships of a mismatch sum to one and the
 range is covered.
@@ -148,10 +148,10 @@ class Memberships:
 
     @classmethod
     def from_vector(cls, vector: FloatArray) -> Memberships:
-        """Return the memberships of a vector (30,) within `bounds`; inputs and outputs are sorted
-        first, so all are valid.
+        """Return the memberships given by an optimiser's vector (30,), which lies within `bounds`.
 
-        For a vector (12,), which ends at ln_scales, the rest keeps the untuned values.
+        Inputs and outputs are sorted, so that every such vector is valid. A vector (12,) gives
+        only the fields up to `ln_scales`; the other fields keep their untuned values.
         """
         v = np.asarray(vector, float)
         if v.shape == (NOISE,):
@@ -191,8 +191,8 @@ class Memberships:
 
     @classmethod
     def from_json(cls, document: object) -> Memberships:
-        """Return the memberships in a parsed JSON document; one without rules gets the untuned
-        ones.
+        """Return the memberships in a parsed JSON document; a document without rules gets the
+        untuned rules.
 
         Raises:
             InputError: a field is missing or is not a list of numbers.

@@ -1,5 +1,5 @@
-"""The rules by which the default estimator adapts: noise, share of the evidence, and speed of
-forgetting.
+"""Fuzzy rules by which the default estimator adapts the noise, the share of the evidence that
+it uses, and the rate of forgetting.
 
 | if | then | kind |
 |---|---|---|
@@ -38,8 +38,10 @@ WIDE = (0.1, 0.35)  # [rad] angles between which the maps of real steering leave
 
 
 class RuleBase(NamedTuple):
-    """Feet and peaks of the sets, and the consequents of the last two rules; or the numbers of
-    `plain_share` without sets.
+    """Parameters of the rules: a ramp (foot, peak) per set, and the consequents.
+
+    If `by_sets` is False, `plain_share` with the parameters `plain` replaces the fuzzy rules of
+    the share of evidence.
     """
 
     far: Annotated[FloatArray, 2]
@@ -69,8 +71,8 @@ def rule_base(memberships: Memberships) -> RuleBase:
 
 
 def plain_rules(half: float, power: float, steady: float) -> RuleBase:
-    """Return rules without fuzzy sets: `plain_share` of the evidence, with R, steering and
-    forgetting not adapted.
+    """Return a rule base without fuzzy sets: `plain_share` gives the share of evidence, and
+    neither R nor forgetting is adapted.
     """
     idle = Memberships(consequents=(0.0, 0.0))
     return rule_base(idle)._replace(by_sets=False, plain=np.array([half, power, steady]))
@@ -98,7 +100,7 @@ def wide_noise(rules: RuleBase, angle: float) -> float:
 
 @compiled
 def plain_share(plain: FloatArray, demand: float, new: float) -> float:
-    """Return the ln of the share of a block's evidence without rules:
+    """Return ln of the share of a block's evidence that is used, without fuzzy rules:
     (steady + (1 - steady)*new)/(1 + (half/demand)^power)."""
     used = demand ** plain[1]
     taken = used / (used + plain[0] ** plain[1])
@@ -110,7 +112,7 @@ def plain_share(plain: FloatArray, demand: float, new: float) -> float:
 def evidence_share(
     rules: RuleBase, slides: float, demand: float, new: float, strain: float
 ) -> float:
-    """Return the ln of the share of a block's evidence on friction that is taken, at most 0.
+    """Return ln of the share of a block's evidence on friction that the filter uses, at most 0.
 
     Zero-order Takagi-Sugeno rules with product inference; the memberships of each input sum to one.
 

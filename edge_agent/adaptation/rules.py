@@ -40,10 +40,11 @@ RATE: Final = np.array([-8.0, -2.0, 0.0, 2.0, 8.0])  # [1/s]
 
 
 def rule_table(printed: tuple[str, ...] = PRINTED) -> FloatArray:
-    """Return the levels (5, 7) [nat] of a table of set names.
+    """Return the levels (5, 7) [nat] of a rule table, whose entries are names of output sets.
 
     Raises:
-        InputError: a name is unknown, the shape is wrong, or zero mismatch does not mean no change.
+        InputError: a name is unknown, the shape is wrong, or the level at zero mismatch and zero
+            rate is not 0.
     """
     try:
         levels = np.array([[math.log(LEVELS[name]) for name in row.split()] for row in printed])

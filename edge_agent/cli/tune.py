@@ -106,7 +106,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Search, compare, print, write; InputError for options out of range."""
+    """Search the memberships, print the comparison on held-out drives, and write the best set.
+
+    Raises:
+        InputError: an option is out of range.
+    """
     ants = args.ants if args.ants is not None else QUICK_ANTS if args.quick else ANTS
     iterations = (
         args.iterations
@@ -203,7 +207,7 @@ def _tuning_drives(
 
 
 def _search_worth(score: Score, objective: str) -> float:
-    """Return the worth of a search: minus the cost of false and missed ice if truth is known,
+    """Return the score of a search: minus the cost of false and missed ice if the truth is known,
     else the objective.
     """
     known = {name: value for name, value in score.model_dump().items() if value is not None}
@@ -283,7 +287,7 @@ def _run_searches(objective: Objective, ants: int, iterations: int, seed: int) -
 
 
 def print_line(line: str) -> None:
-    """Print at once, also into a pipe."""
+    """Print a line and flush it, so that it appears at once in a pipe as well."""
     print(line, flush=True)
 
 

@@ -93,9 +93,7 @@ class _Entry:
 
 @dataclass
 class _Sequence:
-    """Seqs of one stream: the next number and those still held. All its entries share the
-    stream's name.
-    """
+    """Sequence numbers of one stream: the next free number, and the numbers of held batches."""
 
     stream: Stream
     next: int = 1
@@ -227,8 +225,8 @@ class Outbox:
         )
 
     def count_stranded(self, vehicles: Collection[str]) -> int:
-        """Return the number of records of other vehicles than these: of a former name, which is
-        not sent.
+        """Return the number of records that are not sent because they belong to none of these
+        vehicles, for example after a change of name.
         """
         return sum(
             e.records for e in list(self._entries.values()) if e.stream.vehicle not in vehicles
@@ -240,7 +238,9 @@ class Outbox:
         return self._bytes
 
     def unanswered_s(self, now: float) -> float:
-        """Return for how long nothing sent was answered, in the region that waits longest [s]."""
+        """Return for how long sent batches have been without an answer [s], in the region that has
+        waited longest; 0 if none waits.
+        """
         since = (pacer.unanswered_since for pacer in list(self._pacers.values()))
         return max((now - one for one in since if one is not None), default=0.0)
 
@@ -301,7 +301,7 @@ class Outbox:
         return self._random.uniform(1 - JITTER, 1 + JITTER)
 
     def reset_in_flight(self, vehicle: str, now: float) -> None:
-        """Treat everything a vehicle had in flight as lost: it has just found a router again."""
+        """Treat all batches in flight of a vehicle as lost, because it has just reconnected."""
         for (name, _), pacer in self._pacers.items():
             if name == vehicle:
                 pacer.record_reconnect(now)

@@ -1,5 +1,6 @@
-"""The standard normal distribution, for arrays of any shape. Compiled: a library for it takes 15
-MB of a service.
+"""Standard normal distribution for arrays of any shape.
+
+It is compiled here because importing a library for it would cost the service 15 MB of memory.
 """
 
 from __future__ import annotations
@@ -18,12 +19,15 @@ _FAR: Final = (
 
 
 def normal_cdf(x: FloatArray) -> FloatArray:
-    """Φ(x)."""
+    """Return the distribution function Φ(x)."""
     return _normal_cdf(np.ravel(x)).reshape(x.shape)
 
 
 def log_distribution(x: FloatArray) -> FloatArray:
-    """ln Φ(x); far below nought -½x² - ln(-x·√(2π)) + ln(1 - 1/x² + 3/x⁴)."""
+    """Return ln Φ(x).
+
+    Below _FAR it is the asymptotic series -½x² - ln(-x·√(2π)) + ln(1 - 1/x² + 3/x⁴).
+    """
     return _log_distribution(np.ravel(x)).reshape(x.shape)
 
 

@@ -1,5 +1,5 @@
-"""The figures of the campaign with their bars, and how measured values become figures. A missing
-name is a failure.
+"""Bars (required limits) of the campaign's figures. A figure that was not measured fails its
+bar.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ Side = Literal["less", "more", "within"]
 
 
 class MapBar(NamedTuple):
-    """Bar of a figure; with `bar` None the figure is only shown."""
+    """Required limit of a figure; if `bar` is None, the figure is listed but not judged."""
 
     bar: float | tuple[float, float] | None
     better: Side
@@ -138,8 +138,8 @@ BARS: Final[dict[str, MapBar]] = {
 
 
 def judge_figures(measured: Mapping[str, float]) -> list[Figure]:
-    """Every figure that has a bar, NaN where it was not measured; then those that are only
-    shown.
+    """Return every figure of BARS, NaN if it was not measured, and then all other measured
+    figures.
     """
     named = [
         Figure(name, measured.get(name, math.nan), bar.unit, bar.bar, bar.better)

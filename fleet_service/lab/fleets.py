@@ -38,13 +38,12 @@ EARLIER = 20
 
 
 class Fleet(NamedTuple):
-    """One campaign: share of vehicles that always claim `claim`; the minute from which it counts,
-    and its length.
+    """One campaign of `minutes`, in which a share of the vehicles always reports the value `claim`.
 
-    Vehicles are judged by their earlier reports. So where some misbehave, coverage and error count
-    from `begin` on: by then every vehicle has some 200 visits, a day of a car's life. The rates of
-    alerts count as soon as each vehicle has EARLIER visits, two minutes after the service knew no
-    vehicle; `…_settled` are those from `begin` on.
+    The service judges vehicles by their earlier reports. Coverage and error are therefore measured
+    from minute `begin` on, when every vehicle has about 200 visits, as many as a car makes in a
+    day. The rates of alerts are measured as soon as each vehicle has EARLIER visits, about two
+    minutes after the start; the figures `…_settled` are measured from `begin` on.
     """
 
     name: str
@@ -109,7 +108,7 @@ def drive_seed(fleet: Fleet, seed: int, found: Found) -> None:
 
 
 def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
-    """All campaigns; `log_line` hears the progress."""
+    """Run all campaigns and return their figures; `log_line` receives one line per campaign."""
     out: dict[str, float] = {}
     for fleet in FLEETS:
         found = Found()
@@ -149,7 +148,7 @@ def _fleet_figures(fleet: Fleet, found: Found) -> dict[str, float]:
 
 
 def _reliability_curve(ours: Scores) -> dict[str, float]:
-    """The reliability diagram."""
+    """Return the points of the reliability diagram."""
     return {
         f"fusion.clean.reliability.{level:.2f}": float(share)
         for level, share in zip(LEVELS, reliability(ours), strict=True)

@@ -98,7 +98,7 @@ def make_reports(
 
 
 def make_observations(drive: ForeignDrive) -> Observations:
-    """Return the drive's visits as the service takes them: without a single optional column."""
+    """Return the drive's visits as observations for the service, without any optional column."""
     rows = rows_of(drive.visits, drive.cells)
     rows["used_longitudinal"] = rows["used_lateral"] = np.full(
         len(drive.visits), np.nan, np.float32
@@ -130,7 +130,7 @@ def drive_honest(rng: Generator, gain_std: float) -> tuple[ForeignDrive, FloatAr
 
 
 def select_visits(v: Visits, rows: IntArray) -> Visits:
-    """Return some of the visits."""
+    """Return the visits at the given indices."""
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
     return Visits(
         v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports
@@ -156,7 +156,7 @@ def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, In
 
 
 def split_by(seconds: FloatArray, step: float) -> list[IntArray]:
-    """Return the rows of visits, which are in order of time, in portions of `step` seconds."""
+    """Return the rows of visits, which are sorted by time, in portions of `step` seconds."""
     borders = np.flatnonzero(np.diff(seconds // step)) + 1
     return np.split(np.arange(len(seconds)), borders)
 
@@ -188,8 +188,8 @@ def drive_change(rng: Generator, excitement: float) -> ForeignDrive:
     """Return a drive over cells that are DRY, then WHITE, then DRY again, in a town where the same
     fleet drives.
 
-    The changing cells come first; the honest fleet's cells, with its visits for as long, come after
-    them.
+    The first CHANGE_CELLS cells are the changing ones. The cells of the town follow, and its visits
+    last as long.
     """
     town_mu = np.repeat(rng.choice(FRICTIONS, CELLS // STRETCH), STRETCH)
     changing = CHANGE_CELLS * CHANGE_VISITS * 3
@@ -219,10 +219,11 @@ def drive_change(rng: Generator, excitement: float) -> ForeignDrive:
 
 
 def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]:
-    """Return the excited passes of the white road before the alert, and of the dry one after it
-    before its end.
+    """Return the number of excited passes over each changing cell until the alert and until its
+    end.
 
-    Both (CHANGE_CELLS,); NEVER where it did not come.
+    The first is counted from the change to WHITE, the second from the change back to DRY. Both are
+    (CHANGE_CELLS,), with NEVER where the event did not occur.
     """
     drive = drive_change(rng, excitement)
     v = drive.visits
@@ -273,8 +274,9 @@ def measure_change(seeds: range) -> dict[str, float]:
 
 
 def count_cold(rng: Generator) -> int:
-    """Return how many passes over ice a service that knows nobody needs, by a fleet of the lab's
-    own vehicles.
+    """Return the number of passes over ice until a service that knows no vehicle raises an alert.
+
+    The vehicles are the lab's own; each makes one pass.
     """
     n = VEHICLES
     who = np.arange(n)
@@ -298,7 +300,7 @@ def count_cold(rng: Generator) -> int:
 
 
 def measure_cold(seed: int) -> dict[str, float]:
-    """Return the passes that ice needs in a service that knows nobody, over COLD_SEEDS fleets."""
+    """Return quantiles of `count_cold` over COLD_SEEDS fleets."""
     found = np.array([count_cold(np.random.default_rng([seed, 31, k])) for k in range(COLD_SEEDS)])
     return {
         "cold.ice_passes.median": float(np.median(found)),

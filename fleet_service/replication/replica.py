@@ -60,9 +60,9 @@ class BucketReplica:
     """Copy of one archive; call `upload_segments` from one thread and `sync` from another.
 
     Args:
-        root: of the archive.
-        url: of the copy.
-        options: of the store, see `ObjectBucket`.
+        root: folder of the archive.
+        url: address of the copy.
+        options: options of the object store, see `ObjectBucket`.
 
     Raises:
         InputError: the URL or an option cannot be used, or obstore is not installed.
@@ -419,9 +419,7 @@ class BucketReplica:
         return self._root / f"{name}{BAD}"
 
     def _list_files(self, folders: Iterable[str]) -> dict[str, Stamp]:
-        """Return names and stamps of the files that belong into the copy, in the order of the
-        folders.
-        """
+        """Return names and stamps of the files that are copied, in the order of the folders."""
         found: dict[str, Stamp] = {}
         for folder in folders:
             for path in sorted((self._root / folder).rglob("*")):
@@ -434,9 +432,7 @@ class BucketReplica:
 
 
 def _is_copied(name: str) -> bool:
-    """Return True for the name of a file that belongs into the copy; drafts and files set aside
-    do not.
-    """
+    """Return True if a file of this name is copied; drafts and files set aside are not."""
     folder, *rest = name.split("/")
     hidden = any(part.startswith(".") for part in rest)
     return (
@@ -449,7 +445,8 @@ def _is_copied(name: str) -> bool:
 
 
 def open_replica(config: ServiceConfig, root: Path) -> BucketReplica | None:
-    """Return the copy of the settings, synchronised with the folder; None without one.
+    """Open the bucket replica named in the configuration and synchronise it with the folder `root`;
+    return None if the configuration names none.
 
     Raises:
         InputError, OSError: as for `BucketReplica` and its `sync_without_lease`.

@@ -21,7 +21,7 @@ WarningState = Literal["raised", "updated", "ended"]
 
 @dataclass(frozen=True)
 class GripWarning:
-    """A slippery stretch within reach, as it is told; see the message `Warning`."""
+    """Warning of a slippery stretch of road within reach; fields as in the message `Warning`."""
 
     id: str
     state: WarningState
@@ -39,7 +39,7 @@ class GripWarning:
     reason: str
 
     def line(self) -> str:
-        """All of it in a line for people."""
+        """Return the warning as one line of text for people."""
         if self.state == "ended":
             return f"warning over: {self.reason}; id {self.id}"
         where = "here" if self.distance_m <= 0.0 else f"in {self.distance_m:.0f} m"
@@ -52,7 +52,7 @@ class GripWarning:
 
 
 class Runs(NamedTuple):
-    """A horizon as runs of metres in the same place, each (n,); see the message `Ahead`."""
+    """Horizon as n runs; a run is a stretch within one cell and sector. See the message `Ahead`."""
 
     start_m: FloatArray
     end_m: FloatArray
@@ -71,8 +71,8 @@ class Outlook(NamedTuple):
     """The road ahead of one vehicle: the current warnings, and the horizon along its most probable
     route.
 
-    `here` is the friction at the vehicle, from its own measurements and the map: median, 5 and 95
-    %; NaN where none is known.
+    `here` is the friction at the vehicle, from its own measurements and the map: median, 5 % and
+    95 % quantile; NaN if none is known.
     """
 
     vehicle: str
@@ -97,7 +97,7 @@ def encode_ahead(outlook: Outlook) -> bytes:
 
 
 def decode_ahead(payload: bytes) -> Outlook:
-    """Read an outlook.
+    """Return the outlook in the bytes of a message.
 
     Raises:
         WireError: not an Ahead, or columns of different lengths.

@@ -1,10 +1,10 @@
 """Correction of a recorded drive by the measurements of the signal doctor: late devices and locked
 axles.
 
-A clock that is further off than the filter bears is a finding of the doctor. Where the drive tells
-by how much, the lag is taken out of the log before the estimator sees it; a clock that is off by an
-unknown time stays a finding, and the log is not published. Lags that the filter bears are left to
-its own states, so that a replay of a sound log stays causal.
+The doctor reports a clock error that is too large for the filter. If the drive shows how large it
+is, the lag is removed from the log before the estimator reads it. An error of unknown size remains
+a finding, and the log is not published. The filter's own states estimate smaller lags, so that a
+replay of a log without faults stays causal.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from schemas.vehicle import Vehicle
 
 
 class Adopted(NamedTuple):
-    """A log as the estimator gets it, its vehicle, its diagnosis, and notes on the changes."""
+    """A corrected log for the estimator, its vehicle, its diagnosis, and notes on the changes."""
 
     log: SignalLog
     vehicle: Vehicle
@@ -37,8 +37,8 @@ class Adopted(NamedTuple):
 
 
 def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
-    """Return a log as the estimator gets it: corrected by its calibration, then by the doctor's
-    measurements.
+    """Return the log that the estimator processes: corrected by the calibration, then by the
+    doctor's measurements.
     """
     return adopt_measured(replace(log, signals=correct_log(log.t, log.signals, vehicle)), vehicle)
 
@@ -84,11 +84,11 @@ def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
 def align_import(
     merged: Merged, profile: Profile, vehicle: Vehicle, merge_with: Callable[[Profile], Merged]
 ) -> tuple[Merged, Profile]:
-    """Return the merged recordings and their profile with the delays that the doctor measured of
-    late devices.
+    """Correct the delays of late devices in merged recordings; return the recordings and a profile
+    that contains the delays.
 
-    `merge_with` merges the same recordings by another profile. Without a late device both stay as
-    they are.
+    The doctor measures the delays. `merge_with` merges the same recordings with a given profile. If
+    no device is late, both are returned unchanged.
     """
     signals = np.full((len(merged.t), len(CHANNELS)), np.nan)
     for index, name in enumerate(CHANNELS):
@@ -109,8 +109,8 @@ def align_import(
 
 
 def align_devices(t: FloatArray, signals: FloatArray, delays: Mapping[str, float]) -> FloatArray:
-    """Return signals (T, 18) with devices moved earlier by `delays` [s]; readings between
-    samples are linear.
+    """Return signals (T, 18) with the readings of late devices moved earlier by `delays` [s], by
+    linear interpolation between samples.
     """
     signals = signals.copy()
     for device, seconds in delays.items():
@@ -123,7 +123,7 @@ def align_devices(t: FloatArray, signals: FloatArray, delays: Mapping[str, float
 
 
 def _shift_channel(t: FloatArray, values: FloatArray, seconds: float, *, angle: bool) -> FloatArray:
-    """Return values (T,) as they were read `seconds` later; missing readings stay missing."""
+    """Return values (T,) moved earlier by `seconds`; missing readings stay missing."""
     at = t + seconds
     after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
     share = np.clip((at - t[after - 1]) / (t[after] - t[after - 1]), 0.0, 1.0)

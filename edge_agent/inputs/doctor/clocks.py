@@ -1,4 +1,4 @@
-"""Clocks of the devices, by the lags that the turns of a drive tell."""
+"""Delays of the devices, from the lags between their signals in the turns of a drive."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ LARGEST_LAG_S: Final = 0.085  # devices of sound cars lie within .06 s
 
 
 def wheels_speak_late(axle: Fit, seconds: float) -> bool:
-    """Return True if the wheels' yaw rate is late as well, by half of it at least."""
+    """Return True if the axle's yaw rate lags in the same direction as `seconds`, the measured lag
+    of the wheels, and by more than half of it.
+    """
     return (
         axle.is_known
         and np.isfinite(axle.lag_error_s)
@@ -43,11 +45,10 @@ def measure_clocks(
 
 
 def late_devices(diagnosis: Diagnosis) -> dict[str, float]:
-    """Return by how many seconds each device speaks late, by the lags that the turns of a drive
-    tell.
+    """Return the delay of each device [s], from the lags measured in the turns of a drive.
 
-    Wheels and steering that are early by the same time show that the yaw rate is late. Where the
-    accelerometer is not late against the wheels, the gyroscope is late alone.
+    If wheels and steering lead the yaw rate by about the same time, the inertial unit is late. If
+    the accelerometer is not late compared with the wheels, only the gyroscope is late.
     """
     wheel, steer = (diagnosis.lags.get(name, 0.0) for name in ("wheel_lag", "steer_lag"))
     if not (abs(wheel) > LARGEST_LAG_S and abs(wheel - steer) < 0.5 * abs(wheel)):

@@ -1,8 +1,8 @@
-"""ASAM MDF 4: measured channels, or a logged bus, by asammdf; its blocks are walked first.
+"""Reader of ASAM MDF 4 files: measured channels, or the frames of a logged bus.
 
-A block that points to itself or out of the file would keep a reader busy for ever: the chains of
-data groups, channel groups and channels, and the data lists, are followed once here, each address
-at most once.
+The library asammdf decodes the file. It can loop for ever on a block that points to itself or out
+of the file. Therefore `check_blocks` first follows the chains of data groups, channel groups,
+channels and data lists, and visits each address at most once.
 """
 
 from __future__ import annotations
@@ -92,8 +92,8 @@ def _linked_blocks(file: BinaryIO, address: int, size: int, path: Path) -> list[
 
 
 class MdfContent(NamedTuple):
-    """Content of a file: frames and the time of the first [s since 1970 UTC], or the channels of a
-    measurement.
+    """Content of a file: either frames and the time of the first one [s since 1970 UTC], or the
+    channels of a measurement.
     """
 
     frames: tuple[Log, float] | None
@@ -105,9 +105,9 @@ def read_isolated(path: Path, identifiers: set[int] | None, names: set[str] | No
 
     Args:
         path: the file.
-        identifiers: of the frames that are wanted, if it holds frames; None where nothing can
-            decode them.
-        names: of the channels that are wanted, if it is a measurement; None for all.
+        identifiers: frame identifiers to read from a bus log; None if no database can decode
+            them.
+        names: channels to read from a measurement; None for all.
 
     Raises:
         InputError: the file is broken, or asammdf is missing.
@@ -143,7 +143,7 @@ def has_frames(mdf: Any) -> bool:  # noqa: ANN401
 
 
 def mdf_frames(mdf: Any, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
-    """Frames of the wanted identifiers, and the time of the first one [s since 1970 UTC]."""
+    """Return the frames of the wanted identifiers, and the start of the log [s since 1970 UTC]."""
     log: Log = {}
     first = np.inf
     start = float(mdf.header.start_time.timestamp())
@@ -172,8 +172,9 @@ def mdf_frames(mdf: Any, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
 
 
 def read_mdf(mdf: Any, path: Path, wanted: set[str] | None) -> Recording:  # noqa: ANN401
-    """Channels of a measurement by name, all where none is asked for; of one name the first with
-    samples.
+    """Return the channels of a measurement by name; all if `wanted` is None.
+
+    If several channels have the same name, the first one with samples is used.
     """
     start = mdf.header.start_time.timestamp()
     recording = Recording(path.name, {}, round(start * NS) if start > 0 else None)

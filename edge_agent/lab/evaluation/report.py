@@ -1,4 +1,4 @@
-"""The Markdown report: made from the figures and from nothing else."""
+"""Markdown report, generated from the figures alone."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ SHOWN_LEVELS: Final = LEVELS[::2]
 
 
 def report(figures: Sequence[Figure], *, seeds: int) -> str:
-    """The whole report."""
+    """Return the complete report."""
     by_name = {figure.name: figure.value for figure in figures}
     barred = [figure for figure in figures if figure.bar is not None]
     held = sum(figure.holds for figure in barred)
@@ -114,7 +114,7 @@ def report(figures: Sequence[Figure], *, seeds: int) -> str:
 
 
 def table(values: dict[str, float]) -> str:
-    """Return printed figures next to ours."""
+    """Return a table of the figures printed in the papers next to those measured here."""
     rows = []
     for row in PRINTED:
         cells = (
@@ -127,12 +127,12 @@ def table(values: dict[str, float]) -> str:
 
 
 def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
+    """Return a Markdown table."""
     return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows))
 
 
 def number(values: dict[str, float], name: str, *, spread: bool = True) -> str:
-    """Mean, ± sd if wanted and known, or a dash where it was not measured."""
+    """Return a mean, with ± sd if wanted and known, as text; a dash if it was not measured."""
     value = values.get(name, math.nan)
     sd = values.get(f"{name}.sd")
     return (
@@ -143,7 +143,7 @@ def number(values: dict[str, float], name: str, *, spread: bool = True) -> str:
 
 
 def own_plants(barred: Sequence[Figure], values: dict[str, float]) -> str:
-    """The bars of paper 004, and the same figures on the simulator's own plants."""
+    """Return a table: the bars of paper 004, and the same figures on the simulator's own plants."""
     rows = []
     for bar in (figure for figure in barred if figure.name.startswith("papers.004.")):
         _, _, noise, measure = bar.name.split(".")
@@ -158,7 +158,7 @@ def own_plants(barred: Sequence[Figure], values: dict[str, float]) -> str:
 
 
 def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
-    """The bars for which there is an oracle, the default, and the oracle."""
+    """Return a table of the bars that have an oracle: bar, default estimator, oracle."""
     rows = []
     for bar in barred:
         name = f"oracle.{bar.name.removeprefix('papers.')}"
@@ -168,7 +168,7 @@ def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
 
 
 def world(values: dict[str, float]) -> str:
-    """One row per estimator in the rough world."""
+    """Return a table with one row per estimator in the rough world."""
     shown = {
         "coverage90": "coverage",
         "coverage90.ice": "on ice",
@@ -193,7 +193,7 @@ def world(values: dict[str, float]) -> str:
 
 
 def estimators(values: dict[str, float], prefix: str, suffix: str) -> list[str]:
-    """Names between a prefix and a suffix of figures, in their order."""
+    """Return the part of each figure's name between a prefix and a suffix, each once, in order."""
     found = [
         name[len(prefix) : -len(suffix)]
         for name in values
@@ -203,7 +203,7 @@ def estimators(values: dict[str, float], prefix: str, suffix: str) -> list[str]:
 
 
 def scenarios(values: dict[str, float], prefix: str, measures: Sequence[str]) -> str:
-    """One row per scenario and estimator."""
+    """Return a table with one row per scenario and estimator."""
     rows = []
     for found in estimators(values, prefix, ".rmse_vx"):
         scenario, _, estimator = found.rpartition(".")
@@ -213,7 +213,7 @@ def scenarios(values: dict[str, float], prefix: str, measures: Sequence[str]) ->
 
 
 def faults(values: dict[str, float]) -> str:
-    """One row per sensor fault."""
+    """Return a table with one row per sensor fault."""
     shown = ("coverage90", "width", "rmse_vx", "rmse_vy")
     rows = []
     for name, case in CASES.items():
@@ -248,12 +248,16 @@ def faults(values: dict[str, float]) -> str:
 
 
 def verdict(shares: Sequence[float]) -> str:
-    """Return whether something held in all drives of all estimators."""
+    """Return "yes" if all shares are 1, "NO" with the smallest one otherwise, a dash if there are
+    none.
+    """
     return "–" if not shares else "yes" if min(shares) == 1.0 else f"NO ({min(shares):.2g})"
 
 
 def consistency(values: dict[str, float]) -> str:
-    """One row per estimator: NEES and NIS over all scenarios, and how often within their bounds."""
+    """Return a table with one row per estimator: NEES and NIS over all scenarios, and the share of
+    values within their bounds.
+    """
     names = estimators(values, "reliability.", ".below_05")
     rows = []
     for name in names:
@@ -281,7 +285,7 @@ def consistency(values: dict[str, float]) -> str:
 
 
 def reliability(values: dict[str, float]) -> str:
-    """One row per estimator: share of truths below each stated quantile."""
+    """Return a table with one row per estimator: share of truths below each stated quantile."""
     rows = [
         [
             name,

@@ -1,8 +1,8 @@
-"""Oracle for visits: the evidence of an observer with knowledge of the motion and every tyre's
-force, but not the tyre.
+"""Oracle for visits: the evidence of an observer that knows the motion and the force of every
+tyre, up to noise.
 
-It bounds what any estimator can conclude from a visit. Unknown are the shape of the tyre's curve
-and its stiffness.
+It does not know the stiffness of the tyre and the shape of its force curve. Its evidence bounds the
+information that any estimator can gain from a visit.
 
     f    |F| / F_z, known with noise FORCE_STD          q    slip times stiffness per load, known with the wheels' noise
     f = μ F(k q / μ; c, e)                              c, e shape and curvature of the Magic
@@ -11,8 +11,9 @@ and its stiffness.
     ln L(μ) = ln mean over tyres of Π over wheels and samples N(f; μ F(k q/μ), FORCE_STD² + (slope ·
     σ_q)²) · p(q)
 
-p(q) is the slope, at least LEAST_SLOPE: drivers ask for a force, of which all are as likely, and
-the slip follows. Every EACH-th sample counts: errors are correlated over as many.
+p(q) is the prior of the slip. Drivers demand a force, and all forces are equally likely, so the
+density of the slip is the slope of the force curve, at least LEAST_SLOPE. Only every EACH-th sample
+is used, because the errors of successive samples are correlated.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ STIFFNESS_STD: Final = 0.12  # of ln k, as well as the vehicle file is known
 
 
 def tyres_drawn() -> FloatArray:
-    """Return (TYRES, 3) tyres: shape c, curvature e and stiffness factor k, always the same
-    ones.
+    """Return the same sample of tyres (TYRES, 3) at each call: shape c, curvature e and stiffness
+    factor k.
     """
     rng = np.random.default_rng(0)
     shape = np.clip(rng.normal(*SHAPE, TYRES), 1.2, 1.8)
@@ -53,8 +54,13 @@ def tyres_drawn() -> FloatArray:
 def visit_evidence(
     force: FloatArray, slip: FloatArray, speed: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return ln L (BINS,) of a visit, maximum 0: true f and q (T, 4) [1], speed (T,) [m/s]; rng
-    draws the noise.
+    """Return ln L (BINS,) of a visit, with maximum 0.
+
+    Args:
+        force: true f (T, 4) [1].
+        slip: true q (T, 4) [1].
+        speed: (T,) [m/s].
+        rng: draws the noise.
     """
     picked = slice(None, None, EACH)
     noise = STIFF * SPEED_STD / np.maximum(speed[picked], SLOWEST)
@@ -72,8 +78,8 @@ def visit_evidence(
 def _evidence(
     force: FloatArray, slip: FloatArray, noise: FloatArray, tyres: FloatArray
 ) -> FloatArray:
-    """Return ln L (TYRES, BINS) for each tyre by itself; noise: standard deviation of the slip
-    (T,).
+    """Return ln L (TYRES, BINS) for each of `tyres`; `noise` (T,) is the standard deviation of
+    q.
     """
     out = np.zeros((tyres.shape[0], BINS))
     for j in range(tyres.shape[0]):

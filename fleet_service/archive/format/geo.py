@@ -34,8 +34,8 @@ Pieces = Sequence[Sequence[int]]
 def with_cells(table: pa.Table) -> pa.Table:
     """Return a table with a column `cell` as a GeoParquet table with the cells' polygons.
 
-    If it has a `sector` too, a row's polygon is its quarter of the cell (grid.outline), so that no
-    row hides another.
+    If it also has a column `sector`, a row's polygon is the quarter of the cell that belongs to
+    that heading sector (grid.outline), so that no polygon covers another.
     """
     x, y = _cell_outlines(table, table["cell"].to_numpy())
     return _add_geo_metadata(
@@ -44,10 +44,10 @@ def with_cells(table: pa.Table) -> pa.Table:
 
 
 def with_stretches(table: pa.Table, cells: Pieces) -> pa.Table:
-    """Return a table whose rows consist of several cells as a GeoParquet table with one
-    multi-polygon per row.
+    """Return a GeoParquet table with one multi-polygon per row, for rows of several cells each.
 
-    With a column `sector`, the polygons are the quarters of that sector.
+    `cells` has the cells of each row. If the table has a column `sector`, each polygon is the
+    quarter of the cell that belongs to that heading sector.
     """
     count = np.array([len(own) for own in cells], np.int64)
     first = np.concatenate([[0], np.cumsum(count)])
@@ -110,8 +110,9 @@ def _ring_dtype(corners: int) -> np.dtype[Any]:
 def _cell_outlines(
     table: pa.Table, cells: IntArray, count: IntArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the corners (n, k) of cells, or of the sector of their row; `count` is the number
-    of cells per row.
+    """Return the corners (n, k) of cells, or of their quarters if the table has a column `sector`.
+
+    `count` is the number of cells per row.
     """
     if "sector" not in table.schema.names:
         return grid.outline(cells)
