@@ -74,7 +74,7 @@ class Drive:
 
 
 class ListeningTown:
-    """One drive, second by second."""
+    """Simulated town with its fusion and cars, advanced second by second for one drive."""
 
     def __init__(
         self, scenario: str, vehicles: int, seed: int, *, listening: bool, rough: float = 0.5
@@ -110,8 +110,8 @@ class ListeningTown:
         return self.drive
 
     def _check_intervals(self) -> list[bool]:
-        """Return whether the map's interval holds the last truth, for each place that several
-        vehicles visited.
+        """Return, for each place that several vehicles visited, whether the map's interval contains
+        the last truth.
         """
         place = np.array(list(self._true), np.int64)
         slots = self.fusion.slots_of(place // grid.SECTORS, place % grid.SECTORS)
@@ -166,7 +166,7 @@ class ListeningTown:
             self.heard.store_alert(decode_alert_message(key, wire.encode_alert(alert), now), now)
 
     def _hear(self, second: int) -> None:
-        """Pass on the changed tiles, and repeat the standing alerts."""
+        """Pass changed tiles to the cars, and repeat the active alerts."""
         now = self._now()
         for alert in self.alerts.standing_alerts:
             self.heard.store_alert(alert, now)
@@ -233,7 +233,7 @@ class ListeningTown:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Drive all seeds both ways and write the figures."""
+    """Run every seed with and without listening cars, and write the figures."""
     parser = argparse.ArgumentParser(
         prog="deploy.listening", description=(__doc__ or "").splitlines()[0]
     )

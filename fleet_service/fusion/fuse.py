@@ -42,11 +42,11 @@ class Updated(NamedTuple):
     """Outcome of an update for each observation (n,), and the slots that changed.
 
     Attributes:
-        late: True for an observation that came after the checkpoint, or was one too many and so not
-            fused.
-        late_by: how much later than its own time a late one was fused [ns]; 0 for one in time or
-            not fused.
-        weight: weight that was used; 0 where nothing was fused.
+        late: True for an observation that is older than the checkpoint, or that was not fused
+            because too many visits of its vehicle to the cell were in the window.
+        late_by: delay between the time of a late observation and the time at which it is fused
+            [ns]; 0 if it is in time or not fused.
+        weight: weight that was used; 0 if the observation was not fused.
         slots: slots that changed, (k,).
     """
 
@@ -70,8 +70,8 @@ class Fusion:
     Args:
         lateness_s: L [s]; an observation older than the checkpoint is late, and is fused with aged
             evidence.
-        enrolled: only vehicles of an enrolment file are fused; a vehicle that nobody met yet then
-            has its whole weight.
+        enrolled: True if only vehicles of an enrolment file are fused; an unknown vehicle then has
+            full weight.
 
     Attributes:
         enrolled: as above.
@@ -94,7 +94,7 @@ class Fusion:
         self._shape = UNKNOWN_SHAPE
 
     def resume(self, epoch: int | None, standings: list[Standing], reports: Reports) -> None:
-        """Go on from an epoch, the standings since, and the weather; the store is set before."""
+        """Continue from a checkpoint: its epoch, standings and weather; the caller has set `store`."""
         self._epoch = epoch
         self.standings = standings
         self.reports = reports
@@ -138,7 +138,7 @@ class Fusion:
 
     @property
     def next_epoch(self) -> int:
-        """First time [ns] of which no observation was taken yet; 0 before the first."""
+        """First time [ns] that lies after all fused epochs; 0 before the first observation."""
         return 0 if self._epoch is None else (self._epoch + 1) * c.EPOCH_NS
 
     def update(self, o: Observations, before: Before | None = None) -> Updated:
@@ -195,17 +195,21 @@ class Fusion:
         return Updated(late, late_by, used, distinct_values(np.concatenate(touched)))
 
     def untouched(self, before: int) -> BoolArray:
-        """Slots (size,) of which nobody told anything since `before` [ns]; see `drop`."""
+        """Return True for each slot (size,) whose last visit was before `before` [ns] and that
+        nothing else refers to; see `drop`.
+        """
         return self.store.untouched(before)
 
     def drop(self, dropped: BoolArray) -> IntArray:
-        """Drop slots (size,) that are `untouched`, as if nobody had ever been there; returns where
-        each slot went, -1 for those that are gone."""
+        """Delete slots (size,) that are `untouched`; return the new number of each slot, -1 for
+        deleted ones.
+        """
         return self.store.drop(dropped)
 
     def update_weather(self, reports: Reports) -> None:
-        """Take in weather; each report must act from `next_epoch` on at the earliest, or the map
-        depends on when it came."""
+        """Add weather reports. None may apply before `next_epoch`, because otherwise the map would
+        depend on the time of arrival.
+        """
         columns = (
             np.concatenate([getattr(r, f.name) for r in (self.reports, reports)])
             for f in fields(Reports)
@@ -218,25 +222,24 @@ class Fusion:
         self._weather = weather_of(self.reports)
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
-        """Belief of each slot about its road, (k, 32), with what time did to it until `now` [ns],
-        and with what slippery neighbours tell of it."""
+        """Return the belief about the road of each slot, (k, 32), predicted to `now` [ns],
+        including the evidence of slippery neighbours.
+        """
         return self._read(KERNELS[shape_class(self._shape.reader)], slots, np.full(len(slots), now))
 
     def believed(self, slots: IntArray) -> FloatArray:
-        """Belief of each slot about its road, (k, 32), at its last observation."""
+        """Return the belief about the road of each slot, (k, 32), at its last observation."""
         return self._read(KERNELS[shape_class(self._shape.reader)], slots, self.live.time[slots])
 
     def slippery(self, slots: IntArray) -> FloatArray:
-        """P(slippery) of each slot's road at its last observation by its own reports alone,
-        (k,).
-        """
+        """Return P(slippery) of each slot (k,) at its last observation, from its own reports alone."""
         return _slippery_probability(
             self.store.state.live, SLIPPERY_WEIGHTS[shape_class(self._shape.reader)], slots
         )
 
     def alarming(self, slots: IntArray) -> FloatArray:
-        """As `believed`, with the doubt about gentle values that an alarm has to bear, see
-        `shared`.
+        """Return the same as `believed`, but with the upper end of the range of the slope, which
+        alarms assume for gentle values; see `shared`.
         """
         return self._read(KERNELS[shape_class(self._shape.alarm)], slots, self.live.time[slots])
 
@@ -246,11 +249,11 @@ class Fusion:
         )
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
-        """Slot of each cell and sector, -1 where nobody was."""
+        """Return the slot of each cell and sector, -1 if no vehicle has reported it."""
         return self.store.slots_of(cell * grid.SECTORS + sector)
 
     def trust(self, vehicle: int) -> float:
-        """Weight of a vehicle's next vote."""
+        """Return the weight of a vehicle's next vote."""
         return float(self.standings[-1].weights(self._index(vehicle))[0])
 
     def _index(self, vehicle: int) -> IntArray:
@@ -362,8 +365,9 @@ def voted_keys(o: Observations) -> IntArray:
 
 
 def _spread_votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
-    """Votes of some observations: row, key and share; those of other cells and of a second
-    sector too; by time.
+    """Return the votes of some observations, sorted by time: row, key and share.
+
+    An observation may also vote on a second sector and on neighbouring cells.
     """
     own = 1.0 - o.other_share[rows].sum(axis=1)
     key = o.cell[rows] * grid.SECTORS
@@ -390,7 +394,7 @@ def _spread_votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, 
 
 
 def _drop_old_reports(reports: Reports, oldest: int) -> Reports:
-    """Without those that ended before `oldest` [ns]."""
+    """Return the reports without those that ended before `oldest` [ns]."""
     return reports.take(reports.time >= oldest - 4 * 3600 * NS)
 
 

@@ -1,4 +1,4 @@
-"""Scores of answers: coverage, error, interval score, by the number of excited vehicles. Pure."""
+"""Scores of map answers against the truth: coverage, error, interval score and calibration. Pure."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ LEVELS: Final = np.linspace(0.05, 0.95, 19)
 
 @dataclass(frozen=True)
 class Scores:
-    """Answers next to the truth, (k,).
+    """Scores of k answers of the map, each (k,).
 
-    `vehicles` are the distinct excited ones that had been there. `slippery` is the answer's
-    P(slippery), and `crps` its continuous ranked probability score; both NaN where an answer is an
-    interval and no distribution.
+    `vehicles` is the number of distinct excited vehicles that had visited the cell. `slippery` is
+    the answer's P(slippery), and `crps` its continuous ranked probability score; both are NaN if
+    an answer is an interval and not a distribution.
     """
 
     vehicles: IntArray
@@ -45,12 +45,12 @@ class Scores:
     crps: FloatArray
 
     def taken(self, rows: BoolArray) -> Scores:
-        """Some of the answers."""
+        """Return the scores of the answers that `rows` selects."""
         return Scores(*(column[rows] for column in vars(self).values()))
 
 
 def join_scores(scores: list[Scores]) -> Scores:
-    """All answers of several runs."""
+    """Return the scores of several runs as one."""
     return Scores(
         *(
             np.concatenate(columns)
@@ -60,8 +60,8 @@ def join_scores(scores: list[Scores]) -> Scores:
 
 
 def excited_vehicles(v: Visits, town: Town, minute: int, vehicles: int) -> IntArray:
-    """Distinct excited vehicles that reported each cell until then, and since its surface
-    changed, (CELLS,).
+    """Return the number of distinct excited vehicles that reported each cell before `minute` and
+    after the last change of its surface, (CELLS,).
     """
     since = np.where(town.changed <= minute, town.changed, 0.0) * 60.0
     rows = v.excited & (v.seconds < 60.0 * minute) & (v.seconds >= since[v.place])
@@ -71,7 +71,7 @@ def excited_vehicles(v: Visits, town: Town, minute: int, vehicles: int) -> IntAr
 
 
 def earlier_visits(v: Visits, until_s: float, vehicles: int) -> IntArray:
-    """Visits of each vehicle until then, (vehicles,)."""
+    """Return the number of visits of each vehicle before `until_s`, (vehicles,)."""
     return np.bincount(v.vehicle[v.seconds < until_s], minlength=vehicles)
 
 
@@ -84,8 +84,10 @@ def of_intervals(
     rank: FloatArray,
     slippery: FloatArray,
 ) -> Scores:
-    """Scores of 90 % intervals, all (k,). Interval score: width, and 2/α for each unit by which
-    the truth is missed.
+    """Return the scores of 90 % intervals, all (k,).
+
+    The interval score is the width plus 2/α times the distance by which the interval misses the
+    truth.
     """
     missed = np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0)
     interval = upper - lower + 2.0 / ALPHA * missed
@@ -104,7 +106,9 @@ def of_intervals(
 
 
 def of_beliefs(belief: FloatArray, truth: FloatArray, vehicles: IntArray) -> Scores:
-    """Scores of beliefs (k, 32); `rank` is P(μ ≤ truth), uniform where the beliefs are right."""
+    """Return the scores of beliefs (k, 32); `rank` is P(μ ≤ truth), which is uniform for calibrated
+    beliefs.
+    """
     lower, mid, upper = (mugrid.quantiles(belief, q) for q in (0.05, 0.5, 0.95))
     place = np.clip(
         (truth - mugrid.LOWER) / (mugrid.UPPER - mugrid.LOWER) * mugrid.BINS,
@@ -143,7 +147,9 @@ def score_snapshots(
     vehicles: int,
     where: BoolArray | bool = True,
 ) -> Scores:
-    """Scores of the cells `where` an excited vehicle was, at some minutes."""
+    """Return the scores at the minutes `at`, of those cells of `where` that an excited vehicle has
+    reported.
+    """
     out = []
     for minute in at:
         n = excited_vehicles(v, town, minute, vehicles)
@@ -153,31 +159,31 @@ def score_snapshots(
 
 
 def rmse(s: Scores) -> float:
-    """Root mean square error where ENOUGH excited vehicles were."""
+    """Return the root mean square error of cells with at least ENOUGH excited vehicles."""
     error = s.error[s.vehicles >= ENOUGH]
     return float(np.sqrt(np.mean(error**2))) if len(error) else float("nan")
 
 
 def coverage(s: Scores) -> float:
-    """Share of the truths inside the interval."""
+    """Return the share of truths inside the interval."""
     return float(s.covered.mean()) if len(s.covered) else float("nan")
 
 
 def safe_share(s: Scores) -> float:
-    """Share of the truths above the lower end, on which the deceleration that is called safe at
-    95 % rests.
+    """Return the share of truths above the lower end, from which the 95 % safe deceleration is
+    computed.
     """
     return float((s.rank >= ALPHA / 2.0).mean()) if len(s.rank) else float("nan")
 
 
 def of_class(s: Scores, n: int) -> Scores:
-    """The answers of a class of COUNTS, which reaches to the next."""
+    """Return the answers with `n` excited vehicles or more, but fewer than the next of COUNTS."""
     edges = (*COUNTS[1:], np.iinfo(np.int64).max)
     return s.taken((s.vehicles >= n) & (s.vehicles < edges[COUNTS.index(n)]))
 
 
 def by_surface(s: Scores) -> dict[str, float]:
-    """Share of the truths inside the interval, by SURFACES."""
+    """Return the share of truths inside the interval for each of SURFACES."""
     return {
         name: coverage(s.taken((s.truth > above) & (s.truth <= to)))
         for name, (above, to) in SURFACES.items()
@@ -185,8 +191,9 @@ def by_surface(s: Scores) -> dict[str, float]:
 
 
 def calibration(scores: Sequence[Scores]) -> FloatArray:
-    """Calibration of P(slippery) in BINS of it: answers, mean of the given probabilities, share of
-    truths that were slippery, (BINS, 3).
+    """Return the calibration table of P(slippery), (BINS, 3).
+
+    Columns: number of answers, mean of their P(slippery), and share of truths that were slippery.
     """
     given = np.concatenate([s.slippery for s in scores])
     truth = np.concatenate([s.truth for s in scores]) < SLIPPERY_MU
@@ -197,14 +204,14 @@ def calibration(scores: Sequence[Scores]) -> FloatArray:
 
 
 def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
-    """Return how good P(slippery) is over all answers: `brier`, `log`, `ece`, `missed` and
+    """Return scores of P(slippery) over all answers: `brier`, `log`, `ece`, `missed` and
     `grip_raised`.
 
     `ece` is the expected calibration error over BINS bins, weighted by answers (Naeini et al.,
     2015). `missed` is the share of truly slippery cells given less than MISSED, `grip_raised` that
-    of cells with grip (μ > SURE_GRIP) given more than RAISED. The worst bin of a few ways is no
-    criterion: all cells of a way share one snow, and a map that is calibrated passes it in a third
-    of the campaigns.
+    of cells with grip (μ > SURE_GRIP) given more than RAISED. The worst bin is not used:
+    all cells of a simulated way share one snow, so that even a calibrated map passes a limit on it
+    in a third of the campaigns only.
     """
     given = np.concatenate([s.slippery for s in scores])
     truth = np.concatenate([s.truth for s in scores])
@@ -221,9 +228,7 @@ def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
 
 
 def false_grip(s: Scores) -> float:
-    """Return the share of truths below the interval: road that is more slippery than the map
-    vouches for.
-    """
+    """Return the share of truths below the interval: road more slippery than the map states."""
     return _mean_or_nan(s.rank < ALPHA / 2.0)
 
 
@@ -239,7 +244,7 @@ def _mean_or_nan(values: FloatArray | BoolArray) -> float:
 
 
 def reliability(s: Scores) -> FloatArray:
-    """Share of truths below each of LEVELS, which the levels themselves would be if the beliefs
-    were right.
+    """Return the share of truths below the quantile of each of LEVELS; equal to LEVELS for
+    calibrated beliefs.
     """
     return np.asarray((s.rank[:, None] <= LEVELS).mean(axis=0))

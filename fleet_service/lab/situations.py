@@ -1,7 +1,7 @@
-"""Situations in which a map deceives itself: bounds by the hundred, an outage, gentle drivers on
-ice, a wet curve.
+"""Short situations in which a fused map can become wrong: many lower bounds, an outage, gentle
+drivers on ice, a wet curve.
 
-Each is as short as it can be; the truth is known by construction. Pure.
+The truth is known by construction. Pure.
 """
 
 from __future__ import annotations
@@ -41,8 +41,11 @@ VALUED: Final = 0.3  # of such passes look like values: a tenth to a third with 
 
 
 def bound_excess(used: float, path: str) -> float:
-    """Lower end less `used`, or than the prior's, after BOUNDED vehicles that used so much, by
-    one path of the wire.
+    """Return by how much the lower end of the interval exceeds `used`, or the prior's lower end if
+    that is larger.
+
+    BOUNDED vehicles have used this much grip and reported it along one `path` (encoding and kind of
+    report).
     """
     n = BOUNDED
     nan = float("nan")
@@ -81,7 +84,7 @@ def bound_excess(used: float, path: str) -> float:
 
 
 def _decode_batch(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
-    """A batch as the service reads it from its bytes."""
+    """Encode a batch and return the observations that the service decodes from the bytes."""
     payload = wire.encode(batch)
     encoding = wire.ENCODING[Kind.OBSERVATION]
     if as_json:
@@ -100,14 +103,14 @@ def _decode_batch(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
 
 
 def lower_excess() -> float:
-    """The worst of all grips used and paths."""
+    """Return the largest `bound_excess` over all of USED and all paths."""
     paths = ("protobuf posterior", "json posterior", "protobuf likelihood", "json likelihood")
     return max(bound_excess(used, path) for used in USED for path in paths)
 
 
 def backlog_fused(rng: Generator) -> float:
-    """Share of an hour's rows that are fused when they come after an outage, while another
-    vehicle drives on.
+    """Return the share of late rows that are fused if an hour's rows arrive after an outage, while
+    another vehicle had a connection all the time.
     """
     place = town.draw_town(rng, 60, 0.0)
     errors = Errors.draw(rng, BACKLOG + 1)
@@ -123,9 +126,12 @@ def backlog_fused(rng: Generator) -> float:
 
 
 def safe_excess(rng: Generator) -> float:
-    """Safe deceleration less the truth's half an hour after black ice came under drivers who use a
-    fifth of the grip, on a road that was dry for an hour; the weather is known to be FREEZING_C,
-    and nothing falls."""
+    """Return the safe deceleration of the map minus the true one [m/s²], 30 minutes after black ice
+    formed.
+
+    The road was dry for an hour. On the ice the drivers use a fifth of the grip. The weather report
+    states FREEZING_C and no precipitation.
+    """
     seconds: FloatArray = np.concatenate(
         [np.sort(rng.random(60)) * HOUR_S, HOUR_S + np.sort(rng.random(60)) * 1800.0]
     )
@@ -192,7 +198,7 @@ def false_alert(rng: Generator) -> bool:
 
 
 def measure(seeds: range) -> dict[str, float]:
-    """All situations."""
+    """Run all situations and return their figures."""
     few = seeds[:4]
     return {
         "fusion.bounds.lower_excess": lower_excess(),

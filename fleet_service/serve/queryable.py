@@ -111,12 +111,12 @@ class _TokenBucket:
 
 
 class MapQueryable:
-    """Callback of the queryables.
+    """Handler of map queries: answers cheap ones at once, and queues or refuses expensive ones.
 
     Args:
-        answering: counts and makes answers.
-        counts: takes `queries`, `heavy_queries`, `refused_queries`, `bad_queries.FIELD` and
-            `answer_failures`.
+        answering: estimates the size of answers and produces them.
+        counts: counter that is increased under `queries`, `heavy_queries`, `refused_queries`,
+            `bad_queries.FIELD` and `answer_failures`.
     """
 
     def __init__(self, answering: Answering, counts: Counter[str]) -> None:

@@ -51,7 +51,7 @@ class Visitors:
 
     @property
     def newest(self) -> int:
-        """Return the begin of the newest part of the window [ns]."""
+        """Return the time [ns] at which the newest part of the window begins."""
         return self._part * PART_NS
 
     def count(self, slots: IntArray, now: int) -> IntArray:

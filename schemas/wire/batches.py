@@ -1,8 +1,8 @@
-"""One batch from its bytes, and what every decoder shares: heads, checks, and the columns that a
-sender may leave out.
+"""Decoder of one batch, and the parts that every decoder shares: heads, checks, and the columns
+that a sender may leave out.
 
 A column that is not sent is filled: floats with NaN, the cell and the sector from the pose, the
-leaving time from the entering one. Many batches at once, at speed: `schemas.runtime.batch_decoder`.
+leaving time with the entering time. `schemas.runtime.batch_decoder` decodes many batches at once.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Head(NamedTuple):
 
 
 class Heads(NamedTuple):
-    """The same of k batches, by column."""
+    """Heads of k batches, one column per field."""
 
     kind: Kind
     vehicle: list[str]
@@ -57,7 +57,7 @@ class Heads(NamedTuple):
     estimator: list[str]
 
     def at(self, index: int) -> Head:
-        """The head of one."""
+        """Return the head of the batch at an index."""
         return Head(
             self.kind,
             self.vehicle[index],
@@ -69,7 +69,7 @@ class Heads(NamedTuple):
         )
 
     def take(self, kept: BoolArray) -> Heads:
-        """Some of them."""
+        """Return the heads that `kept` selects."""
         return Heads(
             self.kind,
             list(compress(self.vehicle, kept)),
@@ -82,16 +82,16 @@ class Heads(NamedTuple):
 
 
 class Decoded(NamedTuple):
-    """The good ones of several messages.
+    """The k valid batches among several messages.
 
     Attributes:
-        indices: which messages these are, (k,).
-        heads: of each.
-        sizes: records of each, (k,).
+        indices: index of the message of each batch, (k,).
+        heads: heads of the batches.
+        sizes: number of records of each batch, (k,).
         columns: every column of the kind's table, all records one after the other, (n,);
             `log_likelihood` is (n, 32).
         with_likelihood: whether a record came with one, (n,).
-        errors: index and reason of each message that is no batch.
+        errors: index and error of each message that is not a valid batch.
     """
 
     indices: list[int]
@@ -103,12 +103,12 @@ class Decoded(NamedTuple):
 
 
 class PresentColumns(NamedTuple):
-    """Which columns the senders of k batches gave.
+    """Presence of columns in k batches.
 
     Attributes:
-        kind: of all batches.
-        sizes: records of each, (k,).
-        columns: name of every column → whether each batch came with it, (k,).
+        kind: kind of all batches.
+        sizes: number of records of each batch, (k,).
+        columns: name of every column → True for each batch that contains it, (k,).
     """
 
     kind: Kind
@@ -116,12 +116,12 @@ class PresentColumns(NamedTuple):
     columns: dict[str, BoolArray]
 
     def records(self, name: str) -> BoolArray:
-        """Which records come with a column, (n,)."""
+        """Return True for each record (n,) whose batch contains a column."""
         return np.repeat(self.columns[name], self.sizes)
 
 
 def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN401 protobuf messages are untyped
-    """A batch as the protobuf library reads it, its columns of one length.
+    """Parse a batch with the protobuf library and check that its columns have equal lengths.
 
     Raises:
         WireError: too large, not the message, no needed column, or columns of unequal length.
@@ -132,9 +132,7 @@ def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN40
 
 
 def head_of(kind: Kind, payload: bytes, encoding: str) -> Head | None:
-    """The head of a batch whose records cannot be used; None where not even that can be read, as
-    of another format.
-    """
+    """Return the head of a batch whose records are invalid; None if the head is unreadable too."""
     try:
         found = parse(payload, encoding, MESSAGES[kind], ENCODING[kind])
     except WireError:
@@ -181,7 +179,7 @@ def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
 
 
 def _read_column(message: Any, name: str, dtype: np.dtype[Any], n: int) -> NDArray[Any]:  # noqa: ANN401
-    """A column of a message as it was sent (integers wide), or filled."""
+    """Return a column of a message, integers as int64; if it was not sent, filled."""
     values = getattr(message, name)
     if name == LIKELIHOOD:
         return np.frombuffer(values or bytes(n * mugrid.BINS), np.uint8).reshape(n, mugrid.BINS)
@@ -214,8 +212,8 @@ def _check(message: Any, kind: Kind) -> None:  # noqa: ANN401
 
 
 def complete(found: Decoded, sent: PresentColumns) -> Decoded:
-    """Derive what follows from the pose; drop messages of which a number does not fit, or that
-    have no place.
+    """Fill the columns that follow from the pose; drop messages without a position, or with a
+    number that does not fit its column.
     """
     kind = sent.kind
     columns = found.columns
@@ -260,8 +258,9 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
 
 
 def _derive(columns: Columns, sent: PresentColumns, unplaced: BoolArray) -> None:
-    """Fill the columns that a sender of observations may leave out. `unplaced`: rows without a
-    cell, at a finite position.
+    """Fill the columns that a sender of observations may leave out.
+
+    `unplaced` is True for rows that have a finite position but no cell.
     """
     without = ~sent.records("leave_time")
     columns["leave_time"] = np.where(without, columns["enter_time"], columns["leave_time"])
@@ -278,7 +277,7 @@ def _derive(columns: Columns, sent: PresentColumns, unplaced: BoolArray) -> None
 
 
 def _with_regions(found: Decoded, columns: Columns) -> Heads:
-    """Heads, with the region of the first record where the sender did not name it."""
+    """Return the heads; a missing region is taken from the first record of the batch."""
     heads = found.heads
     region_missing = found.heads.region == 0
     if not region_missing.any():

@@ -81,7 +81,7 @@ def smooth_twice(x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
 
 
 def interpolate_near(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray:
-    """Readings at other times, linear where they are near enough, else NaN."""
+    """Return readings interpolated linearly at other times; NaN if no reading is near enough."""
     good = np.isfinite(x)
     if good.sum() < 2:
         return np.full(len(at), np.nan)
@@ -95,7 +95,7 @@ def interpolate_near(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray
 def over_ground(
     t: FloatArray, latitude: FloatArray, longitude: FloatArray, at: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Speed [m/s] and course [rad] at times, from fixes half of FIX_S before and behind."""
+    """Return speed [m/s] and course [rad] at given times, from fixes FIX_S / 2 before and after."""
     north = interpolate_near(t, np.radians(latitude) * EARTH_RADIUS_M, at)
     east = interpolate_near(t, np.radians(longitude) * EARTH_RADIUS_M, at) * np.cos(
         np.radians(np.nanmean(latitude))
@@ -114,10 +114,10 @@ def over_ground(
 def prepare_drive(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None
 ) -> EvenDrive:
-    """Signals (T, 18) at times t (T,) [s] as a drive.
+    """Return signals (T, 18) as an evenly sampled, smoothed drive.
 
     Args:
-        t: times.
+        t: times (T,) [s].
         signals: the channels; readings of a wheel far off the median of the four are left out.
         vehicle: its radius, tracks and wheelbase.
         ground: the receiver's own speed (T,) [m/s], where it was recorded; it is better than that
@@ -185,7 +185,7 @@ def prepare_drive(
 
 
 def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
-    """Return where a wheel spins or locks, (n,), by comparison of the wheels (n, 4), in any unit.
+    """Return True where a wheel spins or locks, (n,), by comparing the wheels (n, 4), in any unit.
 
     Front and rear wheels of a side roll nearly alike, in turns as well; a constant difference is
     another tyre. A wheel that is off all along is left out: it is a separate fault and would hide
@@ -211,8 +211,8 @@ def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
 
 
 def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
-    """Return where the wheels' speed leaves that over ground (n,), in any unit: all wheels spin
-    or lock together.
+    """Return True where the speed of the wheels differs from that over ground, (n,), in any unit:
+    all wheels spin or lock together.
     """
     known = np.isfinite(v) & np.isfinite(v_ground) & (np.abs(v) > 0.3 * fast)
     if known.sum() < 5 * RATE_HZ:
@@ -228,7 +228,7 @@ def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
 
 
 def _nearest_yaw(t: FloatArray, yaw: FloatArray, at: FloatArray) -> FloatArray:
-    """The nearest reading of a sparse angle, which must not be averaged across its end."""
+    """Return the nearest reading of a sparse angle; averaging across ±π would be wrong."""
     good = np.flatnonzero(np.isfinite(yaw))
     if len(good) < 2:
         return np.full(len(at), np.nan)

@@ -1,9 +1,12 @@
 """Comparison of quantities that are equal by physics: gain, offset, lag and confidence.
 
-identity left right checks lateral a_y v · r unit and sign of a_y, v, r longitudinal a_x dv/dt unit
-and sign of a_x, v steering δ · v L · r unit and sign of δ, v, r (plus a term understeer · v² r)
-axle r_w r which wheel is left, v, r ground v_g v unit of v: the wheels' radius turning d course r
-sign and unit of r
+identity       left        right    checks
+lateral        a_y         v · r    unit and sign of a_y, v, r
+longitudinal   a_x         dv/dt    unit and sign of a_x, v
+steering       δ · v       L · r    unit and sign of δ, v, r (plus a term understeer · v² r)
+axle           r_w         r        which wheel is left, v, r
+ground         v_g         v        unit of v: the wheels' radius
+turning        d course    r        sign and unit of r
 """
 
 from __future__ import annotations
@@ -37,8 +40,9 @@ CORRELATED_S: Final = 1.0  # that far apart two moments tell different things
 
 @dataclass(frozen=True)
 class Fit:
-    """Result of the fit left = gain · right + offset (+ further terms): `error` of ln |gain| (std),
-    correlation, lag of left [s].
+    """Result of the fit left = gain · right + offset (+ further terms).
+
+    `error` is the standard deviation of ln |gain|, `lag_s` the delay of `left` [s].
     """
 
     gain: float
@@ -64,12 +68,12 @@ NOTHING: Final = Fit(np.nan, np.nan, 0.0, np.inf, 0.0, 0.0, np.inf, np.zeros(0),
 
 
 class Relation(NamedTuple):
-    """The two sides (n,) of an identity, further terms of the left side, and the terms that the
-    offset depends on, where it is not constant.
+    """The two sides `left` and `right` (n,) of an identity, with further terms.
 
-    `bend` (n,) is given where the left side may also grow by a share of right · bend that a drive
-    may not separate from the gain: at one speed, understeer and a gain of the steering are the
-    same. `loose` are standard deviations of the gains of the further terms, for the same reason.
+    The left side may have further terms. If the offset is not constant, it is multiplied by `per`
+    (n,). If `bend` (n,) is given, the left side also has an unknown share of right · bend: at
+    one speed, understeer cannot be separated from a gain of the steering. `loose` are prior
+    standard deviations of the gains of the last further terms, for the same reason.
     """
 
     left: FloatArray
@@ -133,7 +137,7 @@ IDENTITIES: Final[dict[str, Callable[[EvenDrive], Relation]]] = {
 
 
 def fit_identities(drive: EvenDrive) -> dict[str, Fit]:
-    """Every identity of a drive."""
+    """Fit every identity to a drive; return the results by name."""
     return {
         name: fit_identity(sides(drive), drive.moving, drive.grips, level=name == "ground")
         for name, sides in IDENTITIES.items()
@@ -150,8 +154,8 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
     Args:
         sides: the two sides of the identity.
         moving: (n,) 1 where the car moves.
-        grips: (n,) 0 where the wheels' speed is not the car's; the lag is measured there as well.
-        level: no offset, and every moving moment is excited: a quantity that is itself large.
+        grips: (n,) 0 where wheels slip; these samples count for the lag, but not for the fit.
+        level: fit without offset, and use every moving sample as excited.
     """
     left = sides.left
     right = sides.right
@@ -236,11 +240,11 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
 def _bend_of(
     x: FloatArray, y: FloatArray, constant: FloatArray, bend: FloatArray, count: float
 ) -> tuple[float, float]:
-    """Return the share of `bend` in the right side, and the standard deviation of ln gain from its
-    uncertainty.
+    """Return the share of `bend` in the right side, and the standard deviation of ln gain that
+    follows from the uncertainty of this share.
 
-    Each share is tried: the residual of the left side, over `count` independent moments, plus its
-    deviation from usual cars.
+    The share is the posterior mean over BENDS. Its cost is the residual of the left side over
+    `count` independent moments plus the squared deviation from usual cars.
     """
     costs = np.zeros(len(BENDS))
     gains = np.zeros(len(BENDS))
@@ -259,8 +263,9 @@ def _bend_of(
 def _fit_with_priors(
     table: FloatArray, y: FloatArray, loose: tuple[float, ...], count: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Robust least squares with the last columns' gains drawn to zero, and standard deviations
-    of all gains.
+    """Return gains by robust least squares, and their standard deviations.
+
+    The gains of the last columns have a prior with mean 0 and the standard deviations `loose`.
     """
     solution = fit_robustly(table, y)
     off = np.abs(y - table @ solution)
@@ -279,7 +284,7 @@ def _fit_with_priors(
 
 
 def _gains_of_parts(x: FloatArray, y: FloatArray, excited: BoolArray) -> tuple[float, ...]:
-    """Gains of the parts of the excited time, in the order of time."""
+    """Return the gain of each of PARTS parts of the excited time, in order of time."""
     rows = np.flatnonzero(excited)
     found = []
     for part in np.array_split(rows, PARTS):
@@ -309,9 +314,7 @@ def fit_robustly(table: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def shift_series(x: FloatArray, seconds: float) -> FloatArray:
-    """x at times later by `seconds`: positive moves it back to where it belongs when it is
-    early.
-    """
+    """Return x delayed by `seconds`; a positive value corrects a signal that is early."""
     n = np.arange(len(x))
     good = np.isfinite(x)
     if good.sum() < 2:
@@ -322,11 +325,10 @@ def shift_series(x: FloatArray, seconds: float) -> FloatArray:
 
 
 def lag_of(left: FloatArray, right: FloatArray, moving: FloatArray) -> tuple[float, float]:
-    """Return by how many seconds `left` is behind `right`, by the peak of |correlation|, and its
-    error; infinite where unknown.
+    """Return the delay of `left` relative to `right` [s], from the peak of |correlation|, and its
+    error, infinite if unknown.
 
-    The lags of the two halves of the drive are compared as well: their difference adds to the
-    error.
+    The error grows with the difference between the lags of the two halves of the drive.
     """
     lag, sharp = _correlation_peak(left, right, moving)
     if not sharp:

@@ -43,11 +43,11 @@ LEAD: Final = {"wheel_lag": 0.013, "steer_lag": 0.017}
 def find_lags(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, least: float = LEAST_LIKE
 ) -> dict[str, float]:
-    """Lags [s] of a drive, t (T,) [s] and signals (T, 18), by quantity; those that its turns do not
-    tell are left out.
+    """Return the lags [s] of a drive by quantity, from t (T,) [s] and signals (T, 18).
 
-    `least` is the correlation from which on a lag is believed. Signals are smoothed less than the
-    doctor's: over half a second the peak is too round to tell milliseconds.
+    A lag whose correlation is below `least` is left out. Signals are smoothed less than in the
+    doctor's other checks, because after smoothing over half a second the peak of the correlation is
+    too flat for a resolution of milliseconds.
     """
     at = np.arange(t[0], min(t[-1], t[0] + LONGEST_DRIVE_S), 1.0 / RATE_HZ)
 
@@ -93,7 +93,7 @@ class _Peak(NamedTuple):
 def _find_delay(
     left: FloatArray, right: FloatArray, among: BoolArray, least: float
 ) -> _Peak | None:
-    """Return by how much `left` is behind `right`; None where the drive does not tell."""
+    """Return the delay of `left` relative to `right`; None if the drive does not determine it."""
     most = round(LONGEST_S * RATE_HZ)
     among = among.copy()
     among[: most + 1] = among[len(among) - most - 1 :] = False
@@ -118,7 +118,7 @@ def _find_delay(
 
 
 def _bicycle_yaw_rate(speed: FloatArray, steering: FloatArray, vehicle: Vehicle) -> FloatArray:
-    """Yaw rate that the vehicle file's bicycle makes of the steering, by the trapezoidal rule."""
+    """Return the yaw rate of a bicycle model with the measured steering, by the trapezoidal rule."""
     m = vehicle.mass
     inertia = vehicle.yaw_inertia
     a = vehicle.cg_to_front_axle

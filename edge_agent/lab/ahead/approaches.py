@@ -68,8 +68,8 @@ class _Raised:
 
 @dataclass
 class _Track:
-    """Track of one car: metre, speed, friction and the least friction next to it at each look, and
-    the warnings by name.
+    """Record of one car: at each second the distance driven [m], speed [m/s], friction, and least
+    friction near the car; and its warnings by name.
     """
 
     metre: list[float] = field(default_factory=list)
@@ -146,8 +146,8 @@ def drive_town(
 
 
 def _least_beside(fleet: SimulatedFleet, t: float) -> FloatArray:
-    """Least friction (N,) within BESIDE_M of where the vehicles drove in the last second, as it
-    is at t [s].
+    """Return the least friction (N,) at time t [s] within BESIDE_M of the path that each vehicle
+    drove in the last second.
     """
     true = fleet.truth
     every = round(RATE_HZ / BESIDE_HZ)
@@ -220,8 +220,8 @@ def _count_outcome(track: _Track, counts: Approaches) -> None:
 def _stopping_shortfall(
     metre: FloatArray, speed: FloatArray, mu: FloatArray, at: int, start: float
 ) -> float:
-    """By how much the way to the stretch [m] is too short to stop on it, from look `at`; 0 or
-    less: it is not.
+    """Return the stopping distance minus the distance to the stretch [m] at second `at`; 0 or less
+    if the car can stop in time.
     """
     v = float(speed[at])
     on_the_way = (metre >= metre[at]) & (metre <= start)

@@ -75,7 +75,7 @@ class Results:
 
 
 def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str], None]) -> Results:
-    """All measurements; `log_line` is given one line of progress at a time."""
+    """Run every scenario and return all measures; `log_line` receives lines of progress."""
     results = Results(seeds=len(seeds))
     names = QUICK_ESTIMATORS if quick else tuple(ESTIMATORS)
     results.noise, plotted = experiments(seeds)
@@ -120,8 +120,8 @@ def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str],
 
 
 def _as_in_paper(estimator: str, batch: DriveSet) -> EstimatorBank:
-    """The bank for a paper's own conditions: where friction is set by hand, it is set to the
-    truth of the start.
+    """Return the bank for a paper's own conditions: an estimator with fixed friction gets the true
+    friction at the start.
     """
     friction = float(batch.mu[0, 0])
     if estimator == "adaptive-federated-ckf":
@@ -144,7 +144,7 @@ def _all_measures(name: str, batch: DriveSet, reported: Estimates) -> dict[str, 
 
 
 def _foreign_tyres(seeds: Sequence[int], log_line: Callable[[str], None]) -> dict[str, FloatArray]:
-    """Coverage of the default in all scenarios, each seed with the next kind of tyre."""
+    """Return the coverage of the default in all scenarios, with another kind of tyre per seed."""
     found: dict[str, list[float]] = {kind: [] for kind in FOREIGN}
     kinds = list(FOREIGN)
     for scenario in (PAPERS | OTHERS).values():

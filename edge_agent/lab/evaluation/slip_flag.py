@@ -5,11 +5,10 @@ Baseline for detection. It uses the recorded wheel speeds, accelerometers, yaw r
 and the vehicle file.
 
     reference speed  fastest wheel while braking, slowest while driving, else the median; it changes
-    no faster than the
-                     accelerometer says, plus FREE; where all wheels have agreed for AGREE_S it is
-                     their speed
+                     at most by the accelerometer's reading plus FREE; once all wheels have agreed
+                     for AGREE_S it is their speed
     slip flag        |R ω − v_i| > SLIP max(v_i, SLOWEST) at a wheel for longer than SLIP_S; v_i
-                     includes the yaw rate wheels and cars slower than SLOWEST do not slip
+                     includes the yaw rate; wheels and cars slower than SLOWEST do not slip
     yaw flag         |r − v tan δ / l| > YAW_OFF + YAW_SHARE |r| for longer than YAW_S
     friction         |a| / g while a flag is up; while driving, over the share of the load on the
                      driven axle
@@ -74,8 +73,13 @@ def _median(values: FloatArray, count: int) -> float:
 
 @compiled
 def _follow(signals: FloatArray, car: FloatArray, period: float) -> FloatArray:
-    """Return the flagged friction (T,) of one car: signals (T, channels); car: radius,
-    wheelbase, half track, share.
+    """Return the friction (T,) that the flags of one car report; infinite where no flag is up.
+
+    Args:
+        signals: (T, channels).
+        car: wheel radius, wheelbase and half of the track [m], and the share of the load on the
+            driven axle.
+        period: sampling interval [s].
     """
     out = np.full(signals.shape[0], np.inf)
     smooth = 1.0 - np.exp(-period / SMOOTH_S)

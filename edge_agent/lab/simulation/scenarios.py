@@ -94,7 +94,7 @@ class Scenario:
     def from_latlon(
         self, latitude: FloatArray, longitude: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return (x, y) [m]."""
+        """Return the local coordinates (x, y) [m] of positions [deg]."""
         return self.origin.from_latlon(latitude, longitude)
 
 

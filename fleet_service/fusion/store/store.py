@@ -213,8 +213,8 @@ class Store:
             self._rebuild_reporters(hour - _HOUR - _AHEAD)
 
     def untouched(self, before: int) -> BoolArray:
-        """Slots (size,) whose last visit was before a time [ns], and which nothing else points
-        at.
+        """Return True for each slot (size,) whose last visit was before a time [ns] and that
+        nothing else refers to.
         """
         cells = self.state.live.cells[: self.size]
         pairs = self.state.pairs
@@ -223,8 +223,8 @@ class Store:
         return np.asarray(found)
 
     def drop(self, gone: BoolArray) -> IntArray:
-        """Drop slots (size,) that are `untouched`; returns where each slot went, NONE for those
-        that are gone.
+        """Delete slots (size,) that are `untouched`; return the new number of each slot, NONE for
+        deleted ones.
         """
         stay = np.flatnonzero(~gone)
         place = np.full(self.size, NONE, np.int64)
