@@ -27,7 +27,7 @@ from fleet_service.archive.format.version import parse_version
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.fence import fence_of
 from fleet_service.replication.lease import _parse_record
-from schemas import keys, query, wire
+from schemas import keys, query, weather, wire
 from schemas.errors import InputError
 from schemas.runtime.batch_decoder import decode_many
 from schemas.wire import Kind
@@ -114,6 +114,7 @@ PARSERS: Final = {
     "standing": Parser(wire.decode_standing),
     "tiles": Parser(decode_tile),
     "queries": Parser(_parse_query),
+    "weather": Parser(lambda data: weather.decode(data, wire.JSON)),
     "keys": Parser(_decode_first(keys.parse)),
     "versions": Parser(_decode_first(parse_version)),
     "dbc": Parser(_decode_first(parse_dbc)),

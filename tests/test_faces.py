@@ -282,6 +282,32 @@ def test_a_plug_in_that_cannot_be_loaded_is_a_line(monkeypatch: pytest.MonkeyPat
         edge_agent.make_bank("odd", [])
 
 
+def test_broken_plug_in_is_named_and_breaks_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    from importlib.metadata import EntryPoint
+
+    from fleet_service.analytics.questions import QUESTIONS, known_questions, question_of
+    from schemas.runtime import plugins
+
+    (tmp_path / "raises_at_import.py").write_text("raise RuntimeError('no licence')\n")
+    (tmp_path / "leaves_at_import.py").write_text("raise SystemExit\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    names = ("raises_at_import", "leaves_at_import")
+    broken = {name: EntryPoint(name, f"{name}:bank", "any") for name in names}
+    monkeypatch.setattr(plugins, "entry_points_of", lambda group: broken)
+    for name, reason in zip(names, ("no licence", "SystemExit"), strict=True):
+        message = rf"estimator: '{name}' cannot be loaded from {name}:bank \({reason}\)"
+        with pytest.raises(InputError, match=message):
+            edge_agent.make_bank(name, [])
+        with pytest.raises(InputError, match=f"question: '{name}' cannot be loaded"):
+            question_of(name)
+    assert len(list(edge_agent.known_estimators())) > len(names)
+    assert known_questions() == QUESTIONS
+    assert len(caplog.records) == len(names)
+    assert question_of("grip") is QUESTIONS["grip"]
+
+
 def test_the_faces_are_of_packages_that_say_their_types() -> None:
     for name in gripmap.FACES:
         folder = Path(str(importlib.import_module(name).__file__)).parent

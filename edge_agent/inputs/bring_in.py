@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from edge_agent.inputs.memory import bounded_memory
 from edge_agent.inputs.merge import Merged
 from edge_agent.inputs.profile import FOLDER, Channel, Profile
 from edge_agent.inputs.readers import can_log, can_text, gnss, mdf, racelogic, rosbag, tabular
@@ -31,9 +32,14 @@ def read_source(path: Path, profile: Profile | None, database: Database | None) 
     profile.
 
     Raises:
-        InputError: the file is unknown, broken, needs a database, or needs a library that is not
-            installed.
+        InputError: the file is unknown, broken, too large for the memory, needs a database, or
+            needs a library that is not installed.
     """
+    with bounded_memory(path):
+        return _read_source(path, profile, database)
+
+
+def _read_source(path: Path, profile: Profile | None, database: Database | None) -> Recording:
     wanted = None if profile is None else profile.needed_signals()
     suffix = path.suffix.lower()
     if not path.exists():

@@ -54,7 +54,7 @@ def foreign_errors(path: Path, kind: str) -> Iterator[None]:
     """
     try:
         yield
-    except InputError:
+    except (InputError, MemoryError):
         raise
     except FileNotFoundError as error:
         raise InputError(

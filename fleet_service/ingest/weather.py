@@ -38,6 +38,7 @@ from schemas.weather import Report
 FOLDER: Final = "weather"
 # reports that wait at the most: a whole continent's regions; the oldest go first
 WAITING: Final = 10_000
+MOST_BYTES: Final = 4096  # of a report; one with a prior as text has a thousand
 AHEAD_NS: Final = 86_400 * NS  # a forecast for tomorrow is weather, one for next year a wrong clock
 _DIGITS: Final = 20  # of the time in a file's name [ns]
 _TURNS: Final = 100  # a reader that is overtaken so often has another trouble
@@ -72,7 +73,10 @@ class WeatherInbox:
 
     def enqueue(self, message: WeatherMessage) -> None:
         """Queue a sample for the next `take`; thread-safe."""
-        self._waiting.append(message)
+        if len(message.payload) > MOST_BYTES:
+            self._counts["refused.weather"] += 1
+        else:
+            self._waiting.append(message)
 
     def take(self, now: int) -> Reports | None:
         """Archive received reports; return them for the map, None if there are none."""

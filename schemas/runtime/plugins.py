@@ -41,9 +41,11 @@ def load_entry_point(group: str, name: str) -> Any:  # noqa: ANN401 whatever sta
     """
     try:
         return entry_points_of(group)[name].load()
-    except (ImportError, AttributeError) as error:
+    except (Exception, SystemExit) as error:  # a module of others may raise anything
         field = group.rpartition(".")[2].removesuffix("s")
         where = entry_points_of(group)[name].value
         raise InputError(
-            field, f"{name!r} cannot be loaded from {where} ({error})", "mend or remove it"
+            field,
+            f"{name!r} cannot be loaded from {where} ({str(error) or type(error).__name__})",
+            "mend or remove it",
         ) from error

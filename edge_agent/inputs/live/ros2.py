@@ -44,6 +44,11 @@ CAN_FRAME: Final = "\n".join(
 )
 
 
+MOST_MESSAGE: Final = 1 << 20  # bytes; motion and bus messages have some hundred
+MOST_IDENTITY: Final = 64  # bytes of a publisher's identity that matter
+MOST_PUBLISHERS: Final = 1000  # whose sequence numbers are followed
+
+
 class Ros2Feed(Feed):
     """Topics of one domain.
 
@@ -130,6 +135,8 @@ class Ros2Feed(Feed):
         return receive_sample
 
     def _take_sample(self, topic: str, sample: Any) -> None:  # noqa: ANN401
+        if len(sample.payload) > MOST_MESSAGE:
+            raise ValueError("too large")
         kind = type_of(str(sample.key_expr))
         published = self._publication_time(
             sample.attachment.to_bytes() if sample.attachment is not None else b""
@@ -154,7 +161,9 @@ class Ros2Feed(Feed):
         if len(attachment) < ATTACHMENT.size:
             return 0
         number, at = ATTACHMENT.unpack_from(attachment)
-        publisher = attachment[ATTACHMENT.size :]
+        publisher = attachment[ATTACHMENT.size :][:MOST_IDENTITY]
+        if publisher not in self._after and len(self._after) >= MOST_PUBLISHERS:
+            self._after.pop(next(iter(self._after)))
         expected = self._after.get(publisher, number)
         self.lost += max(number - expected, 0)
         self._after[publisher] = max(number + 1, expected)

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 
+from edge_agent.inputs.memory import MOST_BYTES, limit_memory
 from edge_agent.inputs.readers.can_log import Frames, Log, no_database
 from edge_agent.inputs.recording import Recording, Series, foreign_errors, import_optional
 from schemas.errors import InputError
@@ -23,7 +24,6 @@ from schemas.thresholds import NS
 
 SUFFIXES: Final = (".mf4", ".mdf")
 MOST_BLOCKS: Final = 1_000_000
-MOST_MEMORY: Final = 16 << 30  # bytes of the process that reads
 MOST_CPU_S: Final = 600  # a file of 10 GB takes less
 HEADER: Final = 64  # bytes of the identification block
 # block -> places of its links that lead on (next first, then what hangs on it)
@@ -123,7 +123,7 @@ def read_isolated(path: Path, identifiers: set[int] | None, names: set[str] | No
 
 
 def _limit_resources() -> None:
-    resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY))
+    limit_memory(MOST_BYTES)
     resource.setrlimit(resource.RLIMIT_CPU, (MOST_CPU_S, MOST_CPU_S))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 

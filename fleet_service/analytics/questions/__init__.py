@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from importlib import import_module
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -76,12 +77,19 @@ QUESTIONS: Final = {
 }
 
 
+log = logging.getLogger(__name__)
+
+
 def known_questions() -> dict[str, Question]:
-    """Return all questions by name, those of plug-ins too."""
-    others = {
-        name: plugins.load_entry_point(plugins.QUESTIONS, name)
-        for name in plugins.entry_points_of(plugins.QUESTIONS)
-    }
+    """Return all questions by name, those of plug-ins too; plug-ins that cannot be loaded are left
+    out and logged.
+    """
+    others = {}
+    for name in plugins.entry_points_of(plugins.QUESTIONS):
+        try:
+            others[name] = plugins.load_entry_point(plugins.QUESTIONS, name)
+        except InputError as error:
+            log.warning("%s", error)
     return others | QUESTIONS
 
 
@@ -89,11 +97,11 @@ def question_of(name: str) -> Question:
     """Return a question by name.
 
     Raises:
-        InputError: there is no question of that name.
+        InputError: there is no question of that name, or its plug-in cannot be loaded.
     """
-    found = known_questions().get(name)
-    if found is None:
-        raise InputError(
-            "question", f"{name!r} is none", f"use one of {', '.join(known_questions())}"
-        )
-    return found
+    if name in QUESTIONS:
+        return QUESTIONS[name]
+    if name in plugins.entry_points_of(plugins.QUESTIONS):
+        found: Question = plugins.load_entry_point(plugins.QUESTIONS, name)
+        return found
+    raise InputError("question", f"{name!r} is none", f"use one of {', '.join(known_questions())}")

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -20,7 +21,7 @@ from edge_agent.cli import main
 from edge_agent.inputs import live
 from edge_agent.inputs.live.feed import HostClock
 from edge_agent.inputs.live.gpsd import GpsdFeed
-from edge_agent.inputs.live.ros2 import Ros2Feed, type_of
+from edge_agent.inputs.live.ros2 import MOST_MESSAGE, MOST_PUBLISHERS, Ros2Feed, type_of
 from edge_agent.inputs.live.rows import LiveRows
 from edge_agent.inputs.live.sources import is_live, open_sources
 from edge_agent.inputs.profile import Channel, Profile
@@ -125,6 +126,11 @@ def test_hostile_bytes_on_a_topic_are_counted_and_the_next_message_is_read(tmp_p
     good = b"\x00\x01\x00\x00" + bytes(8) + b"\x01\x00\x00\x00" + bytes(300)
     hears(good, lambda: feed.heard > 0)
     assert list(feed.take()) == ["/imu.angular_velocity.z"]
+    broken = feed.broken
+    hears(good + bytes(MOST_MESSAGE), lambda: feed.broken > broken)
+    for number in range(2 * MOST_PUBLISHERS):
+        feed._publication_time(struct.pack("<qqq", 1, 2, number))
+    assert len(feed._after) == MOST_PUBLISHERS
     session.put("0/imu/nonsense/RIHS01_0", good)
     session.close()
     feed.close()

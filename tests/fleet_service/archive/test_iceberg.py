@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from contextlib import closing
+from contextlib import closing, suppress
 from datetime import timedelta
 from pathlib import Path
 
@@ -122,6 +122,12 @@ def test_a_forgotten_vehicle_is_in_no_table_and_the_others_come_back(
         table_of(uri(root), Kind.OBSERVATION).scan().to_arrow()
     )  # rewritten files are out, and it can be read
     assert names[3] not in seen["vehicle"].to_pylist()
+    for kind in Kind:
+        table = table_of(uri(root), kind)
+        for snapshot in table.snapshots():  # a former one has the vehicle, and its files are gone
+            with suppress(FileNotFoundError):
+                former = table.scan(snapshot_id=snapshot.snapshot_id).to_arrow()
+                assert names[3] not in former["vehicle"].to_pylist()
     assert export_tables(root, capsys)["rows"] == 160
     assert export_tables(root, capsys) == {"added": 0, "dropped": 0, "rows": 160}
     assert rows_different(root, uri(root)) == 0

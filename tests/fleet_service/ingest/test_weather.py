@@ -24,6 +24,7 @@ from fleet_service.archive.maintenance.retention import drop_checkpoints
 from fleet_service.fusion import Fusion
 from fleet_service.ingest.inbox import Message
 from fleet_service.ingest.weather import (
+    MOST_BYTES,
     WAITING,
     WeatherInbox,
     WeatherMessage,
@@ -221,3 +222,6 @@ def test_of_reports_that_nobody_takes_so_many_wait_and_the_newest_stay(tmp_path:
     assert len(taken.time) == WAITING
     assert int(taken.time.max()) == now + (many - 1) * 1000
     assert inbox.take(now) is None
+    inbox.enqueue(WeatherMessage(key, bytes(MOST_BYTES + 1), wire.WEATHER_ENCODING))
+    assert inbox.take(now) is None
+    assert counts["refused.weather"] == 1

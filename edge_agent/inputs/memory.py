@@ -1,0 +1,51 @@
+"""Limit of the memory that reading a file may take, because a small compressed file may hold a
+large one.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+from schemas.errors import InputError
+
+# of the machine's, so that it stays usable
+MOST_BYTES: Final = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+_PAGES: Final = Path("/proc/self/statm")  # address space of this process, in pages
+
+
+@contextmanager
+def bounded_memory(path: Path, most: int = MOST_BYTES) -> Iterator[None]:
+    """Let this process allocate at most so many bytes more; do nothing where the system does not
+    count them.
+
+    Raises:
+        InputError: the file needs more.
+    """
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    try:
+        limit_memory(most)
+        yield
+    except MemoryError as error:
+        raise InputError(
+            "source",
+            f"{path} needs more than {most >> 20} MB of memory",
+            "cut it into shorter recordings",
+        ) from error
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def limit_memory(most: int) -> None:
+    """Let this process allocate at most so many bytes more; an existing limit stays if it is
+    lower.
+    """
+    with suppress(FileNotFoundError):
+        held = int(_PAGES.read_text().split()[0]) * resource.getpagesize()
+        limits = [held + most, *resource.getrlimit(resource.RLIMIT_AS)]
+        limit = min(one for one in limits if one != resource.RLIM_INFINITY)
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limits[2]))
