@@ -102,6 +102,11 @@ CAMPAIGNS: Final = {
         "edge-agent evaluate --only worth",
     ),
     "faults": Campaign("make faults", ".faults", "faults"),
+    "link": Campaign(
+        "python -m tests.faults --only link --out .faults/link",
+        ".faults/link",
+        "faults --only link",
+    ),
     "cluster": Campaign("make cluster-faults", ".faults/cluster", "cluster"),
     "bench": Campaign("make bench", ".bench", "bench"),
     "country": Campaign("make country-bench", ".country", "country"),

@@ -28,9 +28,10 @@ def main() -> int:
     chosen = [
         c for c in CAMPAIGNS if (c.name in args.only if args.only else c.in_quick or not args.quick)
     ]
-    found = run_campaigns(
-        chosen, args.out, "faults-quick" if args.quick else "faults", args.quick, args.seed
-    )
+    title = "faults-quick" if args.quick else "faults"
+    if args.only:
+        title += f" --only {' '.join(args.only)}"
+    found = run_campaigns(chosen, args.out, title, args.quick, args.seed)
     print(figures.markdown(found))
     return 0 if all(figure.holds for figure in found) else 1
 
