@@ -64,6 +64,7 @@ def build_client(language: str, folder: Path) -> list[str]:
     Raises:
         RuntimeError: it cannot be built.
     """
+    folder = folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     if language == "c":
         program = folder / "client"
