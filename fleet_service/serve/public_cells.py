@@ -2,9 +2,9 @@
 
 A cell is shown as if the visits since its last publication had not happened, aged to the time of
 reading. It is published again at a moment of a time grid at which LEAST vehicles have visited the
-cell since, and as many have been in its tile since the tile's last publication. So neither a cell
-nor its moment points at one vehicle. Nothing that is more slippery than shown waits: it is
-published when the map is read next.
+cell since, and as many have been in its tile within the running hour. So neither a cell nor its
+moment points at one vehicle: one that comes late completes no count that others began. Nothing that
+is more slippery than shown waits: it is published when the map is read next.
 
 Legend
     k        LEAST, `public_vehicles` of the settings
@@ -34,6 +34,7 @@ from schemas.numeric import IntArray
 from schemas.thresholds import NS
 
 PERIOD_NS: Final = 300 * NS  # of the time grid of publications
+WINDOW_NS: Final = 3600 * NS  # in which enough vehicles must be in a tile
 # A change towards slippery is published at once: P(slippery) grew, or the median fell, by as much.
 # Values of visits to one surface scatter less.
 MORE_SLIPPERY: Final = 0.05
@@ -62,7 +63,7 @@ class PublicCells:
         self._beliefs = np.zeros((0, mugrid.BINS), np.uint16)
         self._cells = np.zeros(0, CELL)
         self._free: list[int] = []
-        self._present: dict[int, int] = {}  # vehicles per tile since its last publication, as bits
+        self._present: dict[int, int] = {}  # vehicles per tile within the hour, as bits
         self._period = 0
         self._published: list[IntArray] = []
         self._grow()
@@ -152,10 +153,13 @@ class PublicCells:
         self._grow()
         if now // PERIOD_NS <= self._period:
             return
+        is_new_hour = now // WINDOW_NS > self._period * PERIOD_NS // WINDOW_NS
         self._period = now // PERIOD_NS
         ready = [t for t, present in self._present.items() if present.bit_count() >= self._least]
         for tile in ready:
             del self._present[tile]
+        if is_new_hour:
+            self._present.clear()
         if ready:
             slots = np.flatnonzero(self._pending)
             slots = slots[np.isin(tile_of(self._fusion, slots), ready)]
