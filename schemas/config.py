@@ -249,8 +249,8 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def moment(text: str, field: str) -> int:
-    """A time as people write it (ISO 8601, a day or more), in ns since 1970. Without a zone it is
-    UTC, everywhere.
+    """Return a time as people write it (ISO 8601, a day or more) in ns since 1970. A time without a
+    zone is UTC.
 
     Raises:
         InputError: it is none, or lies outside what 64 bits of nanoseconds hold.
@@ -269,7 +269,7 @@ def moment(text: str, field: str) -> int:
 
 
 def nanoseconds(time: datetime) -> int:
-    """A time in ns since 1970, exactly; without a zone it is UTC."""
+    """Return a time in ns since 1970, without rounding; a time without a zone is UTC."""
     since = (time if time.tzinfo else time.replace(tzinfo=UTC)) - _EPOCH
     return (since.days * 86_400 + since.seconds) * NS + since.microseconds * 1_000
 
@@ -296,7 +296,7 @@ def load(path: Path | str | None, model: type[Model]) -> Model:
 
 
 def explain(error: ValidationError, where: str) -> InputError:
-    """The first complaint of pydantic as an error that names the field and the fix."""
+    """Return the first validation error of pydantic as an error that names the field and the fix."""
     first = error.errors(include_url=False)[0]
     field = ".".join(str(part) for part in first["loc"]) or "content"
     secret = "store" in first["loc"]

@@ -38,7 +38,7 @@ def covers(wide: str, narrow: str) -> bool:
 
 
 def region_of(tile: int) -> str:
-    """The region in which a tile lies."""
+    """Return the region in which a tile lies."""
     return keys.chunks(int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM)), grid.REGION_ZOOM)
 
 
@@ -81,11 +81,11 @@ class Rank:
         self._place = {key: place for place, key in enumerate(keys_along(route).tolist())}
 
     def of(self, cell: int, sector: int) -> int:
-        """When it is passed, as a number that only compares."""
+        """Return the position of a cell and sector along the route, a number for comparison only."""
         return self._place.get(cell * grid.SECTORS + sector, len(self._place))
 
     def order(self, cells: IntArray, sectors: IntArray) -> IntArray:
-        """Sorts cells and sectors (n,): indices (n,)."""
+        """Return the indices (n,) that sort cells and sectors (n,) along the route."""
         ranks = [
             self.of(cell, sector)
             for cell, sector in zip(cells.tolist(), sectors.tolist(), strict=True)
@@ -94,8 +94,8 @@ class Rank:
 
 
 def keys_along(route: Sequence[tuple[float, float]]) -> IntArray:
-    """Key (cell · 4 + sector) of everything that a route of (longitude, latitude) passes, in its
-    order, each once.
+    """Return the keys (cell · 4 + sector) that a route of (longitude, latitude) passes, in order,
+    each once.
 
     Raises:
         InputError: longer than ROUTE_MOST_M.

@@ -14,7 +14,9 @@ WHEELS: Final = ("fl", "fr", "rl", "rr")
 
 
 def per_wheel(name: str) -> tuple[str, ...]:
-    """Names of a quantity that every wheel has: `per_wheel("omega")` = omega_fl … omega_rr."""
+    """Return the four channel names of a quantity that exists per wheel: `per_wheel("omega")` =
+    omega_fl … omega_rr.
+    """
     return tuple(f"{name}_{wheel}" for wheel in WHEELS)
 
 

@@ -9,8 +9,8 @@ from schemas.thresholds import GRAVITY, REACTION_S
 
 
 def stopping_speed(mu: FloatArray | float, sight_m: float) -> FloatArray:
-    """Speed [m/s] from which one stops within a sight [m] on a level road, after the reaction, at
-    g·mu; 0 at no grip.
+    """Return the speed [m/s] from which a vehicle stops within a sight distance [m] on a level
+    road, after the reaction time and with a deceleration of g·mu; 0 without grip.
 
     v·REACTION_S + v²/(2·g·mu) = sight_m, solved for v.
     """

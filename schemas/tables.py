@@ -349,7 +349,7 @@ SIGNAL_LOG_CONTEXT: Final = tuple(
 
 
 def arrow_schema(*fields: Field) -> pa.Schema:
-    """Arrow schema of columns, with unit and meaning in the field metadata."""
+    """Return the Arrow schema of columns, with unit and meaning in the field metadata."""
     return pa.schema(
         [pa.field(f.name, f.type, metadata={"unit": f.unit, "meaning": f.meaning}) for f in fields]
     )
@@ -359,7 +359,7 @@ CELL_HOUR_SCHEMA: Final = arrow_schema(*CELL_HOUR)
 
 
 def stored_columns(*fields: Field) -> tuple[Field, ...]:
-    """Columns as they lie on disk: times in microseconds."""
+    """Return columns as they are stored on disk: times in microseconds."""
     return tuple(
         f._replace(type=US, unit="us since 1970, UTC") if f.type == NS else f for f in fields
     )

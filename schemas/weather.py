@@ -40,7 +40,7 @@ class Report:
 
 
 def encode(report: Report) -> bytes:
-    """Protobuf bytes of a report."""
+    """Return the protobuf bytes of a report."""
     known = {name: getattr(report, name) for name in RANGES if not np.isnan(getattr(report, name))}
     prior = [] if report.prior is None else np.asarray(report.prior).tolist()
     return pb.Weather(time=report.time, prior=prior, **known).SerializeToString()
@@ -62,7 +62,7 @@ def decode(payload: bytes, encoding: str = wire.WEATHER_ENCODING) -> Report:
 
 
 def broken(values: dict[str, float], prior: NDArray[np.float64] | None) -> WireError | None:
-    """The first rule that a report breaks."""
+    """Return the first rule that a report violates, as an error; None if the report is valid."""
     for name, (least, most) in RANGES.items():
         if not (np.isnan(values[name]) or least <= values[name] <= most):
             return WireError(

@@ -89,7 +89,8 @@ class ManagedProcess:
 
 @contextmanager
 def run_system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
-    """Router and fleet service on a free port of loopback; yields the endpoint and the service.
+    """Run a router and a fleet service on a free port of loopback; yield the endpoint and the
+    service.
 
     The agents' configuration is left in `folder/agent.json`.
     """

@@ -20,8 +20,8 @@ SPEED = 14.0  # [m/s]
 def main(
     endpoint: str, latitude: float, longitude: float, yaw: float = 0.0, within_s: float = 60.0
 ) -> str:
-    """Look ahead from a place (yaw: radians from east) and print warnings; return the first one,
-    or "".
+    """Look ahead from a place (yaw: radians from east) and print warnings; return the first one, or
+    "".
     """
     warnings: queue.Queue[str] = queue.Queue()
     lookout = edge_agent.Lookout(

@@ -58,7 +58,8 @@ Judge: TypeAlias = Callable[[Vehicle, Drive], Prediction]
 
 
 def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> HeldOut:
-    """Learn from all drives what also helps on drives that were held out while it was learned.
+    """Learn a calibration from all drives, and keep only the parts that also help on drives that
+    were held out.
 
     Raises:
         InputError: no drive is excited enough, or one drive is too short to hold a part out.

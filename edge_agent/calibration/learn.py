@@ -110,7 +110,7 @@ it.
 def learn_calibration(
     drives: Sequence[tuple[FloatArray, FloatArray]], vehicle: Vehicle
 ) -> Calibration:
-    """Calibration of a vehicle from its drives, (t (T,), signals (T, 18)) each.
+    """Return the calibration of a vehicle, learned from its drives, (t (T,), signals (T, 18)) each.
 
     Raises:
         InputError: none of them is excited enough.
@@ -127,7 +127,7 @@ def learn_calibration(
 
 
 def weigh_estimates(drives: Sequence[DriveEstimates], vehicle: Vehicle) -> Calibration | None:
-    """Means over several drives with standard deviations; None where no drive was excited."""
+    """Return the means over several drives with standard deviations; None if no drive was excited."""
     estimates: dict[str, list[float]] = {}
     for drive in drives:
         for name, value in drive.items():
@@ -163,7 +163,8 @@ def surer_values(one: Calibration | None, other: Calibration | None) -> Calibrat
 def _posterior_of(
     kind: str, values: FloatArray, bias: float, unknown: float
 ) -> tuple[float, float]:
-    """Value and standard deviation by the estimates of drives (n,).
+    """Return the posterior mean and standard deviation of a quantity from the estimates of drives
+    (n,).
 
     `unknown` is the standard deviation that the best drive leaves; such estimates are drawn to what
     is usual already.

@@ -95,7 +95,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _doubted_flags(log: SignalLog) -> dict[str, str]:
-    """Controller flags of a log that carry no weight at some time, and why."""
+    """Return the controller flags of a log that the estimator does not trust at some time, with the
+    reason.
+    """
     from edge_agent.observe.controller_flags import doubted_flags, new_flag_records, trusted_context
 
     flags = new_flag_records(1)

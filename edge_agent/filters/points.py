@@ -36,8 +36,8 @@ def sigma_points(
 
 @compiled
 def axis_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray) -> None:
-    """Compute points[p] = mean + A*S*xi[p]; mean (n,), sqrt_cov (n, n) finite, xi and points
-    (points, n).
+    """Compute points[p] = mean + A·S·xi[p] with the singular value decomposition A·S·Vᵀ of
+    `sqrt_cov`. Shapes: mean (n,), sqrt_cov (n, n), finite; xi and points (points, n).
     """
     axes, size, _ = np.linalg.svd(sqrt_cov)
     count, n = xi.shape

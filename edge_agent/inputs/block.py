@@ -1,6 +1,4 @@
-"""Where signals come from: a recorded log, or a simulated fleet. A source gives blocks of
-samples.
-"""
+"""Block of samples, as every source of signals (a recorded log, a simulated fleet) delivers it."""
 
 from __future__ import annotations
 
@@ -17,8 +15,8 @@ class Block:
     """Samples of N vehicles: t (T, N) [s], the same instants as time (T, N) [ns UTC], signals (T,
     N, channels).
 
-    `context` (T, N, len(CONTEXT)) is what controllers and surroundings say; None where the source
-    knows nothing of it.
+    `context` (T, N, len(CONTEXT)) has the flags of controllers and the state of the surroundings;
+    None if the source has no such signals.
     """
 
     t: FloatArray
@@ -28,7 +26,7 @@ class Block:
 
 
 def to_utc_ns(t: FloatArray, start_ns: int) -> IntArray:
-    """Seconds since the start as ns UTC, rounded to the ns; same shape."""
+    """Return seconds since the start as ns UTC, rounded to the ns; same shape."""
     whole = t.astype(np.int64)
     time: IntArray = start_ns + whole * NS + np.rint((t - whole) * NS).astype(np.int64)
     return time

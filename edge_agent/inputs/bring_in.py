@@ -113,7 +113,7 @@ def _decode_frames(
 
 
 def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Database | None:
-    """The CAN database that is named on the command line, else the profile's."""
+    """Return the CAN database named on the command line, else that of the profile."""
     if given is not None:
         return read_dbc(given)
     if profile is None or profile.dbc is None:
@@ -125,8 +125,8 @@ def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Da
 
 
 def profile_of(log: Path) -> Profile:
-    """The profile that a log was imported with; of another log, one that takes its columns as they
-    are.
+    """Return the profile with which a log was imported; for another log, a profile that uses its
+    columns unchanged.
 
     Raises:
         InputError: the file cannot be read.

@@ -28,7 +28,7 @@ AIR_C: Final = (
 
 
 def context_values(name: str, values: FloatArray, active: Sequence[float] | None) -> FloatArray:
-    """Readings of a context signal in the log's unit, same shape.
+    """Return the readings of a context signal in the log's unit, same shape.
 
     Args:
         name: of the signal, one of CONTEXT.
@@ -47,8 +47,8 @@ def context_values(name: str, values: FloatArray, active: Sequence[float] | None
 
 
 def held_readings(name: str, series: Series, t: FloatArray, *, lasting: bool) -> FloatArray:
-    """The last reading at or before each time t (T,) [s], NaN where it is too old or there is
-    none.
+    """Return the last reading at or before each time t (T,) [s]; NaN if there is none or it is too
+    old.
     """
     known = np.isfinite(series.values)
     times = series.t[known]
@@ -61,7 +61,7 @@ def held_readings(name: str, series: Series, t: FloatArray, *, lasting: bool) ->
 
 
 def lasting_signals(profile: Profile) -> set[str]:
-    """Whole names of the signals that are sent when they change."""
+    """Return the full names of the signals that are sent only when they change."""
     return {
         name
         for channel in profile.channels.values()
@@ -71,7 +71,7 @@ def lasting_signals(profile: Profile) -> set[str]:
 
 
 def context_signals(profile: Profile) -> set[str]:
-    """Whole names of the signals that context is made of."""
+    """Return the full names of the signals from which the context is made."""
     return {
         name
         for channel in CONTEXT

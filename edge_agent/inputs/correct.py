@@ -37,8 +37,8 @@ class Corrector:
         self._rows = np.empty((0, len(CHANNELS)))
 
     def advance(self, t: FloatArray, signals: FloatArray) -> FloatArray:
-        """The next rows: times t (T,) [s] and signals (T, 18); the same array where nothing is
-        known.
+        """Return the next rows corrected: times t (T,) [s] and signals (T, 18); the same array if
+        there is nothing to correct.
         """
         if self._known is not None:
             signals = _correct_signals(signals, self._known)
@@ -74,7 +74,7 @@ class Corrector:
 
 
 def correct_log(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> FloatArray:
-    """A whole log, times t (T,) [s] and signals (T, 18), as a `Corrector` makes it."""
+    """Return a whole log, times t (T,) [s] and signals (T, 18), corrected by a `Corrector`."""
     return Corrector(vehicle).advance(t, signals)
 
 

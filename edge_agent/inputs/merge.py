@@ -154,7 +154,7 @@ def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tup
 def _align_clocks(
     recordings: Sequence[Recording], reference: int, shifts: Mapping[str, float], notes: list[str]
 ) -> tuple[list[float], int | None]:
-    """Seconds to add to each recording's times, and the ns UTC of time 0."""
+    """Return the seconds to add to the times of each recording, and the ns UTC of time 0."""
     spans = [_time_span(recording) for recording in recordings]
     base = recordings[reference].start_ns
     dated = next(
@@ -213,7 +213,7 @@ def _spans_overlap(span: tuple[float, float], shift: float, other: tuple[float, 
 def make_channel(
     name: str, channel: Channel, recording: Recording, radius: float | None, ratio: float | None
 ) -> tuple[Series, float]:
-    """A channel in SI on its own times, and how unsteady its stamps were [s].
+    """Return a channel in SI units on its own times, and the jitter of its time stamps [s].
 
     Raises:
         InputError: a number of the car is not known that its unit needs.
@@ -269,7 +269,7 @@ def make_channel(
 
 
 def _hold_last(series: Series, t: FloatArray) -> FloatArray:
-    """The last reading at or before each time."""
+    """Return the last reading at or before each time."""
     return series.values[
         np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, len(series.t) - 1)
     ]
@@ -283,8 +283,8 @@ def _describe_rates(series: Series) -> dict[str, object]:
 
 
 def straighten_times(t: FloatArray) -> tuple[FloatArray, float]:
-    """Times of a periodic signal whose stamps come in bursts, straightened; and how far they were
-    off (std) [s].
+    """Return the smoothed times of a periodic signal whose stamps come in bursts, and the standard
+    deviation of their error [s].
 
     Arrival wanders about a line through the count of readings, which a running mean over SMOOTH
     readings to either side follows. Times that are not periodic (off by more than a period), or
@@ -304,7 +304,7 @@ def straighten_times(t: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _still_courses(series: dict[str, Series]) -> None:
-    """A receiver's course at walking speed is none."""
+    """Set a receiver's course to NaN at walking speed."""
     if "yaw" in series and GROUND in series and len(series["yaw"].t) == len(series[GROUND].t):
         yaw = series["yaw"]
         speed = series[GROUND].values
@@ -348,13 +348,13 @@ def _build_rows(
 
 
 def _row_rate(dense: Mapping[str, Series]) -> float:
-    """The rate of the fastest channel, rounded up to a usual one."""
+    """Return the rate of the fastest channel, rounded up to a usual rate."""
     fastest = max(1.0 / max(float(np.median(np.diff(one.t))), 1e-3) for one in dense.values())
     return next((rate for rate in RATES if rate >= 0.95 * fastest), RATES[-1])
 
 
 def sample_at_rows(series: Series, t: FloatArray, *, sparse: bool) -> FloatArray:
-    """The series at the rows' times; NaN where no reading is near enough."""
+    """Return a series sampled at the times of the rows; NaN if no reading is near enough."""
     good = np.isfinite(series.values)
     known = series.t[good]
     values = series.values[good]

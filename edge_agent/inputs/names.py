@@ -73,12 +73,12 @@ COURSE: Final = re.compile(r"heading|course|track")
 
 
 def split_words(name: str) -> str:
-    """A name in lower-case words with a blank between."""
+    """Return a name as lower-case words separated by blanks."""
     return " ".join(_WORDS.findall(name)).lower()
 
 
 def place_of(plain: str) -> str | None:
-    """The wheel that the words of a name tell, fl to rr."""
+    """Return the wheel, fl to rr, that the words of a name denote."""
     tokens = plain.split()
     for wheel, spellings in PLACES.items():
         for spelling in spellings:

@@ -89,11 +89,11 @@ class Channel(Part):
         return {self.full_name(name): values for name, values in self.valid.items()}
 
     def full_name(self, name: str) -> str:
-        """The name under which readers give a signal of this channel's message."""
+        """Return the name that readers use for a signal of this channel's message."""
         return name if self.message is None else f"{self.message}.{name}"
 
     def needed_signals(self) -> list[str]:
-        """Every signal that it reads."""
+        """Return the names of all signals that the channel reads."""
         return [
             *self.signals,
             *self.gates,
@@ -133,7 +133,7 @@ class Profile(Part):
         return self
 
     def needed_signals(self) -> set[str]:
-        """Every signal that it reads."""
+        """Return the names of all signals that the profile reads."""
         return {name for channel in self.channels.values() for name in channel.needed_signals()}
 
     def to_json(self) -> str:
@@ -145,13 +145,13 @@ class Profile(Part):
 
 
 def shipped_profiles() -> list[str]:
-    """Names of the profiles that come with the package."""
+    """Return the names of the profiles in the package."""
     return sorted(path.stem for path in FOLDER.glob("*.json"))
 
 
 def load_profile(name: str) -> tuple[Profile, Path]:
-    """A profile by path or by the name of a shipped one, and the folder that its DBC is looked for
-    in.
+    """Load a profile by path or by the name of a shipped one; return it with the folder in which
+    its DBC is searched.
 
     Raises:
         InputError: it cannot be read, or a field is missing, unknown or out of range.

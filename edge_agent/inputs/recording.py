@@ -68,7 +68,7 @@ def foreign_errors(path: Path, kind: str) -> Iterator[None]:
 
 
 def import_optional(name: str, extra: str = "inputs") -> Any:  # noqa: ANN401 modules of optional libraries have no common type
-    """An optional library, imported now.
+    """Import an optional library.
 
     Raises:
         InputError: it is not installed.

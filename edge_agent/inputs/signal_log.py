@@ -54,7 +54,7 @@ class SignalLog:
     context: FloatArray | None = None  # (T, len(CONTEXT)), where a column of it is there
 
     def blocks(self, start_ns: int, rows: int = BLOCK_ROWS) -> Iterator[Block]:
-        """The log in order, in blocks of at most `rows` samples; t = 0 is at `start_ns`."""
+        """Yield the log in order, in blocks of at most `rows` samples; t = 0 is at `start_ns`."""
         for first in range(0, len(self.t), rows):
             t = self.t[first : first + rows, None]
             context = None if self.context is None else self.context[first : first + rows, None]
@@ -111,7 +111,7 @@ def _read_table(path: Path) -> pa.Table:
 
 
 def _read_context(table: pa.Table) -> FloatArray | None:
-    """Context (T, len(CONTEXT)), None where the log has no column of it."""
+    """Return the context (T, len(CONTEXT)); None if the log has no column of it."""
     if not set(CONTEXT) & set(table.column_names):
         return None
     context = np.full((table.num_rows, len(CONTEXT)), np.nan)
@@ -122,8 +122,8 @@ def _read_context(table: pa.Table) -> FloatArray | None:
 
 
 def _float_column(table: pa.Table, name: str) -> FloatArray:
-    """A column as float64, null as NaN; a copy, since Arrow's own is read-only and numba would
-    compile again for it.
+    """Return a column as float64, with NaN for null. It is a copy, because Arrow's array is
+    read-only and numba would compile again for it.
     """
     try:
         values: Any = pc.cast(table[name], pa.float64())
@@ -135,7 +135,7 @@ def _float_column(table: pa.Table, name: str) -> FloatArray:
 
 
 def _read_time(table: pa.Table) -> tuple[FloatArray, int | None]:
-    """t [s] and the ns UTC of t = 0, None for a log that has only `t`."""
+    """Return t [s] and the ns UTC of t = 0; None for a log that has only `t`."""
     name = next((name for name in ("t", "timestamp") if name in table.column_names), None)
     if name is None:
         raise InputError(
@@ -156,7 +156,7 @@ def _read_time(table: pa.Table) -> tuple[FloatArray, int | None]:
 
 
 def _seconds_from_first(column: Any) -> tuple[FloatArray, int | None]:  # noqa: ANN401 pyarrow's column types are not generic
-    """Seconds since the first sample, and the ns UTC of that sample."""
+    """Return the seconds since the first sample, and the ns UTC of that sample."""
     if column.null_count:
         row = int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])
         raise InputError("timestamp", f"row {row} has no time", "give every sample its time")

@@ -99,7 +99,7 @@ def standard_spelling(text: str) -> str:
 
 
 def unit_of_channel(channel: str, text: str) -> str | None:
-    """The unit of a channel as a recording tells it; None where it tells none that fits."""
+    """Return the unit of a channel as stated by the recording; None if it states none that fits."""
     unit = standard_spelling(text)
     return unit if unit in QUANTITY[channel] else None
 

@@ -55,7 +55,7 @@ class TruthRecorder:
         mu: FloatArray,
         used: FloatArray,
     ) -> None:
-        """One block: time [ns], latitude, longitude [deg], yaw [rad] (T, N); mu and used share
+        """Add one block: time [ns], latitude, longitude [deg], yaw [rad] (T, N); mu and used share
         per wheel (T, N, 4).
         """
         cells = grid.cell_of(*position)

@@ -1,4 +1,4 @@
-"""Options of questions, in addition to the part of the archive."""
+"""Options of questions, apart from the selection of the archive's part."""
 
 from __future__ import annotations
 

@@ -78,7 +78,9 @@ def render(
     about: str = "",
     table: Sequence[Sequence[str]] | None = None,
 ) -> str:
-    """Return the page. `table` holds the lines of a table below the map, the first its heads."""
+    """Return the HTML page. `table` has the rows of a table below the map; its first row is the
+    header.
+    """
     data: dict[str, Any] = {
         "title": title,
         "about": about,

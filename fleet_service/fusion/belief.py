@@ -83,8 +83,8 @@ _TAPS: Final = _kernel_diagonals()
 
 @compiled
 def quantiles(belief: FloatArray, levels: tuple[float, ...]) -> FloatArray:
-    """Quantiles of beliefs (k, 32), a row for each level; bit for bit `mugrid.quantiles`, in a
-    tenth of the time.
+    """Return the quantiles of beliefs (k, 32), one row per level; bit for bit those of
+    `mugrid.quantiles`, in a tenth of the time.
     """
     out = np.empty((len(levels), len(belief)))
     for k in range(len(belief)):
@@ -129,7 +129,7 @@ def sum_bins(p: Bins) -> float:
 
 @refcount_free_inlined
 def largest_bin(p: Bins) -> float:
-    """Largest of 32 numbers, in eight strands."""
+    """Return the largest of 32 numbers; eight independent comparisons allow SIMD."""
     a = p[0]
     b = p[1]
     d = p[2]
@@ -152,7 +152,7 @@ def largest_bin(p: Bins) -> float:
 
 @refcount_free_inlined
 def unpack_belief(belief: PackedArray, row: int, p: Bins) -> None:
-    """p of a belief at rest."""
+    """Fill `p` with the probabilities of a stored (packed) belief."""
     whole = np.uint32(0)
     for i in range(_BINS):
         whole = np.uint32(whole + belief[row, i])
@@ -173,7 +173,7 @@ def pack_belief(p: Bins, belief: PackedArray, row: int) -> None:
 
 @refcount_free_inlined
 def mix_prior(p: Bins, change: float, prior: Float32Array) -> None:
-    """p ← (1 - h)·p + h·prior, in place."""
+    """Mix the prior into a belief in place: p ← (1 - h)·p + h·prior."""
     h = np.float32(change)
     for i in range(_BINS):
         p[i] += h * (prior[i] - p[i])
@@ -213,7 +213,7 @@ def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -
 
 @refcount_free_inlined
 def kind_of(evidence: ByteArray) -> int:
-    """VALUE where the likelihood falls towards the upper end by more than senders differ; else
+    """Return VALUE if the likelihood falls towards the upper end by at least VALUE_DROP_STEPS, else
     BOUND.
     """
     least = np.uint8(255)
@@ -224,11 +224,11 @@ def kind_of(evidence: ByteArray) -> int:
 
 @refcount_free_inlined
 def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
-    """L̃ of a visit into `out` (32), mean 1. The fall of a BOUND above its maximum is noise and is
-    levelled.
+    """Fill `out` (32) with the likelihood L̃ of a visit, with mean 1, after integrating out the
+    vehicle's bias. A BOUND is made flat above its maximum, because a fall there is noise.
 
-    A bound has no error: whatever smoothed its step would let many of them climb above what anybody
-    used. `padded` (PADDED) must hold zeros in its first and last REACH places.
+    The bias is not applied to a bound: smoothing its step would let many bounds together exceed the
+    grip that any vehicle used. `padded` (PADDED) must hold zeros in its first and last REACH places.
     """
     if kind == VALUE:
         for j in range(_BINS):
@@ -250,7 +250,9 @@ def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> No
 
 @refcount_free_inlined
 def apply_vote(p: Bins, likelihood: Bins, strength: float) -> None:
-    """p ← p·(s·L̃ + 1 - s), in place and not normalised."""
+    """Multiply a belief in place by a vote of strength s: p ← p·(s·L̃ + 1 - s), without
+    normalising.
+    """
     s = np.float32(strength)
     rest = np.float32(1.0 - strength)
     for i in range(_BINS):
@@ -259,7 +261,7 @@ def apply_vote(p: Bins, likelihood: Bins, strength: float) -> None:
 
 @refcount_free_inlined
 def mean_of(likelihood: Bins) -> float:
-    """Mean of a likelihood of mean 1 against the uniform prior."""
+    """Return the posterior mean of μ under a uniform prior, for a likelihood whose mean is 1."""
     a = np.float32(0.0)
     b = np.float32(0.0)
     d = np.float32(0.0)
@@ -282,8 +284,8 @@ def mean_of(likelihood: Bins) -> float:
 
 @refcount_free_inlined
 def describe_likelihood(likelihood: Bins, mean: float) -> tuple[float, float]:
-    """Standard deviation about `mean`, and P(slippery), of a likelihood of mean 1 against the
-    uniform prior.
+    """Return the standard deviation around `mean` and P(slippery) under a uniform prior, for a
+    likelihood whose mean is 1.
     """
     second = 0.0
     slippery = 0.0

@@ -58,8 +58,8 @@ LAYOUT: Final = hashlib.blake2b(
 
 
 def image_of(fusion: Fusion) -> Image:
-    """Everything that a fusion holds. Windows, entries and pairs keep their places, since they
-    point at each other.
+    """Return the complete state of a fusion. Windows, entries and pairs keep their indices, because
+    they refer to each other.
     """
     store = fusion.store
     state = fusion.store.state
@@ -105,7 +105,7 @@ def image_of(fusion: Fusion) -> Image:
 
 
 def fusion_of(image: Image, lateness_s: float) -> Fusion:
-    """The fusion of an image, with the lateness that it had."""
+    """Return the fusion that an image describes, with the lateness that it had."""
     fusion = Fusion(lateness_s)
     records = {
         name: _restore_records(image[name]["bytes"], kind) for name, kind in _RECORDS.items()

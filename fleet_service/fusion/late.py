@@ -35,15 +35,15 @@ _FLOOR: Final = mugrid.FLOOR_STEPS
 
 
 def fused_at(time: IntArray, checkpoint: int) -> IntArray:
-    """When late visits of `time` (n,) [ns] stand in the window: within a second, the newest
-    first; whole µs.
+    """Return the times [ns] at which late visits of `time` (n,) enter the window: within one second
+    after the checkpoint, the newest first, in whole µs.
     """
     age = np.clip(checkpoint - time, 0, LATE_MOST_NS)
     return np.asarray(checkpoint + age // (LATE_MOST_NS // _PLACES_NS) // 1000 * 1000)
 
 
 def delay_observations(o: Observations, late_by: IntArray, weather: Weather) -> Observations:
-    """The observations, those with `late_by` (n,) [ns] above nought moved on by it."""
+    """Return the observations with times and evidence moved forward by `late_by` (n,) [ns]."""
     rows = np.flatnonzero(late_by)
     evidence = o.evidence.copy()
     evidence[rows] = aged_evidence(
@@ -60,8 +60,8 @@ def delay_observations(o: Observations, late_by: IntArray, weather: Weather) -> 
 def aged_evidence(
     evidence: ByteArray, key: IntArray, begin: IntArray, end: IntArray, weather: Weather
 ) -> ByteArray:
-    """Likelihoods (n, 32) in steps of roads `key` (n,) at `begin`, as likelihoods of the same
-    roads at `end` [ns].
+    """Return the evidence (n, 32), in steps, that observations of roads `key` (n,) at `begin` [ns]
+    still give about the same roads at `end` [ns].
     """
     out = np.empty_like(evidence)
     likelihood = np.empty(mugrid.BINS, np.float32)

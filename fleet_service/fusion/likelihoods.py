@@ -32,8 +32,8 @@ _USED_STEP: Final = 0.005
 
 
 def make_evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> Evidence:
-    """Log-likelihood of each visit in steps of 1/16 nat below its maximum, (n, 32), and the values
-    as reported.
+    """Return the log-likelihood of each visit in steps of 1/16 nat below its maximum, (n, 32), and
+    the values as reported.
 
     Args:
         columns: `log_likelihood` (n, 32); `mu`, `mu_lower`, `mu_upper`, `mu_utilised`, each (n,),
@@ -77,7 +77,9 @@ def bound_by_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
 
 @cache
 def _levelled_bounds() -> ByteArray:
-    """Levelled bounds in steps, of uses _USED_STEP apart, as far as one is believed."""
+    """Return a table of levelled bounds in steps, for grip used from 0 to UTILISED_MOST in steps of
+    _USED_STEP.
+    """
     used = np.arange(0.0, c.UTILISED_MOST + 0.5 * _USED_STEP, _USED_STEP)
     return level_above_used(mugrid.encode_log_likelihood(at_least(used)), used)
 
@@ -97,7 +99,7 @@ def _bound_rows(steps: ByteArray, used: FloatArray, bounds: ByteArray) -> None:
 
 
 def level_above_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
-    """Likelihoods (n, 32) that claim no more than the grip used (n,) supports.
+    """Return likelihoods (n, 32) that claim no more grip than the grip used (n,) supports.
 
     A bound is made flat from the bin on that holds `used` less half its own error: a hundred of
     them then leave a lower end of .95·used + .04 at most. A value stays as it is, and so does
@@ -120,8 +122,8 @@ def _level_rows(steps: ByteArray, used: FloatArray) -> None:
 
 
 def at_least(used: FloatArray) -> FloatArray:
-    """ℓ(μ) = ln Φ((μ - u) / σ_u): rises to u and is flat above; flat everywhere where u is NaN.
-    (n, 32).
+    """Return the log-likelihoods (n, 32) of lower bounds: ln Φ((μ - u) / σ_u) with the grip used u.
+    They are flat if u is NaN.
     """
     known_use = np.minimum(np.nan_to_num(used, nan=-np.inf), c.UTILISED_MOST)[:, None]
     std = np.hypot(c.UTILISED_STD, c.UTILISED_RELATIVE * np.maximum(known_use, 0.0))
@@ -129,8 +131,8 @@ def at_least(used: FloatArray) -> FloatArray:
 
 
 def interval_likelihood(mu: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """ℓ of a median with 5 % and 95 % bounds: a normal with one standard deviation to each side.
-    (n, 32).
+    """Return the log-likelihoods (n, 32) of medians with 5 % and 95 % bounds: normal, with one
+    standard deviation per side.
     """
     below = _side_std(mu - lower)[:, None]
     above = _side_std(upper - mu)[:, None]

@@ -64,7 +64,7 @@ _EAST, _NORTH, _WEST, _SOUTH = range(grid.SECTORS)
 
 @refcount_free_inlined
 def next_cell(cell: int, heading: int) -> int:
-    """The next cell in a sector's direction; the date line is no border."""
+    """Return the next cell in a sector's direction, also across the date line."""
     x = cell & _X
     y = cell & _Y
     if heading == _EAST:
@@ -87,8 +87,8 @@ def road_beliefs(
     slots: IntArray,
     now: IntArray,
 ) -> FloatArray:
-    """Belief of each slot about its road at a time of its own [ns], (k, 32); `table` finds slots
-    by key.
+    """Return the belief about each slot's road at a time [ns] per slot, (k, 32); `table` finds
+    slots by key.
     """
     out = np.empty((len(slots), _BINS))
     scratch = np.empty((3, SCRATCH))
@@ -161,7 +161,7 @@ def _slippery_probability(road: Bins) -> float:
 
 @refcount_free_inlined
 def _stored_slippery(live: Rows, row: int) -> float:
-    """P(slippery) of a belief at rest, which costs a tenth of reading it."""
+    """Return P(slippery) of a stored belief without unpacking it, in a tenth of the time."""
     whole = 0.0
     slippery = 0.0
     for i in range(_BINS):

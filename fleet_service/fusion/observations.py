@@ -67,12 +67,12 @@ class Observations:
     other_share: Float32Array
 
     def take(self, rows: IntArray | BoolArray | slice) -> Observations:
-        """Some of the rows."""
+        """Return the selected rows."""
         return Observations(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
 
 def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> Observations:
-    """Columns (n,) of admitted rows as the fusion takes them.
+    """Return the columns (n,) of admitted rows as observations for the fusion.
 
     Args:
         columns: those of the archive, times in ns; `with_likelihood` (n,) is true for rows with a

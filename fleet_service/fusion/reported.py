@@ -31,7 +31,9 @@ class Evidence(NamedTuple):
 
 
 def as_reported(steps: NDArray[Any]) -> Evidence:
-    """Likelihoods (n, 32) in steps, brought to maximum 0, and the values among them described."""
+    """Return likelihoods (n, 32) in steps with maximum 0, and a description of those that are
+    values.
+    """
     out = steps.astype(np.uint8)
     reported = np.full((len(steps), 3), np.nan, np.float32)
     _describe_rows(out, reported)

@@ -56,7 +56,7 @@ _MOST: Final = 255.0
 
 
 def manoeuvre_of(longitudinal: FloatArray, lateral: FloatArray) -> NDArray[np.int8]:
-    """Manoeuvre of visits (n,) by how they used the grip; UNKNOWN where that is NaN."""
+    """Return the manoeuvre of visits (n,), from how they used the grip; UNKNOWN where that is NaN."""
     along = np.abs(longitudinal) >= np.abs(lateral)
     kind = np.where(
         along,
@@ -120,13 +120,13 @@ def shared_kernel(
 
 
 def base_kernel() -> FloatArray:
-    """K where nobody gave a value: what bounds have in common, (32, 32)."""
+    """Return the kernel K (32, 32) of cells that have only bounds."""
     relative = c.COMMON_RELATIVE * mugrid.CENTRES
     return _two_sided(np.hypot(relative, c.COMMON_ABSOLUTE), np.hypot(relative, c.COMMON_HIGH))
 
 
 def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
-    """K of standard deviations (32,) of what reads low, and of what reads high."""
+    """Return the kernel K for standard deviations (32,) of readings that are too low and too high."""
     away = mugrid.CENTRES[None, :] - mugrid.CENTRES[:, None]
     kernel = np.exp(-0.5 * np.square(away / np.where(away < 0.0, below[:, None], above[:, None])))
     return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
@@ -157,7 +157,7 @@ def shape_class(slope: float) -> int:
 
 @refcount_free_inlined
 def kernel_of(cells: RecordArray, row: int) -> int:
-    """Which kernel reads a row of cells."""
+    """Return the index of the kernel for a row of cells."""
     whole = 0.0
     squares = 0.0
     for k in range(MANOEUVRES):

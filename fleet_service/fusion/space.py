@@ -31,8 +31,8 @@ _STEPS: Final = np.array([k for k in range(-c.SPREAD_CELLS, c.SPREAD_CELLS + 1) 
 def other_cells(
     cell: IntArray, latitude: FloatArray, yaw: FloatArray, position_std: FloatArray
 ) -> tuple[IntArray, Float32Array]:
-    """Other cells of visits (n,), and the probability that the vehicle was there instead, both (n,
-    2·SPREAD_CELLS).
+    """Return other cells in which the vehicles of visits (n,) may have been, and the probability of
+    each, both (n, 2·SPREAD_CELLS).
 
     -1 and 0 where it is less than SPREAD_LEAST, where yaw or the standard deviation is unknown, and
     in another region, which another service may hold. The probabilities leave at least nothing for
@@ -55,7 +55,9 @@ def other_cells(
 
 
 def cell_shares(std: FloatArray, length: FloatArray) -> FloatArray:
-    """π of the cells behind and ahead, (n, 2·SPREAD_CELLS), for σ and w (n,)."""
+    """Return the probabilities π of the cells behind and ahead, (n, 2·SPREAD_CELLS), for σ and w
+    (n,).
+    """
     ratio = (length / np.maximum(std, 1e-6 * length))[:, None]
     return np.asarray(
         (

@@ -161,8 +161,8 @@ def _own_variance(mean: float, std: float) -> float:
 
 @refcount_free
 def _pair_rank(vehicle: int, other: int) -> int:
-    """A fixed random number of a pair, by their own numbers and not by the order in which they
-    came.
+    """Return a fixed pseudo-random number of a pair, which depends on the two vehicles' numbers and
+    not on their order of arrival.
 
     Of all that share a place the lowest stays, so that a rare companion is as likely to be kept as
     a frequent one; or those that report most would displace the others.
@@ -273,7 +273,7 @@ def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:
 
 
 def initial_trust(established: bool) -> float:
-    """Weight of a vehicle that was compared with nobody yet."""
+    """Return the weight of a vehicle that has not been compared with others yet."""
     weight = _scale_trust(c.TRUST_PRIOR)
     return min(weight, c.NEWCOMER) if established else weight
 

@@ -92,7 +92,7 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
 
 @refcount_free
 def load_likelihood(entries: RecordArray, entry: int, scratch: Bins) -> None:
-    """The likelihood of an entry into the scratch again."""
+    """Compute the likelihood of a stored entry again, into `scratch`."""
     _clear_padding(scratch)
     this = entries[entry]
     convolve_bias(this.evidence, int(this.kind), scratch[PADDED], scratch[LIKELIHOOD])
@@ -162,7 +162,7 @@ def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 
 @refcount_free_inlined
 def _to_parts(number: float | np.floating[Any]) -> np.uint16:
-    """A number in parts of 1/FINE."""
+    """Return a number as an integer in units of 1/FINE."""
     return np.uint16(
         min(max(number * np.float32(FINE) + np.float32(0.5), np.float32(0.0)), np.float32(65535.0))
     )
@@ -170,7 +170,7 @@ def _to_parts(number: float | np.floating[Any]) -> np.uint16:
 
 @refcount_free_inlined
 def _from_parts(parts: int) -> np.float32:
-    """The number of so many parts."""
+    """Return the number that an integer in units of 1/FINE represents."""
     return np.float32(parts) * np.float32(1.0 / FINE)
 
 
@@ -303,13 +303,14 @@ def is_ice_source(entries: RecordArray, entry: int) -> bool:
 
 @refcount_free_inlined
 def ice_evidence(entries: RecordArray, entry: int) -> float:
-    """Return the evidence of a value for ice against grip: the log-likelihood ratio with the doubt
-    about tyres [nat].
+    """Return the evidence of a value for ice against grip [nat]: a log-likelihood ratio that allows
+    for an unknown tyre.
 
-    A vehicle that used u of a road μ may read it too low by d(μ) = μ·clip(λ·(SHARED_SHARE - u/μ),
-    0, SHARED_MOST), one standard deviation, with λ the slope that an alarm doubts of an unknown
-    fleet: a witness vouches alone. So grip explains the value as well as max over μ ≥ SLIPPERY, r ≤
-    μ of L(r)·exp(-½·((μ - r)/d(μ))²), where L has the maximum one.
+    A vehicle that used grip u on a road μ may report a value that is too low, with a standard
+    deviation of d(μ) = μ·clip(λ·(SHARED_SHARE - u/μ), 0, SHARED_MOST). λ is the slope that an alarm
+    assumes for an unknown fleet, because each witness is judged alone. With L scaled to maximum 1,
+    the likelihood of grip is therefore the maximum over μ ≥ SLIPPERY and r ≤ μ of
+    L(r)·exp(-½·((μ - r)/d(μ))²).
     """
     evidence = entries[entry].evidence
     used = entries[entry].used / USED
@@ -354,8 +355,8 @@ def _count_visit(cells: RecordArray, row: int, entries: RecordArray, entry: int)
 def _untrusted_weight(
     cells: RecordArray, row: int, kind: int, power: float, weight: float
 ) -> float:
-    """Weight of a vote among others that are not trusted either: the k-th new one counts 1/k², all
-    together 1.6 votes.
+    """Return the weight of a vote among the votes of other untrusted vehicles: the k-th new one
+    counts 1/k², so all together count at most 1.6 votes.
 
     So names cost nothing and bring nothing. A vehicle's repeated vote is discounted by its `power`
     already.

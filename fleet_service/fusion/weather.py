@@ -60,7 +60,7 @@ class Reports:
     prior: FloatArray
 
     def take(self, rows: IntArray | BoolArray) -> Reports:
-        """Some of the rows."""
+        """Return the selected rows."""
         return Reports(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
@@ -86,7 +86,7 @@ class Weather(NamedTuple):
 
 
 def report_rates(reports: Reports) -> FloatArray:
-    """Rates of drift and of change, (n, 2); 1 where nothing is known."""
+    """Return factors on the rates of drift and of change, (n, 2); 1 where the weather is unknown."""
     road = np.where(
         np.isnan(reports.road_temperature),
         reports.air_temperature - AIR_ABOVE_ROAD_C,
@@ -105,7 +105,7 @@ def report_rates(reports: Reports) -> FloatArray:
 
 
 def report_priors(reports: Reports) -> Float32Array:
-    """Priors (n, 32), mixed with the uniform one."""
+    """Return the priors of reports (n, 32), mixed with the uniform prior."""
     given = np.where(np.isnan(reports.prior), mugrid.PRIOR, reports.prior)
     given = given / given.sum(axis=1, keepdims=True)
     mixed: FloatArray = UNIFORM_SHARE * mugrid.PRIOR + (1.0 - UNIFORM_SHARE) * given
@@ -113,7 +113,9 @@ def report_priors(reports: Reports) -> Float32Array:
 
 
 def weather_of(reports: Reports) -> Weather:
-    """Road time of all regions in `reports`; of several of one region and time the last counts."""
+    """Return the road time of all regions in `reports`; the last of several reports with the same
+    region and time counts.
+    """
     last = np.lexsort((np.arange(len(reports.time)), reports.time, reports.region))
     keep = np.append(np.diff(reports.region[last]) != 0, True) | np.append(
         np.diff(reports.time[last]) != 0, True
@@ -156,7 +158,7 @@ def _accumulate_clock(
 
 
 def no_reports() -> Reports:
-    """Nothing known of any region."""
+    """Return empty reports."""
     nothing = np.zeros(0, np.int64)
     never = np.zeros(0)
     return Reports(nothing, nothing, never, never, never, np.zeros((0, mugrid.BINS)))
@@ -167,8 +169,8 @@ _SHIFT: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM) + 2  # from a slot's key
 
 @refcount_free
 def road_time(weather: Weather, key: int, begin: int, end: int) -> tuple[float, float, int]:
-    """Road time of drift and change between two times [ns], and the row whose prior holds at the
-    end; 0 without one.
+    """Return the road time of drift and of change between two times [ns], and the row whose prior
+    applies at the end; row 0 if there is none.
     """
     seconds = (end - begin) * 1e-9
     if len(weather.region) == 0:

@@ -116,7 +116,7 @@ def _absorb_votes(
     marks: Marks,
     scratch: Bins,
 ) -> int:
-    """Fills the marks; returns how many windows are stale."""
+    """Absorb the votes and fill the marks; return the number of stale windows."""
     cells = state.live.cells
     windows = state.windows
     entries = state.entries
@@ -216,7 +216,7 @@ def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, begin: int, 
 
 @refcount_free_inlined
 def _open_window(state: State, slot: int) -> int:
-    """A window for a slot that has none, with its row as it is."""
+    """Open a window for a slot that has none, with a copy of the slot's row; return its index."""
     state.used[FREE_WINDOWS] -= 1
     window = int(state.free_windows[state.used[FREE_WINDOWS]])
     live = state.live
@@ -236,7 +236,7 @@ def _open_window(state: State, slot: int) -> int:
 
 @refcount_free
 def _open_reporters(state: State, slot: int, window: int) -> None:
-    """Reporters for a slot, with a window, that gets its first value or source for long."""
+    """Allocate a row of reporters for a slot with a window that has none."""
     row = state.used[REPORTERS_USED]
     state.used[REPORTERS_USED] += 1
     state.live.cells[slot].reporters = row
@@ -351,7 +351,7 @@ def _commit_windows(
 
 @refcount_free_inlined
 def _shorten_window(state: State, slot: int, window: int, entry: int) -> None:
-    """A window begins with `entry` now; without one it is given back."""
+    """Let a window begin with `entry`; free the window if `entry` is NONE."""
     windows = state.windows
     windows[window].head = entry
     if entry == NONE:

@@ -91,7 +91,7 @@ class Errors:
 
     @staticmethod
     def draw(rng: Generator, vehicles: int, model: ErrorModel = CLEAN) -> Errors:
-        """A fleet."""
+        """Draw the errors of a fleet."""
         relative = model.bias * rng.normal(size=vehicles)
         return Errors(
             relative + model.tyres + np.where(np.arange(vehicles) % 2, model.half, 0.0),
@@ -129,14 +129,18 @@ class SimulatedReports:
 
 
 def used_shares(rng: Generator, excited: BoolArray, model: ErrorModel = CLEAN) -> FloatArray:
-    """s of visits: within the model's range where excited, ordinary driving else; same shape."""
+    """Return the share s of the grip used in each visit: within the model's range if excited, else
+    that of ordinary driving.
+    """
     ordinary = rng.uniform(0.05, min(0.5, model.share[1]), excited.shape)
     return np.where(excited, rng.uniform(*model.share, excited.shape), ordinary)
 
 
 def reading_noise(rng: Generator, along: IntArray, tails: float = np.inf) -> FloatArray:
-    """e of visits that follow each other; `along` (n,) is 0 where a drive begins. Student's with
-    `tails` degrees of freedom, of standard deviation one, if these are finite."""
+    """Return the correlated noise e of successive visits, with standard deviation 1; `along` (n,)
+    is 0 where a drive begins. If `tails` is finite, it is Student's t with so many degrees of
+    freedom.
+    """
     e = rng.normal(size=len(along))
     heavy = 1.0 if np.isinf(tails) else np.sqrt((tails - 2.0) / rng.chisquare(tails, len(along)))
     for step in range(1, int(along.max(initial=0)) + 1):
@@ -146,7 +150,7 @@ def reading_noise(rng: Generator, along: IntArray, tails: float = np.inf) -> Flo
 
 
 def draw_reports(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
-    """Reports of visits (n,)."""
+    """Draw the reports of visits (n,)."""
     model = errors.model
     who = p.vehicle
     relative = NOISE_AT_LIMIT + NOISE_PER_SHARE * (1.0 - p.share)
@@ -174,7 +178,7 @@ def draw_reports(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
 def reading_likelihood(
     reading: FloatArray, relative: FloatArray, absolute: float = NOISE_ABSOLUTE
 ) -> FloatArray:
-    """ln p(z | μ) of readings (n,) with relative noise (n,), on the grid (n, 32), up to a
+    """Return ln p(z | μ) of readings (n,) with relative noise (n,), on the grid (n, 32), up to a
     constant.
     """
     std = np.hypot(absolute, relative[:, None] * mugrid.CENTRES)
@@ -184,5 +188,7 @@ def reading_likelihood(
 def overconfident_likelihood(
     claim: FloatArray | float, std: float = OVERCONFIDENT_STD
 ) -> FloatArray:
-    """Normal log-likelihoods (n, 32) of one who claims μ (n,) and no doubt."""
+    """Return normal log-likelihoods (n, 32) of a vehicle that claims μ (n,) with a standard
+    deviation that is too small.
+    """
     return np.asarray(-0.5 * np.square((mugrid.CENTRES - np.reshape(claim, (-1, 1))) / std))

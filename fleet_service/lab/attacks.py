@@ -54,14 +54,14 @@ class AttackedDrive:
 
 
 def drive_of(rng: Generator) -> AttackedDrive:
-    """The honest part."""
+    """Simulate the honest fleet's drive."""
     place = town.draw_town(rng, MINUTES, 0.0)
     visits = town.drive_fleet(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
     return AttackedDrive(place, visits, excited_vehicles(visits, place, BEGIN, VEHICLES) >= ENOUGH)
 
 
 def measure(seeds: range) -> dict[str, float]:
-    """Alerts raised or suppressed, summed over the seeds, per attack."""
+    """Return the number of alerts raised or suppressed per attack, summed over the seeds."""
     out = dict.fromkeys((f"fusion.attack.{name}" for name in ATTACKS), 0.0)
     for seed in seeds:
         rng = np.random.default_rng([seed, 7])
@@ -76,7 +76,7 @@ def measure(seeds: range) -> dict[str, float]:
 
 
 def count_differing(drive: AttackedDrive, alone: list[BoolArray], attacked: list[BoolArray]) -> int:
-    """Cells in which the attack raised or suppressed an alert."""
+    """Return the number of cells in which the attack raised or suppressed an alert."""
     raised = np.zeros(CELLS, bool)
     suppressed = np.zeros(CELLS, bool)
     for minute in range(BEGIN, MINUTES):
@@ -93,7 +93,7 @@ def _attacking_rows(v: Visits, count: int) -> BoolArray:
 
 
 def claim_random(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Sure values of anything, at every visit."""
+    """Return visits in which the attackers claim random values with high confidence at every visit."""
     v = drive.visits
     claim = rng.uniform(0.05, 1.2, len(v))
     return _with_claims(v, _attacking_rows(v, ATTACKERS), claim)
@@ -125,14 +125,14 @@ def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
 
 
 def victim_cells(drive: AttackedDrive) -> IntArray:
-    """The driest and the iciest cell that count."""
+    """Return the driest and the iciest of the counted cells."""
     mu = np.where(drive.counted, drive.town.mu[BEGIN], np.nan)
     return np.array([np.nanargmax(mu), np.nanargmin(mu)])
 
 
 def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Hundreds of visits a minute: ice on the driest cell, dry on the iciest; the values vary,
-    so as to look new.
+    """Return hundreds of visits per minute that claim ice in the driest cell and a dry road in the
+    iciest; the values vary, so that they look new.
     """
     count = FLOODERS * FLOOD
     seconds = rng.uniform(60.0 * BEGIN, 60.0 * MINUTES, count)
@@ -144,8 +144,8 @@ def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
 
 
 def add_newcomers(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Forty new names that each pass once and agree: ice on the road of the driest cell, dry on
-    that of the iciest.
+    """Return visits of forty new names that each pass once and agree: ice on the road of the driest
+    cell, dry on that of the iciest.
     """
     roads = victim_cells(drive) // LENGTH * LENGTH
     who, which, along = (
@@ -190,8 +190,8 @@ VISITS: Final[dict[str, Callable[[Generator, AttackedDrive], Visits]]] = {
 
 
 def replay_messages(rng: Generator, drive: AttackedDrive) -> int:
-    """Every message of the town's first minutes again, as it was, on other keys, and under
-    another name.
+    """Return the number of cells whose alert changes if messages of the town's first minutes are
+    sent again: unchanged, on other keys, and under another name.
     """
     sent = make_messages(drive.visits)
     at = drive.visits.seconds[[m.last for m in sent]]
@@ -211,8 +211,8 @@ def replay_messages(rng: Generator, drive: AttackedDrive) -> int:
 def _alerts_by_minute(
     sent: list[SentMessage], at: FloatArray, forged: list[Message], key: bytes
 ) -> list[BoolArray]:
-    """Alerts of each minute; by the `key` vehicles have the same numbers each time, and with
-    them the same peers.
+    """Return the alerts of each minute. The same `key` gives the vehicles the same numbers, and
+    therefore the same peers, in each run.
     """
     out = []
     with tempfile.TemporaryDirectory() as folder:

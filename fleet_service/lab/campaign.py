@@ -95,7 +95,7 @@ def _is_listed(name: str, only: str | None, found: Mapping[str, float]) -> bool:
 
 
 def drives_end_to_end(quick: bool) -> Drives:
-    """The end-to-end drives, level and rough, or a few seconds of them."""
+    """Return the end-to-end drives, level and rough; if quick, a few seconds of them."""
     return {
         world: end_to_end.drive_command(*((4, 3.0) if quick else length), world)
         for world, length in LENGTHS.items()

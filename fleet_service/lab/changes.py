@@ -27,7 +27,7 @@ UNREACHED: Final = 99  # passes, where the drive ended before the map had seen i
 
 
 def changing_town(rng: Generator, before: float, after: float) -> Town:
-    """A town whose first road is `before` and becomes `after`."""
+    """Return a town whose first road changes its friction from `before` to `after`."""
     drawn = town.draw_town(rng, MINUTES, 0.0)
     mu = drawn.mu.copy()
     excitement = drawn.excitement.copy()
@@ -36,7 +36,8 @@ def changing_town(rng: Generator, before: float, after: float) -> Town:
 
 
 def detection_delays(rng: Generator, before: float, after: float) -> IntArray:
-    """Excited passes over each cell of the road, (LENGTH,), until the map has seen the change.
+    """Return the number of excited passes over each cell of the road, (LENGTH,), until the map
+    shows the change.
 
     Ice is seen when P(μ < .4) > .9; its end, when P(μ < .4) < .1, which ends an alert. A pass is
     one excited visit that the map heard of the cell, whether or not it was the right cell.
@@ -67,8 +68,8 @@ def _has_seen(fusion: Fusion, cell: int, ice: bool) -> bool:
 
 
 def measure(seeds: range) -> dict[str, float]:
-    """Medians and 95 % quantiles over the cells of all seeds; and the share of cells after each
-    number of passes.
+    """Return medians and 95 % quantiles over the cells of all seeds, and the share of cells
+    detected after each number of passes.
     """
     out: dict[str, float] = {}
     for name, before, after in (("ice_onset", DRY, ICE), ("ice_end", ICE, DRY)):

@@ -33,8 +33,7 @@ CELL: Final = cell_numbers()
 
 
 def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
-    """Visits as columns of the archive, as far as the fusion reads them; every row is a batch of
-    its own.
+    """Return visits as the archive columns that the fusion reads; every row is a batch of its own.
 
     `cells` are the grid's numbers of the visits' places.
     """
@@ -73,8 +72,8 @@ def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
 
 
 def draw_arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
-    """When each delivery comes [s] and which visit it brings, in order of arrival: some late,
-    some twice.
+    """Draw the arrival times [s] of deliveries and the visit in each, in order of arrival: some
+    late, some twice.
     """
     n = len(v)
     delay = rng.exponential(DELAY_S, n) + np.where(
@@ -88,7 +87,7 @@ def draw_arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
 
 
 def novel_deliveries(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
-    """Those deliveries that the service admits: each identity once."""
+    """Return the deliveries that the service admits: each identity once."""
     streams = SequenceTrackers()
     kept = []
     region = rows["region"].tolist()
@@ -127,7 +126,7 @@ class AlertWatch:
 
 
 def split_minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Observations]:
-    """The observations that arrive in each minute."""
+    """Return the observations that arrive in each minute."""
     for rows in np.split(np.arange(len(at)), np.searchsorted(at, 60.0 * np.arange(1, count + 1)))[
         :count
     ]:

@@ -63,7 +63,7 @@ WAYS: Final = tuple(
 
 
 def drive_command(vehicles: int, seconds: float, world: World) -> Drive:
-    """A drive by `python -m deploy.end_to_end`."""
+    """Return a drive that runs `python -m deploy.end_to_end`."""
     import sys
 
     def run_drive(folder: Path) -> None:
@@ -86,8 +86,8 @@ def drive_command(vehicles: int, seconds: float, world: World) -> Drive:
 
 
 def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float]:
-    """Coverage of cells with SEVERAL vehicles, error of those among them that are measured,
-    alerts, and the counts.
+    """Return coverage of cells with SEVERAL vehicles, error of the measured ones among them,
+    alerts, and counts.
     """
     folder = folder / world.prefix.removeprefix("fusion.")
     drive(folder)
@@ -167,12 +167,14 @@ def _score_figures(scores: Scores, measured: np.ndarray[Any, Any]) -> dict[str, 
 
 
 def mean_or_nan(values: np.ndarray[Any, Any]) -> float:
-    """The mean, NaN of nothing: a figure that was not measured holds no bar."""
+    """Return the mean, or NaN without values, because a figure that was not measured must not hold
+    its bar.
+    """
     return float(values.mean()) if len(values) else float("nan")
 
 
 def read_observations(path: Path) -> dict[str, Any]:
-    """Columns of observations as the archive would give them."""
+    """Read columns of observations in the form in which the archive returns them."""
     table = pq.read_table(path)
     out = {}
     for name, dtype in wire.column_types(wire.Kind.OBSERVATION).items():
@@ -195,7 +197,7 @@ def driven_in(folder: Path) -> DrivenVisits:
 
 
 def observations_in(columns: dict[str, Any]) -> Observations:
-    """As the service would take them, each row a batch of its own."""
+    """Return columns as observations for the fusion, each row a batch of its own."""
     n = len(columns["cell"])
     with_likelihood = np.full(n, columns["log_likelihood"].shape[1] > 0)
     identity = {
@@ -209,8 +211,8 @@ def observations_in(columns: dict[str, Any]) -> Observations:
 
 
 def slots_with_truth(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatArray]:
-    """Slots that a vehicle truly visited, and their friction at the last such visit's half
-    minute.
+    """Return the slots that a vehicle truly visited, and their friction in the half minute of the
+    last such visit.
     """
     cell = visits["cell"].to_numpy()
     sector = visits["sector"].to_numpy()
@@ -240,7 +242,9 @@ def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np
 
 
 def excited_vehicles(fusion: Fusion, visits: pa.Table) -> IntArray:
-    """Distinct vehicles that used EXCITED_SHARE of the grip in each slot, (slots,)."""
+    """Return the number of distinct vehicles that used EXCITED_SHARE of the grip in each slot,
+    (slots,).
+    """
     rows = visits["utilisation"].to_numpy() >= EXCITED_SHARE
     slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))
     _, who = np.unique(visits["vehicle"].to_numpy(zero_copy_only=False), return_inverse=True)

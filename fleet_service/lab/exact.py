@@ -29,8 +29,8 @@ PARTS: Final = 60  # portions in which a shuffled drive comes
 
 
 def largest_difference(a: Fusion, b: Fusion) -> float:
-    """Largest difference of any probability in any cell of two fusions; 1 where one has a cell
-    that the other lacks.
+    """Return the largest difference of any probability in any cell of two fusions; 1 if only one of
+    them has some cell.
     """
     there = b.slots_of(a.cell[: a.size], a.sector[: a.size])
     if a.size != b.size or (there < 0).any():
@@ -40,7 +40,9 @@ def largest_difference(a: Fusion, b: Fusion) -> float:
 
 
 def drive_town(rng: Generator) -> Visits:
-    """Twenty minutes in a town where some vehicles lie, so that weights differ."""
+    """Simulate twenty minutes in a town where some vehicles report false values, so that weights
+    differ.
+    """
     visits = town.drive_fleet(
         rng, town.draw_town(rng, MINUTES, 0.3), Errors.draw(rng, VEHICLES), MINUTES
     )
@@ -48,7 +50,9 @@ def drive_town(rng: Generator) -> Visits:
 
 
 def order_difference(rng: Generator) -> float:
-    """In order of time against any order within the lateness."""
+    """Return the largest difference between fusing in order of time and fusing in a random order
+    within the lateness.
+    """
     visits = drive_town(rng)
     o = observations_of(rows_of(visits), visits.vehicle)
     straight = Fusion(LATENESS_S)
@@ -62,8 +66,8 @@ def order_difference(rng: Generator) -> float:
 
 
 def replay_difference(rng: Generator) -> float:
-    """A service that took messages, some of them late or twice, against one that starts from its
-    archive.
+    """Return the largest difference between a service that received messages, some late or twice,
+    and one restarted from its archive.
     """
     visits = drive_town(rng)
     sent = make_messages(visits)
@@ -81,8 +85,8 @@ def replay_difference(rng: Generator) -> float:
 
 
 def upper_shift(rng: Generator) -> float:
-    """Largest fall of an upper end below the prior's, by any of UNEXCITED numbers of vehicles on
-    any surface.
+    """Return by how much an upper end falls at most below the prior's, over the numbers of vehicles
+    in UNEXCITED and all surfaces.
     """
     prior = float(mugrid.quantiles(mugrid.PRIOR, 0.95))
     worst = -np.inf

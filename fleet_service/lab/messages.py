@@ -26,7 +26,7 @@ class SentMessage(NamedTuple):
 
 
 def name_of(vehicle: int) -> str:
-    """Enrolled name of a simulated vehicle."""
+    """Return the enrolled name of a simulated vehicle."""
     return f"car-{vehicle:05d}"
 
 
@@ -36,7 +36,7 @@ def clock_of(seconds: float) -> int:
 
 
 def make_messages(v: Visits) -> list[SentMessage]:
-    """Each vehicle's visits in batches, in order of time per vehicle and region."""
+    """Return each vehicle's visits as batches, in order of time per vehicle and region."""
     rows = rows_of(v)
     out = []
     latitude, longitude = grid.centre(rows["cell"])
@@ -87,7 +87,9 @@ def _make_message(
 
 
 def forge_messages(message: Message, thief: int) -> tuple[Message, Message]:
-    """Another's message on the thief's own key; and its visits in a batch of the thief's own."""
+    """Return forged messages: another vehicle's message under the attacker's own key, and the same
+    visits in a batch of the attacker's own.
+    """
     batch = decode(message.payload, message.encoding, message.kind)
     name = name_of(thief)
     key = keys.observation_key(batch.region, name)

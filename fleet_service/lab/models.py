@@ -54,8 +54,8 @@ MODELS: Final[dict[str, ErrorModel]] = {
 def score_town(
     model: ErrorModel, seed: int, ways: DrivenVisits | None = None
 ) -> tuple[Scores, list[Scores]]:
-    """Scores of the map, and of the rules, on one town; its reports are drawn from those of
-    `ways`, if there are.
+    """Return the scores of the map and of the rules in one town; reports are drawn from `ways` if
+    given.
     """
     rng = np.random.default_rng([seed, 11])
     place = town.draw_town(rng, MINUTES, 0.0, model)
@@ -72,7 +72,7 @@ def score_town(
 
 
 def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
-    """All fleets; `log_line` hears the progress."""
+    """Return the figures of all fleets; `log_line` receives lines of progress."""
     out: dict[str, float] = {}
     for name, model in MODELS.items():
         out |= _town_figures(f"fusion.{name}", [score_town(model, seed) for seed in seeds])
@@ -83,8 +83,8 @@ def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
 
 
 def measure_real(ways: DrivenVisits, seeds: range) -> dict[str, float]:
-    """The fleet that errs as the real estimator did; nothing where no such visit was excited, or
-    each was.
+    """Return the figures of a fleet whose errors are those of the real estimator; empty if no visit
+    or every visit was excited.
     """
     if not ways.excited.any() or ways.excited.all():
         return {}

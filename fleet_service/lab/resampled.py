@@ -84,7 +84,7 @@ def attach_truth(observations: dict[str, Any], truth: TrueVisits) -> DrivenVisit
 
 
 def join_ways(ways: Sequence[DrivenVisits]) -> DrivenVisits:
-    """Visits of several ways, whose vehicles are different ones."""
+    """Return the visits of several ways as one; vehicles of different ways are different vehicles."""
     begins = np.cumsum([0, *(int(way.vehicle.max()) + 1 for way in ways)])
     columns = zip(*(vars(way.reports).values() for way in ways), strict=True)
     return DrivenVisits(
@@ -96,8 +96,8 @@ def join_ways(ways: Sequence[DrivenVisits]) -> DrivenVisits:
 
 
 def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles: int) -> Visits:
-    """The town's visits with reports of `ways`; each of its `vehicles` is one of theirs, if
-    there are so many.
+    """Return the town's visits with reports drawn from `ways`. Each of the `vehicles` uses the
+    reports of one vehicle there, a different one if there are enough.
     """
     there = np.unique(ways.vehicle)
     who = rng.choice(there, vehicles, replace=vehicles > len(there))
@@ -117,8 +117,8 @@ def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles
 
 
 def _nearest_friction(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntArray) -> IntArray:
-    """For each friction one of the NEAREST of `rows`, which are in its order; -1 where there are
-    none.
+    """Return, for each friction, a random one of the NEAREST of `rows`, which are sorted by
+    friction; -1 without rows.
     """
     if not len(rows):
         return np.full(len(mu), -1)
@@ -127,7 +127,7 @@ def _nearest_friction(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntA
 
 
 def _scale_reports(reports: SimulatedReports, row: IntArray, by: FloatArray) -> SimulatedReports:
-    """Rows of reports, on roads with `by` times the grip."""
+    """Return rows of reports, scaled to roads with `by` times the grip."""
     width = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
     place = np.clip(
         (mugrid.CENTRES / by[:, None] - mugrid.CENTRES[0]) / width, 0.0, mugrid.BINS - 1.0

@@ -55,8 +55,8 @@ _NEWEST, _ALL, _ONE, _INTERSECTION, _FEDERATED = range(_KALMAN)
 def vehicle_posteriors(
     vehicle: IntArray, reading: FloatArray, std: FloatArray, vehicles: int
 ) -> FloatArray:
-    """(m, P) that each visit's vehicle sends, (n, 2): its filter's, which goes back to the prior
-    along the road.
+    """Return the posterior (m, P) that the vehicle of each visit sends, (n, 2): that of its filter,
+    which returns to the prior along the road.
     """
     mean = np.full(vehicles, PRIOR_MEAN)
     variance = np.full(vehicles, PRIOR_VAR)
@@ -84,7 +84,7 @@ def fuse_by_rules(
     asked: FloatArray,
     cells: int,
 ) -> FloatArray:
-    """Mean and variance per asking time, rule and cell, (times, 5, cells, 2)."""
+    """Return mean and variance per query time, rule and cell, (times, 5, cells, 2)."""
     mean = np.full((5, cells), PRIOR_MEAN)
     variance = np.full((5, cells), PRIOR_VAR)
     last = np.zeros(cells)
@@ -124,8 +124,8 @@ def fuse_by_rules(
 
 
 def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
-    """Median of the vehicles' last readings within MEDIAN_MIN, and its standard deviation,
-    (cells,) each.
+    """Return the median of the vehicles' last readings within MEDIAN_MIN, and its standard
+    deviation, (cells,) each.
     """
     recent = (v.seconds < 60.0 * minute) & (v.seconds >= 60.0 * (minute - MEDIAN_MIN))
     rows = np.flatnonzero(np.isfinite(v.reports.reading) & recent)
@@ -144,7 +144,9 @@ def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
 def score_rules(
     v: Visits, town: Town, at: tuple[int, ...], vehicles: int, where: BoolArray | bool = True
 ) -> list[Scores]:
-    """Scores of each of RULES at some minutes, for the cells `where` an excited vehicle was."""
+    """Return the scores of each of RULES at the minutes `at`, for those cells of `where` that an
+    excited vehicle has reported.
+    """
     sent = vehicle_posteriors(v.vehicle, v.reports.reading, v.reports.std, vehicles)
     asked = 60.0 * np.array(at, float)
     found = fuse_by_rules(v.place, v.seconds, sent, v.reports.reading, v.reports.std, asked, CELLS)

@@ -50,8 +50,8 @@ _WEST = 11.90
 
 
 def cell_numbers(cells: int = CELLS) -> IntArray:
-    """Quadints of the town's cells, (cells,): each road runs east, the roads lie a few cells
-    apart.
+    """Return the quadints of the town's cells, (cells,): each road runs east, and the roads are a
+    few cells apart.
     """
     x, y = grid.deinterleave(grid.cell_of(_NORTH, _WEST))
     k = np.arange(cells)
@@ -71,7 +71,7 @@ class Town:
     usual: IntArray
 
     def at(self, seconds: FloatArray, place: IntArray) -> FloatArray:
-        """Friction at a time and place, (n,)."""
+        """Return the friction at times and places, (n,)."""
         return np.asarray(
             self.mu[np.minimum((seconds // 60.0).astype(np.int64), len(self.mu) - 1), place]
         )
@@ -170,7 +170,7 @@ def drive_fleet(
 
 
 def select_visits(v: Visits, rows: IntArray | BoolArray) -> Visits:
-    """Some of the visits."""
+    """Return the visits at the given indices."""
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
     return Visits(
         v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports
@@ -178,7 +178,9 @@ def select_visits(v: Visits, rows: IntArray | BoolArray) -> Visits:
 
 
 def claim_falsely(v: Visits, liars: BoolArray, claim: float) -> Visits:
-    """The visits with those of `liars` (V,) claiming `claim`, sure, at every visit."""
+    """Return the visits after `liars` (V,) have replaced their values with `claim`, with high
+    confidence.
+    """
     lying = liars[v.vehicle]
     readings = np.where(lying, claim, v.reports.reading)
     reports = SimulatedReports(

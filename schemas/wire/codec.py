@@ -66,7 +66,7 @@ _KIND_OF: Final = {number: kind for kind, number in _PB_KIND.items()}
 
 
 def encoding_of(message: type[Any]) -> str:
-    """Zenoh encoding of a protobuf message."""
+    """Return the Zenoh encoding of a protobuf message."""
     return f"application/protobuf;{message.DESCRIPTOR.full_name}"
 
 
@@ -112,7 +112,7 @@ class Batch:
 
 
 def encode(batch: Batch) -> bytes:
-    """Protobuf bytes of a batch.
+    """Return the protobuf bytes of a batch.
 
     Raises:
         WireError: columns of unequal length, too many records, or a column that the kind does not
@@ -148,7 +148,7 @@ def encode(batch: Batch) -> bytes:
 
 
 def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> Any:  # noqa: ANN401 protobuf messages are untyped
-    """A message from its bytes, protobuf of the `expected` encoding or JSON.
+    """Parse a message from its bytes: protobuf of the `expected` encoding, or JSON.
 
     Raises:
         WireError: too large, another encoding, or not the message.
@@ -191,7 +191,9 @@ class StreamAck(NamedTuple):
 
 
 def encode_ack(vehicle: str, streams: list[StreamAck], time: int = 0) -> bytes:
-    """Protobuf bytes of an acknowledgement that a service gives at `time` [ns] of its clock."""
+    """Return the protobuf bytes of an acknowledgement that a service sends at `time` [ns] of its
+    clock.
+    """
     message = pb.Ack(vehicle=vehicle, time=time)
     for stream in streams:
         part = message.streams.add()  # field by field: half of what keyword arguments take
@@ -210,7 +212,7 @@ def encode_ack(vehicle: str, streams: list[StreamAck], time: int = 0) -> bytes:
 
 
 def decode_ack(payload: bytes) -> tuple[str, list[StreamAck]]:
-    """Vehicle and streams of an acknowledgement.
+    """Return the vehicle and the streams of an acknowledgement.
 
     Raises:
         WireError: not an Ack, or of a kind that this version does not know.
@@ -253,7 +255,7 @@ class Alert:
 
 
 def encode_alert(alert: Alert) -> bytes:
-    """Protobuf bytes of an alert."""
+    """Return the protobuf bytes of an alert."""
     return pb.Alert(**vars(alert)).SerializeToString()
 
 
@@ -267,7 +269,7 @@ def decode_alert(payload: bytes) -> Alert:
 
 
 def encode_standing(alerts: Sequence[Alert]) -> bytes:
-    """Protobuf bytes of the alerts that stand in a tile."""
+    """Return the protobuf bytes of the active alerts of a tile."""
     return pb.StandingAlerts(
         alerts=[pb.Alert(**vars(alert)) for alert in alerts]
     ).SerializeToString()

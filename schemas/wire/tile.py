@@ -25,7 +25,7 @@ _COMPRESSION = 3
 
 
 def decode_tile(payload: bytes) -> pa.Table:
-    """The cells of a tile.
+    """Return the cells of a tile.
 
     Raises:
         WireError: too large, compressed, not of the map's columns, or damaged.
@@ -76,7 +76,7 @@ def _refuse_compressed(payload: bytes) -> None:
 
 
 def _field_offset(data: bytes, table: int, index: int) -> int:
-    """Where a field of a FlatBuffers table lies; 0 where it is absent."""
+    """Return the offset of a field in a FlatBuffers table; 0 if the field is absent."""
     layout = table - int(struct.unpack_from("<i", data, table)[0])
     if 4 + 2 * index >= int(struct.unpack_from("<H", data, layout)[0]):
         return 0

@@ -177,8 +177,8 @@ def _take_velocity(
     direction: tuple[float, float],
     reading: tuple[float, float, float],
 ) -> float:
-    """Apply a velocity along `direction` (x, y): (innovation, variance, huber); return half its
-    normalised square.
+    """Update node j with a velocity reading (innovation, variance, Huber threshold) along
+    `direction` (x, y); return half of its normalised square.
     """
     root = scratch.root[j]
     row = scratch.velocity_row

@@ -139,8 +139,8 @@ def begin_motion(memory: FederatedMemory) -> None:
 
 @compiled
 def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> None:
-    """Share, predict by `dt` [s] and update in both sub-filters, and fuse; friction (4,) is
-    given.
+    """Distribute the fused state, predict by `dt` [s], update both sub-filters and fuse them;
+    friction (4,) is given.
     """
     motion = memory.motion
     track = memory.track

@@ -154,7 +154,7 @@ def diagnose(
 
 
 def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
-    """Times in seconds, and whether they are too few to say anything."""
+    """Return the times in seconds, and True if the sampling rate is unusable."""
     step = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
     if step > 0.0 and not 1.0 / FASTEST_HZ <= step <= 1.0 / SLOWEST_HZ:
         for unit, factor in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("minutes", 60.0)):
@@ -169,7 +169,8 @@ def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
 
 
 def _find_jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
-    """Status bits above a wheel's number: readings far off the other three, and back.
+    """Find status bits above the number of a wheel speed: readings that jump away from the other
+    three wheels and back.
 
     A wheel that spins or locks is off as well, but gets there in steps and by any amount. A bit is
     whole from one reading to the next, and adds the same each time.
@@ -363,7 +364,9 @@ def _find_radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Fi
 
 
 def _compare_axles(drive: EvenDrive) -> list[Finding]:
-    """Front wheels go the longer way in a turn: v_f² = v_r² + (L r)²."""
+    """Return findings about exchanged axles: in a turn the front wheels travel further, v_f² = v_r²
+    + (L r)².
+    """
     front = drive.wheels[:, :2].mean(axis=1)
     rear = drive.wheels[:, 2:].mean(axis=1)
     good = (

@@ -31,7 +31,7 @@ COMPASS: Final[dict[str, Callable[[FloatArray], FloatArray]]] = {
 
 
 def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
-    """Faults of yaw."""
+    """Return the faults of the yaw angle."""
     findings = []
     if np.isfinite(signals[:, S.LATITUDE]).sum() < 10:
         return []
@@ -58,9 +58,7 @@ def _total_turn(angle: FloatArray) -> float:
 
 
 def _course_agreement(yaw: FloatArray, course: FloatArray) -> float:
-    """1 where they are equal, by the part of the mean resultant that lies along no difference at
-    all.
-    """
+    """Return the mean cosine of the difference between yaw and course; 1 if they are equal."""
     return float(np.mean(np.cos(yaw - course)))
 
 

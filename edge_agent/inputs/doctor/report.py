@@ -82,7 +82,7 @@ def _finite_or_none(value: object) -> object:
 
 
 def publishing_advice(diagnosis: Diagnosis) -> str:
-    """One line: whether the log may be published, and what to do if not."""
+    """Return one line that states whether the log may be published, and otherwise what to do."""
     if diagnosis.is_passed:
         return "passed: units, signs, clocks and offsets agree with each other"
     if diagnosis.findings:
@@ -93,7 +93,7 @@ def publishing_advice(diagnosis: Diagnosis) -> str:
 
 
 def report_page(diagnosis: Diagnosis, title: str) -> str:
-    """A page of HTML: verdict, findings, and each identity as a plot."""
+    """Return an HTML page with the verdict, the findings, and a plot of each identity."""
     rows = [
         f"<tr class='bad'><td>{escape(f.channel)}<td>{escape(f.kind)}<td>{escape(f.words)}"
         for f in diagnosis.findings

@@ -150,7 +150,7 @@ class Verdict:
 
 
 def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
-    """The fewest faults of unit and sign that explain the identities."""
+    """Return the smallest set of faults of unit and sign that explains the identities."""
     choices = faults_of(vehicle, found["ground"])
     known = {name: fit for name, fit in found.items() if fit.is_known}
     costs: list[tuple[float, dict[str, Mistake]]] = []
@@ -213,8 +213,8 @@ def _misfit_of(name: str, fit: Fit, guess: Mapping[str, Mistake]) -> float:
 
 
 def late_clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
-    """Device -> (seconds that its clock is late, the margin of that), for the fewest late
-    devices; empty for none.
+    """Return the smallest set of late devices that explains the lags, as device → (delay of its
+    clock [s], margin); empty if none is late.
     """
     known = {
         name: fit

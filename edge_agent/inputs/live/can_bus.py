@@ -40,7 +40,7 @@ class Decoder:
         }
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """The signals of (time, (identifier, extended, data))."""
+        """Return the signals in frames (time, (identifier, extended, data))."""
         log: Log = {}
         for time, (identifier, extended, data) in heard:
             log.setdefault((0, identifier, extended), Frames()).add(time, data)
@@ -69,7 +69,7 @@ class CanFeed(Feed):
         self._options = dict(options)
 
     def listen(self) -> None:
-        """Hear frames until the bus fails."""
+        """Receive frames until the bus fails."""
         filters = [
             {
                 "can_id": identifier,
@@ -88,5 +88,5 @@ class CanFeed(Feed):
                 self.hear(round(message.timestamp * NS), frame)
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """The profile's signals in the frames."""
+        """Return the profile's signals in the frames."""
         return self._decoder.series(heard)

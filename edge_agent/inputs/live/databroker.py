@@ -86,7 +86,7 @@ class DatabrokerFeed(Feed):
         super().close()
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Values by path."""
+        """Return the values by path."""
         times: dict[str, list[float]] = {}
         values: dict[str, list[float]] = {}
         for time, (path, value) in heard:
@@ -95,8 +95,8 @@ class DatabrokerFeed(Feed):
         return {path: Series(np.array(times[path]), np.array(values[path])) for path in times}
 
     def _known_paths(self, channel: Any) -> list[str]:  # noqa: ANN401
-        """The paths that the broker knows: a subscription with an unknown one is refused as a
-        whole.
+        """Return the paths that the broker knows, because it refuses a whole subscription if it
+        contains an unknown path.
         """
         m = self._messages
         connection = self._connection

@@ -45,11 +45,11 @@ class HostClock:
     steady_s: float = field(default_factory=time.monotonic)
 
     def now(self) -> float:
-        """Seconds since the start."""
+        """Return the seconds since the start."""
         return time.monotonic() - self.steady_s
 
     def seconds_of(self, stamp_ns: int) -> float:
-        """Seconds since the start of a date in ns UTC."""
+        """Return a date in ns UTC as seconds since the start."""
         return (stamp_ns - self.start_ns) / NS
 
 
@@ -67,7 +67,7 @@ class Stamps:
         return 0.0 if -EARLY_S <= least < BELIEVED_S or least == float("inf") else least
 
     def host_time(self, stamp: float, arrival: float) -> float:
-        """The host's time of a stamp that arrived now."""
+        """Return the host's time of a stamp that arrived now."""
         if arrival - self._turned > WHILE_S:
             self._before = self._lately
             self._lately = float("inf")
@@ -142,7 +142,7 @@ class Feed(ABC):
         self.say(reason)
 
     def take(self) -> dict[str, Series]:
-        """The signals heard since the last call."""
+        """Return the signals received since the last call."""
         heard = [self._waiting.popleft() for _ in range(len(self._waiting))]
         return self.series(heard) if heard else {}
 

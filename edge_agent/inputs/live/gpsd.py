@@ -24,7 +24,7 @@ class GpsdFeed(Feed):
         self._address = address
 
     def listen(self) -> None:
-        """Hear reports until the connection ends."""
+        """Receive reports until the connection ends."""
         with socket.create_connection(self._address, CONNECT_S) as connection:
             connection.sendall(WATCH)
             connection.settimeout(TICK_S)
@@ -59,7 +59,7 @@ class GpsdFeed(Feed):
             self.hear(fix.time, fix)
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Signals latitude, longitude, speed and course."""
+        """Return the signals latitude, longitude, speed and course."""
         t = np.array([time for time, _ in heard])
         return {
             name: Series(t, np.array([getattr(fix, name) for _, fix in heard]), UNITS[name])

@@ -94,7 +94,7 @@ class Ros2Feed(Feed):
         self._after: dict[bytes, int] = {}  # publisher -> the sequence number that is next
 
     def listen(self) -> None:
-        """Hear samples; Zenoh itself looks for a router that was lost."""
+        """Receive samples until stopped; Zenoh itself reconnects to a lost router."""
         session = open_session(self._settings, self.stopping)
         if session is None:
             return
@@ -111,7 +111,7 @@ class Ros2Feed(Feed):
                 subscriber.undeclare()
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Values by name; frames by the database."""
+        """Return the values by name; frames are decoded with the database."""
         frames = [(time, what) for time, what in heard if isinstance(what, tuple)]
         found = self._decoder.series(frames) if self._decoder and frames else {}
         times: dict[str, list[float]] = {}
@@ -171,7 +171,7 @@ class Ros2Feed(Feed):
 
 
 def type_of(key: str) -> str:
-    """The message type that a key tells: `sensor_msgs::msg::dds_::Imu_` is sensor_msgs/msg/Imu.
+    """Return the message type in a key: `sensor_msgs::msg::dds_::Imu_` is sensor_msgs/msg/Imu.
 
     Raises:
         ValueError: it tells none.

@@ -88,7 +88,7 @@ class LiveRows:
         )  # speed over ground of the last block's rows (T,) [m/s]
 
     def blocks(self) -> Generator[Block]:
-        """Blocks as time goes, until the caller stops; the sources are closed then."""
+        """Yield blocks in real time until the caller stops, then close the sources."""
         size = max(1, round(BLOCK_S * self.rate_hz))
         self._next = math.ceil(self._clock.now() * self.rate_hz)
         for feed in self.feeds:
@@ -111,7 +111,7 @@ class LiveRows:
                 feed.close()
 
     def health_problems(self) -> list[str]:
-        """Sources that are silent."""
+        """Return one message per silent source."""
         return [trouble for feed in self.feeds if (trouble := feed.trouble)]
 
     def _may_deliver(self, time: float) -> bool:
@@ -190,7 +190,9 @@ class LiveRows:
         return Recording(feed.name, dict(kept))
 
     def _place_fixes(self, fixes: dict[str, Series], t: FloatArray, signals: FloatArray) -> None:
-        """Each fix in the row next to it, or, moved, in the first one where that has gone."""
+        """Write each fix into the row nearest to its time; if that row has already been sent, move
+        the fix into the first row.
+        """
         half = 0.5 / self.rate_hz
         speed = fixes.get(GROUND)
         course = fixes.get("yaw")
@@ -226,14 +228,14 @@ class LiveRows:
                 signals[rows, CHANNELS.index(name)] = values
 
     def _fill_steering(self, signals: FloatArray) -> None:
-        """As in a log: a front wheel that no profile names is as the other, rear wheels do not
-        steer.
+        """Fill missing steering as in a log: a front wheel outside the profile steers like the
+        other one, rear wheels do not steer.
         """
         fill_steering(signals, [name not in self._profile.channels for name in STEERING])
 
     def _start_ns(self) -> int:
-        """The date of the host's start: by a receiver's clock where the host's is off, settled
-        by the first fix.
+        """Return the date of the start [ns UTC], corrected by a receiver's clock; the first fix
+        determines it for good.
         """
         if self._date_ns is None and self._used["latitude"] > -math.inf:
             leads = [
@@ -248,7 +250,7 @@ class LiveRows:
 
 
 def _readings_at(series: Series | None, times: FloatArray) -> FloatArray:
-    """The readings at just these times, NaN where there are none."""
+    """Return the readings at exactly these times, NaN where there are none."""
     found = np.full(len(times), np.nan)
     if series is not None and len(series.t):
         place = np.clip(np.searchsorted(series.t, times), 0, len(series.t) - 1)

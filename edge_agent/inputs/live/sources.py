@@ -46,7 +46,8 @@ def is_live(source: str) -> bool:
 def open_sources(
     sources: Sequence[str], profile_name: str | None, dbc: Path | None = None
 ) -> tuple[list[Feed], Profile, HostClock]:
-    """The sources, the profile that they are read by, and the clock that they share.
+    """Open the sources; return them with the profile that they are read by and the clock that they
+    share.
 
     Args:
         sources: as they are asked for.
@@ -164,7 +165,7 @@ def _open_ros2(
 
 
 def _parse_option(text: str) -> int | float | bool | str:
-    """An option as python-can wants it."""
+    """Return an option in the type that python-can expects."""
     if text in ("true", "false"):
         return text == "true"
     for kind in (int, float):

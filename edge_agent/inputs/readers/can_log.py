@@ -39,13 +39,13 @@ class Frames:
     shortest: int = LONGEST
 
     def add(self, time: float, data: bytes | bytearray) -> None:
-        """One frame more."""
+        """Add one frame."""
         self.times.append(time)
         self.shortest = min(self.shortest, len(data))
         self.data += data[:LONGEST].ljust(LONGEST, b"\0")
 
     def to_columns(self) -> tuple[FloatArray, Bytes]:
-        """Times (n,) and bytes (n, LONGEST)."""
+        """Return the times (n,) and bytes (n, LONGEST) of the frames."""
         return np.array(self.times), np.frombuffer(bytes(self.data), np.uint8).reshape(-1, LONGEST)
 
 
@@ -99,14 +99,16 @@ def decode_log(
 
 
 def no_database(path: Path) -> InputError:
-    """The error of frames that nothing can decode."""
+    """Return the error for CAN frames without a database."""
     return InputError(
         "dbc", f"{path} holds CAN frames", "name their database: --dbc, or dbc in the profile"
     )
 
 
 def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
-    """Frames of the wanted identifiers by python-can, and the time of the log's first frame [s]."""
+    """Return the frames of the wanted identifiers, read by python-can, and the time of the log's
+    first frame [s].
+    """
     log: Log = defaultdict(Frames)
     first = np.inf
     logging.getLogger("can").setLevel(
@@ -136,7 +138,9 @@ def bus_of(channel: Any) -> int:  # noqa: ANN401 python-can gives a number, a na
 
 
 def _find_messages(log: Log, messages: list[CanMessage], buses: dict[str, int]) -> dict[str, Key]:
-    """Which frames are which message."""
+    """Return the key (bus, identifier, extended) of each message in the log; without a given bus,
+    the one with the most frames.
+    """
     counts: dict[int, int] = defaultdict(int)
     for message in messages:
         for (bus, identifier, extended), frames in log.items():

@@ -52,7 +52,7 @@ class Signal:
     switch: int | None = None  # value of the multiplexer at which it is present
 
     def decode(self, data: Bytes) -> FloatArray:
-        """Physical values (n,) of the frames (n, LONGEST)."""
+        """Return the physical values (n,) in frames (n, LONGEST)."""
         raw = self._raw_values(data)
         number: NDArray[np.int64] | NDArray[np.uint64] = (
             raw.view(np.int64) if self.size < 64 or self.signed else raw
@@ -106,7 +106,7 @@ class CanMessage:
     multiplexer: str | None = None
 
     def decode(self, data: Bytes, names: list[str]) -> dict[str, FloatArray]:
-        """Physical values by signal; NaN where a multiplexed signal is not in the frame."""
+        """Return the physical values by signal; NaN if a multiplexed signal is not in the frame."""
         found = {name: self.signals[name].decode(data) for name in names}
         switched = [name for name in names if self.signals[name].switch is not None]
         if switched and self.multiplexer is not None:
@@ -120,7 +120,7 @@ Database: TypeAlias = dict[str, CanMessage]
 
 
 def read_dbc(path: Path) -> Database:
-    """The messages of a database by name.
+    """Return the messages of a database by name.
 
     Raises:
         InputError: the file cannot be read, is too large, or holds no message with a signal.
@@ -144,8 +144,8 @@ def read_dbc(path: Path) -> Database:
 
 
 def parse_dbc(text: str) -> Database:
-    """The messages of a database's text; lines that make no sense are left out, and of two alike
-    the last holds.
+    """Return the messages in a database's text; invalid lines are left out, and the last of two
+    equal names counts.
     """
     database: Database = {}
     message: CanMessage | None = None
@@ -171,7 +171,7 @@ def parse_dbc(text: str) -> Database:
 
 
 def _parse_signal(found: re.Match[str]) -> tuple[Signal | None, str]:
-    """The signal of a line, None if it makes no sense, and its multiplexer mark."""
+    """Return the signal in a line and its multiplexer mark; None if the line is invalid."""
     words = found["label"].split()
     mux = words.pop() if len(words) > 1 and _MULTIPLEXED.fullmatch(words[-1]) else ""
     try:

@@ -38,7 +38,8 @@ class Fix(NamedTuple):
 
 
 def parse_nmea(line: str) -> Fix | None:
-    """The fix of an RMC sentence; None for every other line and for a receiver without position.
+    """Return the fix in an RMC sentence; None for any other line, and if the receiver has no
+    position.
 
     Raises:
         ValueError: the sentence is broken.
@@ -69,7 +70,7 @@ def parse_nmea(line: str) -> Fix | None:
 
 
 def parse_gpsd(line: str) -> Fix | None:
-    """The fix of a TPV report; None for every other object and for one without position.
+    """Return the fix in a TPV report; None for any other object, and if the report has no position.
 
     Raises:
         ValueError: the line is no JSON object, or a field is no number.
@@ -104,7 +105,7 @@ def _check_position(fix: Fix) -> Fix:
 
 
 def read_gnss(path: Path) -> Recording:
-    """Signals latitude, longitude, speed and course of a file of sentences or reports.
+    """Return the signals latitude, longitude, speed and course from a file of sentences or reports.
 
     Raises:
         InputError: the file cannot be read, or holds no position with a time.

@@ -34,8 +34,8 @@ def is_bag(path: Path) -> bool:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Any]:
-    """A reader, opened and in the end closed; the folder is taken for a database file that lies
-    in it.
+    """Open a bag and close it at the end of the block; the path of a database file stands for its
+    folder.
     """
     highlevel = import_optional("rosbags.highlevel")
     typesys = import_optional("rosbags.typesys")
@@ -61,8 +61,8 @@ def has_frames(reader: Any) -> bool:  # noqa: ANN401
 
 
 def bag_frames(reader: Any, path: Path, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
-    """Frames of the wanted identifiers, and the time of the first one [s since 1970 UTC]; a
-    topic is a bus.
+    """Return the frames of the wanted identifiers, and the time of the first one [s since 1970
+    UTC]; each topic is a bus.
     """
     log: Log = {}
     first = np.inf
@@ -77,7 +77,7 @@ def bag_frames(reader: Any, path: Path, wanted: set[int]) -> tuple[Log, float]: 
 
 
 def read_bag(reader: Any, path: Path, wanted: set[str] | None) -> Recording:  # noqa: ANN401
-    """Signals of a bag by name, all of them where none is asked for."""
+    """Return the signals of a bag by name; all if none is requested."""
     topics = [
         c
         for c in reader.connections
@@ -106,7 +106,7 @@ def read_bag(reader: Any, path: Path, wanted: set[str] | None) -> Recording:  # 
 
 
 def _read_messages(reader: Any, connections: list[Any]) -> Iterator[tuple[Any, int, int, Any]]:  # noqa: ANN401
-    """Connection, time of the recorder, time of the message [ns], message."""
+    """Yield connection, time of the recorder [ns], time of the message [ns], and message."""
     if not connections:
         return
     for connection, stored, raw in reader.messages(connections=connections):
@@ -115,14 +115,14 @@ def _read_messages(reader: Any, connections: list[Any]) -> Iterator[tuple[Any, i
 
 
 def stamp_of(message: Any) -> int:  # noqa: ANN401
-    """The message's own time [ns], 0 where it has none."""
+    """Return the message's own time [ns]; 0 if it has none."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     return 0 if stamp is None else int(stamp.sec) * NS + int(stamp.nanosec)
 
 
 def leaves_of(message: Any, prefix: str = "", depth: int = 0) -> Iterator[Leaf]:  # noqa: ANN401
-    """The numbers in a message: their names behind the topic's, and how to take them out of one
-    of its kind.
+    """Yield the name of each number in a message and a function that reads it from a message of the
+    same type.
     """
     for name in getattr(message, "__dataclass_fields__", {}):
         if name.startswith("__") or any(name.endswith(word) for word in SKIPPED):

@@ -44,7 +44,7 @@ _UNIT: Final = re.compile(r"^(?P<name>.*)[\[(](?P<unit>[^\[\](]*)[\])]\s*$")
 
 
 def read_table(path: Path, time: str | None = None, time_unit: str | None = None) -> Recording:
-    """The columns of a table.
+    """Return the columns of a table.
 
     Args:
         path: a CSV or Parquet file.
@@ -181,7 +181,7 @@ def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
 
 
 def _parse_seconds(column: Any, name: str, unit: str | None) -> tuple[FloatArray, int | None]:  # noqa: ANN401 Arrow columns are not generic
-    """Seconds since the first row, and its ns UTC where the time is a date."""
+    """Return the seconds since the first row, and the ns UTC of that row if the time is a date."""
     if pa.types.is_timestamp(column.type):
         ns = pc.cast(pc.cast(column, pa.timestamp("ns", tz=column.type.tz)), pa.int64())
         values = np.asarray(ns.to_numpy(zero_copy_only=False))

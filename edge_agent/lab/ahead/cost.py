@@ -37,7 +37,7 @@ CENTRE: Final = Pose(57.70, 11.97, 0.0, SPEED, 1_800_000_000 * NS)
 
 
 def street_places() -> IntArray:
-    """Every place of the city's streets, sorted."""
+    """Return all places of the city's streets, sorted."""
     side = np.arange(0.0, BLOCK_M * BLOCKS, 4.0)
     line = np.arange(0.0, BLOCK_M * (BLOCKS + 1), BLOCK_M)
     found = []
@@ -53,8 +53,8 @@ def street_places() -> IntArray:
 
 
 def draw_way(rng: np.random.Generator, metres: float) -> FloatArray:
-    """A drive through the city, corners (n, 2) [m]: at each crossing straight on, left or right,
-    never out of it.
+    """Draw a route through the city, corners (n, 2) [m]: at each crossing straight on, left or
+    right, never out of the city.
     """
     here = np.array([BLOCKS // 2, BLOCKS // 2])
     heading = 0
@@ -95,7 +95,7 @@ def cost_figures(seed: int, metres: float) -> list[Figure]:
 def drive_way(
     rng: np.random.Generator, known: IntArray, metres: float, *, routed: bool
 ) -> tuple[float, float]:
-    """Megabytes heard, and processor time over time driven."""
+    """Return the megabytes received, and the processor time over the time driven."""
     corners = draw_way(rng, metres)
     run = BLOCK_M * np.arange(len(corners))
     route = GivenRoute(*to_degrees(corners[:, 0], corners[:, 1], CENTRE))

@@ -124,7 +124,9 @@ def record_beliefs(
 
 
 def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
-    """|error| of the median within FIRST_S of entering a cell that the map knows, (n, 2): with the map and without."""
+    """Return |error| of the median within FIRST_S of entering a cell that the map knows, (n, 2):
+    with and without the map.
+    """
     with_prior = with_map(trace, known, now)
     alone = _median_friction(np.exp(trace.own))
     since = _since_entry(trace.place)
@@ -136,8 +138,8 @@ def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
 def arrival_times(
     trace: FilterTrace, wrong: LocalMap, right: LocalMap, now: int
 ) -> list[tuple[float, float]]:
-    """Seconds from where a map is wrong until |μ - truth| <= ARRIVED, with it and without; the
-    stay, if never.
+    """Return, for each stretch where the map is wrong, the seconds until |μ - truth| <= ARRIVED,
+    with and without the map; the duration of the stay if that is never reached.
     """
     differ = _maps_differ(trace.place, wrong, right, now)
     with_prior = with_map(trace, wrong, now)
@@ -159,8 +161,8 @@ def arrival_times(
 
 
 def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) -> float:
-    """Largest change [nat] of a published likelihood where the cars hear a map that is wrong
-    everywhere.
+    """Return the largest change [nat] of a published likelihood if the cars receive a map that is
+    wrong everywhere.
     """
     seed = int(fleet.scenario.name.split("-")[1])
     again = SimulatedFleet(fleet.scenario, len(fleet.vehicles), seed, RATE_HZ, rough=0.5)
@@ -207,7 +209,9 @@ def _since_entry(place: IntArray) -> IntArray:
 
 
 def _maps_differ(place: IntArray, wrong: LocalMap, right: LocalMap, now: int) -> BoolArray:
-    """Where one map says slippery and the other does not."""
+    """Return True where exactly one of two maps is slippery and their medians differ by more than
+    0.3.
+    """
     keys, inverse = np.unique(place, return_inverse=True)
     one, other = (known.look_up(keys, now).mu for known in (wrong, right))
     with np.errstate(invalid="ignore"):

@@ -29,7 +29,7 @@ class KnownPlaces(NamedTuple):
 
 
 def places_of(scenario: Scenario, t: float) -> KnownPlaces:
-    """The places of a scenario's lanes as they are at t [s]."""
+    """Return the places of a scenario's lanes at t [s]."""
     points = scenario.network.points
     x = points[:, LanePoint.X]
     y = points[:, LanePoint.Y]

@@ -41,7 +41,7 @@ ORIGIN: Final = Pose(57.70, 11.97, 0.0, SPEED, 0)
 
 @contextmanager
 def open_router() -> Iterator[ZenohSettings]:
-    """A router in this process, on a free port of loopback."""
+    """Open a router in this process, on a free port of loopback; yield the settings of its clients."""
     config = zenoh.Config()
     chosen = {
         "mode": "router",
@@ -62,7 +62,9 @@ def open_router() -> Iterator[ZenohSettings]:
 
 
 def latency_figures(seed: int, alerts: int, vehicles: int = VEHICLES) -> list[Figure]:
-    """Quantiles of the time from put to warning, and the processor's share of looking."""
+    """Return quantiles of the time from put to warning, and the share of processor time that
+    looking ahead takes.
+    """
     waited, share, lost = measure_alerts(np.random.default_rng(seed), alerts, vehicles)
     return [
         Figure(
@@ -84,7 +86,9 @@ def latency_figures(seed: int, alerts: int, vehicles: int = VEHICLES) -> list[Fi
 def measure_alerts(
     rng: np.random.Generator, alerts: int, vehicles: int
 ) -> tuple[list[float], float, int]:
-    """Seconds of each alert, share of a core per car, and alerts that no warning came of."""
+    """Return the latency of each alert [s], the share of a core per car, and the number of alerts
+    without a warning.
+    """
     names = [f"car-{k:04d}" for k in range(vehicles)]
     warned: dict[str, queue.Queue[tuple[float, GripWarning]]] = {
         name: queue.Queue() for name in names

@@ -22,7 +22,7 @@ from schemas.wire import Alert
 
 
 def tile_payload(key: IntArray, friction: float | FloatArray, now: int, **changes: object) -> bytes:
-    """A tile as a service sends it; `changes` replace columns."""
+    """Return the payload of a tile in the form that a service sends; `changes` replace columns."""
     n = len(key)
     mu = np.broadcast_to(friction, len(key))
     lower = np.maximum(mu - 0.1, 0.06)

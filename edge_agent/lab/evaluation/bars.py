@@ -34,7 +34,7 @@ class EstimatorBar(NamedTuple):
 
 
 def mean_of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[Results], float]:
-    """Mean over seeds of a measure with ordinary sensors."""
+    """Return a function that computes the mean over seeds of a measure with ordinary sensors."""
 
     def read_mean(results: Results) -> float:
         return mean(results.real.get((scenario, estimator), {}).get(measure))
@@ -43,12 +43,16 @@ def mean_of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[
 
 
 def noise_mean(experiment: str, measure: str) -> Callable[[Results], float]:
-    """Mean over seeds of a measure of paper 004's own experiments."""
+    """Return a function that computes the mean over seeds of a measure of paper 004's own
+    experiments.
+    """
     return lambda results: mean(results.noise.get((experiment, "paper-aco-fckf"), {}).get(measure))
 
 
 def in_the_world(name: str) -> Callable[[Results], float]:
-    """A figure of the default over the rough towns, or on a slope."""
+    """Return a function that reads a figure of the default estimator in the rough towns, or on a
+    slope.
+    """
     return lambda results: results.world.get(DEFAULT, {}).get(name, math.nan)
 
 
@@ -60,13 +64,13 @@ def worth_of(name: str) -> Callable[[Results], float]:
 
 
 def mean(values: FloatArray | None) -> float:
-    """Mean; NaN of nothing."""
+    """Return the mean; NaN without values."""
     return math.nan if values is None or not len(values) else float(np.mean(values))
 
 
 def false_per_hour(results: Results) -> float:
-    """False changes of the default over all hours of scenarios whose friction is one and does
-    not change.
+    """Return the false changes per hour of the default estimator in scenarios with one constant
+    friction.
     """
     counted = [m for (_, name), m in results.real.items() if name == DEFAULT and "hours" in m]
     hours = sum(float(m["hours"].sum()) for m in counted)
@@ -74,7 +78,7 @@ def false_per_hour(results: Results) -> float:
 
 
 def both_stops(results: Results) -> float:
-    """Coverage over the anti-lock stops on dry road and on snow."""
+    """Return the mean coverage of the anti-lock stops on dry road and on snow."""
     return 0.5 * (
         mean_of("default.abs.dry", "coverage90")(results)
         + mean_of("default.abs.snow", "coverage90")(results)
@@ -82,12 +86,12 @@ def both_stops(results: Results) -> float:
 
 
 def on_foreign_tyres(results: Results) -> float:
-    """Coverage of the default over all scenarios and kinds of tyre."""
+    """Return the coverage of the default over all scenarios and kinds of tyre."""
     return mean(np.concatenate(list(results.foreign.values()))) if results.foreign else math.nan
 
 
 def width_ratio(results: Results) -> float:
-    """Width of the interval over the prior's, straight on at constant speed."""
+    """Return the width of the interval over the prior's, when driving straight at constant speed."""
     return mean_of("default.straight", "width")(results) / PRIOR_WIDTH
 
 
@@ -188,7 +192,7 @@ UNITS: Final = {
 
 
 def unit_of(measure: str) -> str:
-    """Unit of a measure, by the end of its name."""
+    """Return the unit of a measure, from the end of its name."""
     if measure.startswith("coverage90"):
         return SHARE
     whole = (
@@ -200,8 +204,8 @@ def unit_of(measure: str) -> str:
 
 
 def figures(results: Results, *, quick: bool) -> list[Figure]:
-    """Bars first (when quick, those that were measured), then `KIND.SCENARIO.ESTIMATOR.MEASURE`
-    with its spread.
+    """Return the figures with bars first (if quick, the measured ones), then
+    `KIND.SCENARIO.ESTIMATOR.MEASURE` with its spread.
     """
     barred = [Figure(bar.name, bar.read(results), bar.unit, bar.bar, bar.better) for bar in BARS]
     listed = [figure for figure in barred if not (quick and math.isnan(figure.value))]
@@ -228,7 +232,7 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
 
 
 def _consistency_figures(results: Results) -> list[Figure]:
-    """Bounds of NEES and NIS, and the reliability of every estimator over all scenarios."""
+    """Return the bounds of NEES and NIS, and the reliability of every estimator over all scenarios."""
     listed = []
     for measure in COMPONENTS if results.seeds else ():
         for end, value in zip(("lower", "upper"), bounds(measure, results.seeds), strict=True):

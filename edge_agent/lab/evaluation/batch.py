@@ -63,19 +63,19 @@ class DriveSet:
         return np.asarray(self.mu_wheel.mean(axis=-1))
 
     def last(self, seconds: float) -> slice:
-        """The samples of the last so many seconds."""
+        """Return the slice of the samples in the last `seconds`."""
         return slice(int(np.searchsorted(self.t[:, 0], self.t[-1, 0] - seconds)), None)
 
 
 def realistic(
     scenario: DriveSpec, seeds: Sequence[int], sensors: str | Sensors = USUAL
 ) -> DriveSet:
-    """One drive per seed with ordinary sensors, of a vehicle known to a few per cent."""
+    """Simulate one drive per seed with ordinary sensors, of a vehicle known to a few per cent."""
     return join_drives([_simulate_drive(scenario, seed, sensors, 1) for seed in seeds])
 
 
 def ideal(scenario: DriveSpec) -> DriveSet:
-    """One drive with sensors without error, of a vehicle known exactly; simulated finely,
+    """Simulate one drive with error-free sensors, of a vehicle known exactly; fine time steps,
     sampled at the rate.
     """
     step = max(1, round(FINE_HZ / scenario.rate_hz))
@@ -104,7 +104,7 @@ def _simulate_drive(
 
 
 def join_drives(drives: Sequence[tuple[pa.Table, Vehicle]]) -> DriveSet:
-    """Drives of one length side by side."""
+    """Return drives of equal length as one set."""
 
     def stack_column(name: str) -> FloatArray:
         return np.stack(
@@ -122,7 +122,7 @@ def join_drives(drives: Sequence[tuple[pa.Table, Vehicle]]) -> DriveSet:
 
 
 def repeat_drive(batch: DriveSet, count: int) -> DriveSet:
-    """The one drive of a batch `count` times, for noise to be laid on it."""
+    """Return the one drive of a batch `count` times, as a base for different noise."""
     truth = {name: np.repeat(value, count, axis=1) for name, value in batch.truth.items()}
     return DriveSet(
         np.repeat(batch.t, count, axis=1),

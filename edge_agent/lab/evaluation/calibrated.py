@@ -77,7 +77,7 @@ class Narrowed(NamedTuple):
 
 
 def learn_and_narrow(cars: int, seed: int, judged_s: int = JUDGED_S) -> Narrowed:
-    """Rough cars that learn from DRIVES drives, and are judged on the drive after them."""
+    """Let rough cars learn from DRIVES drives, and judge them on the next drive."""
     fleet = SimulatedFleet("hills", cars, seed, RATE_HZ, rough=1.0)
     t, signals = _drive_fleet(fleet, DRIVES * DRIVE_S)[:2]
     size = len(t) // DRIVES
@@ -108,7 +108,7 @@ def learn_and_narrow(cars: int, seed: int, judged_s: int = JUDGED_S) -> Narrowed
 
 
 def _drive_fleet(fleet: SimulatedFleet, seconds: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Times (T, N), signals (T, N, 18), and true friction, the mean of the wheels (T, N)."""
+    """Return times (T, N), signals (T, N, 18), and true friction as the mean of the wheels (T, N)."""
     parts = []
     for _ in range(seconds):
         t, signals = fleet.step(round(RATE_HZ))
@@ -118,7 +118,7 @@ def _drive_fleet(fleet: SimulatedFleet, seconds: int) -> tuple[FloatArray, Float
 
 
 def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
-    """Width with calibration over without, and both coverages."""
+    """Return the ratio of widths with and without calibration, and both coverages."""
     groups = [
         learn_and_narrow(min(CARS_AT_ONCE, cars - k), seed + k, judged_s)
         for k in range(0, cars, CARS_AT_ONCE)
@@ -135,8 +135,8 @@ def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
 
 
 def figures(cars: int, seed: int) -> list[Figure]:
-    """RMS of (learned − true) / standard deviation over cars, by quantity; the four radii as
-    one.
+    """Return the RMS of (learned − true) / standard deviation over cars, by quantity; the four
+    radii count as one.
     """
     away: dict[str, list[float]] = {}
     for first in range(0, cars, CARS_AT_ONCE):

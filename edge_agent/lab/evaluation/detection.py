@@ -162,7 +162,7 @@ def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTall
 
 
 def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
-    """Coverage, false ice, false grip and interval score over samples."""
+    """Return coverage, false ice, false grip and interval score over samples."""
     mu = drive.mu
     apart = ~drive.stood
     inside = (drive.lower <= mu) & (mu <= drive.upper)
@@ -234,7 +234,9 @@ def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
 
 
 def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
-    """Slides on slippery road: does the estimator report it before they end?"""
+    """Judge slides on slippery road: does the estimator report the road at most TOLD_AFTER_S after
+    the slide?
+    """
     beyond = drive.theta[:, n] > SLIDING
     for first, end in slides_of(drive.theta[:, n], TOLD_SLIDE_S):
         if float(drive.mu_wheel[first:end, n].mean()) >= TOLD_MU or drive.stood[first:end, n].any():
@@ -249,8 +251,8 @@ def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
 def _judge_contradictions(
     tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches
 ) -> None:
-    """Onsets of CONTRADICTION in slides on slippery road and outside of slides, and the seconds
-    of each without it.
+    """Count onsets of CONTRADICTION in slides on slippery road and elsewhere, and the seconds of
+    each without it.
     """
     sliding = np.zeros(len(drive.mu), np.bool_)
     extended = np.zeros(len(drive.mu), np.bool_)
@@ -271,7 +273,7 @@ def _judge_contradictions(
 
 
 def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
-    """Settled false events of the estimator, of its belief at each threshold, and of the slip
+    """Count settled false events of the estimator, of its belief at each threshold, and of the slip
     flag.
     """
     grips = drive.mu[:, n] > SNOW_MU

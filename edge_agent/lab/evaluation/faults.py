@@ -36,7 +36,7 @@ DRIVES: Final = {
 
 
 def in_order(t: FloatArray) -> FloatArray:
-    """The clock as it is."""
+    """Return the clock unchanged."""
     return t
 
 
@@ -48,7 +48,9 @@ def kept_samples(t: FloatArray) -> FloatArray:
 
 
 def late_samples(t: FloatArray) -> FloatArray:
-    """From BEGINS to ENDS every tenth sample carries the time of fifty milliseconds before."""
+    """Return a clock on which, from BEGINS to ENDS, every tenth sample carries a time that is fifty
+    milliseconds old.
+    """
     number = np.arange(len(t))[:, None]
     return np.where((t >= BEGINS) & (t < ENDS) & (number % 10 == 0), t - 0.05, t)
 
@@ -66,7 +68,7 @@ class Case:
 
 
 def fault_on(kind: str, *channels: str, size: float = 0.0) -> tuple[Fault, ...]:
-    """The fault on some channels from BEGINS to ENDS."""
+    """Return a fault of each of some channels from BEGINS to ENDS."""
     return tuple(Fault(kind, channel, BEGINS, ENDS, size) for channel in channels)
 
 
@@ -136,7 +138,7 @@ CASES: Final = {
 
 
 def apply_fault(batch: DriveSet, case: Case) -> DriveSet:
-    """The drives with the fault in their signals and on their clock."""
+    """Return the drives with the fault in their signals and clock."""
     each = [
         apply_faults(batch.t[:, n], batch.signals[:, n], case.faults)
         for n in range(batch.t.shape[1])
@@ -165,7 +167,9 @@ def case_measures(batch: DriveSet, reported: Estimates, case: Case) -> dict[str,
 def campaign(
     seeds: Sequence[int], estimators: Sequence[str], drives: Sequence[str] = tuple(DRIVES)
 ) -> dict[tuple[str, str], dict[str, FloatArray]]:
-    """Every case for every estimator over all drives and seeds: measures by (case, estimator)."""
+    """Run every case for every estimator over all drives and seeds; return the measures by (case,
+    estimator).
+    """
     batches = [realistic(DRIVES[name], seeds) for name in drives]
     found = {}
     for name, case in CASES.items():

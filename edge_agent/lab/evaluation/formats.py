@@ -21,7 +21,7 @@ from schemas.thresholds import NS
 
 
 def as_log(path: Path, messages: Sequence[Any]) -> Path:
-    """A CAN log by python-can; the ending says which."""
+    """Write a CAN log by python-can; the suffix of the path selects the format."""
     with import_optional("can").Logger(str(path)) as writer:
         for message in messages:
             writer(message)
@@ -29,7 +29,7 @@ def as_log(path: Path, messages: Sequence[Any]) -> Path:
 
 
 def as_mf4(path: Path, messages: Sequence[Any]) -> Path:
-    """A bus log by asammdf, in the layout of its standard."""
+    """Write a bus log by asammdf, in the layout of its standard."""
     asammdf = import_optional("asammdf")
     types = np.dtype(
         [
@@ -63,7 +63,7 @@ def as_mf4(path: Path, messages: Sequence[Any]) -> Path:
 
 
 def as_bag(folder: Path, messages: Sequence[Any], storage: str = "mcap") -> Path:
-    """A bag of can_msgs/Frame by rosbags."""
+    """Write a bag of can_msgs/Frame by rosbags."""
     rosbag2 = import_optional("rosbags.rosbag2")
     typesys = import_optional("rosbags.typesys")
     types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
@@ -84,7 +84,7 @@ def as_bag(folder: Path, messages: Sequence[Any], storage: str = "mcap") -> Path
 
 
 def as_csv(path: Path, log: Path, *, mark: str = ",") -> Path:
-    """A signal log as CSV, to the last digit."""
+    """Write a signal log as CSV, to the last digit."""
     table = pq.read_table(log)
     names = table.column_names
     t = np.array(table["timestamp"].cast(pa.int64()))

@@ -36,7 +36,8 @@ START_S: Final = 1_700_000_000
 
 
 def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
-    """Values that differ from those of cantools, and how many were compared.
+    """Return the number of values that differ from those of cantools, and the number of compared
+    values.
 
     Made frames of random bytes for every shipped profile with a database; and those of a recorded
     log, by the database of the profile that it has frames of.
@@ -82,8 +83,8 @@ def _compare_decoders(ours: Database, message: Any, frames: Sequence[bytes]) -> 
 
 
 def on_a_bus(drive: Recorded) -> list[Any]:
-    """A drive as frames: four messages a sample, among others that nobody asks for if there is
-    room in a minute.
+    """Return a drive as CAN frames: four messages per sample, and, if a minute has room for them,
+    frames that the import does not need.
     """
     frames = []
     columns = drive.signals[:, [ALL.index(name) for name in CHANNELS]]
@@ -103,8 +104,8 @@ def _make_frame(t: float, identifier: int, data: bytes) -> Any:  # noqa: ANN401 
 
 
 def a_minute(path: Path) -> Path:
-    """MINUTE_FRAMES of a bus in a minute: four messages at 100 Hz that are asked for, and
-    OTHERS.
+    """Write one minute of a bus with MINUTE_FRAMES frames: four wanted messages at 100 Hz, and
+    OTHERS unwanted ones.
     """
     rng = np.random.default_rng(1)
     others = rng.choice(np.arange(512, 512 + OTHERS), MINUTE_FRAMES - 24_000)
@@ -117,7 +118,7 @@ def a_minute(path: Path) -> Path:
 
 
 def import_file(path: Path, profile: Profile, out: Path) -> Path:
-    """A source as a signal log, the way of `edge-agent import`."""
+    """Import a source as a signal log like `edge-agent import`."""
     database = parse_dbc(DBC) if path.suffix != ".csv" else None
     merged = merge_recordings([read_source(path, profile, database)], profile)
     write_log(out, merged, profile, [path.name])
@@ -125,7 +126,7 @@ def import_file(path: Path, profile: Profile, out: Path) -> Path:
 
 
 def import_s(folder: Path) -> float:
-    """Seconds for a minute of a bus, the best of TRIES."""
+    """Return the seconds that importing a minute of a bus takes, the best of TRIES."""
     path = a_minute(folder / "minute.blf")
     profile = profile_of("can")
     spent = []
@@ -137,7 +138,7 @@ def import_s(folder: Path) -> float:
 
 
 def estimates_of(log: Path, drive: Recorded) -> FloatArray:
-    """Everything that the default estimator says of a log."""
+    """Return all outputs of the default estimator for a log."""
     read = read_log(log)
     return np.asarray(
         bank_of("aco-fckf", [drive.vehicle]).advance(read.t[:, None], read.signals[:, None]).values
@@ -145,8 +146,8 @@ def estimates_of(log: Path, drive: Recorded) -> FloatArray:
 
 
 def same_estimates(folder: Path, seed: int, seconds: int = DRIVE_S) -> tuple[float, int]:
-    """Largest difference of estimates of one drive over its formats, and how many formats there
-    were.
+    """Return the largest difference between the estimates of one drive over its formats, and the
+    number of formats.
     """
     (drive,) = drives(1, seed, rough=True, seconds=seconds)
     frames = on_a_bus(drive)

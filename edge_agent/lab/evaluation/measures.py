@@ -25,7 +25,7 @@ COMPONENTS = {
 
 
 def errors(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Errors (T, N) of the motion: vx, vy [m/s], yaw_rate [rad/s], beta [rad]."""
+    """Return the errors (T, N) of the motion: vx, vy [m/s], yaw_rate [rad/s], beta [rad]."""
     truth = batch.truth
     beta = np.arctan2(truth["true_vy"], np.maximum(truth["true_vx"], SLOWEST_M_S))
     return {
@@ -42,7 +42,7 @@ def is_covered(batch: DriveSet, reported: Estimates) -> BoolArray:
 
 
 def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """All measures that every drive has."""
+    """Return all measures that every drive has."""
     end = batch.last(LAST_S)
     found: dict[str, FloatArray] = {}
     for name, error in errors(batch, reported).items():
@@ -60,7 +60,7 @@ def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def nees(batch: DriveSet, reported: Estimates) -> FloatArray:
-    """Squared error of (v_x, v_y) over its stated variance, per component, (T, N)."""
+    """Return the squared error of (v_x, v_y) over its stated variance, per component, (T, N)."""
     off = errors(batch, reported)
     return np.asarray(
         0.5 * ((off["vx"] / reported.vx_std) ** 2 + (off["vy"] / reported.vy_std) ** 2)
@@ -68,8 +68,8 @@ def nees(batch: DriveSet, reported: Estimates) -> FloatArray:
 
 
 def bounds(measure: str, drives: int) -> tuple[float, float]:
-    """Where the mean of "nees" or "nis" over so many drives lies 95 times in 100 if the filter
-    is right.
+    """Return the 95 % interval of the mean of "nees" or "nis" over so many drives if the filter is
+    consistent.
     """
     from scipy.stats import chi2
 
@@ -78,8 +78,8 @@ def bounds(measure: str, drives: int) -> tuple[float, float]:
 
 
 def consistency(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Share of instants whose mean NEES, and NIS, over the drives lies within its bounds, (1,)
-    each.
+    """Return the share of instants at which the mean NEES, and NIS, over the drives lies within its
+    bounds, (1,) each.
     """
     found = {}
     for name, value in (("nees", nees(batch, reported)), ("nis", reported.innovation_nis)):
@@ -109,8 +109,8 @@ def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def arrival(batch: DriveSet, reported: Estimates) -> FloatArray:
-    """Seconds from the change of friction until mu is within NEAR of it; what never arrives
-    counts to the end.
+    """Return the seconds from the change of friction until mu is within NEAR of it; the time to the
+    end if it never is.
     """
     changed = batch.mu == batch.mu[-1]
     seconds = np.empty(batch.t.shape[1])

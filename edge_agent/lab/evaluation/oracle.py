@@ -66,7 +66,7 @@ class OracleSignals(NamedTuple):
 
 
 def speed(seeds: Sequence[int]) -> FloatArray:
-    """RMSE of v_x [m/s] in 002.sine, one per seed."""
+    """Return the RMSE of v_x [m/s] in 002.sine, one per seed."""
     scenario = PAPERS["002.sine"]
     car = scenario.vehicle
     batch = realistic(scenario, seeds)
@@ -163,14 +163,16 @@ def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
 
 
 def _theta(force: FloatArray, shape: float, curvature: float) -> FloatArray:
-    """Normalised slip on the rising branch that gives the share `force` of the grip."""
+    """Return the normalised slip on the rising branch at which the tyre uses the share `force` of
+    the grip.
+    """
     curve = _curve(shape, curvature)
     return np.interp(force, curve, THETA[: len(curve)])
 
 
 @cache
 def _curve(shape: float, curvature: float) -> FloatArray:
-    """The curve at THETA up to its peak."""
+    """Return the tyre's force curve at THETA up to its peak."""
     curve = np.array([magic_formula(x, shape, curvature) for x in THETA])
     return curve[: int(np.argmax(curve)) + 1]
 
@@ -178,8 +180,8 @@ def _curve(shape: float, curvature: float) -> FloatArray:
 def _cost(
     measured: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stiff: float
 ) -> float:
-    """−ln of the likelihood of a friction and a shape, the other unknowns fitted and integrated
-    out (Laplace).
+    """Return −ln of the likelihood of a friction and a shape; the other unknowns are fitted and
+    integrated out (Laplace).
     """
     t = np.arange(len(v)) / 100.0
     std = np.array(

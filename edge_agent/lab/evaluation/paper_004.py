@@ -38,7 +38,7 @@ STILL = Memberships(outputs=(0.0,) * 5)  # fuzzy sets that leave R as it is
 
 
 def noisy(batch: DriveSet, variance: FloatArray, seeds: Sequence[int]) -> DriveSet:
-    """One copy of the drive per seed, with white noise of variance (T,) on a_x, a_y and r."""
+    """Return one copy of the drive per seed, with white noise of variance (T,) on a_x, a_y and r."""
     copies = repeat_drive(batch, len(seeds))
     for n, seed in enumerate(seeds):
         add_white(copies.signals[:, n], variance, np.random.default_rng([seed, 4]))
@@ -46,14 +46,15 @@ def noisy(batch: DriveSet, variance: FloatArray, seeds: Sequence[int]) -> DriveS
 
 
 def variances(t: FloatArray, experiment: str) -> FloatArray:
-    """Noise variance at the times t (T,) [s] of the experiment "constant" or "variable"."""
+    """Return the noise variance at the times t (T,) [s] of the experiment "constant" or "variable"."""
     return np.full(len(t), CONSTANT) if experiment == "constant" else scheduled_variance(t)
 
 
 def experiments(
     seeds: Sequence[int],
 ) -> tuple[dict[tuple[str, str], dict[str, FloatArray]], dict[str, tuple[DriveSet, Estimates]]]:
-    """(measures per drive by experiment and filter, drives for plots by experiment).
+    """Return the measures per drive by experiment and filter, and the drives for plots by
+    experiment.
 
     "sedan" and "van" are "constant" with the simulator's own plants, and with ".variable" the
     other. The filters are the paper's, and its controls: untuned (paper-fckf), without adaptation

@@ -56,7 +56,7 @@ class Planted(NamedTuple):
 
 
 def scale_columns(columns: Sequence[int], factor: float | Callable[[float], float]) -> Spoil:
-    """Columns times a factor, which may depend on the wheel's radius."""
+    """Return a fault that multiplies columns by a factor, which may depend on the wheel's radius."""
 
     def scale_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
@@ -67,7 +67,7 @@ def scale_columns(columns: Sequence[int], factor: float | Callable[[float], floa
 
 
 def offset_columns(columns: Sequence[int], offset: float) -> Spoil:
-    """Columns plus an offset."""
+    """Return a fault that adds an offset to columns."""
 
     def offset_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
@@ -78,7 +78,7 @@ def offset_columns(columns: Sequence[int], offset: float) -> Spoil:
 
 
 def delay_columns(columns: Sequence[int]) -> Spoil:
-    """Columns LATE samples late."""
+    """Return a fault that delays columns by LATE samples."""
 
     def delay_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
@@ -90,7 +90,7 @@ def delay_columns(columns: Sequence[int]) -> Spoil:
 
 
 def swap_columns(one: Sequence[int], other: Sequence[int]) -> Spoil:
-    """Columns in each other's place."""
+    """Return a fault that exchanges two groups of columns."""
 
     def swap_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
@@ -101,27 +101,27 @@ def swap_columns(one: Sequence[int], other: Sequence[int]) -> Spoil:
 
 
 def status_bits(drive: Recorded) -> Recorded:
-    """A bit above the number of a wheel speed, set in a third of the readings."""
+    """Set a status bit above the number of a wheel speed, in two of seven readings."""
     signals = drive.signals.copy()
     signals[np.arange(len(signals)) % 7 < 2, S.OMEGA] += STATUS / drive.vehicle.wheel_radius
     return drive._replace(signals=signals)
 
 
 def turn_yaw_clockwise(drive: Recorded) -> Recorded:
-    """Yaw clockwise from north."""
+    """Return the drive with yaw measured clockwise from north."""
     signals = drive.signals.copy()
     signals[:, S.YAW] = math.pi / 2.0 - signals[:, S.YAW]
     return drive._replace(signals=signals)
 
 
 def other_tyre(drive: Recorded) -> Recorded:
-    """A vehicle file whose radius is a tenth too small."""
+    """Return the drive with a vehicle file whose wheel radius is 10 % too small."""
     radius = 0.9 * drive.vehicle.wheel_radius
     return drive._replace(vehicle=drive.vehicle.model_copy(update={"wheel_radius": radius}))
 
 
 def rim_speed_factor(unit: str) -> Callable[[float], float]:
-    """Wheel speeds given as speeds at the rim."""
+    """Return the drive with wheel speeds given as speeds at the rim."""
     return lambda radius: radius / SPEED[unit]
 
 

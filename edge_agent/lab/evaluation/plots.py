@@ -115,7 +115,7 @@ def title(scenario: str, drive: PlottedDrive, seed: int) -> str:
 
 
 def _line(estimator: str) -> dict[str, Any]:
-    """The estimator's own line: the same in every plot."""
+    """Return the line style of an estimator, the same in every plot."""
     style = line_of(estimator)
     return {"color": style.colour, "linestyle": style.dash, "lw": 1.0}
 
@@ -171,7 +171,7 @@ def _rough(world: RealWorldResults, path: Path) -> Path:
 
 
 def _surfaces(figures: Sequence[Figure], path: Path) -> Path:
-    """Coverage of the 90 % interval by surface, for every estimator in the rough world."""
+    """Plot the coverage of the 90 % interval by surface, for every estimator in the rough world."""
     from matplotlib import pyplot as plt
 
     values = {figure.name: figure.value for figure in figures if figure.name.startswith("world.")}
@@ -202,7 +202,7 @@ def _surfaces(figures: Sequence[Figure], path: Path) -> Path:
 
 
 def _consistency(figures: Sequence[Figure], path: Path) -> Path:
-    """NEES and NIS per scenario and estimator, with the 95 % bounds of their mean over the
+    """Plot NEES and NIS per scenario and estimator, with the 95 % bounds of their mean over the
     drives at one instant.
     """
     from matplotlib import pyplot as plt
@@ -241,7 +241,7 @@ def _consistency(figures: Sequence[Figure], path: Path) -> Path:
 
 
 def _memberships(path: Path) -> Path:
-    """The fuzzy sets before and after the ant colony."""
+    """Plot the fuzzy sets before and after the ant colony."""
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(3, 2, figsize=(9, 7), layout="constrained")
@@ -272,7 +272,7 @@ def _triangles(axis: Axes, peaks: tuple[float, ...], title: str, name: str) -> N
 
 
 def _reliability(figures: Sequence[Figure], path: Path) -> Path:
-    """Share of truths below each stated quantile, over all scenarios."""
+    """Plot the share of truths below each stated quantile, over all scenarios."""
     from matplotlib import pyplot as plt
 
     found: dict[str, dict[float, float]] = {}

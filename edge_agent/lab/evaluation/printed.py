@@ -37,7 +37,7 @@ PRINTED_002: Final = {"sine": (".1008", ".0779"), "jturn": (".0825", ".0117")}
 def printed_row(
     paper: str, scenario: str, estimator: str, measure: str, what: str, value: str
 ) -> Printed:
-    """A row whose own figure comes from sensors without error."""
+    """Return a row whose own figure is measured with error-free sensors."""
     same = f"ideal.{scenario}.{estimator}.{measure}"
     real = f"real.{scenario}.ESTIMATOR.{measure}"
     return Printed(paper, what, value, same, real)

@@ -79,8 +79,8 @@ class Tally:
         self.count[name] = self.count.get(name, 0) + taken.size
 
     def means(self) -> dict[str, float]:
-        """Mean by name; NaN of nothing. What ends in "_squared" is reported as its root, without
-        that end.
+        """Return the mean by name; NaN without values. A name that ends in "_squared" is reported
+        as its root, without that suffix.
         """
         found = {
             name: total / self.count[name] if self.count[name] else np.nan
@@ -100,7 +100,8 @@ def in_winter(seed: int) -> bool:
 
 
 def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
-    """Rough cars in a town that the seed draws, and the largest share of the grip they use (T, N).
+    """Simulate rough cars in a town drawn from the seed; return their drives and the largest share
+    of the grip that they use (T, N).
 
     In winter towns all cars have winter equipment.
     """
@@ -124,7 +125,7 @@ def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
 
 
 def in_use(batch: DriveSet) -> FloatArray:
-    """Grip that the car as a whole uses, smoothed and a little less for noise, (T, N)."""
+    """Return the grip that the car as a whole uses, smoothed and reduced by the noise, (T, N)."""
     used = np.hypot(batch.truth["true_ax"], batch.truth["true_ay"]) / GRAVITY
     width = max(1, round(SMOOTH_S * RATE_HZ))
     summed = np.cumsum(np.concatenate([np.zeros((width, used.shape[1])), used]), axis=0)
@@ -132,7 +133,7 @@ def in_use(batch: DriveSet) -> FloatArray:
 
 
 def recent_maximum(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDOW_S) -> FloatArray:
-    """Largest value of the last `seconds`, (T, N)."""
+    """Return the largest value of the last `seconds`, (T, N)."""
     samples = round(seconds * RATE_HZ)
     padded = np.concatenate([np.zeros((samples - 1, used.shape[1])), used])
     return np.asarray(
@@ -204,8 +205,8 @@ def baseline(tally: Tally, batch: DriveSet) -> None:
 
 
 def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSet]:
-    """Cars that stand on the slope: each seed another, with ordinary sensors, and with rough
-    ones without torque.
+    """Simulate cars that stand on a slope, one slope per seed: with ordinary sensors, and with
+    rough ones without torque.
     """
     batches = []
     for sensors in (USUAL, "rough"):
@@ -218,7 +219,9 @@ def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSe
 
 
 def fastest(estimator: str, batches: Sequence[DriveSet]) -> float:
-    """Largest speed [m/s], in any direction, that the estimator gives to any of the cars."""
+    """Return the largest speed [m/s], in any direction, that the estimator reports for any of the
+    cars.
+    """
     reported = [estimates(bank_of(estimator, batch.vehicles), batch) for batch in batches]
     return max(float(np.hypot(each.vx, each.vy).max()) for each in reported)
 
@@ -235,8 +238,8 @@ class RealWorldResults:
 
 
 def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) -> RealWorldResults:
-    """Towns of rough cars, and cars that stand on slopes, for every estimator; the first town is
-    kept for plots.
+    """Run towns of rough cars, and cars that stand on slopes, for every estimator; keep the first
+    town for plots.
     """
     cars, seconds, towns = (4, 15.0, 1) if quick else (TOWN_CARS, TOWN_S, TOWNS)
     tallies = {name: Tally() for name in (*estimators, "baseline")}

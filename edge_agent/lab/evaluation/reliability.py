@@ -42,14 +42,14 @@ def estimate_with_ranks(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates
 
 
 def join_estimates(parts: list[Estimates]) -> Estimates:
-    """Estimates of one drive, one stretch after the other; evidence is left out."""
+    """Return the estimates of successive stretches of one drive as one; evidence is left out."""
     return Estimates(np.concatenate([part.values for part in parts]))
 
 
 def _rank_of_truth(
     bank: EstimatorBank, batch: DriveSet, now: int, reported: Estimates
 ) -> FloatArray:
-    """Share of the posterior below the true friction of the sample before `now`, (N,)."""
+    """Return the share of the posterior below the true friction of the sample before `now`, (N,)."""
     truth = batch.mu[now - 1]
     closes = np.ones((1, len(truth)), np.bool_)
     likelihood = (
@@ -65,8 +65,8 @@ def _rank_of_truth(
 
 
 def on_the_grid(truth: FloatArray, log_likelihood: FloatArray) -> FloatArray:
-    """Share below the truth (N,) of posteriors with log-likelihoods (N, 32) upon the uniform
-    prior, (N,).
+    """Return the probability below the truth (N,) of posteriors with log-likelihoods (N, 32) and a
+    uniform prior, (N,).
     """
     weight = np.exp(log_likelihood)
     below = np.cumsum(weight / weight.sum(axis=1, keepdims=True), axis=1)
@@ -78,8 +78,8 @@ def on_the_grid(truth: FloatArray, log_likelihood: FloatArray) -> FloatArray:
 def between_quantiles(
     truth: FloatArray, lower: FloatArray, mu: FloatArray, upper: FloatArray
 ) -> FloatArray:
-    """The same of Gaussians with these 5, 50 and 95 % quantiles, one of which may be cut off; of
-    the prior, uniform.
+    """Return the probability below the truth (N,) of Gaussians with these 5, 50 and 95 % quantiles,
+    one of which may be cut off; an interval as wide as the prior's counts as uniform.
     """
     from scipy.stats import norm
 
@@ -89,5 +89,5 @@ def between_quantiles(
 
 
 def shares(ranks: FloatArray) -> FloatArray:
-    """Share of ranks at or below each of LEVELS."""
+    """Return the share of ranks at or below each of LEVELS."""
     return np.asarray((ranks.ravel()[:, None] <= np.array(LEVELS)).mean(axis=0))

@@ -54,8 +54,8 @@ MATCHED: Final = matched_to_papers(
 
 
 def steered_behind(speed: float) -> TrueVehicle:
-    """The vehicle of 000 and 001 with the rear wheels steered for no sideslip in a steady turn at
-    `speed` [m/s].
+    """Return the vehicle of 000 and 001 with the rear wheels steered for zero sideslip in a steady
+    turn at `speed` [m/s].
 
     Paper 001, equation 53: (K*m*a*v^2 - b) / (K*m*b*v^2 + a), K = 1/(axle stiffness*wheelbase),
     alike at both axles.
@@ -188,5 +188,5 @@ FOREIGN: Final = {
 
 
 def foreign(scenario: DriveSpec, kind: str) -> DriveSpec:
-    """The scenario with tyres of a kind of FOREIGN."""
+    """Return the scenario with tyres of a kind of FOREIGN."""
     return replace(scenario, vehicle=replace(scenario.vehicle, **FOREIGN[kind]))  # type: ignore[arg-type]

@@ -117,8 +117,8 @@ def without_sets() -> MixtureDesign:
 
 
 def manoeuvres(seed: int, seconds: float) -> DriveSet:
-    """One drive of each manoeuvre with misaligned devices: vehicle, friction and road drawn by
-    the seed.
+    """Simulate one drive of each manoeuvre with misaligned devices; the seed determines vehicle,
+    friction and road.
     """
     rng = np.random.default_rng([seed, 17])
     drives = []
@@ -139,8 +139,8 @@ def manoeuvres(seed: int, seconds: float) -> DriveSet:
 
 
 def _score_drives(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[str, float]:
-    """Mean interval score over the drives, and over all samples of each surface (NaN where none
-    is met).
+    """Return the mean interval score over the drives, and over all samples of each surface (NaN if
+    a surface does not occur).
     """
     drives = []
     samples = []
@@ -160,8 +160,8 @@ def _score_drives(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[st
 
 
 def ratio(scores: Scores, name: str) -> float:
-    """Mean interval score of a way over that of another, over all seeds; NaN where one of them
-    was not measured.
+    """Return the mean interval score of one variant over that of another, over all seeds; NaN if
+    one was not measured.
     """
     over, under = (scores.get(way) for way in RATIOS[name])
     return float(over["all"].mean() / under["all"].mean()) if over and under else math.nan

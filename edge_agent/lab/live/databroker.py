@@ -75,7 +75,7 @@ class Databroker:
             return self._values[path]
 
     def publish(self, values: Mapping[str, float], time_ns: int) -> None:
-        """Tell new values of one moment."""
+        """Publish new values with one time stamp."""
         update = {}
         for path, value in values.items():
             point = messages.Datapoint(value=messages.Value(double=value))

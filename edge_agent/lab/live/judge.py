@@ -50,7 +50,7 @@ class Peer:
         raise RuntimeError(f"the peer ended before it was {word}")
 
     def send_go(self) -> None:
-        """Tell it to begin, or to leave."""
+        """Send the peer the signal to begin or to end."""
         assert self.process.stdin is not None
         self.process.stdin.write("\n")
         self.process.stdin.flush()
@@ -69,7 +69,7 @@ def _read_lines(stream: IO[str] | None) -> Iterator[str]:
 
 @contextmanager
 def run_peer(kind: str, address: str, samples: int, rate: float = RATE_HZ) -> Iterator[Peer]:
-    """A peer in a process of its own, ended at the end."""
+    """Run a peer in a process of its own until the block ends."""
     words = [
         sys.executable,
         "-m",
@@ -91,14 +91,14 @@ def run_peer(kind: str, address: str, samples: int, rate: float = RATE_HZ) -> It
 
 
 def free_port() -> int:
-    """A port that nobody has now."""
+    """Return a port that is free now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def peer_addresses(kind: str) -> tuple[str, str]:
-    """Where the peer is, and the source that listens to it."""
+    """Return the address of the peer, and the name of the source that listens to it."""
     port = free_port()
     if kind == "can":
         return f"udp_multicast/{MULTICAST}/{port}", f"can:udp_multicast/{MULTICAST}?port={port}"
@@ -108,7 +108,7 @@ def peer_addresses(kind: str) -> tuple[str, str]:
 
 
 def write_profile(kind: str, folder: Path) -> tuple[str, Path | None]:
-    """The peer's profile and database as files."""
+    """Write the peer's profile and database; return their paths."""
     if kind == "vss":
         return "vss", None
     profile = folder / f"{kind}.json"
@@ -119,7 +119,8 @@ def write_profile(kind: str, folder: Path) -> tuple[str, Path | None]:
 
 
 def count_lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
-    """Samples lost between a source and the rows, and how many were sent.
+    """Return the number of samples lost between a source and the rows, and the number of samples
+    sent.
 
     Lost are messages that were not heard, and readings that came after their row.
     """
@@ -164,8 +165,8 @@ def count_lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
 
 
 def count_crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
-    """Agents that did not notice a loss or a return of their source, or did not end as they
-    should: why; losses.
+    """Return the reasons of agents that did not notice a loss or a return of their source, or did
+    not end correctly, and the number of losses.
     """
     vehicle = folder / "car.json"
     vehicle.write_text(
@@ -268,7 +269,7 @@ def _health_problems(port: int) -> list[str]:
 
 
 def figures(folder: Path, seconds: float, kills: int = KILLS) -> list[Figure]:
-    """Samples lost by kind, and crashes."""
+    """Return the number of lost samples by kind of source, and the number of crashes."""
     found = []
     for kind in COUNTED:
         missing, sent = count_lost(kind, folder, seconds)

@@ -58,7 +58,7 @@ def drive_at(t: float) -> dict[str, float]:
 
 
 def profile_of(kind: str) -> Profile:
-    """The profile of a peer; a databroker's is the shipped one."""
+    """Return the profile of a peer; for a databroker the shipped one."""
     if kind == "can":
         return Profile(
             name=kind,
@@ -77,7 +77,7 @@ def profile_of(kind: str) -> Profile:
 
 
 def pace_samples(samples: int, rate: float) -> Iterator[float]:
-    """Times of samples [s], each when it is due."""
+    """Yield the times of samples [s], each when it is due."""
     began = time.monotonic()
     for k in range(samples):
         time.sleep(max(0.0, began + k / rate - time.monotonic()))
@@ -85,7 +85,7 @@ def pace_samples(samples: int, rate: float) -> Iterator[float]:
 
 
 def send_can(address: str, samples: int, rate: float) -> int:
-    """Four messages a sample onto a bus; the address is interface/channel/port."""
+    """Send four messages per sample on a CAN bus; the address is interface/channel/port."""
     interface, channel, port = address.split("/")
     made = import_optional("can")
     with made.Bus(interface=interface, channel=channel, port=int(port)) as bus:
@@ -99,8 +99,8 @@ def send_can(address: str, samples: int, rate: float) -> int:
 
 
 def send_ros2(address: str, samples: int, rate: float) -> int:
-    """An Imu and a JointState a sample, as rmw_zenoh publishes them; the address is where a
-    router is opened.
+    """Send an Imu and a JointState per sample, as rmw_zenoh publishes them; a router is opened at
+    the address.
     """
     session = open_session(
         ZenohSettings(connect=[], config={"mode": "router", "listen/endpoints": [address]})
@@ -155,7 +155,7 @@ def send_ros2(address: str, samples: int, rate: float) -> int:
 
 
 def send_vss(address: str, samples: int, rate: float) -> int:
-    """A databroker, and its provider; the address is host:port."""
+    """Run a databroker and its provider; the address is host:port."""
     from edge_agent.inputs.live.sources import VSS_PROFILE
     from edge_agent.inputs.profile import load_profile
 
@@ -177,7 +177,7 @@ def send_vss(address: str, samples: int, rate: float) -> int:
 
 
 def send_gpsd(address: str, samples: int, rate: float) -> int:
-    """Fixes of a car that goes east; the address is host:port."""
+    """Send fixes of a car that drives east; the address is host:port."""
     import socket
 
     host, port = address.split(":")
@@ -200,13 +200,13 @@ def send_gpsd(address: str, samples: int, rate: float) -> int:
 
 
 def report_ready() -> None:
-    """Say that it is, and wait to be told to begin."""
+    """Print `ready`, and wait for the signal to begin."""
     print("ready", flush=True)
     wait_for_line()
 
 
 def wait_for_line() -> None:
-    """Until a line comes, or the input ends."""
+    """Wait until a line is read or the input ends."""
     sys.stdin.readline()
 
 
@@ -219,7 +219,7 @@ PEERS: Final[dict[str, Callable[[str, int, float], int]]] = {
 
 
 def main(words: Any) -> None:  # noqa: ANN401
-    """Be a peer."""
+    """Run a peer and print how many messages it sent."""
     kind, address, samples, rate = words
     print(json.dumps({"sent": PEERS[kind](address, int(samples), float(rate))}), flush=True)
     wait_for_line()

@@ -221,19 +221,19 @@ def firm_acceleration(now: Moment) -> tuple[float, float]:
 
 
 def brisk_acceleration(now: Moment) -> tuple[float, float]:
-    """0.45 g after one second, kept straight."""
+    """Accelerate with 0.45 g after one second, straight on."""
     return steer_to(now, now.x + preview(now), 0.0), 0.45 * GRAVITY if now.t >= 1.0 else hold(now)
 
 
 def moderate_braking(now: Moment) -> tuple[float, float]:
-    """0.28 g after one second, down to walking pace."""
+    """Brake with 0.28 g after one second, down to walking pace."""
     return steer_to(
         now, now.x + preview(now), 0.0
     ), -0.28 * GRAVITY if now.t >= 1.0 and now.vx > 2.0 else min(hold(now), 1.0)
 
 
 def pulses(now: Moment) -> tuple[float, float]:
-    """Two seconds of throttle, two of brakes, in a gentle weave: town traffic in short."""
+    """Alternate two seconds of throttle and two of brakes in a gentle weave, like town traffic."""
     wanted = 2.5 if now.t % 4.0 < 2.0 else -2.5
     return 0.03 * math.sin(
         2.0 * now.t
@@ -241,13 +241,13 @@ def pulses(now: Moment) -> tuple[float, float]:
 
 
 def standing(_now: Moment) -> tuple[float, float]:
-    """At rest, the foot on the brake."""
+    """Stand at rest with the brake applied."""
     return 0.0, -3.0
 
 
 def stop_and_go(now: Moment) -> tuple[float, float]:
-    """Straight on for eight seconds, to a stop with 2.5 m/s^2 and at rest for six, over and
-    over: traffic lights.
+    """Repeat: drive straight for eight seconds, stop with 2.5 m/s^2, rest for six seconds, as at
+    traffic lights.
     """
     go = now.t % 14.0 < 8.0
     return steer_to(now, now.x + preview(now), 0.0), min(hold(now), 2.0) if go else -2.5

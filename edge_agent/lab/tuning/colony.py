@@ -67,7 +67,9 @@ def transition_probabilities(
     alpha: float,
     theta: float,
 ) -> FloatArray:
-    """Equation (31) for every vertex at once: (V, K), zero outside A, each row sums to one."""
+    """Return the probabilities of equation (31) for all vertices, (V, K): zero outside A, each row
+    sums to one.
+    """
     attraction = np.where(reachable, pheromone**alpha * visibility**theta, 0.0)
     probabilities: FloatArray = attraction / attraction.sum(axis=1, keepdims=True)
     return probabilities
@@ -88,7 +90,9 @@ def lowest_pheromone(reachable: BoolArray, retrace: float) -> FloatArray:
 
 
 def deposit(paths: IntArray, weights: FloatArray, reachable: BoolArray) -> FloatArray:
-    """Δτ (V, K) of paths (P, V) with weights (P,); every vertex receives Σ weights."""
+    """Return the pheromone Δτ (V, K) of paths (P, V) with weights (P,); every vertex receives Σ
+    weights.
+    """
     laid = np.zeros(reachable.shape)
     vertices = np.arange(reachable.shape[0])
     for path, weight in zip(paths, weights, strict=True):
@@ -104,13 +108,15 @@ def renew(
     evaporation: float,
     retrace: float,
 ) -> FloatArray:
-    """Equation (32) within the bounds [τ_min, 1]; zero where there is no position."""
+    """Return the pheromone after equation (32), limited to [τ_min, 1]; zero where there is no
+    position.
+    """
     renewed = (1.0 - evaporation) * pheromone + laid
     return np.where(reachable, np.clip(renewed, lowest_pheromone(reachable, retrace), HIGHEST), 0.0)
 
 
 def _walk_ant(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
-    """One ant's path (V,): a draw from each row of (31)."""
+    """Return the path of one ant (V,): one draw from each row of (31)."""
     reached = np.cumsum(probabilities, axis=1)
     drawn = rng.random((len(probabilities), 1)) * reached[:, -1:]
     path: IntArray = np.argmax(reached > drawn, axis=1)
@@ -118,8 +124,8 @@ def _walk_ant(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
 
 
 def _rank_weights(ants: int, habits: Habits) -> FloatArray:
-    """Deposits (P,) of the best ants of an iteration by rank; with the best path so far they sum
-    to ρ.
+    """Return the deposits (P,) of the best ants of an iteration by rank; with that of the best path
+    so far they sum to ρ.
     """
     count = max(1, round(habits.elite * ants))
     ranks = np.arange(count, 0, -1, dtype=np.float64)
@@ -179,7 +185,9 @@ def optimise(
 def _laid_pheromone(
     paths: list[IntArray], values: list[float], weights: FloatArray, ledger: Ledger, habits: Habits
 ) -> FloatArray:
-    """Δτ of one iteration: its best ants by rank, and the best path so far."""
+    """Return the pheromone Δτ of one iteration: that of its best ants by rank, and of the best path
+    so far.
+    """
     order = np.argsort(-np.asarray(values), kind="stable")[: len(weights)]
     best = ledger.best_path if ledger.best_path is not None else paths[0]
     depositing = np.array([paths[ant] for ant in order] + [best])

@@ -151,8 +151,9 @@ def _next_vector(
     rng: np.random.Generator,
     habits: ArchiveHabits,
 ) -> FloatArray:
-    """The next vector: the start, then any until the archive is full, then one about a vector of
-    the archive."""
+    """Return the next vector: first the start, then random ones until the archive is full, then one
+    near a vector of the archive.
+    """
     if tally.count == 0 and tally.problem.start is not None:
         return tally.fit(np.asarray(tally.problem.start, float))
     if len(vectors) < habits.archive:

@@ -49,7 +49,7 @@ def optimise(
 def _mutate_vector(
     tally: SearchTally, parent: FloatArray, step: float, rng: np.random.Generator
 ) -> FloatArray:
-    """An admissible child; the parent where none is found."""
+    """Return an admissible child; the parent if none is found."""
     for _ in range(REDRAWS):
         child = tally.fit(rng.normal(parent, step * (tally.upper - tally.lower)))
         if tally.problem.admissible(child):

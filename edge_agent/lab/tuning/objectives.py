@@ -183,7 +183,7 @@ def record(drives: Sequence[TuningDrive], duration_s: float) -> TuningSet:
 
 
 def record_all(name: str, duration_s: float) -> TuningSet:
-    """The drives and towns of "train" or "held_out" side by side, each `duration_s` [s] long."""
+    """Return the drives and towns of "train" or "held_out" as one set, each `duration_s` [s] long."""
     sets = [record(TRAIN if name == "train" else HELD_OUT, duration_s)]
     seeds, cars = TOWNS[name]
     sets += [record_town(seed, cars, duration_s) for seed in seeds]
@@ -199,7 +199,7 @@ def record_all(name: str, duration_s: float) -> TuningSet:
 
 
 def record_town(seed: int, cars: int, duration_s: float) -> TuningSet:
-    """Cars in the town that the seed draws, from WARM_S on; a share of them is rough."""
+    """Simulate cars in a town drawn from the seed, from WARM_S on; a share of them is rough."""
     fleet = SimulatedFleet(drawn_town(seed), cars, seed, RATE_HZ, rough=ROUGH_SHARE)
     fleet.step(round(WARM_S * RATE_HZ))
     t, signals = fleet.step(round(duration_s * RATE_HZ))
@@ -214,7 +214,7 @@ def record_town(seed: int, cars: int, duration_s: float) -> TuningSet:
 
 
 def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
-    """IS of 90 % intervals, elementwise [unit of the truth]."""
+    """Return the interval score of 90 % intervals, elementwise [unit of the truth]."""
     score: FloatArray = (
         upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0))
     )
@@ -269,7 +269,7 @@ def _share(of: BoolArray, among: BoolArray) -> float:
 
 
 def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
-    """An objective over membership vectors; a vector that is no membership counts as the worst.
+    """Return an objective over membership vectors; an invalid vector has the worst value.
 
     Raises:
         InputError: there is no objective of that name.
@@ -290,8 +290,8 @@ def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
 
 
 def choices(positions: int) -> tuple[FloatArray, ...]:
-    """Candidate positions of every vertex and noise scale: evenly over the bounds, the default
-    among them.
+    """Return candidate positions of every vertex and noise scale: evenly over the bounds, and the
+    default.
     """
     default = Memberships().to_vector()
     found = []

@@ -23,8 +23,8 @@ HELD_OUT: Final = 3  # the last of so many parts of the recordings judge
 def own_drives(
     logs: Sequence[tuple[SignalLog, Vehicle]], duration_s: float
 ) -> tuple[TuningSet, TuningSet]:
-    """Recordings cut into parts of `duration_s` [s]: those to search on, and the last third of
-    them, to judge by.
+    """Return recordings cut into parts of `duration_s` [s]: parts to search on, and the last third
+    of the parts to judge by.
 
     Recordings may have any rate; parts have as many samples as the slowest gives in that time.
 

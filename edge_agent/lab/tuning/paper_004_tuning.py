@@ -66,7 +66,7 @@ def record_levels(
 
 
 def likelihood(sets: Sets, drive: LevelDrive) -> float:
-    """Mean log-likelihood of the innovations [nat per sample]."""
+    """Return the mean log-likelihood of the innovations [nat per sample]."""
     reported = _run_filter(sets, drive)
     value = np.nan_to_num(
         reported.innovation_log_likelihood[1:], nan=WORST, neginf=WORST, posinf=WORST
@@ -75,7 +75,7 @@ def likelihood(sets: Sets, drive: LevelDrive) -> float:
 
 
 def mismatch(sets: Sets, drive: LevelDrive) -> float:
-    """Equation (33) with |e|."""
+    """Return the variance mismatch of equation (33) with |e|."""
     batch = drive.batch
     filters = make_bank(batch.vehicles, sets, drive.setting)
     differences = []
@@ -87,7 +87,7 @@ def mismatch(sets: Sets, drive: LevelDrive) -> float:
 
 
 def accuracy(sets: Sets, drive: LevelDrive) -> float:
-    """Less the mean of RMSE over the printed RMSE."""
+    """Return minus the mean ratio of the RMSE to the printed RMSE."""
     reported = _run_filter(sets, drive)
     batch = drive.batch
     truth = {name: batch.truth[f"true_{name}"] for name in ("vx", "vy", "yaw_rate")} | {

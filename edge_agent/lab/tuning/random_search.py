@@ -14,7 +14,9 @@ def optimise(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> Result:
-    """Best of `ants`·`iterations` uniform draws; arguments and result as those of the colony."""
+    """Return the best of `ants`·`iterations` uniform draws; arguments and result as those of the
+    colony.
+    """
     graph = Graph.from_choices(problem.choices)
     ledger = Ledger(problem.objective, graph, problem.admissible)
     counts = graph.reachable.sum(axis=1)

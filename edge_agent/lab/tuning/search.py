@@ -18,7 +18,7 @@ Admissible = Callable[[FloatArray], bool]
 
 
 def is_always_allowed(_vector: FloatArray) -> bool:
-    """The admissible set without limits."""
+    """Return True: an admissible set without limits."""
     return True
 
 
@@ -94,7 +94,7 @@ class Graph:
         return cls(positions, np.isfinite(positions))
 
     def vector(self, path: IntArray) -> FloatArray:
-        """The values (V,) at a path of position indices (V,)."""
+        """Return the values (V,) at a path of position indices (V,)."""
         return self.positions[np.arange(len(path)), path]
 
 
@@ -113,8 +113,10 @@ class Ledger:
     history: list[Iteration] = field(default_factory=list)
 
     def draw(self, sample: Callable[[], IntArray]) -> IntArray:
-        """An admissible path from `sample`, a new one if the draws allow; InputError if none is
-        admissible.
+        """Draw an admissible path from `sample`, if possible a new one.
+
+        Raises:
+            InputError: none of the drawn paths is admissible.
         """
         fallback: IntArray | None = None
         for _ in range(REDRAWS):
@@ -130,8 +132,8 @@ class Ledger:
         return fallback
 
     def evaluate(self, path: IntArray) -> float:
-        """The objective at a path, asked for once; a value that is not a number counts as the
-        worst.
+        """Return the objective at a path, computed once per path; a value that is not finite counts
+        as the worst.
         """
         key = path.tobytes()
         if key not in self.values:
@@ -162,7 +164,7 @@ class Ledger:
 
 
 def nearest(graph: Graph, vector: FloatArray) -> IntArray:
-    """Indices (V,) of the positions nearest to a vector (V,)."""
+    """Return the indices (V,) of the positions nearest to a vector (V,)."""
     distance = np.abs(graph.positions - np.asarray(vector)[:, None])
     indices: IntArray = np.argmin(np.where(graph.reachable, distance, np.inf), axis=1)
     return indices

@@ -57,7 +57,7 @@ def uniform_search(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> Result:
-    """Best of ants·iterations uniform draws from the whole range."""
+    """Return the best of ants·iterations uniform draws from the whole range."""
     tally = SearchTally(problem)
     for _ in range(iterations):
         found = []

@@ -141,7 +141,7 @@ def record(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> Stud
 def _noisy(
     exact: FloatArray, t: FloatArray, seeds: Sequence[int], condition: Condition
 ) -> FloatArray:
-    """A copy with white noise on a_x, a_y and r."""
+    """Return a copy with white noise on a_x, a_y and r."""
     variance = scheduled_variance(t) if condition.schedule else np.full(len(t), VARIANCE)
     noisy = exact.copy()
     for n, seed in enumerate(seeds):
@@ -150,7 +150,7 @@ def _noisy(
 
 
 def setting(condition: Condition) -> Setting:
-    """The filter's setting under a condition."""
+    """Return the filter's setting under a condition."""
     return AT_THE_TRUTH._replace(noise=(condition.scale * VARIANCE,) * 3)
 
 
@@ -171,7 +171,7 @@ def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudySco
 
 
 def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[float, float]:
-    """(interval score, coverage) of the 90 % friction interval under a condition."""
+    """Return interval score and coverage of the 90 % friction interval under a condition."""
     reported = make_bank(drives.vehicles, memberships, setting(CONDITIONS[name])).advance(
         drives.t, drives.signals[name]
     )
@@ -190,12 +190,14 @@ def overall(memberships: Memberships, drives: StudySet) -> float:
 
 
 def memberships_of(vector: FloatArray) -> Memberships:
-    """Memberships of the ten vertices; this filter has no noise scales to tune: its R is given."""
+    """Return the memberships of the ten vertices. This filter has no noise scales to tune, because
+    its R is given.
+    """
     return Memberships.from_vector(np.append(vector, np.zeros(CHANNELS)))
 
 
 def objective_on(drives: StudySet) -> Objective:
-    """The objective over vectors of ten vertices."""
+    """Return the objective over vectors of ten vertices."""
     return lambda vector: overall(memberships_of(vector), drives)
 
 

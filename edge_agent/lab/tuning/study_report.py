@@ -65,7 +65,7 @@ class Study:
         return [memberships_of(result.best) for result in self.found[way]]
 
     def best(self, way: str) -> Memberships:
-        """The memberships of the repeat that did best on the drives it was searched on."""
+        """Return the memberships of the repeat with the best objective on its training drives."""
         if way in GIVEN:
             return GIVEN[way]
         return memberships_of(max(self.found[way], key=lambda result: result.value).best)
@@ -100,8 +100,8 @@ def run(
 
 
 def figures(done: Study) -> list[Figure]:
-    """Per way: each condition on held-out drives, the objective on both sets, and how the
-    searches came there.
+    """Return, per way of tuning, the score under each condition on held-out drives, the objective
+    on both sets, and the progress of the searches.
     """
     listed = []
     overalls: dict[str, list[float]] = {}
@@ -148,8 +148,8 @@ def _mean_sd(name: str, values: Sequence[float], unit: str) -> list[Figure]:
 
 
 def markdown(listed: Sequence[Figure]) -> str:
-    """The table: a row per condition and measure, a column per way; made from the figures and
-    nothing else.
+    """Return the table with a row per condition and measure and a column per way, from the figures
+    alone.
     """
     values = {figure.name: figure.value for figure in listed}
 

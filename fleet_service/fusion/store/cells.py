@@ -46,13 +46,13 @@ class Cells(NamedTuple):
 
 
 def cells_of(rows: Rows) -> Cells:
-    """Columns of rows."""
+    """Return the columns of rows as `Cells`."""
     return Cells(rows.belief, *(rows.cells[name] for name in CELL.names or ()))
 
 
 def rows_of_lines(rows: int, kind: np.dtype[Any], *shape: int) -> NDArray[Any]:
-    """Zeros (rows, *shape) that begin where a LINE does, so that a row of 64 bytes costs one
-    read of memory.
+    """Return zeros (rows, *shape) aligned to cache lines (LINE), so that a row of 64 bytes costs
+    one read of memory.
     """
     size = rows * kind.itemsize * int(np.prod(shape, dtype=np.int64))
     memory = np.zeros(size + LINE, np.uint8)
@@ -61,13 +61,13 @@ def rows_of_lines(rows: int, kind: np.dtype[Any], *shape: int) -> NDArray[Any]:
 
 
 def no_beliefs(rows: int) -> PackedArray:
-    """Room for beliefs at rest."""
+    """Return memory for packed beliefs."""
     return rows_of_lines(rows, np.dtype(np.uint16), mugrid.BINS)
 
 
 @refcount_free
 def begin_slot(live: Rows, slot: int, key: int) -> None:
-    """A slot that holds the prior."""
+    """Initialise a slot for a key with the prior."""
     live.belief[slot] = FULL
     cell = live.cells[slot]
     cell.key = key
@@ -90,7 +90,7 @@ def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
 
 @refcount_free_inlined
 def copy_sources(source: RecordArray, at: int, target: RecordArray, to: int) -> None:
-    """The corroborating sources of a slot, from one row to another."""
+    """Copy the corroborating sources of a slot from one row to another."""
     for side in range(2):
         for k in range(SOURCES):
             target[to].source[side, k] = source[at].source[side, k]

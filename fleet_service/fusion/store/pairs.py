@@ -128,7 +128,7 @@ def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: 
 
 @refcount_free_inlined
 def returning_bit(number: int) -> np.uint64:
-    """The bit of `Cells.returned` that a vehicle has."""
+    """Return the bit that represents a vehicle in `Cells.returned`."""
     return np.uint64(1) << ((np.uint64(number) * _FIBONACCI) >> np.uint64(58))
 
 

@@ -83,7 +83,7 @@ class Store:
     def of(
         state: State, peers: RecordArray, names: RecordArray, size: int, vehicles: int, hour: int
     ) -> Store:
-        """A store with these contents."""
+        """Return a store with the given contents."""
         store = Store()
         store.state = state
         store.peers = peers
@@ -106,8 +106,8 @@ class Store:
         return len(self.state.free_entries) - int(self.state.used[FREE_ENTRIES])
 
     def due_windows(self, before: int) -> tuple[IntArray, IntArray]:
-        """Windows with entries before `before` [ns]: those without a value, and those with one in
-        the order of cells.
+        """Return the windows with entries before `before` [ns]: first those without a value, then
+        those with one, sorted by cell.
 
         Values that pass the checkpoint are compared with others, which is what reputation is made
         of; so their order may not depend on who came first. All else is done in the order of
@@ -119,7 +119,7 @@ class Store:
         ]
 
     def slots_of(self, keys: IntArray) -> IntArray:
-        """Slot of each key, NONE where there is none."""
+        """Return the slot of each key, NONE if the key has none."""
         return rows_of(self._slots, self.state.live.cells, np.asarray(keys, np.int64))
 
     @property
@@ -128,7 +128,7 @@ class Store:
         return self._slots
 
     def slots_for(self, keys: IntArray) -> IntArray:
-        """Slot of each key; new ones begin with the prior."""
+        """Return the slot of each key; new slots begin with the prior."""
         slots = self.slots_of(keys)
         new = np.flatnonzero(slots == NONE)
         if not len(new):
@@ -272,7 +272,9 @@ class Store:
 
 @compiled
 def find_due_windows(windows: RecordArray, before: int) -> tuple[IntArray, IntArray]:
-    """Windows with entries before `before` [ns]: those without a value, and those with one."""
+    """Return the windows with entries before `before` [ns]: first those without a value, then those
+    with one.
+    """
     plain = np.empty(len(windows), np.int64)
     valued = np.empty(len(windows), np.int64)
     without = 0
@@ -289,15 +291,15 @@ def find_due_windows(windows: RecordArray, before: int) -> tuple[IntArray, IntAr
 
 
 def no_peers(vehicles: int) -> RecordArray:
-    """Vehicles whose values were compared with nobody's."""
+    """Return records of vehicles whose values have not been compared with others yet."""
     peers = np.zeros(vehicles, PEER)
     peers["other"] = NOBODY
     return peers
 
 
 def distinct_values(values: IntArray) -> IntArray:
-    """Each value once, ascending; by sorting, which for numbers of this kind is several times
-    faster than a set.
+    """Return the distinct values in ascending order, by sorting, which is several times faster than
+    a set for such numbers.
     """
     ordered = np.sort(values)
     return np.asarray(

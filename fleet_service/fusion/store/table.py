@@ -42,13 +42,13 @@ def _hash_key(key: int | np.int64) -> np.uint64:
 
 @refcount_free_inlined
 def _first_place(mixed: np.uint64, places: int) -> int:
-    """Where a key is sought first."""
+    """Return the place at which the search for a key begins."""
     return int(np.int64(((mixed >> np.uint64(32)) * np.uint64(places)) >> np.uint64(32)))
 
 
 @refcount_free_inlined
 def _row_at(held: int) -> int:
-    """Row that a place holds; NONE in a free one."""
+    """Return the row stored in a place; NONE if the place is free."""
     return int(np.int32(held & _LOWER))
 
 
@@ -73,13 +73,13 @@ def locate_key(table: IntArray, rows: RecordArray, key: int) -> int:
 
 @refcount_free_inlined
 def find_row(table: IntArray, rows: RecordArray, key: int) -> int:
-    """Row of a key; NONE where it is unknown."""
+    """Return the row of a key; NONE if the key is unknown."""
     return _row_at(table[locate_key(table, rows, key)])
 
 
 @compiled
 def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
-    """Row of each key, (n,); NONE where it is unknown."""
+    """Return the row of each key, (n,); NONE if the key is unknown."""
     out = np.empty(len(wanted), np.int64)
     for group in range(0, len(wanted), AHEAD):
         end = min(group + AHEAD, len(wanted))
@@ -95,8 +95,8 @@ def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
 
 @compiled
 def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int) -> tuple[IntArray, int]:
-    """Slot of each key, (n,), and how many are used then; an unknown key begins the next. Room
-    must be there.
+    """Return the slot of each key, (n,), and the number of slots in use afterwards. An unknown key
+    gets the next slot; the table must have room for it.
     """
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
@@ -113,8 +113,8 @@ def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int) -> tuple
 def assign_rows(
     table: IntArray, rows: RecordArray, wanted: IntArray, used: int
 ) -> tuple[IntArray, int]:
-    """Row of each key, (n,), and how many are used then; an unknown key is written to the next
-    of `rows`.
+    """Return the row of each key, (n,), and the number of rows in use afterwards. An unknown key is
+    written to the next of `rows`.
     """
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
@@ -138,7 +138,7 @@ def fill_table(table: IntArray, rows: RecordArray, used: int) -> None:
 
 @refcount_free_inlined
 def first_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
-    """Where a pair is sought first."""
+    """Return the place at which the search for a pair begins."""
     return _first_place(_hash_key((np.int64(slot) << np.int64(32)) | np.int64(vehicle)), len(pairs))
 
 
@@ -156,15 +156,15 @@ def pair_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
 
 
 def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
-    """A table with room for `entries` that holds the first `used` rows."""
+    """Return a hash table with room for `entries` that contains the first `used` rows."""
     table = np.full(places_for(entries, ROWS_MOST), NONE, np.int64)
     fill_table(table, rows, used)
     return table
 
 
 def places_for(entries: int, most: float) -> int:
-    """Places for so many entries, and for a third more until a share `most` is taken: an hour
-    after three, of pairs.
+    """Return the number of places for `entries` and a third more at a load of `most`; for pairs
+    that is one hour of growth after three.
     """
     return max(LEAST, int(1.35 * entries / most))
 

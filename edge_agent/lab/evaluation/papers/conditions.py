@@ -33,8 +33,9 @@ def with_losses(vehicle: TrueVehicle) -> TrueVehicle:
 
 
 def _in_wheel() -> tuple[TrueVehicle, TyreOption]:
-    """The vehicle of 002 with C_f, C_r and J of table 1, and the tyre that its filter needs for
-    it."""
+    """Return the vehicle of 002 with C_f, C_r and J of table 1, and the tyre that its filter needs
+    for it.
+    """
     row = parameter_row(SMALL.vehicle)
     base = row[Parameter.TO_FRONT] + row[Parameter.TO_REAR]
     weight = row[Parameter.MASS] * GRAVITY

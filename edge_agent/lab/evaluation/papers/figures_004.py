@@ -144,7 +144,7 @@ def _lower_vertices(tuned: LowerVertices) -> PaperPlot:
 
 
 def _shoulder_values(k: int) -> FloatArray:
-    """Memberships at left foot, peak and right foot of an outer set."""
+    """Return the memberships at left foot, peak and right foot of an outer set."""
     return np.array([1.0, 1.0, 0.0]) if k == 0 else np.array([0.0, 1.0, 1.0])
 
 

@@ -48,7 +48,9 @@ def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
 
 
 def _run_friction(spec: DriveSpec, setting: FederatedSetting) -> tuple[DriveSet, FloatArray]:
-    """The drive, and the friction of the wheels (T, 4) by the printed filter with given motion."""
+    """Return the drive, and the friction of the wheels (T, 4) by the printed filter with given
+    motion.
+    """
     batch = ideal(spec)
     return batch, estimate(given_motion(batch, spec.vehicle), setting).mu
 

@@ -52,7 +52,7 @@ class MotionRun:
     reported: dict[str, Estimates]
 
     def values(self, name: str) -> Values:
-        """Measures of one of the filters."""
+        """Return the measures of one of the filters."""
         return means(self.batch, self.reported[name])
 
 

@@ -89,7 +89,7 @@ class ForceRun:
     second: dict[str, FloatArray]  # forces compensated (TFC), motion of WCKF-B
 
     def erms(self, stage: str) -> Values:
-        """Root of the mean squared error (38)."""
+        """Return the root of the mean squared error (38)."""
         found = self.first if stage == "A" else self.second
         return {
             name: float(np.sqrt(np.mean((found[name] - true) ** 2)))
@@ -97,7 +97,9 @@ class ForceRun:
         }
 
     def pre(self, stage: str) -> Values:
-        """Relative error of the peak (37), as a share: peaks are those of the largest size."""
+        """Return the relative error of the peak (37), as a share; a peak is the value of largest
+        magnitude.
+        """
         found = self.first if stage == "A" else self.second
         values = {}
         for name, true in self.truth.items():

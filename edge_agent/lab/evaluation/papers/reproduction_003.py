@@ -88,12 +88,13 @@ class CaseRuns:
     runs: dict[str, FrictionRun]
 
     def error(self, name: str) -> float:
-        """Mean absolute error over all wheels and samples, convergence included."""
+        """Return the mean absolute error over all wheels and samples, convergence included."""
         return float(np.abs(self.runs[name].mu - self.batch.mu_wheel[:, 0]).mean())
 
     def arrival(self, name: str) -> float:
-        """Seconds from the start, or from the change of friction, until all wheels are within
-        NEAR."""
+        """Return the seconds from the start, or from the change of friction, until all wheels are
+        within NEAR.
+        """
         truth = self.batch.mu_wheel[:, 0]
         changes = np.flatnonzero(np.abs(np.diff(truth, axis=0)).max(axis=1) > NEAR)
         first = int(changes[-1]) + 1 if len(changes) else 0
@@ -303,7 +304,7 @@ def _sensor_errors() -> tuple[PaperRow, ...]:
 
 
 def _add_noise(signals: FloatArray) -> FloatArray:
-    """Signals with white noise on the wheel speeds."""
+    """Return the signals with white noise on the wheel speeds."""
     changed = signals.copy()
     shape = changed[:, S.OMEGA : S.OMEGA + 4].shape
     changed[:, S.OMEGA : S.OMEGA + 4] += WHEEL_SPEED_NOISE * np.random.default_rng(3).normal(
@@ -313,7 +314,7 @@ def _add_noise(signals: FloatArray) -> FloatArray:
 
 
 def _scale_radius(signals: FloatArray) -> FloatArray:
-    """Signals of wheels whose radius is larger than the filter's."""
+    """Return the signals of wheels whose radius is larger than the filter's."""
     changed = signals.copy()
     changed[:, S.OMEGA : S.OMEGA + 4] /= 1.0 + WHEEL_RADIUS_ERROR
     return changed

@@ -59,7 +59,9 @@ class NoisyRun:
     reported: dict[str, Estimates]
 
     def values(self, name: str) -> Values:
-        """MAE and RMSE of each state, mean over the seeds, and relative errors of the peaks."""
+        """Return MAE and RMSE of each state, averaged over the seeds, and the relative errors of
+        the peaks.
+        """
         found: Values = {}
         truth = {key: self.batch.truth[f"true_{key}"] for key in ("vx", "vy", "yaw_rate")} | {
             "mu": self.batch.mu
