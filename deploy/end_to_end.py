@@ -79,13 +79,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--vehicles", type=int, default=200)
-    parser.add_argument("--duration", type=float, default=60.0, help="[s] of driving")
+    parser.add_argument("--duration", type=float, default=60.0, help="duration of the drive [s]")
     parser.add_argument("--seed", type=int, default=FIGURES)
     parser.add_argument(
-        "--scenario", default="demo", help="demo (default), hills; hills-7: drawn by seed 7"
+        "--scenario",
+        default="demo",
+        help="demo (default), hills, or hills-N: a town drawn from seed N",
     )
     parser.add_argument(
-        "--rough", type=float, default=0.0, help="share of vehicles as real cars are (default 0)"
+        "--rough",
+        type=float,
+        default=0.0,
+        help="share of vehicles with the sensor errors of real cars (default 0)",
     )
     parser.add_argument(
         "--winter", type=float, default=0.0, help="share with winter equipment (default 0)"

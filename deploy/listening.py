@@ -241,8 +241,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--first", type=int, default=FIGURES, help="seed")
     parser.add_argument("--vehicles", type=int, default=36)
-    parser.add_argument("--duration", type=float, default=150.0, help="[s] of driving")
-    parser.add_argument("--scenario", default="hills-SEED", help="hills-SEED: drawn by each seed")
+    parser.add_argument("--duration", type=float, default=150.0, help="duration of the drive [s]")
+    parser.add_argument(
+        "--scenario", default="hills-SEED", help="scenarios (default: hills-SEED of each seed)"
+    )
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     with_: list[Drive] = []
@@ -254,12 +256,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             ).run(args.duration)
             out.append(drive)
             passes = (
-                f"{len(drive.slid)} of {len(drive.passed)} passes slid, alert after "
+                f"{len(drive.slid)} of {len(drive.passed)} passes lost grip, alert after "
                 f"{drive.alert_passes:.0f}"
             )
             more = f"{drive.alerts} alerts on the ice, {drive.warnings} warnings"
             print(
-                f"  seed {seed} {'listening' if listening else 'deaf'}: {passes}; {more}",
+                f"  seed {seed} {'listening' if listening else 'not listening'}: {passes}; {more}",
                 flush=True,
             )
     found = measure(with_, without)

@@ -1,4 +1,4 @@
-"""`python -m deploy.precompile [papers]`: compile frequently used kernels once on this machine.
+"""`python -m deploy.precompile [papers]`: compile frequently used kernels once for this machine.
 
 `make setup` ends with the kernels of service, agent and simulated vehicle, so that their first
 start does not wait. The tests need the papers' filters too. A kernel that cannot be compiled here
@@ -39,7 +39,7 @@ def main(words: list[str]) -> int:
     began = time.monotonic()
     papers = words == ["papers"]
     print(
-        f"compiling {'the filters of the papers' if papers else 'kernels'}, once on this machine",
+        f"compiling {'the filters of the papers' if papers else 'kernels'}, once for this machine",
         flush=True,
     )
     names = [name for name, _ in known_estimators() if name != DEFAULT] if papers else [DEFAULT]

@@ -61,13 +61,13 @@ def open_router(
         session = zenoh.open(settings)
     except zenoh.ZError as error:
         raise InputError(
-            "listen", f"the router cannot start ({error})", "free the port or give another"
+            "listen", f"the router cannot start ({error})", "free the port or choose another"
         ) from error
     if listen is None:
         return session, list(json.loads(settings.get_json("listen/endpoints")))
     reply = next(iter(session.get(f"@/{session.zid()}/router"))).ok
     if reply is None:
-        raise InputError("listen", "the router does not tell its endpoints", "give a fixed port")
+        raise InputError("listen", "the router does not report its endpoints", "give a fixed port")
     return session, list(json.loads(reply.payload.to_string())["locators"])
 
 
@@ -79,20 +79,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--listen",
         nargs="+",
-        help="endpoints instead of the file's, e.g. tcp/127.0.0.1:0 for a free port",
+        help="listen endpoints; override the file's; e.g. tcp/127.0.0.1:0 for a free port",
     )
     parser.add_argument(
         "--metrics-port", type=int, help="serve /metrics: sessions and links; 0 for a free port"
     )
     parser.add_argument(
-        "--metrics-host", default="127.0.0.1", help="listen address of it (default 127.0.0.1)"
+        "--metrics-host", default="127.0.0.1", help="listen address of /metrics (default 127.0.0.1)"
     )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a router until a signal ends it."""
     parser = argparse.ArgumentParser(
-        prog="deploy.router", description="A Zenoh router for GripMap."
+        prog="deploy.router", description="Run a Zenoh router for GripMap."
     )
     add_arguments(parser)
     return run(parser.parse_args(argv))

@@ -62,7 +62,7 @@ def open_page(
     """
     program = find_chromium()
     if program is None:
-        pytest.skip("no Chromium on this machine: apt install chromium")
+        pytest.skip("Chromium is not installed: apt install chromium")
     api: Any = pytest.importorskip(
         "playwright.sync_api", reason="no Playwright: pip install 'gripmap[dev]'"
     )

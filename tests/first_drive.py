@@ -83,8 +83,8 @@ def _publish_drive(system: System, log: Path) -> tuple[Cells, list[str]]:
         refused = json.loads(told.getvalue().splitlines()[-1])["rejected"]
         assert refused > 50
         assert (
-            f"error: publish: {refused} records were refused; it is older than a month: --start now"
-            in warned.getvalue()
+            f"error: publish: {refused} records were refused; the log is older than a month: "
+            "publish it with --start now" in warned.getvalue()
         )
         cells = system.query_cells()
         held.undeclare()

@@ -104,7 +104,7 @@ def test_estimates_of_one_of_many_vehicles_become_a_table() -> None:
     bank = edge_agent.make_bank("ckf", [vehicle, vehicle])
     found = bank.advance(t, signals)
     assert edge_agent.to_table(t, found, 1).equals(edge_agent.to_table(t[:, 0], found))
-    with pytest.raises(InputError, match="vehicle: 2 is none of 2"):
+    with pytest.raises(InputError, match="vehicle: 2 is not one of the 2 vehicles"):
         edge_agent.to_table(t, found, 2)
 
 
@@ -243,7 +243,7 @@ def test_estimator_source_and_question_of_another_distribution_are_found(tmp_pat
     for estimator, problem in (
         ("ckf@steep", "tyre-curve: begins with slope 2"),
         ("ckf@no", "tyre-curve: 'no' is unknown"),
-        ("sr-ukf@brush", "tyre-curve: sr-ukf has its own"),
+        ("sr-ukf@brush", "tyre-curve: sr-ukf uses its own"),
     ):
         done = run_command(
             "edge_agent",

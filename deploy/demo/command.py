@@ -16,28 +16,39 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--vehicles", type=int, default=36, help="simulated vehicles (default 36)")
     parser.add_argument(
-        "--duration", type=float, default=150.0, help="seconds of driving (default 150)"
+        "--duration",
+        type=float,
+        default=150.0,
+        help="duration of the drive in seconds (default 150)",
     )
     parser.add_argument(
-        "--seed", type=int, default=1, help="of vehicles, sensors and routes (default 1)"
+        "--seed", type=int, default=1, help="seed of vehicles, sensors and routes (default 1)"
     )
     parser.add_argument(
         "--warned",
         type=float,
         default=0.5,
-        help="share of the drivers who hear the map (default 0.5)",
+        help="share of the vehicles that receive the map (default 0.5)",
     )
     parser.add_argument(
-        "--stay", action="store_true", help="keep map and page running after it, until Ctrl-C"
+        "--stay",
+        action="store_true",
+        help="keep the map and the page running after the drive, until Ctrl-C",
     )
     parser.add_argument(
-        "--open", action="store_true", help="open the page in the browser of this machine"
+        "--open", action="store_true", help="open the page in this machine's browser"
     )
     parser.add_argument(
-        "--page-port", type=int, default=8080, help="of the live page; 0: a free one (default 8080)"
+        "--page-port",
+        type=int,
+        default=8080,
+        help="port of the live page; 0 selects a free one (default 8080)",
     )
     parser.add_argument(
-        "--screenshot", type=Path, metavar="FILE", help="keep a picture of the page, by Chromium"
+        "--screenshot",
+        type=Path,
+        metavar="FILE",
+        help="save a screenshot of the page (needs Chromium)",
     )
 
 
@@ -58,5 +69,5 @@ def run(args: argparse.Namespace) -> int:
         return story.run(args)
     except processes.DemoError as error:
         raise InputError(
-            "demo", str(error), "read that log; its last line names the reason"
+            "demo", str(error), "read that log; its last line gives the reason"
         ) from error

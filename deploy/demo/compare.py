@@ -250,8 +250,8 @@ class LostGrip:
             f"{int(self.lost[rows].sum())} of {int(rows.sum())}"
             for rows in (self.warned, ~self.warned)
         ]
-        known = "Over the new ice, once it was known"
-        return f"{known}: {counts[0]} warned drivers lost grip, {counts[1]} who were not warned."
+        known = "On the new ice, after it was known"
+        return f"{known}: {counts[0]} warned drivers lost grip, and {counts[1]} unwarned drivers."
 
 
 def lost_grip(

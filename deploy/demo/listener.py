@@ -63,7 +63,7 @@ class Listener:
         return (
             f"{len(basis):5d} cells, {basis.count('measured'):4d} measured, {several:4d} by two or "
             "more vehicles, "
-            f"{sum(standing.values()):3d} alerts stand"
+            f"{sum(standing.values()):3d} active alerts"
         )
 
     def whole_map(self) -> pa.Table:

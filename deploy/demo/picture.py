@@ -45,7 +45,7 @@ def draw_maps(comparison: MapComparison, path: Path, grip: LostGrip | None = Non
     figure.suptitle(
         f"{cells.num_rows} cells and directions; truth inside the interval in "
         f"{comparison.is_covered.mean():.0%}, "
-        f"{comparison.has_several_vehicles.sum()} of them seen by two or more vehicles"
+        f"{comparison.has_several_vehicles.sum()} of them visited by two or more vehicles"
     )
     figure.savefig(path, dpi=130)
 

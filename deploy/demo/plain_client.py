@@ -23,8 +23,7 @@ def main() -> int:
                 return 1
             features = json.loads(reply.ok.payload.to_string())["features"]
             print(
-                f"{reply.ok.key_expr} ({reply.ok.encoding}): {len(features)} cells, the first of "
-                "them:"
+                f"{reply.ok.key_expr} ({reply.ok.encoding}): {len(features)} cells, the first one:"
             )
             print(json.dumps(features[0]["properties"]) if features else "none")
     return 0

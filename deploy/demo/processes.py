@@ -54,7 +54,7 @@ class ManagedProcess:
             if self.process.poll() is not None:
                 break
             time.sleep(0.05)
-        raise DemoError(f"{self.name} did not say {start!r}; see {self.log}")
+        raise DemoError(f"{self.name} did not print {start!r}; see {self.log}")
 
     def wait(self, every_s: float, tick: Callable[[], None]) -> int:
         """Wait for the end, calling `tick` now and then; return the exit code."""
@@ -83,7 +83,9 @@ class ManagedProcess:
         try:
             counts: dict[str, float] = json.loads(self.lines()[-1])
         except (IndexError, json.JSONDecodeError) as error:
-            raise DemoError(f"{self.name} ended without its counts; see {self.log}") from error
+            raise DemoError(
+                f"{self.name} ended without printing its counts; see {self.log}"
+            ) from error
         return counts
 
 

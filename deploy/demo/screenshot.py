@@ -30,7 +30,7 @@ def take_screenshot(address: str, path: Path) -> None:
     except ImportError as error:
         raise InputError("screenshot", "Playwright is missing", install_command("dev")) from error
     if program is None:
-        raise InputError("screenshot", "no Chromium on this machine", "apt install chromium")
+        raise InputError("screenshot", "Chromium is not installed", "apt install chromium")
     size: Any = SIZE
     with sync_api.sync_playwright() as play:
         browser = play.chromium.launch(executable_path=program, args=["--no-sandbox"])

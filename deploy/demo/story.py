@@ -43,7 +43,7 @@ def drive_fleet(
         print(f"  {time.monotonic() - began:4.0f} s  {listener.progress()}", flush=True)
 
     if fleet.wait(REPORT_S, print_progress) != 0:
-        raise processes.DemoError(f"the fleet ended with an error; see {fleet.log}")
+        raise processes.DemoError(f"the simulated fleet failed; see {fleet.log}")
     return listener, fleet.report()
 
 
@@ -53,11 +53,11 @@ def show_clients(folder: Path, endpoint: str, comparison: compare.MapComparison)
     bbox = ",".join(
         f"{value:.6f}" for value in (sides[0].min(), sides[1].min(), sides[2].max(), sides[3].max())
     )
-    print("\nA client that knows only Zenoh asks for the map:", flush=True)
+    print("\nA client with only a Zenoh library queries the map:", flush=True)
     subprocess.run([sys.executable, "-m", "deploy.demo.plain_client", endpoint, bbox], check=True)
     compact(folder / "archive")
     print(f"""
-The observations, as any Parquet reader sees them:
+The observations are Parquet files; for example, with DuckDB:
   import duckdb
   print(duckdb.sql("select sector, count(*), median(mu), count(distinct vehicle)
                     from '{folder}/archive/observations/*/*/*.parquet' where value group by sector"))""")
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
         processes.run_system(FOLDER) as (endpoint, service),
         processes.run_page(FOLDER, endpoint, service, args.page_port) as address,
     ):
-        print(f"\n  See it: {address}\n", flush=True)
+        print(f"\n  Live map: {address}\n", flush=True)
         if args.open:
             webbrowser.open(address)
         listener, counts = drive_fleet(FOLDER, endpoint, args)
@@ -122,6 +122,9 @@ def run(args: argparse.Namespace) -> int:
         if args.screenshot is not None:
             screenshot.take_screenshot(address, args.screenshot)
         if args.stay:
-            print(f"\n{address} stays until Ctrl-C; the truth can be laid over it.", flush=True)
+            print(
+                f"\n{address} runs until Ctrl-C; the page can show the true friction on top.",
+                flush=True,
+            )
             stop_on_signals().wait()
     return 0 if compare.demo_works(found) else 1

@@ -48,7 +48,7 @@ def main(
     if outlook is not None:
         known = int((outlook.runs.basis > 0).sum())
         print(f"ahead on {outlook.way}: {known} of {len(outlook.runs.basis)} stretches are known")
-    print(warned or "nothing slippery is known ahead")
+    print(warned or "no slippery road is known ahead")
     return warned
 
 

@@ -39,10 +39,10 @@ class LowerVertices:
     Attributes:
         feet: alternately how far set k reaches towards peak k + 1, and set k + 1 towards peak k
         [1], 1 at the peak.
-        out_feet: the same for the output sets.
+        out_feet: the same of the sets of the step.
 
     Raises:
-        InputError: a share leaves its range, or peaks do not rise.
+        InputError: a share leaves its range, or peaks are not in increasing order.
     """
 
     feet: tuple[float, ...] = (1.0,) * FEET
@@ -61,12 +61,16 @@ class LowerVertices:
             peaks = np.asarray(getattr(self, name), float)
             if peaks.shape != (SETS,) or not (np.diff(peaks) > 0.0).all():
                 raise InputError(
-                    f"lower_vertices.{name}", "do not rise", f"give {SETS} numbers in order"
+                    f"lower_vertices.{name}",
+                    "are not in increasing order",
+                    f"give {SETS} numbers in order",
                 )
         pairs = np.asarray(self.feet).reshape(-1, 2)
         if (pairs.sum(axis=1) < 1.0 + LEAST_OVERLAP).any():
             raise InputError(
-                "lower_vertices.feet", "two neighbours leave a gap", "let a pair sum to more than 1"
+                "lower_vertices.feet",
+                "two neighbouring sets leave a gap",
+                "let a pair sum to more than 1",
             )
 
     def triangle_sets(self) -> tuple[FloatArray, FloatArray]:

@@ -129,7 +129,7 @@ class Memberships:
             if not 0.0 <= foot <= peak - CLOSEST:
                 raise InputError(
                     f"memberships.{name}",
-                    "does not rise",
+                    "is not increasing",
                     f"give a foot and a peak {CLOSEST:g} above it",
                 )
         if min(self.consequents) < 0.0 or max(self.consequents) > LARGEST_SCALE:
@@ -158,7 +158,7 @@ class Memberships:
             v = np.append(v, cls().to_vector()[NOISE:])
         if v.shape != (sum(LENGTHS.values()),):
             raise InputError(
-                "memberships", f"a vector of {v.shape} numbers", f"give {sum(LENGTHS.values())}"
+                "memberships", f"the vector has {v.shape} numbers", f"give {sum(LENGTHS.values())}"
             )
         inputs = np.sort(v[:SETS])
         for k in range(1, SETS):
@@ -206,7 +206,7 @@ class Memberships:
                 raise InputError(
                     f"memberships.{name}",
                     "missing or not a list of numbers",
-                    "write it with edge-agent tune",
+                    "write the file with edge-agent tune",
                 )
             fields[name] = tuple(float(x) for x in value)
         return cls(**fields)

@@ -54,7 +54,9 @@ def rule_table(printed: tuple[str, ...] = PRINTED) -> FloatArray:
         raise InputError("rules", f"a table of {levels.shape}", f"give {(len(RATE), len(ALPHA))}")
     levels[:, ALPHA < 0.0] *= -1.0
     if levels[RATE == 0.0][:, ALPHA == 0.0].any():
-        raise InputError("rules", "R changes where nothing is wrong", "let the middle be PSM")
+        raise InputError(
+            "rules", "the rule for zero mismatch changes R", "set the middle entry to PSM"
+        )
     return levels
 
 

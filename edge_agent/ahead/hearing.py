@@ -30,14 +30,18 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
     """
     tile = _tile_of_key(key, "map")
     if len(payload) > MOST_TILE_BYTES:
-        raise WireError("tile", f"{len(payload)} bytes", f"ask for less than {MOST_TILE_BYTES}")
+        raise WireError(
+            "tile",
+            f"has {len(payload)} bytes",
+            f"query a smaller area: the limit is {MOST_TILE_BYTES} bytes",
+        )
     table = decode_tile(payload)
     names = ("cell", "sector", "vehicles", "last_time")
     if any(
         table[name].null_count
         for name in (*names, "mu_lower", "mu_upper", "p_slippery", "age_s", "basis")
     ):
-        raise WireError("tile", "has holes", "send every needed column whole")
+        raise WireError("tile", "has null values", "send every required column without nulls")
     cell, sector, vehicles, last = (_int_column(table, name) for name in names)
     lower, mu, upper, p, age = (
         _float_column(table, name) for name in ("mu_lower", "mu", "mu_upper", "p_slippery", "age_s")
@@ -60,11 +64,11 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
             raise WireError(
                 name,
                 f"is not possible in row {int(rows.argmax())}",
-                "send what the map's table says",
+                "send values that the table of the map allows",
             )
     place = cell * grid.SECTORS + sector
     if len(np.unique(place)) < len(place):
-        raise WireError("cell", "is there twice", "send each place once")
+        raise WireError("cell", "occurs twice", "send each cell and sector once")
     heard = np.minimum(
         last + (age * NS).astype(np.int64), now
     )  # when the tile was made: a reader may have kept it
@@ -80,7 +84,7 @@ def decode_alert_message(key: str, payload: bytes, now: int) -> Alert:
         WireError: it is not a valid message of a service.
     """
     if len(payload) > wire.MAX_BYTES:
-        raise WireError("alert", f"{len(payload)} bytes", f"send at most {wire.MAX_BYTES}")
+        raise WireError("alert", f"has {len(payload)} bytes", f"send at most {wire.MAX_BYTES}")
     return _check_alert(wire.decode_alert(payload), _tile_of_key(key, "alert"), now)
 
 
@@ -107,7 +111,9 @@ def _check_alert(alert: Alert, tile: int, now: int) -> Alert:
         and 0.0 <= alert.p_slippery <= 1.0
     )
     if not possible:
-        raise WireError("alert", "is not possible", "send what the message's description says")
+        raise WireError(
+            "alert", "has values out of range", "send values that the message definition allows"
+        )
     return alert
 
 
@@ -116,10 +122,12 @@ def _tile_of_key(key: str, topic: str) -> int:
         parsed = keys.parse(key)
     except InputError as error:
         raise WireError(
-            "key", f"{key[:80]!r} is no tile's", "put on the key of the topic"
+            "key", f"{key[:80]!r} does not name a tile", "publish on the key of the topic"
         ) from error
     if parsed.topic.name != topic or parsed.quadint is None:
-        raise WireError("key", f"{key[:80]!r} is no tile's", "put on the key of the topic")
+        raise WireError(
+            "key", f"{key[:80]!r} does not name a tile", "publish on the key of the topic"
+        )
     return parsed.quadint
 
 

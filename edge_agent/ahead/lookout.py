@@ -213,7 +213,10 @@ class Lookout:
             self._look_ahead(k, watcher, watcher.subscriber, pose)
         except Exception:  # whatever it is: the car drives on, and so must this thread
             self.counts.failures += 1
-            log.exception("a look ahead of %s failed; going on", watcher.name)
+            log.exception(
+                "looking ahead for %s failed; it is tried again with the next position",
+                watcher.name,
+            )
 
     def _look_ahead(self, k: int, watcher: _Watcher, subscriber: MapSubscriber, pose: Pose) -> None:
         length = horizon_length(pose.speed)

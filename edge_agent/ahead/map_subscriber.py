@@ -157,7 +157,7 @@ class MapSubscriber:
             self._session.get(selector, receive_reply, timeout=ANSWER_S)
         except zenoh.ZError as error:
             self.counts["unanswered"] += 1
-            log.warning("the map cannot be asked: %s", error)
+            log.warning("the map cannot be queried: %s", error)
 
     def _on_alert(self, sample: zenoh.Sample) -> None:
         self._pass_payload(self._hear_alert, str(sample.key_expr), sample.payload.to_bytes())
@@ -168,7 +168,7 @@ class MapSubscriber:
             take(key, payload)
         except WireError as error:
             self.counts[f"refused.{error.field}"] += 1
-            log.warning("what was said on %s is not believed: %s", key, error)
+            log.warning("a message on %s is ignored: %s", key, error)
 
     def _hear_alert(self, key: str, payload: bytes) -> None:
         now = self._clock()

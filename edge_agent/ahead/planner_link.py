@@ -57,4 +57,4 @@ class PlannerLink:
                 express=True,
             )
         except zenoh.ZError as error:
-            log.warning("the planner cannot be reached: %s", error)
+            log.warning("the planner is unreachable: %s", error)

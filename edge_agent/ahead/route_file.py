@@ -60,9 +60,9 @@ def route_of(points: list[tuple[float, float]]) -> GivenRoute:
         and (np.abs(place[:, 0]) <= MAX_LATITUDE).all()
         and (np.abs(place[:, 1]) <= 180.0).all()
     ):
-        raise InputError("route", "has points that are nowhere on earth", "give degrees of WGS 84")
+        raise InputError("route", "has coordinates out of range", "give degrees of WGS 84")
     if not (np.abs(np.diff(place, axis=0)).sum(axis=1) > 0.0).any():
-        raise InputError("route", "stays at one point", "give a line")
+        raise InputError("route", "stays at one point", "give a line with two different points")
     return GivenRoute(place[:, 0], place[:, 1])
 
 
@@ -88,7 +88,7 @@ def _parse_gpx(data: bytes) -> list[tuple[float, float]]:
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:
-        raise InputError("route", f"is no XML ({error})", "give a GPX file") from error
+        raise InputError("route", f"is not valid XML ({error})", "give a GPX file") from error
     return next((points for points in found.values() if len(points) >= 2), [])
 
 

@@ -159,11 +159,11 @@ def _make_warning(
     alerted = horizon.alerted[first:last]
     own = (alerted & (horizon.basis[first:last] == MEASURED)).any()
     reason = (
-        "an alert stands"
+        "an alert is active"
         if own
-        else "an alert stands for the other way"
+        else "an alert is active for the opposite direction"
         if alerted.any()
-        else "the map says so"
+        else "the map reports low grip"
     )
     return GripWarning(
         id=name,
@@ -185,9 +185,9 @@ def _make_warning(
 
 def _end_warning(one: Active, pose: Pose, *, stands: bool) -> GripWarning:
     if not stands:
-        reason = "it is no longer slippery there, or nobody knows"
+        reason = "the map no longer reports the stretch as slippery"
     elif one.distance_m <= NEAR_M:
         reason = "passed"
     else:
-        reason = "the car took another way"
+        reason = "the vehicle left this route"
     return replace(one.warning, state="ended", time=pose.time, reason=reason)

@@ -38,7 +38,7 @@ def bank_of(
     estimator, _, own = estimator.partition("@")
     if own and own not in plugins.entry_points_of(plugins.TYRE_CURVES):
         others = ", ".join(plugins.entry_points_of(plugins.TYRE_CURVES)) or "none is installed"
-        raise InputError("tyre-curve", f"{own!r} is unknown", f"choose one of these: {others}")
+        raise InputError("tyre-curve", f"{own!r} is unknown", f"choose one of {others}")
     curve = plugins.load_entry_point(plugins.TYRE_CURVES, own) if own else None
     if estimator not in ESTIMATORS and estimator in plugins.entry_points_of(plugins.ESTIMATORS):
         if memberships is not None:

@@ -57,7 +57,7 @@ class KuksaProvider:
         host, _, port = address.partition(":")
         if not host or not (port or str(PORT)).isdigit() or not set(files) <= set(FILES):
             fix = f"write it like 127.0.0.1:{PORT}?ca=ca.pem&token=agent.jwt"
-            raise InputError("kuksa", f"{text!r} is no databroker", fix)
+            raise InputError("kuksa", f"{text!r} is not the address of a databroker", fix)
         self.written = 0
         self.refused = 0
         self._connection = BrokerConnection(text, f"{host}:{port or PORT}", files)
@@ -122,7 +122,7 @@ class KuksaProvider:
             code = error.code()
             if code in (grpc.StatusCode.NOT_FOUND, grpc.StatusCode.INVALID_ARGUMENT):
                 self._unknown.add(path)
-                log.warning("the databroker does not take %s: %s", path, error.details())
+                log.warning("the databroker rejects %s: %s", path, error.details())
             else:
                 self._log_problem(f"{code.name}: {error.details()}")
             self.refused += 1  # after the log line, so that whoever sees the count finds the line
@@ -134,7 +134,7 @@ class KuksaProvider:
     def _log_problem(self, problem: str) -> None:
         """Log a problem once, and its end."""
         if problem and not self._problem:
-            log.warning("the databroker cannot be written (%s); trying again", problem)
+            log.warning("writing to the databroker fails (%s); trying again", problem)
         elif self._problem and not problem:
-            log.warning("the databroker is written again")
+            log.warning("writing to the databroker works again")
         self._problem = problem

@@ -93,7 +93,9 @@ def to_table(t: FloatArray, estimates: Estimates, vehicle: int = 0) -> pa.Table:
     """
     count = estimates.values.shape[1]
     if not 0 <= vehicle < count:
-        raise InputError("vehicle", f"{vehicle} is none of {count}", f"give 0 to {count - 1}")
+        raise InputError(
+            "vehicle", f"{vehicle} is not one of the {count} vehicles", f"give 0 to {count - 1}"
+        )
     time = np.asarray(t if t.ndim == 1 else t[:, vehicle])[:, None]
     return estimates_table(time, Estimates(estimates.values[:, vehicle : vehicle + 1]))
 

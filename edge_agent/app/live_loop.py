@@ -100,7 +100,7 @@ def _warn_of_flags(pipeline: Pipeline, warned: set[tuple[int, str]]) -> None:
         if (vehicle, flag) not in warned:
             warned.add((vehicle, flag))
             log.warning(
-                "vehicle %d: %s %s: it counts as unknown; correct the profile",
+                "vehicle %d: %s %s: it is treated as unknown; correct the profile",
                 vehicle,
                 flag,
                 reason,

@@ -24,28 +24,28 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         Metric(
             "published_records",
             "counter",
-            "put on disk and sent",
+            "records written to the outbox and sent",
             _by_kind_name(counts.published),
             "kind",
         ),
         Metric(
             "acknowledged_records",
             "counter",
-            "held by a service",
+            "records acknowledged by a service",
             _by_kind_name(counts.acknowledged),
             "kind",
         ),
         Metric(
             "rejected_records",
             "counter",
-            "rejected by a service",
+            "records rejected by a service",
             _by_kind_name(counts.rejected),
             "kind",
         ),
         Metric(
             "dropped_records",
             "counter",
-            "dropped for lack of room",
+            "records dropped because the outbox was full",
             {"": publisher.dropped_records},
         ),
         Metric(
@@ -58,10 +58,10 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         Metric(
             "unanswered_records",
             "counter",
-            "given up because only later batches were answered",
+            "records given up because only later batches were acknowledged",
             {"": publisher.unanswered_records},
         ),
-        Metric("resent_batches", "counter", "sent again", {"": counts.resent_batches}),
+        Metric("resent_batches", "counter", "records sent again", {"": counts.resent_batches}),
         Metric(
             "bad_acks", "counter", "acknowledgements that could not be read", {"": counts.bad_acks}
         ),
@@ -74,18 +74,18 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         Metric(
             "damaged_records",
             "counter",
-            "lost by damage of the outbox",
+            "records lost because the outbox was damaged",
             {"": publisher.damage_counts[1]},
         ),
         Metric(
             "sender_failures",
             "counter",
-            "failed rounds of the sending thread",
+            "failed iterations of the sending thread",
             {"": counts.failures},
         ),
         gauge(
             "stranded_records",
-            "records in the outbox under a former name",
+            "records in the outbox under a previous vehicle name",
             publisher.stranded_records,
         ),
         gauge(
@@ -128,8 +128,8 @@ def health_problems(publisher: Publisher, progress: Progress) -> list[str]:
         )
     if publisher.stranded_records:
         found.append(
-            f"{publisher.stranded_records} records are stored under a former name; run once with the "
-            "former --name"
+            f"{publisher.stranded_records} records are stored under a previous vehicle name; "
+            "run once with that --name"
         )
     if publisher.is_broken:
         found.append("the sending thread has died; restart the agent")

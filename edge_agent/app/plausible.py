@@ -86,9 +86,9 @@ class Plausibility:
         """Return one message per implausible finding."""
         n = max(self.samples, 1)
         found = {
-            "speed far off the wheels": self.median_speed_error > FURTHEST_SPEED,
-            "an upper bound below the grip in use": self.violations / n > MOST_VIOLATION,
-            "started anew again and again": self.resets > 1 + MOST_RESETS_PER_S * self.seconds,
+            "speed differs much from that of the wheels": self.median_speed_error > FURTHEST_SPEED,
+            "the upper bound lies below the grip in use": self.violations / n > MOST_VIOLATION,
+            "the filter was reset repeatedly": self.resets > 1 + MOST_RESETS_PER_S * self.seconds,
         }
         return [words for words, bad in found.items() if bad]
 
@@ -97,7 +97,7 @@ class Plausibility:
         n = max(self.samples, 1)
         summary = (
             f"{self.samples} samples, {self.seconds:.1f} s; speed {self.median_speed_error:.1%} "
-            "off the wheels, "
+            "from the wheels', "
             f"excited {self.excited / n:.0%}, sliding {self.sliding / n:.0%}, "
             f"violations {self.violations / n:.1%}, resets {self.resets}"
         )

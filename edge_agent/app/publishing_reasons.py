@@ -23,7 +23,7 @@ _NUMBER: Final = re.compile(r"\d+(\.\d+)?")
 
 
 class PublisherState(Protocol):
-    """Part of a publisher that shows whether its records arrive."""
+    """Part of a publisher that tells whether its records arrive."""
 
     @property
     def links(self) -> int:
@@ -98,7 +98,9 @@ def reasons_not_publishing(
     """
     found = list(troubles)
     if watch.is_missing("wheels"):
-        found.append("no wheel speed in the signals: compare the profile with what the car sends")
+        found.append(
+            "the signals contain no wheel speed: compare the profile with the car's signals"
+        )
     elif watch.is_missing("turning"):
         found.append("the vehicle stands: only a moving vehicle visits cells")
     if watch.is_missing("position"):
@@ -114,16 +116,14 @@ def reasons_not_publishing(
         )
     elif publisher.cut_off:
         found.append(
-            f"the router at {where} is away: records wait on disk and are sent when it returns"
+            f"the router at {where} does not answer: records wait on disk and are sent when it returns"
         )
     elif publisher.unanswered_s > UNANSWERED_S:
         found.append(
             "no service acknowledges the records: start `fleet-service run` on the same router"
         )
     if any(publisher.counts.rejected.values()) and not any(publisher.counts.acknowledged.values()):
-        found.append(
-            "a service refuses all records: the reason stands in its log and in its metrics"
-        )
+        found.append("a service refuses all records: its log and its metrics give the reason")
     return found
 
 
@@ -161,5 +161,5 @@ class ReasonReporter:
         if alike == self._told:
             return
         self._told = alike
-        text = f"not published: {'; '.join(found)}" if found else "publishing: every reason is gone"
+        text = f"not published: {'; '.join(found)}" if found else "publishing: no obstacle is left"
         self._say(LogLine(text, event="unpublished" if found else "publishing", reasons=found))

@@ -48,7 +48,10 @@ class Known(BaseModel):
 
     version: Literal[1] = 1
     of: Annotated[
-        str, Field(description="hash of vehicle file and profile; with others all begins anew")
+        str,
+        Field(
+            description="hash of vehicle file and profile; another hash discards what was learned"
+        ),
     ]
     passed: bool = False
     drives: list[DriveEstimates] = []
@@ -61,7 +64,7 @@ class Trip:
         vehicle: its file.
         profile: name of the profile by which its signals are read.
         path: of the stored knowledge; it need not exist.
-        trusted: True to publish regardless of the doctor's findings.
+        trusted: True to publish whatever the doctor finds.
     """
 
     def __init__(
@@ -123,7 +126,7 @@ class Trip:
             try:
                 self._looking.result(LEAVE_S)
             except TimeoutError:
-                log.warning("the end of this trip is not learned from: no time left")
+                log.warning("the end of this trip is not used for learning: no time left")
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     def _keep_block(self, block: Block, ground: FloatArray) -> None:
@@ -161,7 +164,7 @@ class Trip:
             if diagnosis.is_passed and final and t[-1] - t[0] >= LEAST_S:
                 estimates = one_drive(t, signals, self._plain)
         except (ValueError, FloatingPointError, np.linalg.LinAlgError) as error:
-            log.warning("a part of this trip cannot be examined: %s", error)
+            log.warning("a part of this trip cannot be analysed: %s", error)
             return
         if diagnosis.is_passed and not self._known.passed:
             log.info(
@@ -197,11 +200,11 @@ def _read_state(path: Path, identity: str) -> Known:
         return Known(of=identity)
     except (OSError, ValidationError) as error:
         log.warning(
-            "%s cannot be read (%s): the car is learned anew", path, str(error).splitlines()[0]
+            "%s cannot be read (%s): learning starts again", path, str(error).splitlines()[0]
         )
         return Known(of=identity)
     if known.of != identity:
-        log.warning("%s is of another vehicle file or profile: the car is learned anew", path)
+        log.warning("%s belongs to another vehicle file or profile: learning starts again", path)
         return Known(of=identity)
     return known
 
@@ -216,4 +219,8 @@ def _write_state(path: Path, known: Known) -> None:
             os.fsync(file.fileno())
         part.replace(path)
     except OSError as error:
-        log.warning("%s cannot be written (%s): this part of the trip is forgotten", path, error)
+        log.warning(
+            "%s cannot be written (%s): what was learned from this part of the trip is lost",
+            path,
+            error,
+        )

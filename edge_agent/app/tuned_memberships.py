@@ -32,11 +32,14 @@ class Score(Record):
     """
 
     interval_score: Annotated[
-        Finite | None, Field(description="of the 90 % friction interval, less is better [1]")
+        Finite | None,
+        Field(description="interval score of the 90 % friction interval, less is better [1]"),
     ]
-    coverage: Annotated[Finite | None, Field(description="share of true frictions inside it [1]")]
+    coverage: Annotated[
+        Finite | None, Field(description="share of true frictions inside the interval [1]")
+    ]
     log_likelihood: Annotated[
-        Finite, Field(description="of the innovations, more is better [nat/s]")
+        Finite, Field(description="log-likelihood of the innovations, more is better [nat/s]")
     ]
     nis_ratio: Annotated[
         Finite, Field(description="normalised innovation squared over its expectation [1]")
@@ -45,10 +48,11 @@ class Score(Record):
         Finite | None, Field(description="interval score, mean over kinds of surface [1]")
     ] = None
     false_ice: Annotated[
-        Finite | None, Field(description="share of grippy samples called slippery [1]")
+        Finite | None, Field(description="share of grippy samples reported as slippery [1]")
     ] = None
     missed_ice: Annotated[
-        Finite | None, Field(description="share of felt slippery samples not called so [1]")
+        Finite | None,
+        Field(description="share of excited slippery samples not reported as slippery [1]"),
     ] = None
 
 
@@ -85,11 +89,13 @@ class Document(Record):
     estimator: str
     memberships: dict[str, list[Finite]]
     objective: str
-    winner: Annotated[str, Field(description="way that found them: the best held out")] = "colony"
+    winner: Annotated[
+        str, Field(description="search that found the sets: the best on held-out drives")
+    ] = "colony"
     scores: dict[str, SplitScores]
     candidates: Annotated[
         dict[str, list[dict[str, list[Finite]]]],
-        Field(description="what every search of a way found"),
+        Field(description="memberships found by every search, per kind of search"),
     ] = {}
     provenance: Provenance
 
@@ -132,7 +138,9 @@ def load_tuned(path: Path | str) -> Tuned:
         text = Path(path).read_bytes()
     except OSError as error:
         raise InputError(
-            "memberships", f"cannot read {path} ({error.strerror})", "name a tuned file"
+            "memberships",
+            f"cannot read {path} ({error.strerror})",
+            "name a file written by edge-agent tune",
         ) from error
     return parse_tuned(text, f"tuned file {path}")
 

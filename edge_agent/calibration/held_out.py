@@ -77,7 +77,7 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
     if not judged:
         raise InputError(
             "log",
-            "no part can be held out to judge the calibration",
+            "the logs are too short to hold out a part for validation",
             "give two drives or a longer one",
         )
     before = [judge(vehicle, held) for held in judged]

@@ -24,7 +24,7 @@ COMMANDS: Final = (
     Command(
         "simulate",
         "edge_agent.cli.simulate",
-        "write the signal log of a manoeuvre, with truth",
+        "simulate a manoeuvre and write its signal log with the true states",
         "edge-agent simulate double-lane-change --mu 0.5 --seed 1 --out drive.parquet "
         "--vehicle-out drive.json",
     ),
@@ -38,7 +38,7 @@ COMMANDS: Final = (
     Command(
         "check",
         "edge_agent.cli.check",
-        "run the signal doctor: units, signs, clocks, offsets, by physics",
+        "check a log's units, signs, clocks and offsets by physics (signal doctor)",
         "edge-agent check drive.parquet --vehicle car.json --out check.html",
     ),
     Command(
@@ -74,7 +74,7 @@ COMMANDS: Final = (
     Command(
         "evaluate",
         "edge_agent.cli.evaluate",
-        "run every estimator on the papers' manoeuvres, with figures",
+        "compare all estimators on the papers' manoeuvres",
         "edge-agent evaluate --quick --out evaluation",
     ),
     Command(
@@ -84,7 +84,11 @@ COMMANDS: Final = (
         "edge-agent completion bash > ~/.local/share/bash-completion/completions/edge-agent",
     ),
 )
-LINE: Final = ("edge-agent", "Friction and motion of a vehicle from its sensors.", COMMANDS)
+LINE: Final = (
+    "edge-agent",
+    "Estimate friction and motion of a vehicle from its sensors.",
+    COMMANDS,
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

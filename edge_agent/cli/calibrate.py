@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, help="vehicle file to write (JSON)")
     parser.add_argument(
-        "--trust", action="store_true", help="learn from logs that the signal doctor did not pass"
+        "--trust", action="store_true", help="accept logs that did not pass the signal doctor"
     )
 
 
@@ -99,7 +99,7 @@ def report_lines(found: HeldOut) -> list[str]:
                 f"{name:<14} {estimate[0]:+.5f} ± {estimate[1]:.5f} {UNITS.get(name, '1')}"
             )
     lines += [
-        f"not written: {group}: it makes a held-out drive no better" for group in found.refused
+        f"not written: {group}: it does not improve a held-out drive" for group in found.refused
     ]
     before = found.before
     after = found.after

@@ -23,9 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("log", type=Path, help="signal log (Parquet)")
     parser.add_argument(
-        "--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)"
+        "--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json next to LOG.parquet)"
     )
-    add_json(parser, "what was found")
+    add_json(parser, "the findings")
     parser.add_argument("--out", type=Path, help="HTML page with the evidence and plots")
     parser.add_argument(
         "--fix",
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         )
     else:
         flags = [
-            f"{'no weight':<10}{name} {reason}: it counts as unknown"
+            f"{'no weight':<10}{name} {reason}: it is treated as unknown"
             for name, reason in doubts.items()
         ]
         print(
@@ -87,8 +87,8 @@ def run(args: argparse.Namespace) -> int:
             )
         for finding in left:
             _print_stderr(
-                f"not mended: {finding.channel} {finding.kind}: its recording must be decoded "
-                "otherwise"
+                f"not corrected: {finding.channel} {finding.kind}: its recording must be decoded "
+                "in another way"
             )
         _print_stderr(f"{args.fix}: the corrected profile; import the recording again with it")
     return 0 if diagnosis.is_passed else NOT_PASSED

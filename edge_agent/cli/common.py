@@ -39,7 +39,7 @@ def checked_name(name: str) -> str:
     if not re.fullmatch(NAME_PATTERN, name):
         raise InputError(
             "name",
-            f"{name!r} is no vehicle name",
+            f"{name!r} is not a vehicle name",
             "give --name, 3 to 63 of a-z, 0-9 and -, a letter first",
         )
     return name
@@ -90,8 +90,8 @@ def require_valid_signals(diagnosis: Diagnosis) -> None:
         )
         raise InputError(
             "log",
-            "is not fit to be published",
-            f"{publishing_advice(diagnosis)}; --trust publishes it as it is",
+            "did not pass the signal doctor",
+            f"{publishing_advice(diagnosis)}; --trust publishes it unchanged",
         )
 
 
@@ -104,7 +104,7 @@ def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
         print(f"warning: {fault.channel} {fault.kind}: {fault.words}", file=sys.stderr)
     if found:
         print(
-            "warning: the estimates below mean nothing until that is mended; run edge-agent check",
+            "warning: the estimates below are invalid until this is corrected; run edge-agent check",
             file=sys.stderr,
         )
     notes = []
@@ -155,7 +155,9 @@ def close_publisher(
 
     clean = publisher.close(drain_s)
     if not clean:
-        print_line("warning: a session did not close; leaving it behind", sys.stderr)
+        print_line(
+            "warning: a session did not close in time; exiting without closing it", sys.stderr
+        )
         left_behind.set()
     print(json.dumps(final_counts(progress, publisher) | more), flush=True)
 
@@ -165,7 +167,7 @@ def print_status(progress: Progress, publisher: Publisher, log_line: Callable[[s
     from edge_agent.app.live_loop import final_counts
 
     counts = publisher.counts
-    late = f", behind real time by {progress.lag_s:.1f} s at the most" if progress.behind else ""
+    late = f", at most {progress.lag_s:.1f} s behind real time" if progress.behind else ""
     text = (
         f"{progress.signals_s:7.1f} s  {publisher.links} sessions, "
         f"{sum(counts.published.values())} records published, "

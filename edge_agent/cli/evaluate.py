@@ -37,15 +37,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--quick",
         action="store_true",
-        help="three scenarios, two estimators, two seeds, to check that it runs",
+        help="three scenarios, two estimators and two seeds, as a smoke test",
     )
     parser.add_argument(
-        "--seeds", type=int, help=f"how many drives per scenario (default {LEAST_SEEDS})"
+        "--seeds", type=int, help=f"number of drives per scenario (default {LEAST_SEEDS})"
     )
     parser.add_argument(
         "--only",
         choices=ONLY,
-        help="a campaign of its own: inputs: readers, signal doctor, calibration, live sources; "
+        help="run one other campaign instead: inputs: readers, signal doctor, calibration, live sources; "
         "ahead: warnings, their cost and delay, the map as a prior; "
         "detection: slippery road found, missed and falsely reported, in short and long drives; "
         "searches: ant colony, ACO_R, (1+1)-ES and random search with equal budgets; "

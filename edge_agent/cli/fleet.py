@@ -17,29 +17,29 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--vehicles", type=int, default=36, help="how many (default 36)")
+    parser.add_argument("--vehicles", type=int, default=36, help="number of vehicles (default 36)")
     parser.add_argument(
         "--scenario",
         default="demo",
-        help="demo (default), hills, test; hills-7, winter-7: drawn by seed 7",
+        help="demo (default), hills, test, or hills-N, winter-N: a town drawn from seed N",
     )
     parser.add_argument(
         "--rough",
         type=float,
         default=0.0,
-        help="share of them with the sensor errors of real cars (default 0)",
+        help="share of vehicles with the sensor errors of real cars (default 0)",
     )
     parser.add_argument(
         "--winter",
         type=float,
         default=0.0,
-        help="share of them with winter tyres and controllers (default 0)",
+        help="share of vehicles with winter tyres and stability controllers (default 0)",
     )
     parser.add_argument(
         "--warned",
         type=float,
         default=0.0,
-        help="share of them that receive the map and are warned",
+        help="share of vehicles that receive the map and are warned (default 0)",
     )
     add_estimator(parser)
     parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
@@ -49,9 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rate", type=float, default=100.0, help="samples per second (default 100)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the simulation (default 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the simulation (default 0)")
     parser.add_argument(
-        "--duration", type=float, default=float("inf"), help="[s]; else until stopped"
+        "--duration", type=float, default=float("inf"), help="duration [s] (default: until stopped)"
     )
 
 

@@ -25,10 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--profile", help="profile that maps signals to channels: a file, or a shipped one (--list)"
     )
     parser.add_argument("--list", action="store_true", help="list the shipped profiles and exit")
-    add_json(parser, "the list")
+    add_json(parser, "the profiles")
     parser.add_argument("--dbc", type=Path, help="CAN database (default: the profile's)")
     parser.add_argument(
-        "--vehicle", type=Path, help="vehicle file (JSON): radius of the wheels, steering ratio"
+        "--vehicle", type=Path, help="vehicle file (JSON): supplies wheel radius and steering ratio"
     )
     parser.add_argument(
         "--draft", type=Path, help="where to write a drafted profile (default: next to the log)"
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
             "source", "sources and --out are needed", "name recordings, and the log to write"
         )
     if any(args.out.resolve() == source.resolve() for source in args.source):
-        raise InputError("out", f"would replace the recording {args.out}", "name another file")
+        raise InputError("out", f"{args.out} is one of the recordings", "name another file")
     out = prepare_path("out", args.out)
     profile, folder = load_profile(args.profile) if args.profile else (None, Path())
     vehicle = load_vehicle(args.vehicle) if args.vehicle else None
@@ -81,12 +81,14 @@ def run(args: argparse.Namespace) -> int:
             seen = ", ".join(sorted(units)[:MOST_NAMES]) or "nothing"
             raise InputError(
                 "source",
-                f"no signal has a known name; seen: {seen}",
+                f"no signal has a known name; names in the file: {seen}",
                 "write a profile that names them",
             )
         target = prepare_path("draft", args.draft or out.with_suffix(".profile.json"))
         target.write_text(profile.to_json(), encoding="utf-8")
-        print(f"{target}: drafted from names, {len(profile.channels)} channels; look it over")
+        print(
+            f"{target}: drafted from names, {len(profile.channels)} channels; check it before use"
+        )
     merge_with = partial(
         merge_recordings,
         recordings,
@@ -124,6 +126,6 @@ def _parse_shifts(given: list[str]) -> dict[str, float]:
             shifts[Path(name).name] = float(seconds)
         except ValueError as error:
             raise InputError(
-                "clock", f"{text!r} is no shift", "write it like drive.nmea=-0.4"
+                "clock", f"{text!r} is not a time shift", "write it like drive.nmea=-0.4"
             ) from error
     return shifts

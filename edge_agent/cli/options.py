@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 def add_estimator(parser: argparse.ArgumentParser) -> None:
     """Declare the options for estimator and fuzzy sets."""
     parser.add_argument(
-        "--estimator", help="estimator by name (default: the configuration's, aco-fckf)"
+        "--estimator", help="name of the estimator (default: the configuration's, aco-fckf)"
     )
     parser.add_argument(
-        "--memberships", type=Path, metavar="FILE", help="fuzzy sets that tune wrote"
+        "--memberships", type=Path, metavar="FILE", help="fuzzy sets written by edge-agent tune"
     )
 
 

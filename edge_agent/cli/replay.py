@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("log", type=Path, nargs="+", help="signal log (Parquet)")
     parser.add_argument(
-        "--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)"
+        "--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json next to LOG.parquet)"
     )
     add_estimator(parser)
     parser.add_argument(
@@ -54,9 +54,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME,NAME",
         help="more estimators on the same drive, side by side in a report",
     )
-    parser.add_argument("--jobs", type=int, default=1, help="logs at a time (default 1)")
     parser.add_argument(
-        "--engine", default=LOCAL, metavar="local|spark", help="several logs: where (default local)"
+        "--jobs", type=int, default=1, help="number of logs processed at a time (default 1)"
+    )
+    parser.add_argument(
+        "--engine",
+        default=LOCAL,
+        metavar="local|spark",
+        help="where to process several logs (default local)",
     )
     parser.add_argument(
         "--publish",
@@ -66,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--trust",
         action="store_true",
-        help="publish although the signal doctor did not pass the log",
+        help="publish a log that did not pass the signal doctor",
     )
     parser.add_argument("--config", type=Path, help="agent configuration (JSON), for --publish")
     parser.add_argument("--name", help="name to publish under (default: the vehicle file's)")
@@ -116,14 +121,16 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.compare is not None and args.out.suffix not in REPORTS:
         raise InputError(
-            "compare", f"is of no use for {args.out.name}", f"write {', '.join(REPORTS)}"
+            "compare",
+            f"works only with a report, not with {args.out.name}",
+            f"write {', '.join(REPORTS)}",
         )
     path = args.log[0]
     commandline.refuse_input_path("out", args.out, [path, args.vehicle or vehicle_file_of(path)])
     vehicle = load_vehicle(args.vehicle or vehicle_file_of(path))
     if args.out.suffix in REPORTS and args.publish:
         raise InputError(
-            "publish", "does not go together with a report", "replay twice: once with .parquet"
+            "publish", "cannot be combined with a report", "replay twice: once with .parquet"
         )
     bank_of(estimator, [vehicle], memberships)  # a wrong name is an error before the log is read
     log = read_log(path)
@@ -186,18 +193,18 @@ def _write_report(
 
 def _check_engine(engine: str, jobs: int, *, several: bool) -> None:
     if engine not in (LOCAL, SPARK):
-        raise InputError("engine", f"{engine!r} is none", f"use {LOCAL} or {SPARK}")
+        raise InputError("engine", f"{engine!r} is unknown", f"use {LOCAL} or {SPARK}")
     if engine == SPARK and not several:
         raise InputError(
             "engine",
-            "one log into one file needs no cluster",
+            "Spark needs several logs",
             "give several logs, or an existing folder",
         )
     if engine == SPARK and jobs != 1:
         raise InputError(
             "jobs",
-            f"{jobs} says nothing to Spark",
-            "its master says how many run at once, e.g. local[4]",
+            f"{jobs} has no effect on Spark",
+            "set the number in Spark's master, e.g. local[4]",
         )
 
 
@@ -253,9 +260,9 @@ def _publish_log(
     if refused := sum(publisher.counts.rejected.values()):
         old = time.time_ns() - start_ns > OLD_NS
         fix = (
-            "it is older than a month: --start now drives it today"
+            "the log is older than a month: publish it with --start now"
             if old
-            else "the reasons stand above"
+            else "the reasons are above"
         )
         print(f"error: publish: {refused} records were refused; {fix}", file=sys.stderr)
     return 1 if refused or publisher.count_unsettled() else 0

@@ -30,10 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--source",
         action="append",
-        help="'simulated' (default), a signal log (Parquet), or live ones, as often as there are "
-        "sources: "
-        "can:INTERFACE/CHANNEL, ros2:ENDPOINT, vss:HOST:PORT, gpsd:HOST:PORT, or NAME:ADDRESS of a "
-        "package of yours",
+        help="'simulated' (default), a signal log (Parquet), or live sources (repeat the "
+        "option for each): can:INTERFACE/CHANNEL, ros2:ENDPOINT, vss:HOST:PORT, gpsd:HOST:PORT, or "
+        "NAME:ADDRESS of your own plug-in",
     )
     parser.add_argument(
         "--profile", help="profile that maps live signals to channels: a file, or a shipped one"
@@ -42,18 +41,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--trust",
         action="store_true",
-        help="publish although the signal doctor did not pass the signals",
+        help="publish signals that did not pass the signal doctor",
     )
     parser.add_argument(
         "--ahead", action="store_true", help="receive the map and warn of slippery road ahead"
     )
     parser.add_argument(
-        "--autoware", metavar="ENDPOINT", help="with --ahead: router of a planner for limits"
+        "--autoware",
+        metavar="ENDPOINT",
+        help="with --ahead: Zenoh router of an Autoware planner that receives speed limits",
     )
     parser.add_argument(
         "--autoware-hash",
         metavar="RIHS01_…",
-        help="hash of VelocityLimit in that planner's version",
+        help="type hash of VelocityLimit in that planner's version",
     )
     parser.add_argument("--route", type=Path, help="route for --ahead (GPX or GeoJSON)")
     parser.add_argument(
@@ -64,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--kuksa",
         metavar="HOST:PORT",
-        help="write the friction to a Kuksa databroker; ?ca=FILE&token=FILE as of --source vss:",
+        help="write the friction to a Kuksa databroker; ?ca=FILE&token=FILE as in --source vss:",
     )
     parser.add_argument(
         "--vehicle", type=Path, help="vehicle file (JSON); required except for simulated"
@@ -78,12 +79,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rate", type=float, default=100.0, help="samples per second of the simulation"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the simulation")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the simulation")
     parser.add_argument(
         "--duration",
         type=float,
         default=float("inf"),
-        help="[s]; else until stopped or the log ends",
+        help="duration [s] (default: until stopped or the end of the log)",
     )
 
 
@@ -100,15 +101,17 @@ def run(args: argparse.Namespace) -> int:
 
     config = load(args.config, AgentConfig)
     if args.route is not None and not args.ahead:
-        raise InputError("route", "is of no use without --ahead", "give both, or neither")
+        raise InputError("route", "needs --ahead", "give both, or neither")
     if args.autoware is not None and not args.ahead:
-        raise InputError("autoware", "is of no use without --ahead", "give both, or neither")
+        raise InputError("autoware", "needs --ahead", "give both, or neither")
     sources = args.source or [SIMULATED]
     if all(is_live(source) for source in sources):
         return _run_live(args, sources, config)
     if len(sources) > 1:
         raise InputError(
-            "source", f"{', '.join(sources)} do not go together", "name live ones, or one log"
+            "source",
+            f"{', '.join(sources)} cannot be combined",
+            "give live sources only, or one log",
         )
     kind, _, address = sources[0].partition(":")
     others = plugins.entry_points_of(plugins.SOURCES)
@@ -120,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
         known = ", ".join(sorted([SIMULATED, *KINDS, *others]))
         raise InputError(
             "source",
-            f"{sources[0]!r} is no file, and {kind!r} no kind of source",
+            f"{sources[0]!r} is not a file, and {kind!r} is not a kind of source",
             f"kinds are {known}",
         )
     else:

@@ -15,27 +15,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("manoeuvre", nargs="?", help="name of the manoeuvre; --list shows them")
     parser.add_argument("--list", action="store_true", help="list the manoeuvres and exit")
-    add_json(parser, "the list")
+    add_json(parser, "the manoeuvres")
     parser.add_argument(
-        "--mu", type=float, help="peak friction of the road; else the manoeuvre's own"
+        "--mu", type=float, help="peak friction of the road (default: the manoeuvre's)"
     )
-    parser.add_argument("--speed", type=float, help="[m/s]; else the manoeuvre's own")
-    parser.add_argument("--duration", type=float, help="[s]; else the manoeuvre's own")
+    parser.add_argument(
+        "--speed", type=float, help="speed at the start [m/s] (default: the manoeuvre's)"
+    )
+    parser.add_argument("--duration", type=float, help="duration [s] (default: the manoeuvre's)")
     parser.add_argument(
         "--rate", type=float, default=100.0, help="samples per second (default 100)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the sensor errors (default 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the sensor errors (default 0)")
     parser.add_argument(
         "--sensors",
         choices=SENSORS,
         default="mems",
-        help="quality (default mems); rough: real cars'",
+        help="sensor quality (default mems); rough: as in real cars",
     )
     parser.add_argument(
-        "--no-torque", action="store_true", help="record no wheel torque, like most cars"
+        "--no-torque", action="store_true", help="omit wheel torque, as most cars do"
     )
     parser.add_argument(
-        "--road", choices=ROADS, default="level", help="relief, drawn by the seed (default level)"
+        "--road",
+        choices=ROADS,
+        default="level",
+        help="road profile, drawn from the seed (default level)",
     )
     parser.add_argument(
         "--slope",

@@ -67,12 +67,12 @@ POSITIONS: Final = 7  # per vertex: the default and three to each side
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `edge-agent tune`."""
     parser.add_argument(
-        "log", type=Path, nargs="*", help="signal logs of your own instead of simulated drives"
+        "log", type=Path, nargs="*", help="your own signal logs instead of simulated drives"
     )
     parser.add_argument(
         "--vehicle",
         type=Path,
-        help="vehicle file of the logs (default: LOG.json beside LOG.parquet)",
+        help="vehicle file of the logs (default: LOG.json next to LOG.parquet)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of both searches (default 0)")
     parser.add_argument("--ants", type=int, help=f"paths per iteration (default {ANTS})")
@@ -97,11 +97,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--study",
         type=Path,
         metavar="DIR",
-        help="the study of paper 004's filter instead: figures.json, study.md, convergence.png, "
+        help="run the study of paper 004's filter instead: figures.json, study.md, convergence.png, "
         "paper-aco-fckf.json",
     )
     parser.add_argument(
-        "--quick", action="store_true", help="a few ants on short drives, to check that it runs"
+        "--quick", action="store_true", help="a few ants on short drives, as a smoke test"
     )
 
 
@@ -126,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
         ("--repeats", args.repeats, 1),
     ):
         if value < least:
-            raise InputError(name, f"{value} is too small", f"use {least} or more")
+            raise InputError(name, f"{value} is below {least}", f"use {least} or more")
     duration = QUICK_DURATION_S if args.quick else DURATION_S
     if args.study is not None:
         return _run_study(args, ants, iterations)
@@ -134,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
     chosen = args.objective or ("predictive" if args.log else "interval")
     train, held_out = _tuning_drives(args, chosen, duration)
     print_line(
-        f"{len(train.vehicles)} drives to search on, {len(held_out.vehicles)} to judge by, "
+        f"{len(train.vehicles)} drives for the search, {len(held_out.vehicles)} held out, "
         f"{duration:g} s each"
     )
     objective = objective_on(train, ESTIMATOR, chosen)
@@ -180,21 +180,23 @@ def run(args: argparse.Namespace) -> int:
     )
     candidates = {way: [one.to_json() for one in found] for way, found in sets.items()}
     save_tuned(args.out, document.model_copy(update={"winner": winner, "candidates": candidates}))
-    print(f"wrote {args.out}: what {winner} found")
+    print(f"wrote {args.out}: the sets found by {winner}")
     return 0
 
 
 def _tuning_drives(
     args: argparse.Namespace, objective: str, duration_s: float
 ) -> tuple[TuningSet, TuningSet]:
-    """Return the drives to search on and to judge by: simulated ones, or parts of the given
-    logs.
+    """Return the drives for the search and the held-out drives: simulated ones, or parts of the
+    given logs.
     """
     if not args.log:
         return record_all("train", duration_s), record_all("held_out", duration_s)
     if objective == "interval":
         raise InputError(
-            "objective", "interval wants the true friction, which no log tells", "use predictive"
+            "objective",
+            "interval needs the true friction, which a log does not contain",
+            "use predictive",
         )
     logs = []
     for path in args.log:

@@ -73,7 +73,7 @@ def create(
     Raises:
         InputError: the name is unknown, no vehicle is given, tuned memberships are missing,
             memberships are given to an estimator that has none, the curve is invalid, or a curve
-            is given to an estimator that has its own.
+            is given to an estimator that uses its own tyre curve.
     """
     if name not in ESTIMATORS:
         raise InputError(
@@ -83,7 +83,7 @@ def create(
         raise InputError("vehicles", "none given", "give at least one vehicle")
     if curve is not None:
         if name in PLAIN or name == "paper-aco-fckf":
-            raise InputError("tyre-curve", f"{name} has its own", "leave it out")
+            raise InputError("tyre-curve", f"{name} uses its own tyre curve", "leave it out")
         try:
             check_curve(curve)
         except (ValueError, TypeError) as error:
@@ -101,7 +101,9 @@ def create(
     if memberships is None:
         if name in TUNED:
             raise InputError(
-                "memberships", f"{name} needs tuned ones", "make it with estimator_factory.bank_of"
+                "memberships",
+                f"{name} needs tuned memberships",
+                "create the estimator with estimator_factory.bank_of",
             )
         memberships = Memberships()
     if name == "paper-aco-fckf":

@@ -40,12 +40,14 @@ class SigmaRule:
         points, n = self.xi.shape
         if self.w_mean.shape != (points,) or self.w_cov.shape != (points,):
             raise InputError(
-                self.name, "one weight per point is wanted", "give weights of shape (points,)"
+                self.name,
+                "the number of weights differs from the number of points",
+                "give weights of shape (points,)",
             )
         if np.any(self.w_cov < 0.0):
             raise InputError(
                 self.name,
-                "a covariance weight is negative, which has no square root",
+                "a covariance weight is negative, so it has no square root",
                 "raise alpha, beta or kappa",
             )
         first = self.w_mean @ self.xi

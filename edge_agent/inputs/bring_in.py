@@ -61,7 +61,9 @@ def _read_source(path: Path, profile: Profile | None, database: Database | None)
         return _decode_frames(lambda _: content.frames or ({}, 0.0), path, profile, database)
     if path.name.lower().startswith(RLOGS):
         fix = "export CAN frames (candump) or a CSV with openpilot's LogReader"
-        raise InputError("source", f"{path} is an openpilot log, which is not read here", fix)
+        raise InputError(
+            "source", f"{path} is an openpilot log, which this command cannot read", fix
+        )
     if suffix == ".trc" and can_text.is_bare_trace(path):
         return _decode_frames(lambda ids: can_text.trace_frames(path, ids), path, profile, database)
     if suffix in can_log.SUFFIXES:
@@ -90,7 +92,9 @@ def _read_source(path: Path, profile: Profile | None, database: Database | None)
         }
     )
     raise InputError(
-        "source", f"{path} is of no known kind", f"give one of {' '.join(known)}, or a bag's folder"
+        "source",
+        f"{path} has an unknown format",
+        f"give one of {' '.join(known)}, or a bag's folder",
     )
 
 

@@ -1,5 +1,5 @@
-"""Context signals: flags of controllers and state of the surroundings, from the readings of a
-source to the rows of a log.
+"""Context signals: what controllers and surroundings say, from the readings of a source to the rows
+of a log.
 
 A flag or a temperature is not interpolated. A row has the last reading at or before its time, as
 long as that is not older than HELD_S; a channel that the profile calls `lasting` is sent when it
@@ -102,7 +102,7 @@ def context_block(
         ValueError: a shape does not fit.
     """
     if unknown := values.keys() - set(CONTEXT):
-        raise KeyError(f"{sorted(unknown)[0]} is no context signal; use {', '.join(CONTEXT)}")
+        raise KeyError(f"{sorted(unknown)[0]} is not a context signal; use {', '.join(CONTEXT)}")
     block = np.full((samples, vehicles, len(CONTEXT)), np.nan)
     for name, value in values.items():
         block[..., CONTEXT.index(name)] = context_values(

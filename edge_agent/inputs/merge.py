@@ -110,7 +110,9 @@ def merge_recordings(
     context = {name: series.pop(name) for name in CONTEXT if name in series}
     if not series:
         raise InputError(
-            "profile", "no recording has any of the channels", "context alone is no drive"
+            "profile",
+            "no recording has any of the channels",
+            "a drive needs more than context signals",
         )
     merged = _build_rows(series, profile, recordings, found)
     for name, one in context.items():
@@ -170,7 +172,7 @@ def _align_clocks(
             if place != reference:
                 shift += spans[reference][0] - spans[place][0]
                 notes.append(
-                    f"{recording.name}: no common date; taken to begin when "
+                    f"{recording.name}: no common date; assumed to begin when "
                     f"{recordings[reference].name} does"
                 )
             offsets.append(shift)
@@ -191,8 +193,8 @@ def _align_clocks(
         if meets[0]:
             hours = meets[0] * ZONE_S / 3600.0
             notes.append(
-                f"{recording.name}: its date is {-hours:g} h from the others', as of another time "
-                "zone"
+                f"{recording.name}: its date is {-hours:g} h from the others', "
+                "probably because of another time zone"
             )
             if dated is not None and recording.start_ns == dated:
                 start_ns = base - round(meets[0] * ZONE_S * NS)  # the receiver is right
@@ -251,7 +253,9 @@ def make_channel(
         flag = recording.signals.get(channel.full_name(channel.sign.signal))
         if flag is None:
             raise InputError(
-                where, f"its sign {channel.sign.signal} is not there", "name the signal of the sign"
+                where,
+                f"the signal of its sign, {channel.sign.signal}, is missing",
+                "name the signal of the sign",
             )
         values = np.where(_hold_last(flag, first.t) == channel.sign.negative, -values, values)
     values = values + channel.offset

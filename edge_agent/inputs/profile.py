@@ -43,39 +43,46 @@ class Sign(Part):
 class Channel(Part):
     """Where a channel comes from, and what makes SI of it."""
 
-    signal: Annotated[list[Text] | Text, Field(description="name, or names that are added")]
+    signal: Annotated[list[Text] | Text, Field(description="name, or names whose values are added")]
     message: Annotated[
-        Text | None, Field(description="CAN message; else the signal's name is whole")
+        Text | None, Field(description="CAN message (default: taken from the signal's name)")
     ] = None
     source: Annotated[
-        Text | None, Field(description="file name it must come from, where several have it")
+        Text | None, Field(description="name of the file, if several files contain the signal")
     ] = None
     bus: Annotated[
-        int | None, Field(ge=0, le=255, description="CAN bus; else the one that has the messages")
+        int | None,
+        Field(ge=0, le=255, description="CAN bus (default: the bus that has the messages)"),
     ] = None
-    unit: Annotated[str | None, Field(description="of the recorded value; SI if not given")] = None
+    unit: Annotated[str | None, Field(description="unit of the recorded value (default: SI)")] = (
+        None
+    )
     at: Literal["road wheel", "steering wheel"] = "road wheel"
     scale: Annotated[
-        Finite, Field(description="beside the unit's; negative for a flipped sign")
+        Finite, Field(description="additional factor; negative for a flipped sign")
     ] = 1.0
-    offset: Annotated[Finite, Field(description="added at the end, SI")] = 0.0
+    offset: Annotated[Finite, Field(description="offset that is added last, in SI units")] = 0.0
     delay_s: Annotated[
-        Finite, Field(ge=-10.0, le=10.0, description="[s] that its time stamps are late")
+        Finite, Field(ge=-10.0, le=10.0, description="delay of its time stamps [s]")
     ] = 0.0
     sign: Sign | None = None
     valid: Annotated[
-        dict[Text, list[Finite]], Field(description="signal -> values at which to believe it")
+        dict[Text, list[Finite]],
+        Field(description="signal -> values at which the reading is valid"),
     ] = {}
     wrap: Annotated[
-        float | None, Field(gt=0.0, description="recorded values count modulo this (status bits)")
+        float | None,
+        Field(
+            gt=0.0, description="recorded values are taken modulo this number (removes status bits)"
+        ),
     ] = None
     course: Annotated[bool, Field(description="a heading, clockwise from north")] = False
     active: Annotated[
-        list[Finite] | None, Field(description="values at which a flag is on; else all but 0")
+        list[Finite] | None, Field(description="values at which a flag is on (default: all but 0)")
     ] = None
-    lasting: Annotated[bool, Field(description="sent when it changes: its last value holds")] = (
-        False
-    )
+    lasting: Annotated[
+        bool, Field(description="sent only when it changes; the last value is held")
+    ] = False
 
     @property
     def signals(self) -> list[str]:
@@ -85,7 +92,7 @@ class Channel(Part):
 
     @property
     def gates(self) -> dict[str, list[float]]:
-        """Full names of the signals that must be valid for it."""
+        """Whole names of the signals that vouch for it."""
         return {self.full_name(name): values for name, values in self.valid.items()}
 
     def full_name(self, name: str) -> str:
@@ -107,11 +114,11 @@ class Profile(Part):
     version: Literal[1] = 1
     name: Annotated[str, Field(min_length=1, max_length=64)]
     about: str = ""
-    dbc: Annotated[Text | None, Field(description="CAN database, beside the profile")] = None
+    dbc: Annotated[Text | None, Field(description="CAN database, next to the profile")] = None
     time: Annotated[Text | None, Field(description="column that holds the time of a table")] = None
     time_unit: Literal["s", "ms", "us", "ns"] | None = None
     rate_hz: Annotated[
-        float | None, Field(gt=0.0, le=1000.0, description="rows a second of the log")
+        float | None, Field(gt=0.0, le=1000.0, description="rows per second of the log")
     ] = None
     wheel_radius: Annotated[float | None, Field(gt=0.05, lt=2.0, description="[m]")] = None
     steering_ratio: Annotated[
@@ -123,13 +130,15 @@ class Profile(Part):
     def _check_channels(self) -> Self:
         for name, channel in self.channels.items():
             if name not in QUANTITY:
-                raise ValueError(f"there is no channel {name}; choose of {', '.join(QUANTITY)}")
+                raise ValueError(f"there is no channel {name}; choose one of {', '.join(QUANTITY)}")
             if channel.unit is not None and channel.unit not in QUANTITY[name]:
-                raise ValueError(f"{name} in {channel.unit}; choose of {', '.join(QUANTITY[name])}")
+                raise ValueError(
+                    f"{name} in {channel.unit}; choose one of {', '.join(QUANTITY[name])}"
+                )
             if channel.active is not None and name not in FLAGS:
                 raise ValueError(f"{name} has active values; only {', '.join(FLAGS)} have")
             if channel.lasting and name not in CONTEXT:
-                raise ValueError(f"{name} is lasting; only {', '.join(CONTEXT)} may be")
+                raise ValueError(f"{name} cannot be `lasting`; only {', '.join(CONTEXT)} may be")
         return self
 
     def needed_signals(self) -> set[str]:

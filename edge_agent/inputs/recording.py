@@ -47,8 +47,7 @@ class Recording:
 
 @contextmanager
 def foreign_errors(path: Path, kind: str) -> Iterator[None]:
-    """Turn any exception that a library raises on a broken file into an error of one line that
-    names the file.
+    """Turn whatever a library raises over a broken file into one line that names it.
 
     Raises:
         InputError: the file cannot be read as `kind`.
@@ -64,7 +63,7 @@ def foreign_errors(path: Path, kind: str) -> Iterator[None]:
     except Exception as error:  # a reader of others may raise anything over a hostile file
         reason = (str(error) or type(error).__name__).splitlines()[0][:200]
         raise InputError(
-            "source", f"{path} is not a sound {kind} file ({reason})", "record or convert it anew"
+            "source", f"{path} is not a valid {kind} file ({reason})", "record or convert it again"
         ) from error
 
 

@@ -3,9 +3,10 @@
 Needed columns: `t` [s] or `timestamp`; ax, ay, yaw_rate; the four omega; delta_fl or delta_fr. Each
 of them must hold at least one reading. The other channels may be missing, and NaN or null is a
 missing reading anywhere. A front wheel whose steering angle has no column takes that of the other;
-rear wheels without a column do not steer. Context signals (`schemas.signals.CONTEXT`) are optional.
-`timestamp` is an Arrow timestamp, or a number: integer ns since 1970 UTC, float s since 1970 UTC.
-Time may stand still (the estimator reports this in `health`) but not go back.
+rear wheels without a column do not steer. What controllers and surroundings say
+(`schemas.signals.CONTEXT`) may be there too. `timestamp` is an Arrow timestamp, or a number:
+integer ns since 1970 UTC, float s since 1970 UTC. Time may stand still (the estimator says so in
+`health`) but not go back.
 """
 
 from __future__ import annotations
@@ -183,7 +184,7 @@ def _check_log(table: pa.Table, signals: FloatArray) -> None:
             )
         if np.isnan(signals[:, CHANNELS.index(name)]).all():
             raise InputError(
-                name, "has no reading in any row", "record the channel, or mend its conversion"
+                name, "has no reading in any row", "record the channel, or correct its conversion"
             )
     front = [name for name in FRONT_STEERING if name in table.column_names]
     if not front:
@@ -192,7 +193,7 @@ def _check_log(table: pa.Table, signals: FloatArray) -> None:
         )
     if all(np.isnan(signals[:, CHANNELS.index(name)]).all() for name in front):
         raise InputError(
-            front[0], "has no reading in any row", "record the channel, or mend its conversion"
+            front[0], "has no reading in any row", "record the channel, or correct its conversion"
         )
 
 

@@ -122,7 +122,7 @@ class Publisher:
 
     @property
     def unanswered_s(self) -> float:
-        """Time [s] for which sent batches have been without an answer."""
+        """Time for which nothing sent was answered [s]."""
         return self._outbox.unanswered_s(self._clock())
 
     @property
@@ -198,7 +198,8 @@ class Publisher:
             self._outbox.close()
         except sqlite3.Error as error:
             log.warning(
-                "the outbox cannot be tidied (%s); settled batches will be sent again", error
+                "settled batches cannot be deleted from the outbox (%s) and will be sent again",
+                error,
             )
         return True
 
@@ -226,11 +227,11 @@ class Publisher:
                 if is_damage(error):
                     self._recover_outbox()
                 else:
-                    log.warning("the outbox cannot be read or tidied (%s); trying again", error)
+                    log.warning("the outbox cannot be read or written (%s); trying again", error)
                 self._stopped.wait(TICK_S)
             except Exception:  # whatever it is: estimation goes on, and so must this thread
                 self.counts.failures += 1
-                log.exception("a round of sending failed; going on")
+                log.exception("sending failed; trying again")
                 self._stopped.wait(TICK_S)
 
     def _send_round(self) -> None:
@@ -247,7 +248,7 @@ class Publisher:
         try:
             self._outbox.recover_file()
         except (sqlite3.Error, OSError) as error:
-            log.warning("the damaged outbox cannot be mended (%s); trying again", error)
+            log.warning("the damaged outbox cannot be repaired (%s); trying again", error)
 
     def _is_finished(self) -> bool:
         if not self._closing.is_set():
@@ -268,7 +269,7 @@ class Publisher:
         except Exception:
             self.counts.failures += 1
             self.counts.dropped[records.kind] += len(records.vehicle)
-            log.exception("%d records that nobody can send are dropped", len(records.vehicle))
+            log.exception("%d records that cannot be sent are dropped", len(records.vehicle))
 
     def _store_and_send(self) -> None:
         """Commit waiting records, then send them. A disk that refuses is tried again in the next
@@ -327,7 +328,7 @@ class Publisher:
         behind = (reported - self._wall()) / NS
         if abs(behind) > CLOCK_OFF_S and abs(behind - self.clock_behind_s) > CLOCK_OFF_S:
             log.warning(
-                "the clock is %.0f s behind the service's: reports come late, or are refused",
+                "the clock is %.0f s behind the service's: reports arrive late or are refused",
                 behind,
             )
         self.clock_behind_s = behind

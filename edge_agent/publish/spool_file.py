@@ -73,7 +73,7 @@ def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
             if not is_damage(error) or not _is_outbox(path):
                 raise
             log.warning(
-                "the outbox %s is damaged (%s): set aside, and what can be read is saved",
+                "the outbox %s is damaged (%s): it is set aside, and readable records are saved",
                 path,
                 error,
             )
@@ -81,7 +81,7 @@ def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
     except (sqlite3.Error, OSError) as error:
         if isinstance(error, sqlite3.OperationalError) and "locked" in str(error):
             raise InputError(
-                "spool", f"{path} is used by another agent", "give each agent its own"
+                "spool", f"{path} is used by another agent", "give each agent its own outbox"
             ) from error
         problem = f"{path} cannot be opened ({error})"
         raise InputError(

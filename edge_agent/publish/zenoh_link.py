@@ -87,7 +87,7 @@ class Link:
         try:
             self.session.put(key, batch.payload, **_QUALITY[stream.kind])
         except zenoh.ZError as error:
-            log.warning("%s cannot put: %s", stream.vehicle, error)
+            log.warning("%s cannot publish: %s", stream.vehicle, error)
             return False
         return True
 

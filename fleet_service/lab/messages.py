@@ -1,4 +1,4 @@
-"""Visits encoded as messages for the service, so that they pass the real admission."""
+"""Visits as the messages that the service would hear, so that admission judges them as in life."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def name_of(vehicle: int) -> str:
 
 
 def clock_of(seconds: float) -> int:
-    """Return the time of the service [ns] at so many seconds after the start."""
+    """Time of the service [ns] so long after the start."""
     return START + int(seconds * NS) + NS
 
 

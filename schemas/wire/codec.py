@@ -276,7 +276,7 @@ def encode_standing(alerts: Sequence[Alert]) -> bytes:
 
 
 def decode_standing(payload: bytes) -> list[Alert]:
-    """Return the active alerts in the bytes of a tile's message.
+    """Read the alerts that stand in a tile.
 
     Raises:
         WireError: no StandingAlerts.

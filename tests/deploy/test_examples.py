@@ -83,7 +83,7 @@ def test_a_car_is_warned_of_what_three_others_found(tmp_path: Path, capsys: Outp
     with serve_ice(tmp_path) as endpoint:
         warned = be_warned.main(endpoint, LATITUDE, before)
     assert warned.startswith("my-car: slippery in ")
-    assert "an alert stands" in warned or "the map says so" in warned
+    assert "an alert is active" in warned or "the map reports low grip" in warned
     assert capsys.readouterr().out.startswith("ahead on ")
 
 

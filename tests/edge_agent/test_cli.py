@@ -293,7 +293,7 @@ def test_run_drives_with_the_source_of_another_distribution(
         >= 3
     )
     assert main([*words[:2], "no-such:address", *words[3:]]) == 2
-    assert "source: 'no-such:address' is no file, and 'no-such' no kind of source" in (
+    assert "source: 'no-such:address' is not a file, and 'no-such' is not a kind of source" in (
         line := capsys.readouterr().err
     )
     assert "kinds are can, gpsd, ros2, simulated, theirs, vss" in line
@@ -383,7 +383,7 @@ BAD_ARGUMENTS = {
     "no configuration": (["--config", "nowhere.json"], "^error: config: cannot read nowhere.json"),
     "name for no key": (
         ["--publish", "--trust", "--name", "My Car/**"],
-        "^error: name: 'My Car/\\*\\*' is no vehicle name; give",
+        "^error: name: 'My Car/\\*\\*' is not a vehicle name; give",
     ),
     "folder that is none": (["--out", "/dev/null/out"], "^error: out: cannot write /dev/null/out"),
 }
@@ -446,7 +446,7 @@ BAD_COMMANDS = {
     "log without vehicle": (["run", "--source", __file__], "^error: vehicle: is not given; "),
     "misspelt source": (
         ["run", "--source", "simulted", "--name", "car-x"],
-        "^error: source: 'simulted' is no file",
+        "^error: source: 'simulted' is not a file",
     ),
 }
 

@@ -40,11 +40,15 @@ def fit_tyres(filters: RecordArray, tyre: TyreOption) -> None:
     """
     if tyre.stiffness not in STIFFNESSES:
         choices = ", ".join(STIFFNESSES)
-        raise InputError("tyre.stiffness", f"there is no {tyre.stiffness!r}", f"choose {choices}")
+        raise InputError("tyre.stiffness", f"{tyre.stiffness!r} is unknown", f"choose {choices}")
     if not 0.0 <= tyre.quadratic < 1.0:
         raise InputError("tyre.quadratic", f"{tyre.quadratic} is out of range", "use 0 to 1")
     if not tyre.rear_slope > 0.0:
-        raise InputError("tyre.rear_slope", f"{tyre.rear_slope} is not positive", "use the ratio")
+        raise InputError(
+            "tyre.rear_slope",
+            f"{tyre.rear_slope} is not positive",
+            "give the ratio of the slopes, above 0",
+        )
     rows = filters["row"]
     rows[:, Parameter.PROPORTIONAL] = STIFFNESSES[tyre.stiffness]
     rows[:, Parameter.QUADRATIC] = tyre.quadratic

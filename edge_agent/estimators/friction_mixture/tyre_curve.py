@@ -54,13 +54,13 @@ def check_curve(curve: Curve) -> Curve:
     theta = np.linspace(0.0, 10.0, 10_001)
     f = np.asarray(curve(theta), dtype=np.float64)
     if f.shape != theta.shape or not np.isfinite(f).all():
-        raise ValueError("is not a finite force for each slip")
+        raise ValueError("does not give one finite force for each slip")
     if abs(f[0]) > 1e-9 or abs(f[1] / theta[1] - 1.0) > 0.01:
         raise ValueError(f"begins with slope {f[1] / theta[1]:.3g} at {f[0]:.3g}, not with 1 at 0")
     if abs(f.max() - 1.0) > 1e-3 or f.min() < 0.0:
         raise ValueError(f"goes from {f.min():.3g} to {f.max():.3g}, not from 0 to 1")
     if (np.diff(f[: int(np.argmax(f)) + 1]) <= 0.0).any():
-        raise ValueError("does not rise up to its peak")
+        raise ValueError("does not increase up to its peak")
     return curve
 
 

@@ -57,20 +57,22 @@ def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
     if any(finding.channel == "t" for finding in diagnosis.findings):  # a time in another unit
         return Adopted(log, vehicle, diagnosis, [])
     notes = [
-        f"note: {device} speaks {abs(seconds):.3f} s {'late' if seconds > 0.0 else 'early'}; "
+        f"note: the data of {device} are {abs(seconds):.3f} s {'late' if seconds > 0.0 else 'early'}; "
         "corrected for this replay"
         for device, seconds in delays.items()
     ]
     if any(finding.kind == "lift" for finding in diagnosis.findings):
         standing = log.signals.copy()
         standing[:, S.OMEGA : S.OMEGA + 4] = 0.0
-        notes.append("note: the car stands on a lift or rollers; its wheels are taken to stand")
+        notes.append(
+            "note: the car stands on a lift or rollers; its wheels are treated as standing"
+        )
         return Adopted(replace(log, signals=standing), vehicle, diagnosis, notes)
     signals = align_devices(log.t, log.signals, delays) if delays else log.signals
     if diagnosis.locked == ["rear"] and not vehicle.rear_axle_locked:
         vehicle = vehicle.model_copy(update={"rear_axle_locked": True})
         notes.append(
-            "note: the rear wheels turn as one; taken as a locked differential (rear_axle_locked)"
+            "note: the rear wheels turn as one; treated as a locked differential (rear_axle_locked)"
         )
         signals = free_rear_wheels(signals, vehicle)
     if signals is log.signals:

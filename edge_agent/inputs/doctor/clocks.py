@@ -40,7 +40,7 @@ def measure_clocks(
     for device, seconds in listed.items():
         if abs(seconds) > LARGEST_LAG_S:
             way = "late" if seconds > 0.0 else "early"
-            words = f"speaks {abs(seconds):.2f} s {way}; the estimator bears {FILTER_BEARS_S:g} s"
+            words = f"is {abs(seconds):.2f} s {way}; the estimator tolerates {FILTER_BEARS_S:g} s"
             diagnosis.findings.append(Finding(device, "clock", words, delay_s=seconds))
 
 

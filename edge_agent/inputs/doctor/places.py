@@ -1,4 +1,6 @@
-"""Faults of position and heading: latitude and longitude exchanged, a compass angle as yaw."""
+"""Where the receiver says the car is, and where it points: latitude and longitude exchanged, a
+compass for yaw.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,7 @@ def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
 
 
 def _total_turn(angle: FloatArray) -> float:
-    """Return the range of an angle (n,) [rad] from its 5 % to its 95 % quantile, unwrapped."""
+    """Return how far an angle (n,) goes [rad], but for its ends."""
     unwrapped = np.unwrap(angle)
     return float(np.percentile(unwrapped, 95) - np.percentile(unwrapped, 5))
 

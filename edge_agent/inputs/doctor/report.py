@@ -43,7 +43,8 @@ def report_lines(diagnosis: Diagnosis) -> list[str]:
     """Return the findings, one line each."""
     lines = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in diagnosis.findings]
     lines += [
-        f"{'unknown':<8} {channel:<10} nothing in this drive tells" for channel in diagnosis.unknown
+        f"{'unknown':<8} {channel:<10} this drive gives no evidence"
+        for channel in diagnosis.unknown
     ]
     lines += [
         f"{'lag':<8} {name:<10} {lag:+.3f} s behind the inertial unit"
@@ -88,7 +89,8 @@ def publishing_advice(diagnosis: Diagnosis) -> str:
     if diagnosis.findings:
         return "not passed: correct the profile (--fix writes it), import again"
     return (
-        "not passed: drive half a minute with turns and some braking, or vouch for it with --trust"
+        "not passed: drive half a minute with turns and some braking, or accept the log unchecked "
+        "with --trust"
     )
 
 
@@ -99,7 +101,7 @@ def report_page(diagnosis: Diagnosis, title: str) -> str:
         for f in diagnosis.findings
     ]
     rows += [
-        f"<tr><td>{escape(channel)}<td>unknown<td>nothing in this drive tells"
+        f"<tr><td>{escape(channel)}<td>unknown<td>this drive gives no evidence"
         for channel in diagnosis.unknown
     ]
     rows += [f"<tr><td>{escape(channel)}<td>sound<td>" for channel in diagnosis.sound]

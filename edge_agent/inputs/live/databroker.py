@@ -61,7 +61,7 @@ class DatabrokerFeed(Feed):
         with connection.open_channel() as channel:
             known = self._known_paths(channel)
             if not known:
-                raise ConnectionError("it knows none of the profile's signals")
+                raise ConnectionError("it has none of the profile's signals")
             m = self._messages
             self._call = connection.make_call(
                 channel.unary_stream, "Subscribe", m.SubscribeResponse
@@ -110,7 +110,7 @@ class DatabrokerFeed(Feed):
             except connection.grpc.RpcError as error:
                 if error.code() != connection.grpc.StatusCode.NOT_FOUND:
                     raise ConnectionError(f"{error.code().name}: {error.details()}") from None
-                self.say(f"does not know {path}")
+                self.say(f"has no signal {path}")
         return known
 
     def _hear_update(self, update: Any, *, standing: bool) -> None:  # noqa: ANN401

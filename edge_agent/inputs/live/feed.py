@@ -150,11 +150,11 @@ class Feed(ABC):
     def trouble(self) -> str | None:
         """Why nothing comes, None while something does."""
         silent = self.clock.now() - self.last
-        return f"{self.name} is silent for {silent:.0f} s" if silent > SILENT_S else None
+        return f"{self.name} has sent nothing for {silent:.0f} s" if silent > SILENT_S else None
 
     def _listen_loop(self) -> None:
         while not self.stopping.is_set():
-            reason = "it ended"
+            reason = "the source ended"
             try:
                 self.listen()
             except Exception as error:  # noqa: BLE001 a driver or a peer may raise anything; a lost source is no crash

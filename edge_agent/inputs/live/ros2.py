@@ -174,7 +174,7 @@ def type_of(key: str) -> str:
     """Return the message type in a key: `sensor_msgs::msg::dds_::Imu_` is sensor_msgs/msg/Imu.
 
     Raises:
-        ValueError: it contains none.
+        ValueError: it tells none.
     """
     place, mark, name = key.split("/")[-2].partition(DDS)
     if not mark or not name.endswith("_"):
@@ -190,13 +190,15 @@ def _load_typestore(folder: Path | None) -> Any:  # noqa: ANN401
         texts[f"{file.parent.name}/msg/{file.stem}"] = file.read_text(encoding="utf-8")
     if folder and len(texts) == 1:
         raise InputError(
-            "source", f"{folder} holds no PACKAGE/NAME.msg", "name a folder of message definitions"
+            "source",
+            f"{folder} contains no PACKAGE/NAME.msg",
+            "name a folder of message definitions",
         )
     try:
         for kind, text in texts.items():
             store.register(typesys.get_types_from_msg(text, kind))
     except Exception as error:  # what a parser of others raises
         raise InputError(
-            "source", f"a message definition makes no sense ({error})", "correct it"
+            "source", f"a message definition is invalid ({error})", "correct it"
         ) from error
     return store

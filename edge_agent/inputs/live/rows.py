@@ -53,7 +53,7 @@ class LiveRows:
         wait: sleeps so many seconds.
 
     Raises:
-        InputError: the profile reads the steering wheel, and its ratio is not given.
+        InputError: the profile reads the steering wheel, and nobody says its ratio.
     """
 
     def __init__(

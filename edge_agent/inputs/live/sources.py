@@ -64,7 +64,7 @@ def open_sources(
         raise InputError(
             "profile",
             "is not given",
-            "say which signal is which channel with --profile (import drafts one)",
+            "map signals to channels with --profile (edge-agent import drafts one)",
         )
     profile, folder = load_profile(profile_name)
     database = database_of(profile, folder, dbc)
@@ -81,7 +81,7 @@ def _open_source(
         options = dict(parse_qsl(query, strict_parsing=True)) if query else {}
     except ValueError as error:
         raise InputError(
-            "source", f"{source!r} has odd options ({error})", "write them like ?bus=1&fd=true"
+            "source", f"{source!r} has invalid options ({error})", "write them like ?bus=1&fd=true"
         ) from error
     if kind == "can":
         if database is None:
@@ -109,7 +109,7 @@ def _open_source(
         )
     raise InputError(
         "source",
-        f"{source!r} is of no known kind",
+        f"{source!r} is of an unknown kind",
         f"begin it with one of {', '.join(KINDS)} and a colon",
     )
 
@@ -151,7 +151,9 @@ def _open_ros2(
     domain = options.get("domain", "0")
     folder = options.get("messages")
     if not domain.isdigit():
-        raise InputError("source", f"{source!r}: a domain is a number", "write it like ?domain=0")
+        raise InputError(
+            "source", f"{source!r}: the domain is not a number", "write it like ?domain=0"
+        )
     return Ros2Feed(
         source,
         clock,

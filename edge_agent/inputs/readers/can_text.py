@@ -31,7 +31,7 @@ def is_gvret(path: Path) -> bool:
 
 
 def is_bare_trace(path: Path) -> bool:
-    """Return True if a PCAN trace does not state its version."""
+    """Return True if a PCAN trace does not say its version."""
     with path.open("rb") as file:
         head = file.read(65_536).decode("utf-8", errors="replace")
     return "$FILEVERSION" not in head
@@ -61,7 +61,9 @@ def gvret_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
                 extended = row[places["extended"]].strip().lower() in ("true", "1")
             except (ValueError, IndexError) as error:
                 raise InputError(
-                    "source", f"{path} has no frame in line {number} ({error})", "save it again"
+                    "source",
+                    f"{path} has no frame in line {number} ({error})",
+                    "export the log again",
                 ) from error
             first = time if first is None else first
             if identifier in wanted:

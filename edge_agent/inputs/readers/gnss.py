@@ -80,7 +80,7 @@ def parse_gpsd(line: str) -> Fix | None:
         raise ValueError("no object")
     mode = report.get("mode", 0)
     if not isinstance(mode, (int, float)):
-        raise ValueError("mode is no number")
+        raise ValueError("mode is not a number")
     if report.get("class") != "TPV" or mode < 2 or "time" not in report:
         return None
     moment = datetime.fromisoformat(str(report["time"])).astimezone(UTC)
@@ -100,7 +100,7 @@ def _parse_number(text: str) -> float:
 
 def _check_position(fix: Fix) -> Fix:
     if not (abs(fix.latitude) <= 90.0 and abs(fix.longitude) <= 180.0):
-        raise ValueError("no place on earth")
+        raise ValueError("position out of range")
     return fix
 
 

@@ -66,11 +66,13 @@ def check_blocks(path: Path) -> None:
             address = waiting.pop()
             if address in seen:
                 raise InputError(
-                    "source", f"{path} has blocks in a circle at byte {address}", "record it anew"
+                    "source",
+                    f"{path} has blocks that refer to each other in a circle at byte {address}",
+                    "record it again",
                 )
             if address + 24 > size or len(seen) > MOST_BLOCKS:
                 raise InputError(
-                    "source", f"{path} points beyond its end, to byte {address}", "record it anew"
+                    "source", f"{path} refers to byte {address}, beyond its end", "record it again"
                 )
             seen.add(address)
             waiting += _linked_blocks(file, address, size, path)
@@ -80,13 +82,15 @@ def _linked_blocks(file: BinaryIO, address: int, size: int, path: Path) -> list[
     file.seek(address)
     kind, _, length, count = struct.unpack("<4sIQQ", file.read(24))
     if not kind.startswith(b"##") or length > size or count > (length - 24) // 8:
-        raise InputError("source", f"{path} has no sound block at byte {address}", "record it anew")
+        raise InputError(
+            "source", f"{path} has no valid block at byte {address}", "record it again"
+        )
     links = struct.unpack(f"<{count}Q", file.read(8 * count).ljust(8 * count, b"\0"))
     if kind == b"##CG":
         _, cycles = struct.unpack("<QQ", file.read(16).ljust(16, b"\0"))
         if cycles > 1000 * size:  # deflate makes at most a thousand bytes of one
             raise InputError(
-                "source", f"{path} counts {cycles} records in {size} bytes", "record it anew"
+                "source", f"{path} declares {cycles} records in {size} bytes", "record it again"
             )
     return [links[place] for place in LINKS.get(kind, ()) if place < count and links[place]]
 

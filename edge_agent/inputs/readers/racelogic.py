@@ -94,7 +94,7 @@ def convert_vbo(
             unit = "deg"
         elif "acc" in short and not unit and np.nanmax(np.abs(values)) < LARGEST_G:
             unit = "g"
-            recording.notes.append(f"{path.name}: {name} has no unit; taken to be in g")
+            recording.notes.append(f"{path.name}: {name} has no unit; assumed to be in g")
         recording.signals[NAMES.get(short, name)] = Series(t - t[0], values, unit)
     return recording
 

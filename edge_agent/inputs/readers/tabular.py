@@ -164,7 +164,9 @@ def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
             return whole
         if given not in named:
             raise InputError(
-                "time", f"{path} has no column {given}", f"choose of {', '.join(list(named)[:20])}"
+                "time",
+                f"{path} has no column {given}",
+                f"choose one of {', '.join(list(named)[:20])}",
             )
         return given
     lower = {name.lower(): name for name in reversed(named)}
@@ -176,7 +178,9 @@ def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
             return name
     seen = ", ".join(list(named)[:MOST_NAMES])
     raise InputError(
-        "time", f"{path} has no column of time among {seen}", 'name it in the profile as "time"'
+        "time",
+        f"{path} has no time column; its columns are {seen}",
+        'name it in the profile as "time"',
     )
 
 

@@ -57,7 +57,7 @@ def open_router() -> Iterator[ZenohSettings]:
     with zenoh.open(config) as session:
         answer = next(iter(session.get(f"@/{session.zid()}/router"))).ok
         if answer is None:
-            raise RuntimeError("the router does not tell its endpoints")
+            raise RuntimeError("the router does not report its endpoints")
         yield ZenohSettings(connect=[json.loads(answer.payload.to_string())["locators"][0]])
 
 

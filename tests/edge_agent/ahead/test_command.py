@@ -78,14 +78,14 @@ def test_limits_for_a_planner_without_listening_are_a_mistake(
     capsys: pytest.CaptureFixture[str], more: list[str]
 ) -> None:
     assert main([*WORDS, "--autoware", "tcp/127.0.0.1:7447", *more]) == 2
-    assert "autoware: is of no use without --ahead" in capsys.readouterr().err
+    assert "autoware: needs --ahead" in capsys.readouterr().err
 
 
 def test_a_route_without_listening_is_a_mistake(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*WORDS, "--route", str(tmp_path / "way.gpx")]) == 2
-    assert "route: is of no use without --ahead" in capsys.readouterr().err
+    assert "route: needs --ahead" in capsys.readouterr().err
 
 
 @pytest.mark.campaign

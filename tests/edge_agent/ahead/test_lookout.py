@@ -104,7 +104,7 @@ def test_an_alert_ahead_is_a_warning_at_once_and_its_end_too(
         town.put(alert(int(ICE[0]), time=NOW))
         raised = car.next_warning()
         assert raised.state == "raised"
-        assert raised.reason == "an alert stands"
+        assert raised.reason == "an alert is active"
         assert 50.0 < raised.distance_m < 75.0
         town.put(alert(int(ICE[0]), raised=False, time=NOW + NS))
         assert car.next_warning().state == "ended"
@@ -153,7 +153,7 @@ def test_the_map_alone_warns_and_what_it_says_lies_on_the_horizon(
     town.mu = {int(key): 0.85 for key in keys_on()} | {int(key): 0.15 for key in ICE}
     with driving(router) as car:
         warning = car.next_warning()
-        assert warning.reason == "the map says so"
+        assert warning.reason == "the map reports low grip"
         seen = car.drive_until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
         assert seen.way == "route"
         dry = seen.runs.start_m < 60.0

@@ -119,7 +119,7 @@ def test_alert_over_a_mere_bound_is_exported_with_its_own_grip() -> None:
         cache.store_alert(alert(key, time=NOW - NS), NOW)
     raised = Car(cache).drive(290.0)[0]
     assert raised.mu == pytest.approx(0.15, abs=0.03)
-    assert raised.reason == "an alert stands"
+    assert raised.reason == "an alert is active"
 
 
 def test_a_stretch_that_grows_is_an_update_and_one_that_is_cleared_an_end() -> None:
@@ -155,7 +155,7 @@ def test_a_car_that_takes_another_way_is_told_that_the_warning_is_over() -> None
     horizon = look_ahead(straight_path(pose, 200.0), car.cache, pose.time)
     _, told = update_warnings(car.active, [horizon], pose, car.cache)
     assert [one.state for one in told] == ["ended"]
-    assert told[0].reason == "the car took another way"
+    assert told[0].reason == "the vehicle left this route"
 
 
 def test_nearly_touching_stretches_are_one_warning_distant_ones_two() -> None:

@@ -141,11 +141,11 @@ def test_an_engine_is_for_several_logs_and_wants_no_jobs(
     paths = [str(path) for path in logs(drives)]
     out = ["--out", str(tmp_path / "out")]
     assert main(["replay", *paths, *out, "--engine", "abacus"]) == 2
-    assert "error: engine: 'abacus' is none" in capsys.readouterr().err
+    assert "error: engine: 'abacus' is unknown" in capsys.readouterr().err
     assert main(["replay", *paths, *out, "--engine", "spark", "--jobs", "2"]) == 2
-    assert "error: jobs: 2 says nothing to Spark" in capsys.readouterr().err
+    assert "error: jobs: 2 has no effect on Spark" in capsys.readouterr().err
     assert main(["replay", paths[0], *out, "--engine", "spark"]) == 2
-    assert "error: engine: one log into one file" in capsys.readouterr().err
+    assert "error: engine: Spark needs several logs" in capsys.readouterr().err
 
 
 def test_two_tries_at_one_drive_write_it_once_and_leave_no_draft(

@@ -157,11 +157,11 @@ def test_a_simulated_source_hands_its_context_to_the_observations(
     told = [
         record.getMessage()
         for record in caplog.records
-        if "counts as unknown" in record.getMessage()
+        if "is treated as unknown" in record.getMessage()
     ]
     assert told == [
         (
-            "vehicle 1: abs_active has been on since the start: it counts as unknown; correct the "
+            "vehicle 1: abs_active has been on since the start: it is treated as unknown; correct the "
             "profile"
         )
     ]

@@ -48,7 +48,7 @@ def block(position: bool = True, wheels: float = 20.0) -> Block:
 
 
 CAUSES: dict[str, tuple[Block, State, list[str], str]] = {
-    "silent source": (block(), State(), ["can0 is silent for 3 s"], "is silent"),
+    "silent source": (block(), State(), ["can0 has sent nothing for 3 s"], "has sent nothing"),
     "doctor has not passed": (
         block(),
         State(),
@@ -59,7 +59,7 @@ CAUSES: dict[str, tuple[Block, State, list[str], str]] = {
     "no wheel speed": (block(wheels=float("nan")), State(), [], "no wheel speed"),
     "standing": (block(wheels=0.0), State(), [], "stands"),
     "no router": (block(), State(links=0), [], "no router answers at tcp/127.0.0.1:7447"),
-    "router away": (block(), State(cut_off=True), [], "is away"),
+    "router away": (block(), State(cut_off=True), [], "does not answer"),
     "no service": (block(), State(unanswered_s=4.5), [], "no service acknowledges"),
     "refused": (block(), State(counts=REFUSED), [], "refuses"),
 }
@@ -102,11 +102,11 @@ def test_nothing_is_printed_while_records_are_published() -> None:
 
 def test_a_reason_is_printed_again_only_when_it_changes() -> None:
     seconds = iter(range(10**6))
-    lines = told_within(block(), lambda _: [f"can0 is silent for {next(seconds)} s"], 60.0)
+    lines = told_within(block(), lambda _: [f"can0 has sent nothing for {next(seconds)} s"], 60.0)
     assert len(lines) == 1
     changing = iter([["a"], ["a"], ["b"], []] + [[]] * 100)
     assert told_within(block(), lambda _: next(changing), 20.0) == [
         "not published: a",
         "not published: b",
-        "publishing: every reason is gone",
+        "publishing: no obstacle is left",
     ]

@@ -30,4 +30,4 @@ def test_comparison_without_a_report_is_refused(
 ) -> None:
     out = str(tmp_path / "estimates.parquet")
     assert main(["replay", str(drive), "--out", out, "--compare", "sr-ukf"]) == 2
-    assert "compare: is of no use" in capsys.readouterr().err
+    assert "compare: works only with a report" in capsys.readouterr().err

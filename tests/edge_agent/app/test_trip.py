@@ -125,7 +125,7 @@ def test_another_car_or_a_broken_file_begins_anew(
         path.write_text(text)
         caplog.clear()
         assert not Trip(smooth.vehicle, PROFILE, path).is_admitted()
-        assert "learned anew" in caplog.text
+        assert "learning starts again" in caplog.text
 
 
 def test_a_short_trip_teaches_nothing_and_a_disk_that_refuses_is_no_crash(

@@ -61,7 +61,7 @@ def test_nothing_is_written_where_no_group_helps(drive: Recorded) -> None:
 def test_short_single_drive_cannot_be_validated(drive: Recorded) -> None:
     short = (drive.t[:3500], drive.signals[:3500])
     assert split_folds([short]) == []
-    with pytest.raises(InputError, match="no part can be held out"):
+    with pytest.raises(InputError, match="too short to hold out a part"):
         learn_validated([short], drive.vehicle, offset_judge)
 
 

@@ -162,7 +162,7 @@ def test_what_has_not_passed_is_not_published_unless_it_is_trusted(
     run = ["run", "--source", *log, *send, "--duration", "1"]
     for words in (replay, run):
         assert main(words) == 2
-        assert "error: log: is not fit to be published" in capsys.readouterr().err
+        assert "error: log: did not pass the signal doctor" in capsys.readouterr().err
     assert not service.batches
     assert main([*run, "--trust"]) == 0
     assert main([*replay, "--trust"]) in (0, 3)

@@ -123,7 +123,7 @@ def test_rows_interpolate_readings_and_are_empty_for_a_silent_source(
     assert (signals[:, S.DELTA + 2] == 0.0).all(), "rear wheels do not steer"
     assert np.allclose(np.diff(t), 0.01)
     assert (got[0].time[0] - clock.start_ns) / NS == pytest.approx(t[0], abs=1e-8)
-    assert rows.health_problems() == ["bus is silent for 2 s"]
+    assert rows.health_problems() == ["bus has sent nothing for 2 s"]
     assert clock.now() == pytest.approx(t[-1] + 0.01 + DELAY_S)
     blocks.close()
     assert not feed._thread.is_alive()
@@ -204,7 +204,7 @@ def test_a_source_that_raises_or_ends_is_opened_again_and_told_once(
     assert feed.losses == 2
     assert [record.getMessage() for record in caplog.records] == [
         "bus: lost (no such device); trying again",
-        "bus: lost (it ended); trying again",
+        "bus: lost (the source ended); trying again",
     ]
 
 

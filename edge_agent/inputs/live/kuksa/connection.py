@@ -54,7 +54,7 @@ class BrokerConnection:
         self.metadata = (("authorization", f"Bearer {token}"),) if token else ()
         if token and self._authority is None and not address.startswith(LOOPBACK):
             raise InputError(
-                "source", "would send its token without encryption", "give ca=FILE as well"
+                "source", "the token would be sent without encryption", "give ca=FILE as well"
             )
 
     def open_channel(self) -> Any:  # noqa: ANN401 grpc has no types
