@@ -154,10 +154,10 @@ class ServiceToken(NamedTuple):
 
 
 def parse_served(key: str, root: str = SERVES) -> ServiceToken:
-    """Parse such a token.
+    """Parse the key of a service's token.
 
     Raises:
-        InputError: the key is not such a token.
+        InputError: the key is not that of a service's token.
     """
     *found, service, start = ["", "", *key.removeprefix(f"{root}/").split("/")]
     region = "/".join(found[2:]).replace(_ALL, "*")

@@ -21,8 +21,8 @@ def read_tile(payload: bytes) -> pa.Table:
 
 @dataclass
 class Listener:
-    """Subscribes to map and alerts; keeps the newest of each tile, and every alert with its time
-    of receipt.
+    """Subscriber to map and alerts; stores the newest version of each tile, and every alert with
+    its time of receipt.
     """
 
     session: zenoh.Session

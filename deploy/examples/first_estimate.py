@@ -15,7 +15,7 @@ import edge_agent
 
 
 def main(folder: Path) -> None:
-    """Drive, estimate, show."""
+    """Simulate a drive, estimate friction with two estimators, and plot the result."""
     folder.mkdir(parents=True, exist_ok=True)
     truth, vehicle = edge_agent.simulate_manoeuvre("double-lane-change", mu=0.5, seed=1)
     pq.write_table(

@@ -59,8 +59,8 @@ def adapted_within(
     pace: float,
     bounds: tuple[float, float],
 ) -> float:
-    """Return `adapted_factor` within other bounds, for `pace` times as many steps as the sets were
-    made for.
+    """Return the same as `adapted_factor` with other bounds, and with the step of ln R multiplied
+    by `pace`.
     """
     if not theoretical > 0.0:
         return factor

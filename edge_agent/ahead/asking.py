@@ -79,7 +79,7 @@ class Tiles:
 
     @property
     def subscribed_tiles(self) -> list[int]:
-        """Return the tiles."""
+        """Return the tiles to which the vehicle subscribes."""
         return list(self._wanted)
 
     def update_subscriptions(self, paths: list[Path], pose: Pose) -> tuple[list[int], list[int]]:

@@ -118,7 +118,7 @@ def thin_parts(count: int) -> list[slice]:
 
 
 def page_of(drive: RecordedDrive) -> str:
-    """Return the page."""
+    """Return the report as an HTML page."""
     plots = [_plot_of(drive, panel) for panel in PANELS]
     data: dict[str, Any] = {
         "title": drive.title,

@@ -80,7 +80,7 @@ class SignalWatch:
         self._seen.update({name: now for name, here in present.items() if here})
 
     def is_missing(self, name: str) -> bool:
-        """Return True if the blocks have lacked something for MISSING_S."""
+        """Return True if a required signal has been missing for MISSING_S."""
         return bool(self._seen) and self._clock() - self._seen[name] > MISSING_S
 
 

@@ -117,7 +117,7 @@ class Trip:
                 yield replace(block, signals=mended[:, None])
 
     def learn_rest(self) -> None:
-        """Start to learn from the rest."""
+        """Start the examination of the last part of the trip, to learn from it."""
         self._start_examination(final=True)
 
     def close(self) -> None:

@@ -72,7 +72,7 @@ class Budget(Record):
 
 
 class Provenance(Record):
-    """Everything needed to reproduce the numbers."""
+    """Parameters needed to reproduce the numbers."""
 
     command: str
     seed: Annotated[int, Field(ge=0)]

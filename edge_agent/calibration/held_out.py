@@ -42,8 +42,8 @@ class Prediction(NamedTuple):
 
 
 class HeldOut(NamedTuple):
-    """The calibration to write, the groups that were left out, and predictions without and with
-    it.
+    """Result of learning: the calibration to write, the groups left out of it, and the prediction
+    scores without and with it.
     """
 
     calibration: Calibration

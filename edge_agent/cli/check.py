@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check; return 0 if the log has passed, 1 if something is wrong or unknown."""
+    """Check a log; return 0 if it has passed, 1 if a channel is faulty or unknown."""
     from edge_agent.app.backfill import vehicle_file_of
     from edge_agent.app.estimates_file import prepare_path
     from edge_agent.inputs.bring_in import profile_of

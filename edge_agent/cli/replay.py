@@ -83,8 +83,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay; return 0 if all was written and acknowledged, 1 if something was left or refused,
-    3 if not plausible.
+    """Replay logs; return 0 if all records were written and acknowledged, 1 if some were left or
+    refused, 3 if a log is not plausible.
     """
     from edge_agent.app.backfill import (
         backfill_on_spark,

@@ -21,8 +21,7 @@ TURNING = (S.OMEGA, S.OMEGA + 4)
 
 
 class Corrector:
-    """One vehicle's signals, less what its calibration knows of their errors; blocks may be cut
-    anywhere.
+    """Correction of one vehicle's signals by its calibration; blocks may be cut anywhere.
 
     Devices that speak early wait for the latest one: of each the reading is taken that is nearest
     to the moment that the latest tells of, as it came. So a row is of a moment up to a tenth of a

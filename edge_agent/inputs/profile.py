@@ -41,7 +41,7 @@ class Sign(Part):
 
 
 class Channel(Part):
-    """Where a channel comes from, and what makes SI of it."""
+    """Source of a channel, and its conversion to SI units."""
 
     signal: Annotated[list[Text] | Text, Field(description="name, or names whose values are added")]
     message: Annotated[
@@ -109,7 +109,7 @@ class Channel(Part):
 
 
 class Profile(Part):
-    """One car's or one recorder's signals."""
+    """Profile of one car or recorder: the mapping from its signals to channels."""
 
     version: Literal[1] = 1
     name: Annotated[str, Field(min_length=1, max_length=64)]

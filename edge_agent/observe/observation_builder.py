@@ -161,7 +161,7 @@ def build_records(
 
 
 class SampleNotes(NamedTuple):
-    """Context of samples.
+    """Additional data of samples for the visits that contain them.
 
     row, told: where friction changed within a visit (T, N), and the evidence of the part before:
     row of (k, 32). context: (T, N, len(CONTEXT)); no rows where nothing is known.

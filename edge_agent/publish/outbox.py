@@ -68,7 +68,7 @@ class StoredBatch:
 
 @dataclass
 class OutboxCounts:
-    """Records by result."""
+    """Numbers of records by result."""
 
     stored: int = 0
     settled: int = 0
@@ -234,7 +234,7 @@ class Outbox:
 
     @property
     def bytes(self) -> int:
-        """Payload bytes held."""
+        """Size of all held payloads [bytes]."""
         return self._bytes
 
     def unanswered_s(self, now: float) -> float:

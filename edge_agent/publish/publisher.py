@@ -157,8 +157,8 @@ class Publisher:
         )
 
     def count_unsettled(self, kind: Kind | None = None) -> int:
-        """Return the number of unsettled records: in the outbox, also of an earlier start, or on
-        their way to it.
+        """Return the number of unsettled records: in the outbox, also of an earlier start, or not
+        yet stored in it.
         """
         counts = self.counts
         kinds = Kind if kind is None else (kind,)

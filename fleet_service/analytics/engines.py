@@ -119,7 +119,7 @@ class QueryEngine:
         return sum(int(pq.read_metadata(path).num_rows) for path in self.files("observations"))
 
     def answer(self, expression: Table) -> pa.Table:
-        """Run an expression."""
+        """Run an expression and return its result."""
         found: pa.Table = expression.to_pyarrow()
         return found
 

@@ -133,7 +133,7 @@ class Engine:
         checkpoints.mark_survived(self._root)
 
     def close(self) -> None:
-        """Release the archive."""
+        """Close all parts and release the archive."""
         self.queries.close()
         self.mark_survived()
         self.settlement.close()

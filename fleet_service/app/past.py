@@ -147,7 +147,7 @@ class _Process:
         return head
 
     def end(self) -> None:
-        """Kill it."""
+        """Kill the subprocess and close its pipes."""
         self._child.kill()
         with suppress(BrokenPipeError):
             self._in.close()
@@ -203,7 +203,7 @@ def encode_question(question: PastQuery) -> bytes:
 
 
 def answer_line(root: Path, line: bytes, out: BinaryIO) -> None:
-    """Answer a question."""
+    """Answer one query about a past map, given as a line of JSON."""
     heard = json.loads(line)
     question = PastQuery(**{**heard, "query": MapQuery.model_validate_json(heard["query"])})
     try:

@@ -12,7 +12,7 @@ from schemas.runtime.process import limit_memory
 
 
 def main() -> int:
-    """Answer the questions."""
+    """Answer queries about past maps from standard input until it ends."""
     limit_memory(*UNUSED)  # before anything loads what it keeps out: 40 MB
     from fleet_service.app.past import answer_all
 

@@ -295,7 +295,9 @@ class Service:
             self.engine.mark_survived()
 
     def _shut_down(self, session: zenoh.Session, stop: threading.Event) -> None:
-        """Process and settle waiting messages within LEAVE_S; senders keep the rest."""
+        """Process and settle waiting messages within LEAVE_S; senders keep messages that were not
+        settled.
+        """
         if self.engine.holding.is_lost:
             self._followed = True
             stop.set()  # then nothing that hangs on a bucket, or on a router, keeps it for long

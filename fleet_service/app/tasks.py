@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 class Tasks:
-    """Queue of such work; true if it is not empty."""
+    """Queue of work that other threads request from the worker; true if it is not empty."""
 
     def __init__(self) -> None:
         self._queue: queue.SimpleQueue[tuple[Future[Any], Callable[[], object]]] = (

@@ -84,7 +84,7 @@ def queue_path(url: str) -> Path:
 
 
 class Webhook:
-    """Sender of alerts with a thread of its own; `close` sends the rest once.
+    """Sender of alerts with a thread of its own; `close` sends waiting alerts once.
 
     Args:
         url: of the receiver, http or https.
@@ -159,7 +159,7 @@ class Webhook:
         self._more.set()
 
     def close(self) -> None:
-        """Try to send the rest once, and stop; undelivered alerts stay in the file."""
+        """Try to send waiting alerts once, and stop; undelivered alerts stay in the file."""
         self._stop.set()
         self._more.set()
         self._thread.join(2 * self._timeout_s)

@@ -24,7 +24,7 @@ PRIVATE: Final = 0o700  # of the authority's folder
 
 @dataclass(frozen=True)
 class Terms:
-    """Validity in days.
+    """Validity of certificates in days.
 
     Attributes:
         days: of a certificate.
@@ -39,7 +39,7 @@ class Terms:
 
 @dataclass
 class EnrolmentResult:
-    """Names by result."""
+    """Names of vehicles, grouped by result."""
 
     made: list[str] = field(default_factory=list)
     kept: list[str] = field(default_factory=list)

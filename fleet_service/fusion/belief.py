@@ -163,8 +163,8 @@ def unpack_belief(belief: PackedArray, row: int, p: Bins) -> None:
 
 @refcount_free_inlined
 def pack_belief(p: Bins, belief: PackedArray, row: int) -> None:
-    """Put a belief at rest; it need not be normalised. Rounding keeps a rising one rising and a
-    uniform one uniform.
+    """Store a belief in packed form; it need not be normalised. After rounding, a non-decreasing
+    belief is still non-decreasing, and a uniform one uniform.
     """
     scale = np.float32(FULL) / np.float32(largest_bin(p))
     for i in range(_BINS):
@@ -184,8 +184,9 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
     """Let time pass: diffusion over `drift_s` with reflecting ends, then the hazard of a change
     over `change_s`.
 
-    In place. Both keep the uniform belief and keep a rising one rising, so that time alone never
-    lowers an upper end below the prior's. `padded` (34 at least) is for keeps.
+    `p` is changed in place. A uniform belief stays uniform and a non-decreasing one non-decreasing,
+    so that time alone never lowers an upper end below the prior's. `padded` (34 or more) is scratch
+    memory.
     """
     if drift_s > 0.0:
         whole = _DIFFUSION * drift_s

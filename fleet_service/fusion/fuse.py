@@ -113,7 +113,7 @@ class Fusion:
 
     @property
     def size(self) -> int:
-        """Slots in use."""
+        """Number of slots in use."""
         return self.store.size
 
     @property
@@ -295,7 +295,7 @@ class Fusion:
         )
 
     def _advance(self, epoch: int) -> None:
-        """Move T to `epoch`, one epoch at a time while the window holds anything."""
+        """Move T to `epoch`, one epoch at a time while the window has entries."""
         if self._epoch is None:
             self._epoch = epoch
         while self._epoch < epoch:

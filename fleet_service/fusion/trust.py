@@ -142,8 +142,8 @@ def judge_flag(
 def _note_shape(
     peers: RecordArray, vehicle: int, used: float, difference: float, variance: float
 ) -> None:
-    """Note how a vehicle's values of one cell differ with the grip that it used: its gain error
-    is in both of them.
+    """Record how a vehicle's values of one cell change with the grip that it used; its gain error
+    is the same in both values.
     """
     this = peers[vehicle]
     this.used_squares += np.float32(used * used / variance)

@@ -1,4 +1,4 @@
-"""Rate limit: a token bucket of bytes per vehicle, applied before anything of a message is read.
+"""Rate limit: a token bucket of bytes per vehicle, applied before a message is parsed.
 
 A bucket fills at a constant rate and holds a burst, so that a vehicle can catch up after an outage.
 Messages beyond it are dropped, counted and not acknowledged: the sender keeps them and sends them

@@ -39,9 +39,7 @@ Drive = Callable[[Path], None]  # drives and writes both files into a folder
 
 
 class World(NamedTuple):
-    """Where whom the vehicles are driven: a scenario of the simulator, and the share of rough
-    vehicles.
-    """
+    """Conditions of a drive: a scenario of the simulator, and the share of rough vehicles."""
 
     scenario: str
     rough: float

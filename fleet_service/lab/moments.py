@@ -41,8 +41,8 @@ MIDDLE: Final = 0.91  # of the bar on coverage: the worst is the farthest from i
 
 
 class AskedWay(NamedTuple):
-    """Scores of the cells that several vehicles visited until then, and which of them are
-    measured.
+    """Scores of the cells that several vehicles had visited at one moment, and True for those that
+    are measured.
     """
 
     scores: Scores

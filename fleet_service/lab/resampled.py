@@ -36,8 +36,8 @@ FARTHEST: Final = 0.35
 
 
 class TrueVisits(NamedTuple):
-    """Where vehicles truly were, (m,): vehicle, first moment [ns], mean friction, largest share
-    of it used.
+    """True visits of vehicles, (m,): vehicle, first moment [ns], mean friction, largest share of it
+    used.
     """
 
     vehicle: IntArray

@@ -69,11 +69,11 @@ class FeatureRoutes:
         return JSONResponse(features.collections_document(_base_address(request), self._extent()))
 
     async def collection(self, request: Request) -> Response:
-        """Return the collection."""
+        """Return the description of the collection."""
         return JSONResponse(features.collection_document(_base_address(request), self._extent()))
 
     async def schema(self, request: Request) -> Response:
-        """Return its columns."""
+        """Return the columns of the collection as a JSON schema."""
         return JSONResponse(
             features.feature_schema(_base_address(request)), media_type=features.SCHEMA_JSON
         )
@@ -85,8 +85,8 @@ class FeatureRoutes:
         )
 
     async def items(self, request: Request) -> Response:
-        """Return features ordered by place, from `after` on; `next` continues there, whatever
-        changes meanwhile.
+        """Return features ordered by place, from `after` on; `next` continues at the same place
+        even if features change meanwhile.
         """
         question = asked.parse_features(request, time.time_ns())
         if not self._reader.is_served:

@@ -38,8 +38,8 @@ def _to_list(column: NDArray[Any]) -> pa.Array[Any]:
 
 
 def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
-    """Return the column that a list holds; a view if Arrow's own conversion would import another
-    library.
+    """Return the values of a list column as a numpy array. Numbers are a view, because Arrow's own
+    conversion would import another library.
     """
     whole = (
         column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()

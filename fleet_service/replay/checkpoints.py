@@ -1,5 +1,5 @@
-"""Checkpoints: state of a service when everything up to a segment was on disk; a restart replays
-the rest.
+"""Checkpoints: state of a service when all rows up to a segment were on disk; a restart replays the
+later segments.
 
     checkpoints/EPOCH-NUMBER/NAME.arrow          the newest segment that it includes
     checkpoints/EPOCH-NUMBER/manifest.json       a digest of every file, and the weather that it

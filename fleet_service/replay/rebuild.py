@@ -63,7 +63,7 @@ MARGIN_DEG: Final = 0.002
 
 
 class Begin(NamedTuple):
-    """Where a replay begins: the first day of measurement, and the position in the log."""
+    """Start of a replay: the first day of measurement, and the position in the log."""
 
     day: int | None = None
     after: layout.Cut | None = None

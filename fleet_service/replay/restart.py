@@ -1,4 +1,6 @@
-"""Begin of a restart: the newest readable checkpoint, or nothing; the log supplies the rest."""
+"""Begin of a restart: the newest readable checkpoint, or an empty state; later rows come from the
+log.
+"""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def size_asked(
 def _select_tiles(
     cache: TileCache, query: MapQuery, route: IntArray | None, only: int | None
 ) -> list[int]:
-    """Select the tiles that may contain something."""
+    """Select the tiles that may contain cells of the answer."""
     if route is not None:
         tiles = np.unique(grid.tile_of(route // grid.SECTORS))
     elif only is not None:

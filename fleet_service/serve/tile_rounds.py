@@ -73,7 +73,7 @@ class TileRounds:
                 break
 
     def finish(self, most_s: float) -> None:
-        """Publish the rest and later changes within `most_s`, because the service stops."""
+        """Publish the remaining tiles and later changes within `most_s`, because the service stops."""
         known = set(self._left)
         self._left.extend(tile for tile in self._changed() if tile not in known)
         self.go_on(most_s)

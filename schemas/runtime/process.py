@@ -93,8 +93,9 @@ class _Without(MetaPathFinder):
 
 
 def print_line(line: str, stream: TextIO) -> None:
-    """Print a line at once and as a whole, also with several threads. Errors of the stream (full
-    disk, closed pipe) are ignored."""
+    """Print a line with one write and flush it, so that lines of several threads do not mix. Errors
+    of the stream (full disk, closed pipe) are ignored.
+    """
     with suppress(OSError):
         stream.write(f"{line}\n")  # in one piece: `print` writes the end of a line by itself
         stream.flush()

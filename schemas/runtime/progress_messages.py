@@ -41,7 +41,7 @@ _voice = _State()
 
 
 def enable_messages(*, quiet: bool = False) -> None:
-    """Enable progress messages; the command lines call it."""
+    """Enable progress messages; only the command lines do this."""
     _voice.on = not quiet
     _voice.said_once.clear()
 
@@ -53,7 +53,7 @@ def report(line: str) -> None:
 
 
 def report_once(line: str) -> None:
-    """Report something once; on a terminal it becomes the spinner's text."""
+    """Print a message once; on a terminal it becomes the spinner's text."""
     if line not in _voice.said_once:
         _voice.said_once.add(line)
         report(line)

@@ -260,7 +260,7 @@ def encode_alert(alert: Alert) -> bytes:
 
 
 def decode_alert(payload: bytes) -> Alert:
-    """Read an alert.
+    """Return the alert in the bytes of a message.
 
     Raises:
         WireError: not an Alert.

@@ -109,7 +109,7 @@ class Feed(ABC):
         """Return the signals in the received messages."""
 
     def start(self) -> None:
-        """Begin to listen."""
+        """Start the thread that listens to the source."""
         self.last = self.clock.now()
         self._thread.start()
 
@@ -148,7 +148,7 @@ class Feed(ABC):
 
     @property
     def trouble(self) -> str | None:
-        """Why nothing comes, None while something does."""
+        """Reason why the source delivers nothing; None while it delivers."""
         silent = self.clock.now() - self.last
         return f"{self.name} has sent nothing for {silent:.0f} s" if silent > SILENT_S else None
 

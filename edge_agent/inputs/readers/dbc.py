@@ -37,8 +37,8 @@ Bytes: TypeAlias = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Signal:
-    """Where a signal lies in a frame: start and size [bit], byte order, and what makes a
-    physical value of it.
+    """Position of a signal in a frame (start and size [bit], byte order), and its conversion to a
+    physical value.
     """
 
     name: str

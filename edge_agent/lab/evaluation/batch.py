@@ -59,7 +59,7 @@ class DriveSet:
 
     @property
     def mu(self) -> FloatArray:
-        """Its mean, (T, N)."""
+        """Mean friction of the four wheels, (T, N)."""
         return np.asarray(self.mu_wheel.mean(axis=-1))
 
     def last(self, seconds: float) -> slice:

@@ -87,7 +87,7 @@ class DetectionTally:
         self.add(name, np.array([holds]))
 
     def merge(self, other: DetectionTally) -> None:
-        """Add another town."""
+        """Add the counts of another town."""
         for name, value in other.total.items():
             self.total[name] = self.total.get(name, 0.0) + value
             self.count[name] = self.count.get(name, 0) + other.count[name]

@@ -30,7 +30,7 @@ ONE: Final = np.uint64(1)
 
 
 def checked_seed(seed: int) -> int:
-    """Return the seed.
+    """Return the seed if it is valid.
 
     Raises:
         InputError: it is negative.

@@ -53,7 +53,7 @@ Effect = Callable[[FloatArray, BoolArray, float], None]
 
 
 def drop_readings(values: FloatArray, when: BoolArray, _size: float) -> None:
-    """Return no readings."""
+    """Replace the readings at `when` with NaN."""
     values[when] = np.nan
 
 

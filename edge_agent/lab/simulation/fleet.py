@@ -291,8 +291,10 @@ def rough_ones(vehicles: int, share: float) -> BoolArray:
 
 
 def winter_ones(vehicles: int, share: float) -> BoolArray:
-    """Return which vehicles have winter equipment, (N,), by number in pairs: half of them are
-    rough if half are.
+    """Return True for vehicles with winter equipment, (N,).
+
+    Pairs of successive vehicles have the same equipment, so that half of them are rough if half of
+    all vehicles are.
     """
     return np.repeat(rough_ones((vehicles + 1) // 2, share), 2)[:vehicles]
 

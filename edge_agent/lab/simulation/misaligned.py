@@ -44,7 +44,9 @@ DEVICE_OF: Final = np.array([0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 
 
 @dataclass(frozen=True)
 class Misalignment:
-    """Standard deviations, except where a largest size is given."""
+    """Sizes of the misalignments of a fleet: standard deviations, or the largest size where the
+    comment says so.
+    """
 
     tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [rad] θ, φ, ψ
     steering: tuple[float, float, float] = (0.0, 0.0, 0.0)  # δ_0 [rad], γ, β

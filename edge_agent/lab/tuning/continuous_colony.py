@@ -48,8 +48,9 @@ class ArchiveHabits:
 
 
 class SearchTally:
-    """Vectors evaluated so far, the best of them, and the history; for searches over continuous
-    variables."""
+    """Number of evaluated vectors, the best vector, and the history; for searches over continuous
+    variables.
+    """
 
     def __init__(self, problem: Problem) -> None:
         """Begin without any evaluation."""

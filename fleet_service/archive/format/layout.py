@@ -73,8 +73,8 @@ class Partition(NamedTuple):
     zone: int
 
     def folder(self, root: Path, table: str) -> Path:
-        """Return its folder. The letter before the zone keeps readers from parsing it as a
-        number.
+        """Return the partition's folder. The letter before the zone keeps readers from parsing it
+        as a number.
         """
         zone = f"zone=q{grid.quadkey(self.zone, grid.ZONE_ZOOM)}"
         return root / table / f"date={date_of(self.day)}" / zone

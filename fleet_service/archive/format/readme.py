@@ -58,7 +58,7 @@ _TABLES: Final[tuple[tuple[str, tuple[Field, ...]], ...]] = (
 
 
 def page_text() -> str:
-    """Return the page."""
+    """Return the text of the archive's README."""
     parts = [_HEAD]
     for name, fields in _TABLES:
         parts.append(f"\n## `{name}`\n\n| column | type | unit | meaning |\n|---|---|---|---|\n")

@@ -1,5 +1,5 @@
-"""Row filter by the range of a column, which a file's statistics can evaluate before anything is
-read.
+"""Row filter by the range of a column, which can be evaluated on a file's statistics before any row
+is read.
 
 Ranges are used instead of Arrow's expressions. Those import pandas (40 MB per process), and their
 scan holds several complete row groups in memory.

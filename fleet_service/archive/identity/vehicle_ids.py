@@ -87,7 +87,7 @@ class VehicleIds:
         )
 
     def sync(self) -> None:
-        """Make new lines durable, before anything of their vehicles is acknowledged.
+        """Sync new lines to disk, before any record of their vehicles is acknowledged.
 
         Raises:
             OSError: the disk is full or broken; the next call tries again.

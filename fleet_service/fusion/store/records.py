@@ -246,7 +246,7 @@ FREE_WINDOWS, FREE_ENTRIES, PAIRS, REPORTERS_USED = range(4)
 
 
 class State(NamedTuple):
-    """All that compiled code works on.
+    """State of the store in arrays, for compiled code.
 
     Attributes:
         live: the slots as they are now.

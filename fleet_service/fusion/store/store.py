@@ -51,7 +51,7 @@ _AHEAD = 120
 
 
 class Store:
-    """Everything that a fusion holds, empty at first.
+    """Complete state of a fusion, empty at first.
 
     Attributes:
         state: of compiled code.
@@ -102,7 +102,7 @@ class Store:
 
     @property
     def waiting(self) -> int:
-        """Entries in use."""
+        """Number of entries in use."""
         return len(self.state.free_entries) - int(self.state.used[FREE_ENTRIES])
 
     def due_windows(self, before: int) -> tuple[IntArray, IntArray]:
@@ -124,7 +124,7 @@ class Store:
 
     @property
     def table(self) -> IntArray:
-        """Where compiled code finds slots by key."""
+        """Hash table in which compiled code finds slots by key."""
         return self._slots
 
     def slots_for(self, keys: IntArray) -> IntArray:

@@ -117,7 +117,7 @@ class PaperTable:
 
 @dataclass
 class Reproduction:
-    """Everything that one paper's reproduction found."""
+    """All results of the reproduction of one paper."""
 
     paper: str
     title: str

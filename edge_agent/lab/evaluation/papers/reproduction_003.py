@@ -82,7 +82,7 @@ FILTERS: Final[dict[str, UnscentedSetting]] = {
 
 @dataclass(frozen=True)
 class CaseRuns:
-    """One experiment's drive and what each filter makes of it."""
+    """The drive of one experiment and the results of each filter."""
 
     batch: DriveSet
     runs: dict[str, FrictionRun]

@@ -53,7 +53,7 @@ ITERATIONS: Final = 12
 
 @dataclass(frozen=True)
 class NoisyRun:
-    """One experiment: the drives of all noise seeds, and what each filter makes of them."""
+    """One experiment: the drives of all noise seeds, and the results of each filter."""
 
     batch: DriveSet
     reported: dict[str, Estimates]
