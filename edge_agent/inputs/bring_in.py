@@ -1,5 +1,5 @@
-"""Sources to a signal log: which reader for which file, then the profile, then Parquet with its
-provenance.
+"""Import of sources into a signal log: select the reader of each file, apply the profile, and write
+Parquet with its provenance.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class _Load(Generic[Batch]):
         return sum(len(part["row"]) for waiting in list(self.waiting.values()) for part in waiting)
 
     def take(self, other: _Load[Batch]) -> None:
-        """Add the rows of another load."""
+        """Append the waiting rows and the segments of another load."""
         for kind, waiting in other.waiting.items():
             self.waiting[kind] = self.waiting[kind] + waiting
         self.batches += other.batches

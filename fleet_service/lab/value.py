@@ -184,7 +184,9 @@ def recall(truth: FloatArray, warned: BoolArray) -> float:
 
 
 def measure_rate(cars: int, seeds: range, demand: float = 1.0) -> dict[str, float]:
-    """Return the figures at `cars` an hour and road over `seeds`, of the map and of both rules."""
+    """Return the figures of the map and of both rules for a traffic of `cars` per hour and road,
+    over `seeds`.
+    """
     towns = []
     for seed in seeds:
         rng = np.random.default_rng([seed, 37])

@@ -29,7 +29,7 @@ ROUND: Final = (1.33, 0.05)
 
 
 class TyreCurve(NamedTuple):
-    """Tables of CELLS + 1 values."""
+    """Tables of the tyre's force curve at CELLS + 1 points, for interpolation."""
 
     ratio: Annotated[FloatArray, CELLS + 1]  # f/theta over u
     slope: Annotated[FloatArray, CELLS + 1]  # f' over u
