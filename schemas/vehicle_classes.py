@@ -1,4 +1,4 @@
-"""Vehicle files of common classes, for a car whose own numbers nobody has.
+"""Vehicle files of common classes, for a car whose own parameters are unknown.
 
 Typical values of laden production cars with one or two persons. Stiffness is per wheel, at static
 load, against the angle of its rim: steering, bushes and roll are included, so that the front axle

@@ -39,7 +39,7 @@ class LowerVertices:
     Attributes:
         feet: alternately how far set k reaches towards peak k + 1, and set k + 1 towards peak k
         [1], 1 at the peak.
-        out_feet: the same of the sets of the step.
+        out_feet: the same for the output sets.
 
     Raises:
         InputError: a share leaves its range, or peaks are not in increasing order.

@@ -49,7 +49,7 @@ class RequestLog:
         self._boxes: deque[tuple[Box, int]] = deque(maxlen=MOST_BOXES)
 
     def request_again(self) -> None:
-        """Request everything again, because a session has come back."""
+        """Request everything again after a session has been reopened."""
         self._boxes.clear()
 
     def missing_boxes(self, path: Path, pose: Pose, within: float) -> list[Box]:

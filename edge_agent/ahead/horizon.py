@@ -62,7 +62,7 @@ class Horizon(NamedTuple):
 
 
 def horizon_length(speed: float) -> float:
-    """Return how far to look [m]: the stopping distance on an unknown road."""
+    """Return the length of the horizon [m]: the stopping distance on an unknown road."""
     stop = speed * (REACTION_S + 2.0) + MARGIN_M + speed**2 / (2.0 * UNKNOWN_LOWER * GRAVITY)
     return float(min(max(stop, SHORTEST_M), LONGEST_M))
 

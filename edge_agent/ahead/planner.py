@@ -3,7 +3,7 @@ VelocityLimit.
 
 The limit is the speed from which the vehicle can brake comfortably to the safe speed of each place
 ahead. It falls at once and rises only after it was higher for HOLD_S, so that a planner does not
-see it flutter. A road that nobody measured gives no limit.
+see it flutter. An unmeasured road gives no limit.
 
 Autoware listens on `/planning/scenario_planning/max_velocity_candidates`
 (tier4_planning_msgs/msg/VelocityLimit). The message is put as rmw_zenoh puts it: CDR, with an

@@ -23,7 +23,7 @@ _NUMBER: Final = re.compile(r"\d+(\.\d+)?")
 
 
 class PublisherState(Protocol):
-    """Part of a publisher that tells whether its records arrive."""
+    """Part of a publisher that shows whether its records arrive."""
 
     @property
     def links(self) -> int:

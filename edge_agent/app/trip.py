@@ -64,7 +64,7 @@ class Trip:
         vehicle: its file.
         profile: name of the profile by which its signals are read.
         path: of the stored knowledge; it need not exist.
-        trusted: True to publish whatever the doctor finds.
+        trusted: True to publish regardless of the doctor's findings.
     """
 
     def __init__(

@@ -10,11 +10,11 @@ deviation.
                                             at once
     force_gain        torque over radius, over mass times acceleration: torque gain and mass, where
                       torque is recorded
-    wheel_lag, steer_lag    by which they speak later than the inertial unit: lags.py
+    wheel_lag, steer_lag    delay relative to the inertial unit: lags.py
 
-At one speed gain and understeer are the same; only a prior that the whole fleet shares tells them
-apart there. So the regression of a drive begins from USUAL around SOUND, and its standard
-deviations say how much of that is left.
+At one speed gain and understeer are the same; only a prior that the whole fleet shares separates
+them there. The regression of a drive therefore has the prior SOUND with standard deviation USUAL,
+and its standard deviations show the remaining uncertainty.
 
 Wheels under force slip. The driven axle therefore turns faster, and the dragged one slower; a
 radius is corrected for that by the file's stiffness, its driven axle, and the usual losses to air
@@ -24,7 +24,7 @@ A drive without enough excitation for a quantity leaves it out. The standard dev
 parts. One is the median deviation among drives over the root of their number; it is not less than
 FLOOR, as few drives may agree by chance. The other is BIAS, the error that all drives share
 (crossfall of 2.5 %, a bent steering map, load). Both were set on 40 simulated rough cars with other
-seeds than those of the figures. A quantity with little excitation is drawn to its usual value
+seeds than those of the figures. A quantity with little excitation is shrunk towards its usual value
 (USUAL): value and standard deviation are those of the posterior.
 """
 
@@ -166,8 +166,8 @@ def _posterior_of(
     """Return the posterior mean and standard deviation of a quantity from the estimates of drives
     (n,).
 
-    `unknown` is the standard deviation that the best drive leaves; such estimates are drawn to what
-    is usual already.
+    `unknown` is the standard deviation after the best drive; if it is given, the estimates have
+    already been shrunk towards the usual value.
     """
     sound = SOUND.get(kind, 0.0)
     centre = float(np.median(values))

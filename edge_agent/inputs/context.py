@@ -1,5 +1,5 @@
-"""Context signals: what controllers and surroundings say, from the readings of a source to the rows
-of a log.
+"""Context signals: flags of controllers and state of the surroundings, from the readings of a
+source to the rows of a log.
 
 A flag or a temperature is not interpolated. A row has the last reading at or before its time, as
 long as that is not older than HELD_S; a channel that the profile calls `lasting` is sent when it

@@ -23,9 +23,9 @@ TURNING = (S.OMEGA, S.OMEGA + 4)
 class Corrector:
     """Correction of one vehicle's signals by its calibration; blocks may be cut anywhere.
 
-    Devices that speak early wait for the latest one: of each the reading is taken that is nearest
-    to the moment that the latest tells of, as it came. So a row is of a moment up to a tenth of a
-    second before its time.
+    Early devices are delayed to match the latest one: of each, the reading nearest to the moment
+    that the latest device describes is used, without interpolation. A row therefore describes a
+    moment up to a tenth of a second before its time.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -49,7 +49,7 @@ class Corrector:
         )
 
     def _wait_for_latest(self, t: FloatArray, signals: FloatArray) -> FloatArray:
-        """Return signals of one moment each: devices that speak early wait for the latest."""
+        """Return signals of one moment per row, with early devices delayed to match the latest."""
         times = np.concatenate([self._t, t])
         rows = np.concatenate([self._rows, signals])
         together = signals.copy()
@@ -81,7 +81,7 @@ def scale_axles(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
     """Return signals (T, 18) of wheels that all have `wheel_radius`: speed at the rim and force on
     the road stay.
 
-    The same array where the vehicle file gives no axle a radius of its own.
+    Return the same array if the vehicle file has no radius per axle.
     """
     for axle in range(2):
         share = vehicle.axle_radius(axle) / vehicle.wheel_radius
@@ -99,7 +99,7 @@ def free_rear_wheels(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
     the yaw rate.
 
     Wheels of a locked axle turn alike, so that each slips by half the track times the yaw rate in
-    every turn. That slip tells nothing of the force that the axle transmits as a whole.
+    every turn. That slip contains no information on the total force of the axle.
     """
     signals = signals.copy()
     half = 0.5 * vehicle.track_rear * signals[..., S.YAW_RATE] / vehicle.wheel_radius

@@ -92,7 +92,7 @@ class Channel(Part):
 
     @property
     def gates(self) -> dict[str, list[float]]:
-        """Whole names of the signals that vouch for it."""
+        """Full names of the signals that must be valid for it."""
         return {self.full_name(name): values for name, values in self.valid.items()}
 
     def full_name(self, name: str) -> str:

@@ -47,7 +47,8 @@ class Recording:
 
 @contextmanager
 def foreign_errors(path: Path, kind: str) -> Iterator[None]:
-    """Turn whatever a library raises over a broken file into one line that names it.
+    """Turn any exception that a library raises on a broken file into an error of one line that
+    names the file.
 
     Raises:
         InputError: the file cannot be read as `kind`.

@@ -3,10 +3,9 @@
 Needed columns: `t` [s] or `timestamp`; ax, ay, yaw_rate; the four omega; delta_fl or delta_fr. Each
 of them must hold at least one reading. The other channels may be missing, and NaN or null is a
 missing reading anywhere. A front wheel whose steering angle has no column takes that of the other;
-rear wheels without a column do not steer. What controllers and surroundings say
-(`schemas.signals.CONTEXT`) may be there too. `timestamp` is an Arrow timestamp, or a number:
-integer ns since 1970 UTC, float s since 1970 UTC. Time may stand still (the estimator says so in
-`health`) but not go back.
+rear wheels without a column do not steer. Context signals (`schemas.signals.CONTEXT`) are optional.
+`timestamp` is an Arrow timestamp, or a number: integer ns since 1970 UTC, float s since 1970 UTC.
+Time may stand still (the estimator reports this in `health`) but not go back.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ class Publisher:
 
     @property
     def unanswered_s(self) -> float:
-        """Time for which nothing sent was answered [s]."""
+        """Time [s] for which sent batches have been without an answer."""
         return self._outbox.unanswered_s(self._clock())
 
     @property

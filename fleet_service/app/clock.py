@@ -116,7 +116,8 @@ class SteadyClock:
             self._confirmed = True
 
     def lag(self) -> int:
-        """Return how far the wall clock is behind [ns], or ahead if negative: the size of a jump
-        that is not followed."""
+        """Return the lag of the wall clock [ns], negative if it is ahead: the size of a jump that
+        is not followed.
+        """
         now = self.now()
         return max(now, self._seen if self._seen > now else now) - self._wall()

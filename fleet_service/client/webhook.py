@@ -2,8 +2,8 @@
 
 Every receiver of Alertmanager webhooks accepts them: paging services, chat bridges, scripts.
 Delivery is at least once and in order. A message leaves the queue only after a 2xx answer within
-TIMEOUT_S. Redirects are not followed, because a POST would become an empty GET. Whatever is not
-delivered is counted and reported.
+TIMEOUT_S. Redirects are not followed, because a POST would become an empty GET. Messages that are
+not delivered are counted and reported.
 """
 
 from __future__ import annotations

@@ -91,8 +91,8 @@ def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Sec
 
 
 def rate_caps(fleet: Enrolment, name: str) -> list[Section]:
-    """Return the caps on messages of one session at router `name`, so that a flooding vehicle slows
-    down nobody else.
+    """Return the caps on messages of one session at router `name`, so that a flooding vehicle does
+    not slow down others.
 
     Zenoh counts per session and rule, and cannot tell a vehicle from a router. A session of another
     router carries many vehicles and must not be capped. Routers reach each other over TLS only, so

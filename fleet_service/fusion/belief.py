@@ -106,7 +106,7 @@ def quantiles(belief: FloatArray, levels: tuple[float, ...]) -> FloatArray:
 
 @refcount_free_inlined
 def sum_bins(p: Bins) -> float:
-    """Sum of 32 numbers, in eight strands: a single one waits for itself."""
+    """Return the sum of 32 numbers, with eight independent sums that need not wait for each other."""
     a = p[0]
     b = p[1]
     d = p[2]

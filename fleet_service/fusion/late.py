@@ -9,8 +9,8 @@ the road at the checkpoint, given a measurement at time t before it, is
 
 If no other vehicle visited the cell meanwhile, the result equals that of an observation in time.
 Otherwise the late visit counts in addition to the others, as an old report about the road now. Late
-visits stand in the window like all others, the newest first. So the newest of a vehicle's own
-visits counts, and the order of arrival between two checkpoints does not matter.
+visits enter the window like all others, the newest first. So the newest of a vehicle's own visits
+counts, and the order of arrival between two checkpoints does not matter.
 """
 
 from __future__ import annotations

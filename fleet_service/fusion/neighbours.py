@@ -28,7 +28,7 @@ Legend
     b      belief about the cell from its own reports                                     (32,)
     n      belief about the road of a neighbour, by its own reports                       (32,)
     s      P(slippery) of n
-    p₀     prior of a road of the region that nobody measured                             (32,)
+    p₀     prior of an unmeasured road of the region                                      (32,)
     K      shared kernel, see `shared`                                                    (32, 32)
     d      cells from one to the other; 1 to the other direction's
 """

@@ -93,9 +93,9 @@ class Shape(NamedTuple):
         """Return the slope that an alarm has to doubt: the upper end of its one-sided 95 %
         interval.
 
-        A service that knows nobody doubts .5, and one that knows its fleet little more than a
-        reader. With .5 for all, .044 of the icy cell-minutes of a clean fleet had no alert, with
-        this .010 (tuning).
+        A new service assumes .5; a service that knows its fleet assumes little more than a reader.
+        With .5 for all, .044 of the icy cell-minutes of a clean fleet had no alert, with this .010
+        (tuning).
         """
         return self.reader + Z_95 * self.std
 

@@ -42,5 +42,5 @@ class Standing(NamedTuple):
 
 
 def first_standing(initial: float) -> Standing:
-    """Return the standing in a service that knows nobody."""
+    """Return the standing in a service that knows no vehicle."""
     return Standing(-1, np.zeros(0, np.float32), initial, np.zeros(0, np.bool_))

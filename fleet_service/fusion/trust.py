@@ -201,8 +201,8 @@ def compute_standing(
     """Return the standing of the vehicles (V,) from an epoch on, from their meetings and the
     standing of the vehicles they met, `before`.
 
-    In an established service, a vehicle that has met few trusted vehicles is a newcomer. Where only
-    `enrolled` vehicles are fused nobody can take a new name, and there are no newcomers.
+    In an established service, a vehicle that has met few trusted vehicles is a newcomer. If only
+    `enrolled` vehicles are fused, no vehicle can take a new name, so there are no newcomers.
     """
     weight = np.empty(len(before.weight), np.float32)
     established = _update_weights(peers, before.weight, weight, enrolled)
@@ -260,7 +260,7 @@ def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:
     and its error.
 
     From differences of single vehicles with themselves, in which an error common to value and use
-    cancels. λ corrects no value; it says how much doubt upwards a gentle value bears
+    cancels. λ corrects no value; it determines how far a gentle value's interval is widened upwards
     (`shared.Shape`).
     """
     vehicles = len(weight)

@@ -283,7 +283,7 @@ def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
 
 @refcount_free_inlined
 def _remembered_parts(seconds: float) -> np.uint16:
-    """Time that is not forgotten yet in parts of 1/AGED; it counts below FORGET_S only."""
+    """Return a time, at most FORGET_S, as an integer in units of 1/AGED."""
     return np.uint16(min(seconds, c.FORGET_S) * AGED + 0.5)
 
 

@@ -1,5 +1,5 @@
 """Influence of the weather on forgetting: how fast a region's roads age, and the prior belief about
-a road that nobody measured.
+an unmeasured road.
 
 Roads of a region without weather reports age by the clock. A report holds from its time on, until
 the next one or for VALID_S. Pure; the ageing is compiled.
@@ -74,7 +74,7 @@ class Weather(NamedTuple):
         time: (m,) from which a row acts [ns].
         clock: (m, 2) τ_d and τ_c at that time [s].
         rate: (m, 2) at which they run from then on.
-        prior: (m, 32) belief about a road that nobody measured; uniform in row 0.
+        prior: (m, 32) belief about an unmeasured road; uniform in row 0.
     """
 
     region: IntArray

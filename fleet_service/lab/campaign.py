@@ -57,7 +57,7 @@ def run(
 
     Args:
         folder: is made.
-        quick: one seed, to see that everything works; says nothing about the bars.
+        quick: one seed, to check that everything runs; too little to judge the bars.
         drives: end to end; without one, its figures are missing.
         log_line: gets progress lines.
         only: name of one part and nothing else; figures that it does not measure are not listed.

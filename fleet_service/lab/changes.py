@@ -40,7 +40,7 @@ def detection_delays(rng: Generator, before: float, after: float) -> IntArray:
     shows the change.
 
     Ice is seen when P(μ < .4) > .9; its end, when P(μ < .4) < .1, which ends an alert. A pass is
-    one excited visit that the map heard of the cell, whether or not it was the right cell.
+    one excited visit that was reported for the cell, correctly or not.
     """
     place = changing_town(rng, before, after)
     visits = town.drive_fleet(rng, place, Errors.draw(rng, VEHICLES), MINUTES)

@@ -85,8 +85,8 @@ def replay_difference(rng: Generator) -> float:
 
 
 def upper_shift(rng: Generator) -> float:
-    """Return by how much an upper end falls at most below the prior's, over the numbers of vehicles
-    in UNEXCITED and all surfaces.
+    """Return the largest difference between the prior's upper end and that of unexcited visits,
+    over the numbers of vehicles in UNEXCITED and all surfaces.
     """
     prior = float(mugrid.quantiles(mugrid.PRIOR, 0.95))
     worst = -np.inf

@@ -107,7 +107,9 @@ def _hourly_reports(known: WeatherSince) -> Reports:
 
 
 def format_table(values: Mapping[str, float]) -> str:
-    """Lower end, and the deceleration [m/s²] that it bears, by weather and time."""
+    """Return a table of the lower end, and of the deceleration [m/s²] that it allows, by weather
+    and time.
+    """
     times = [f"{minutes} min" if minutes < 60 else f"{minutes // 60} h" for minutes in AFTER_MIN]
     lines = [
         f"| weather | {' | '.join(['at once', *times[1:]])} |",

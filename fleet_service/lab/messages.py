@@ -1,4 +1,4 @@
-"""Visits as the messages that the service would hear, so that admission judges them as in life."""
+"""Visits encoded as messages for the service, so that they pass the real admission."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def name_of(vehicle: int) -> str:
 
 
 def clock_of(seconds: float) -> int:
-    """Time of the service [ns] so long after the start."""
+    """Return the time of the service [ns] at so many seconds after the start."""
     return START + int(seconds * NS) + NS
 
 

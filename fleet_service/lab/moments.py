@@ -1,9 +1,9 @@
 """Whole ways with the real estimator, judged while they go on: after one, six and thirty minutes,
 the worst of all.
 
-A map that is right after a minute may become too sure of what all vehicles err in alike, and one
-that is right after half an hour may have said too much in the first minute. So each way is asked at
-MOMENTS, and what counts is the worst.
+A map that is calibrated after a minute may later become overconfident about errors that all
+vehicles share, and one that is calibrated after half an hour may have been overconfident in the
+first minute. So each way is asked at MOMENTS, and what counts is the worst.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ def moment_figures(ways: Sequence[Sequence[AskedWay]], prefix: str) -> dict[str,
     """Return the figures of ways (≥ 10 for a judgement): of each moment the mean, the worst and the
     spread over them.
 
-    Error and coverage are of measured cells: a cell that nobody tested reaches to the grid's end,
-    so that it covers.
+    Error and coverage are of measured cells: the interval of an untested cell reaches to the grid's
+    end, so that it covers the truth.
     """
     out: dict[str, float] = {f"{prefix}.ways": float(len(ways))}
     for k, seconds in enumerate(MOMENTS[: min(map(len, ways))]):

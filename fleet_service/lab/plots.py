@@ -1,6 +1,4 @@
-"""Plots of the campaign, made from its figures and from nothing else. Needs matplotlib (the
-`demo` extra).
-"""
+"""Plots of the campaign, generated from its figures alone. Needs matplotlib (the `demo` extra)."""
 
 from __future__ import annotations
 

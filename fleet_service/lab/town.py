@@ -1,8 +1,8 @@
 """A town of roads, cell behind cell, their friction in time, and who drives where and when. Pure.
 
 Every road has stretches of one surface; most passes are unexcited, and where drivers brake or steer
-is a property of the place: a few cells hear many excited vehicles, most hear hardly any. Where all
-do the same they share an error. Fixes are noisy, so that a visit is sometimes reported of the cell
+is a property of the place: a few cells get many excited visits, most get hardly any. Where all do
+the same they share an error. Fixes are noisy, so that a visit is sometimes reported of the cell
 before or behind.
 """
 
@@ -134,7 +134,7 @@ def drive_fleet(
     """Let a fleet drive: each vehicle passes a whole road every minute on average, at random times.
 
     Until the minute `acquainted` only the first half of the roads are driven, from then on the
-    other half, if it is not nought: then vehicles know each other, and nobody knows the roads.
+    other half, if it is not nought: then the service knows the vehicles, but not these roads.
     """
     vehicles = len(errors.slope)
     model = errors.model

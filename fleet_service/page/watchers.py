@@ -1,4 +1,5 @@
-"""Server-sent events to browsers: each has a view and a short queue; a slow one is told to reload.
+"""Server-sent events to browsers: each has a view and a short queue; a slow one gets a request to
+reload.
 
 tiles    blocks in base64, one per line: changed cells, or a complete tile when zoomed out
 alerts   all standing stretches

@@ -42,7 +42,7 @@ class Alerts:
 
     Args:
         fusion: owner of the cells.
-        idle_roads: limit on alerts where nobody but the witnesses drives; None for no limit, in
+        idle_roads: limit on alerts on roads where only the witnesses drive; None for no limit, in
             simulations.
         is_private: True if times and numbers of vehicles are given in steps.
     """

@@ -1,4 +1,4 @@
-"""Limit on alerts that two vehicles raise alone on roads where nobody else drives. Pure.
+"""Limit on alerts that two vehicles raise alone on roads without other vehicles. Pure.
 
 Two enrolled vehicles that agree can report ice anywhere, on a path that is plausible. On a road
 with other traffic the others contradict them. On a road that no third vehicle ever reported nobody

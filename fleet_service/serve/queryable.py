@@ -4,11 +4,12 @@ their own, tile by tile.
 Zenoh queries are anonymous, so per-client limits are impossible. Queries are scheduled by estimated
 cost instead. The next tile always belongs to the query that would have ended first on an idle
 service (`_Heavy.rank`). A small query therefore overtakes a large earlier one, and a stream of
-small ones cannot starve a large one. If too many wait, the most expensive one is told to come
-again. Cheap answers together take at most LIGHT_PER_S; beyond that they are treated as expensive
-ones, smallest first. After each tile of an expensive answer the thread rests as long as the tile
-took. A query beyond the size limit is an error with a hint. One past map is rebuilt at a time, in a
-separate process; a few such queries wait for their turn, and more are told to come again.
+small ones cannot starve a large one. If too many wait, the most expensive one gets an error that
+asks it to retry. Cheap answers together take at most LIGHT_PER_S; beyond that they are treated as
+expensive ones, smallest first. After each tile of an expensive answer the thread rests as long as
+the tile took. A query beyond the size limit is an error with a hint. One past map is rebuilt at a
+time, in a separate process; a few such queries wait for their turn, and further ones get an error
+that asks them to retry.
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ def join_views(*views: CellView) -> CellView:
 def is_measured(
     lower: FloatArray, upper: FloatArray, values: Float32Array, p_slippery: FloatArray
 ) -> BoolArray:
-    """Return True for beliefs that say more than a lower bound, (k,).
+    """Return True for beliefs that contain more than a lower bound, (k,).
 
     A belief that calls the road slippery always does, wherever it came from: values of the other
     headings lower it too, and ice that is known must never be shown as unknown.

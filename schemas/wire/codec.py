@@ -276,7 +276,7 @@ def encode_standing(alerts: Sequence[Alert]) -> bytes:
 
 
 def decode_standing(payload: bytes) -> list[Alert]:
-    """Read the alerts that stand in a tile.
+    """Return the active alerts in the bytes of a tile's message.
 
     Raises:
         WireError: no StandingAlerts.

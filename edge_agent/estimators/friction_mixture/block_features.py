@@ -299,8 +299,8 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
 def wheel_speed_jump(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures, wheel: int
 ) -> float:
-    """Return how far a wheel is from its smoothed speed, advanced by the car's acceleration [m/s];
-    0 where it is unknown.
+    """Return the difference between a wheel's speed and its smoothed speed, advanced by the car's
+    acceleration [m/s]; 0 where it is unknown.
 
     A wheel that spins up or locks stays away for some blocks; a bump is over within one or two.
     """

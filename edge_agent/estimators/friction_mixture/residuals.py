@@ -136,8 +136,8 @@ def find_slips(
 
 @compiled
 def steering_offset(x: FloatArray, features: BlockFeatures) -> float:
-    """Return by how much the front wheels point farther left than measured [rad], with state x
-    (n,).
+    """Return the true minus the measured angle of the front wheels [rad], positive to the left,
+    with state x (n,).
 
     The front axle yields to its own side force: steering column and bushings of production cars
     yield up to 35 mrad/g.

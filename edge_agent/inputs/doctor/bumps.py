@@ -28,8 +28,8 @@ CLIPPED: Final = 3.0  # standard deviations beyond which a reading is a pothole 
 
 
 def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
-    """Return 1 if the front channels meet bumps first, -1 if the rear ones do, 0 where the road
-    does not tell.
+    """Return 1 if the front channels meet bumps first, -1 if the rear ones do, 0 if the road does
+    not show it.
 
     t are times (T,) [s], signals (T, 18).
     """

@@ -2,8 +2,8 @@
 order.
 
 A channel is sound when an identity that was excited enough holds it and no fault explains the drive
-nearly as well; it is unknown when nothing was said of it. Only a log whose channels are all sound
-has passed.
+nearly as well; it is unknown if no finding mentions it. Only a log whose channels are all sound has
+passed.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ EXCHANGED: Final = {
 
 
 def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
-    """Return the lags [s] by device that are no fault, but more than the filter bears."""
+    """Return the lags [s] by device that are no fault, but too large for the filter."""
     if any(finding.kind == "clock" for finding in diagnosis.findings):
         return {}
     return {name: lag for name, lag in late_devices(diagnosis).items() if abs(lag) > FILTER_BEARS_S}

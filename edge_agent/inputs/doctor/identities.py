@@ -68,12 +68,12 @@ NOTHING: Final = Fit(np.nan, np.nan, 0.0, np.inf, 0.0, 0.0, np.inf, np.zeros(0),
 
 
 class Relation(NamedTuple):
-    """The two sides `left` and `right` (n,) of an identity, with further terms.
+    """Terms of an identity: left = gain · right + offset + Σ k · term, each (n,).
 
-    The left side may have further terms. If the offset is not constant, it is multiplied by `per`
-    (n,). If `bend` (n,) is given, the left side also has an unknown share of right · bend: at
-    one speed, understeer cannot be separated from a gain of the steering. `loose` are prior
-    standard deviations of the gains of the last further terms, for the same reason.
+    If `per` is given, the offset is multiplied by it and therefore not constant. If `bend` (n,) is
+    given, the left side also has an unknown share of right · bend: at one speed, understeer cannot
+    be separated from a gain of the steering. `loose` are prior standard deviations of the gains of
+    the last further terms, for the same reason.
     """
 
     left: FloatArray

@@ -1,6 +1,4 @@
-"""Where the receiver says the car is, and where it points: latitude and longitude exchanged, a
-compass for yaw.
-"""
+"""Faults of position and heading: latitude and longitude exchanged, a compass angle as yaw."""
 
 from __future__ import annotations
 
@@ -52,7 +50,7 @@ def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
 
 
 def _total_turn(angle: FloatArray) -> float:
-    """Return how far an angle (n,) goes [rad], but for its ends."""
+    """Return the range of an angle (n,) [rad] from its 5 % to its 95 % quantile, unwrapped."""
     unwrapped = np.unwrap(angle)
     return float(np.percentile(unwrapped, 95) - np.percentile(unwrapped, 5))
 

@@ -48,8 +48,8 @@ class Member(NamedTuple):
 
 
 class Law(NamedTuple):
-    """An identity's gain if all is sound, the spread of its logarithm among sound cars, and what
-    it holds.
+    """Expected gain of an identity without faults, the spread of its logarithm among such cars, and
+    the quantities in it.
     """
 
     centre: float

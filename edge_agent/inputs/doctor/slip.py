@@ -1,4 +1,4 @@
-"""Evidence of slip and of constancy: what tells a wheel that slides from a sensor that is wrong."""
+"""Evidence of slip and of constancy: how to distinguish a sliding wheel from a faulty sensor."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:
 
 
 def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float) -> bool:
-    """Return True if a wheel has nothing to do with the other three (n, 3), which agree: nobody
+    """Return True if a wheel has nothing to do with the other three (n, 3), which agree: no wheel
     spins for that long.
     """
     agree = np.ptp(rest, axis=1) < 0.1 * np.abs(others) + 0.02 * fast
@@ -67,7 +67,7 @@ def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
     """Return the axles whose left and right wheels are exchanged, though the other axle's are not:
     name and wheels.
 
-    With both exchanged the axles agree, and the identity of the axles tells it.
+    With both exchanged the axles agree, and the identity of the axles shows it.
     """
 
     def yaw_likeness(yaw: FloatArray) -> float:
@@ -99,7 +99,7 @@ def find_locked_axles(drive: EvenDrive) -> list[str]:
     """Return the axles whose wheels turn as one, "front" or "rear": a locked differential, or one
     sensor for both.
 
-    The other axle follows the yaw rate. A wheel speed of a locked axle tells the mean of both; a
+    The other axle follows the yaw rate. A wheel speed of a locked axle is the mean of both; a
     filter that takes the difference for slip reads a slide in every tight turn.
     """
     locked = []
@@ -124,7 +124,7 @@ def find_locked_axles(drive: EvenDrive) -> list[str]:
 
 
 def find_followed(drive: EvenDrive) -> BoolArray:
-    """Return where the car goes as it is steered, (n,): it does not slide there, whatever the
+    """Return True where the car follows its steering, (n,): it does not slide there, whatever the
     road.
     """
     fast = np.maximum(np.abs(drive.v), 1.0)
@@ -153,8 +153,8 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
 
 
 def spread_of_parts(beside: FloatArray) -> float:
-    """Return by how much the parts of a drive differ in what should be constant: a tilt is in
-    all, a slide is not.
+    """Return the spread over the parts of a drive of quantities that should be constant: a tilt is
+    in all, a slide is not.
     """
     parts = [
         float(np.nanmedian(part))

@@ -174,7 +174,7 @@ def type_of(key: str) -> str:
     """Return the message type in a key: `sensor_msgs::msg::dds_::Imu_` is sensor_msgs/msg/Imu.
 
     Raises:
-        ValueError: it tells none.
+        ValueError: it contains none.
     """
     place, mark, name = key.split("/")[-2].partition(DDS)
     if not mark or not name.endswith("_"):

@@ -53,7 +53,7 @@ class LiveRows:
         wait: sleeps so many seconds.
 
     Raises:
-        InputError: the profile reads the steering wheel, and nobody says its ratio.
+        InputError: the profile reads the steering wheel, and its ratio is not given.
     """
 
     def __init__(

@@ -31,7 +31,7 @@ def is_gvret(path: Path) -> bool:
 
 
 def is_bare_trace(path: Path) -> bool:
-    """Return True if a PCAN trace does not say its version."""
+    """Return True if a PCAN trace does not state its version."""
     with path.open("rb") as file:
         head = file.read(65_536).decode("utf-8", errors="replace")
     return "$FILEVERSION" not in head

@@ -44,7 +44,7 @@ def places_of(scenario: Scenario, t: float) -> KnownPlaces:
 def map_of_places(
     places: KnownPlaces, now: int, rng: np.random.Generator | None = None
 ) -> LocalMap:
-    """Return the local map of a car that has heard of all places, with their true friction or with
+    """Return the local map of a car that has received all places, with their true friction or with
     random errors.
     """
     off = np.zeros(len(places.key)) if rng is None else rng.normal(0.0, SPREAD, len(places.key))

@@ -146,9 +146,7 @@ def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
 
 
 def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTally:
-    """Return everything that one town tells; `oracle`: ask the oracle about excited visits to
-    ice too.
-    """
+    """Return all results of one town; `oracle`: ask the oracle about excited visits to ice too."""
     tally = DetectionTally()
     _judge_samples(tally, drive)
     for n in range(drive.mu.shape[1]):

@@ -206,9 +206,7 @@ def _samples_of(
 
 
 def _bytes_of(column: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Return the likelihood bytes of visits, (V, 32); flat where the estimator tells no
-    evidence.
-    """
+    """Return the likelihood bytes of visits, (V, 32); flat if the estimator reports no evidence."""
     found = np.asarray(column, dtype=np.uint8)
     return found if found.shape[1] else np.zeros((len(found), mugrid.BINS), np.uint8)
 

@@ -1,10 +1,9 @@
 """Reliability: how often the truth lies below each stated quantile of friction, at LEVELS.
 
-An estimates file tells three quantiles. An estimator that tells the evidence of a visit tells more:
-a visit that has lasted since the start begins at the uniform prior, so its likelihood on the
-friction grid is the whole posterior. It is asked of a copy of the bank, so that the drive itself
-goes on as if nobody had asked. Other estimators are Gaussian between their quantiles, or tell the
-prior.
+An estimates file contains three quantiles. An estimator that reports the evidence of a visit gives
+more: a visit that has lasted since the start begins at the uniform prior, so its likelihood on the
+friction grid is the whole posterior. It is taken from a copy of the bank, so that the drive itself
+is not affected. Other estimators are Gaussian between their quantiles, or report the prior.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Worth of the fuzzy sets and of the ant colony: interval scores on rough drives that nobody tuned
-on.
+"""Worth of the fuzzy sets and of the ant colony: interval scores on rough drives that were not used
+for tuning.
 
 Legend, all scores less is better
     fuzzy        the default as it comes, with all of its rules and the shipped vertices

@@ -122,7 +122,7 @@ def count_lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
     """Return the number of samples lost between a source and the rows, and the number of samples
     sent.
 
-    Lost are messages that were not heard, and readings that came after their row.
+    A sample is lost if its message was not received, or if its reading came after its row.
     """
     samples = round(seconds * RATE_HZ)
     place, source = peer_addresses(kind)

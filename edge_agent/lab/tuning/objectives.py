@@ -110,9 +110,7 @@ class TuningSet:
 
 @dataclass(frozen=True)
 class TuningScores:
-    """Scores of memberships on drives; the first two are NaN where nobody knows the true
-    friction.
-    """
+    """Scores of memberships on drives; the first two are NaN if the true friction is unknown."""
 
     interval_score: float  # less is better [1]
     coverage: float  # share of samples whose truth lies in the 90 % interval [1]

@@ -50,8 +50,8 @@ class Wanted(NamedTuple):
     box: tuple[float, float, float, float] | None = None
 
     def newer(self, path: Path) -> bool:
-        """Return True if a segment, or a file named by its newest segment, was written after the
-        position.
+        """Return True if a file was written after the position `after`: a segment, or a compacted
+        file, whose name contains its newest segment.
         """
         return self.after is None or layout.age_key(path.name)[:2] > self.after
 

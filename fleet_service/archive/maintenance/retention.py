@@ -1,7 +1,7 @@
-"""Removal of data: raw rows after a number of days, when their roll-ups stay; and the rows of one
+"""Removal of data: raw rows after a number of days (their roll-ups stay), and all rows of one
 vehicle.
 
-Only these two rewrite or remove compacted files, one file for one.
+Only these two operations remove a compacted file or replace it with a new one.
 """
 
 from __future__ import annotations

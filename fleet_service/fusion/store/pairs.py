@@ -31,7 +31,7 @@ def comes_before(entries: RecordArray, a: int, b: int) -> bool:
 
 @refcount_free_inlined
 def pair_of(pairs: RecordArray, used: IntArray, slot: int, vehicle: int) -> int:
-    """Place of a pair; makes it where there is none."""
+    """Return the place of a pair; create the pair if there is none."""
     pair = pair_place(pairs, slot, vehicle)
     if pairs[pair].slot == NONE:
         pairs[pair].slot = slot

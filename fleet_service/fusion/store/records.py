@@ -51,7 +51,7 @@ class CellRecord:
         time: last observation that is in the belief [ns]; 0 before the first.
         first: first one [ns].
         returned: a bit for each remainder of the vehicles whose visits were forgotten, so that a
-            vehicle that comes back is not counted as another.
+            returning vehicle is not counted twice.
         visits: observations.
         vehicles: distinct vehicles.
         values: votes with a value, fractions of repeated ones summed.

@@ -147,11 +147,11 @@ class Store:
         return slots
 
     def known(self, vehicle: IntArray) -> IntArray:
-        """Index of each vehicle, NONE for an unknown one."""
+        """Return the index of each vehicle, NONE for an unknown one."""
         return rows_of(self._known, self.names, vehicle)
 
     def vehicles_of(self, vehicle: IntArray) -> IntArray:
-        """Index of each vehicle; an unknown one gets the next."""
+        """Return the index of each vehicle; an unknown one gets the next index."""
         index = self.known(vehicle)
         if not len(index) or index.min() != NONE:
             return index

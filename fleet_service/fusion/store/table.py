@@ -31,8 +31,8 @@ AHEAD: Final = 128
 
 @refcount_free_inlined
 def _hash_key(key: int | np.int64) -> np.uint64:
-    """Hash of a key: mixing steps of the splitmix64 generator, so that every bit of it moves
-    all.
+    """Return the hash of a key: mixing steps of the splitmix64 generator, so that every bit of it
+    moves all.
     """
     h = np.uint64(key)
     h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -60,7 +60,7 @@ def _place_content(mixed: np.uint64, row: int) -> int:
 
 @refcount_free_inlined
 def locate_key(table: IntArray, rows: RecordArray, key: int) -> int:
-    """Place of the row with `key`, or the free place where it belongs."""
+    """Return the place of the row with `key`, or the free place where it belongs."""
     mixed = _hash_key(key)
     place = _first_place(mixed, len(table))
     tag = np.int64(mixed & np.uint64(_TAG))
@@ -144,8 +144,8 @@ def first_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
 
 @refcount_free_inlined
 def pair_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
-    """Place of a pair in a table that holds the pairs themselves, or the free place (slot NONE)
-    where it belongs.
+    """Return the place of a pair in a table that holds the pairs themselves, or the free place
+    (slot NONE) where it belongs.
     """
     place = first_place(pairs, slot, vehicle)
     while pairs[place].slot != NONE and (
@@ -170,5 +170,5 @@ def places_for(entries: int, most: float) -> int:
 
 
 def is_full(entries: int, places: int, most: float) -> bool:
-    """Return True if so many entries are more than a share `most` of the places."""
+    """Return True if the entries fill more than a share `most` of the places."""
     return entries > most * places
