@@ -339,7 +339,7 @@ def archive_counts(archive: Path) -> tuple[int, int, int]:
 
 
 def start_time(visits: pa.Table) -> int:
-    """Return when the first vehicle moved [ns]."""
+    """Return the time of the first visit of any vehicle [ns]."""
     return int(visits["enter_time"].cast(pa.int64()).to_numpy().min())
 
 

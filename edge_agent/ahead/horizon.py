@@ -109,7 +109,7 @@ def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
 
 
 def justifies_warning(found: PlaceBelief) -> BoolArray:
-    """Return which places (n,) are slippery and certain enough for a warning."""
+    """Return True for places (n,) that are slippery and certain enough for a warning."""
     firm = (
         (found.basis == MEASURED)
         & (found.p_slippery >= WARN_ABOVE)

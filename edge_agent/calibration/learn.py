@@ -243,7 +243,9 @@ def trace_steering(drive: EvenDrive) -> DriveEstimates:
 
 
 def _estimate_radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
-    """Return how much faster each wheel turns than the mean of the four, but for yaw and slip."""
+    """Return the relative excess of each wheel's speed over the mean of the four, corrected for yaw
+    and slip.
+    """
     calm = (
         (drive.moving > 0) & (np.abs(drive.v_dot) < CALM) & (np.abs(drive.v * drive.r) < STRAIGHT)
     )

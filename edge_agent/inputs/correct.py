@@ -124,8 +124,8 @@ def _correct_signals(signals: FloatArray, known: Calibration) -> FloatArray:
 
 
 def _device_waits(known: Calibration | None) -> dict[tuple[int, int], float]:
-    """Return how long the readings of a device's channels wait for the latest device [s]; the
-    latest is left out.
+    """Return the delay [s] to add to the channels of each device to match the latest device, which
+    is left out.
     """
     if known is None or (known.wheel_lag is None and known.steer_lag is None):
         return {}

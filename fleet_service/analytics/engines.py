@@ -150,8 +150,8 @@ class QueryEngine:
 
 
 def has_value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
-    """Return which rows give a value of mu and not only a bound: they used EXCITED_SHARE of it (see
-    the contract).
+    """Return True for rows that give a value of mu and not only a bound: their vehicles used
+    EXCITED_SHARE of it (see the contract).
 
     NaN is larger than any number in both engines, so it is checked explicitly.
     """

@@ -131,8 +131,9 @@ class Intake:
         return raised
 
     def _excluded_from_fusion(self, rows: Rows) -> BoolArray:
-        """Return which rows are archived and not fused: their vehicle cannot be there, or reports
-        too many new places. A publisher is no vehicle and has no path."""
+        """Return True for rows that are archived and not fused: their vehicle cannot be there, or
+        it reports too many new places. A publisher is no vehicle and has no path.
+        """
         witness = rows["witness"]
         beyond = np.zeros(len(witness), bool)
         publishers = [self.batches.witness_of(name) for name in self._config.publishers]

@@ -68,7 +68,7 @@ class Settlement:
 
     @property
     def hangs_s(self) -> float:
-        """Return how long the current segment has been written [s]."""
+        """Return the time [s] since the write of the current segment began; 0 if none is written."""
         return self._log.hangs_s
 
     @property

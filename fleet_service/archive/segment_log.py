@@ -85,7 +85,7 @@ class SegmentLog(Generic[Batch]):
 
     @property
     def hangs_s(self) -> float:
-        """Return how long the current write has taken so far [s]."""
+        """Return the time [s] since the current write began; 0 without one."""
         return (
             0.0 if self._written is None or self._written.done() else time.monotonic() - self._begun
         )

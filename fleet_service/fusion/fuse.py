@@ -261,8 +261,8 @@ class Fusion:
         return np.where(index < 0, self.store.vehicles, index)
 
     def sources(self, slots: IntArray, side: int, since: IntArray | int) -> IntArray:
-        """Return when corroborating sources of slots (k,) reported, the newest first, (k, SOURCES)
-        [ns].
+        """Return the report times of the corroborating sources of slots (k,), newest first, (k,
+        SOURCES) [ns].
 
         A source is a vehicle, still trusted, that reported GRIP or ICE there after `since` [ns]. At
         most SOURCES are remembered; 0 stands for none.

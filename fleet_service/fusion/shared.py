@@ -150,7 +150,7 @@ KERNELS: Final = tuple(_kernel_table(slope) for slope in SHAPES)
 
 
 def shape_class(slope: float) -> int:
-    """Return which of SHAPES is nearest to a doubted slope."""
+    """Return the index in SHAPES of the value nearest to a slope."""
     away = [abs(shape - slope) for shape in SHAPES]
     return away.index(min(away))
 

@@ -34,7 +34,7 @@ class Standing(NamedTuple):
         return np.asarray(known[np.minimum(vehicle, len(self.weight))])
 
     def heeds(self, vehicle: IntArray) -> BoolArray:
-        """Return whether the slip controllers of vehicles (n,) may support an alert; true of
+        """Return True for vehicles (n,) whose slip controllers may support an alert; also True for
         unknown vehicles.
         """
         known = np.append(self.heeded, True)

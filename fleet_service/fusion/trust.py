@@ -256,8 +256,8 @@ def heeded_flags(peers: RecordArray) -> BoolArray:
 
 
 def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:
-    """Return how much too low the fleet's values are for each μ that was left unused, λ in [0, 1],
-    and its error.
+    """Return the slope λ in [0, 1] by which the fleet's values are too low per unit of μ left
+    unused, and its error.
 
     From differences of single vehicles with themselves, in which an error common to value and use
     cancels. λ corrects no value; it determines how far a gentle value's interval is widened upwards

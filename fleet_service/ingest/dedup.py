@@ -132,8 +132,8 @@ class SequenceTrackers:
         return max((stream.newest for stream in self._streams.values()), default=0)
 
     def accepted(self, kind: Kind, names: IntArray) -> BoolArray:
-        """Return which batches were accepted: `names` is (n, 4) of vehicle, boot, region and
-        seq.
+        """Return True for batches that were accepted; `names` is (n, 4) of vehicle, boot, region
+        and seq.
         """
         get = self._streams.get
         found = (get((vehicle, boot, kind, region)) for vehicle, boot, region, _ in names.tolist())

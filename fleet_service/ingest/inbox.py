@@ -260,7 +260,9 @@ class BatchIntake:
                 del known[name]
 
     def _is_erased(self, owners: Sequence[Parsed], time: IntArray) -> BoolArray:
-        """Return which batches (n,) belong to an erased time, of all vehicles or of theirs."""
+        """Return True for batches (n,) in a time span that is erased for all vehicles or for their
+        vehicle.
+        """
         out = erasures.in_spans(self._erased.months, time)
         if self._erased.vehicles:
             for place in np.flatnonzero(~out).tolist():

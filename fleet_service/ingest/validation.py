@@ -202,8 +202,8 @@ TOO_LONG: Final = Refusal(
 
 
 def too_long(time: IntArray, sizes: IntArray) -> NDArray[np.bool_]:
-    """Return which batches span more than MAX_SPAN_NS: times (n,) of all rows [ns], rows of each
-    batch (k,).
+    """Return True for batches (k,) that span more than MAX_SPAN_NS, from the times of all rows (n,)
+    [ns] and the number of rows of each batch (k,).
     """
     if not len(time):
         return np.zeros(len(sizes), bool)

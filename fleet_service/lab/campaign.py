@@ -88,7 +88,9 @@ def run(
 
 
 def _is_listed(name: str, only: str | None, found: Mapping[str, float]) -> bool:
-    """Return whether a figure belongs to a run; end to end, its missing ones do as well."""
+    """Return True if a figure belongs to a run; in an end-to-end run also figures that were not
+    measured belong to it.
+    """
     if only == END_TO_END_PART:
         return name.startswith(END_TO_END)
     return only is None or name in found

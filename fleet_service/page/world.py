@@ -165,7 +165,7 @@ class MapMirror:
             return held.made[level]
 
     def version(self, tile: int) -> int:
-        """Return how often a tile has changed; 0 if it is unknown."""
+        """Return the number of changes of a tile; 0 if the tile is unknown."""
         with self._lock:
             return self._tiles[tile].version if tile in self._tiles else 0
 

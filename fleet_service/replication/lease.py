@@ -165,8 +165,8 @@ class Lease:
 
     @property
     def left_s(self) -> float:
-        """Return how long the content of the bucket may be acknowledged without a renewal [s]; 0
-        or less: not now.
+        """Return the time [s] for which the content of the bucket may be acknowledged without a
+        renewal; 0 or less if it may not.
         """
         return (
             0.0

@@ -56,8 +56,8 @@ class Ownership:
 
     @property
     def left_s(self) -> float:
-        """Return how long it may acknowledge without renewing the lease [s]; infinite without a
-        lease.
+        """Return the time [s] for which the service may acknowledge without renewing the lease;
+        infinite without a lease.
         """
         return math.inf if self.lease is None else self.lease.left_s
 

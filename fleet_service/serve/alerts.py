@@ -115,7 +115,7 @@ class Alerts:
         )
 
     def _have_witnesses(self, slots: IntArray, side: int, time: IntArray) -> BoolArray:
-        """Return whether slots (k,) have enough corroborating sources of a side at `time` (k,)
+        """Return True for slots (k,) with enough corroborating sources of a side at `time` (k,)
         [ns].
 
         The least number of them, and one more for each opposite source that is newer than the

@@ -133,7 +133,9 @@ class MapQueryable:
 
     @property
     def hangs_s(self) -> float:
-        """Return how long the current tile of an expensive answer has taken so far [s]."""
+        """Return the time [s] that the current tile of an expensive answer has taken; 0 without
+        one.
+        """
         since = self._busy_since
         return 0.0 if since is None else time.monotonic() - since
 

@@ -92,7 +92,7 @@ class _Fields(NamedTuple):
         return self.walked.sizes
 
     def present_columns(self) -> PresentColumns:
-        """Return which messages contain which column."""
+        """Return the presence of each column in each message."""
         given = self.walked.counts > 0
         return PresentColumns(
             self.kind,

@@ -57,7 +57,7 @@ def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
 
 
 def _side_unevenness(apart: FloatArray, wheelbase: float) -> FloatArray:
-    """Return what sides differ by (n,) less its mean over some wheelbases."""
+    """Return the difference of both sides (n,) minus its running mean over some wheelbases."""
     width = 2 * round(0.5 * WINDOW * wheelbase / STEP_M) + 1
     if width >= len(apart):
         return np.zeros_like(apart)

@@ -37,7 +37,7 @@ def errors(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def is_covered(batch: DriveSet, reported: Estimates) -> BoolArray:
-    """Return whether the 90 % interval holds the mean friction, (T, N)."""
+    """Return True where the 90 % interval contains the mean friction of the wheels, (T, N)."""
     return np.asarray((reported.mu_lower <= batch.mu) & (batch.mu <= reported.mu_upper))
 
 

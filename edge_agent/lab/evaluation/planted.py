@@ -210,7 +210,7 @@ def winter_drives(count: int, seed: int, *, seconds: int = DRIVE_S) -> list[Reco
 
 
 def doctor_verdict(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
-    """Return whether the doctor names the mistake, and whether it accepts the drive."""
+    """Return two truth values: the doctor names the mistake, and the doctor accepts the drive."""
     diagnosis = diagnose(*planted.spoil(drive))
     found = {(finding.channel, finding.kind) for finding in diagnosis.findings}
     same = next((kinds for kinds in RADII_ALIKE if planted.kind in kinds), {planted.kind})

@@ -239,9 +239,7 @@ def _shows_silence(
     silent: bool,
     patience_s: float = PATIENCE_S,
 ) -> bool:
-    """Return whether the health of a running agent begins to report a source as silent, or ceases
-    to.
-    """
+    """Return True if the health of a running agent begins, or ceases, to report a source as silent."""
     deadline = time.monotonic() + patience_s
     while agent.poll() is None and time.monotonic() < deadline:
         troubles = _health_problems(port)

@@ -111,9 +111,7 @@ def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int,
 
 @compiled
 def spin_excess(x: FloatArray, p: FloatArray, w: FloatArray, i: int) -> float:
-    """Return how much faster than the ground wheel `i` turns, over the limit of traction
-    control.
-    """
+    """Return the drive slip of wheel `i` as a multiple of the limit of traction control."""
     along = w[Wheel.SPEED, i]
     faster = p[Parameter.RADIUS] * x[Motion.OMEGA + i] - along
     return float(faster / (p[TrueParameter.SLIP_LIMIT] * max(abs(along), TCS_SLOWEST)))
@@ -143,7 +141,7 @@ def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: fl
 
 @compiled
 def stabilise(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> tuple[int, float]:
-    """Return which wheel ESC brakes (-1: none) and with what torque, over weight times radius."""
+    """Return the wheel that ESC brakes (-1: none) and the torque, over weight times radius."""
     vx = x[Motion.VX]
     r = x[Motion.YAW_RATE]
     if p[TrueParameter.ESC] <= 0.0 or vx < ESC_SLOWEST:

@@ -199,8 +199,8 @@ def heeds_warning(d: FloatArray) -> bool:
 
 @compiled
 def traffic_braking(t: float, key: Key) -> float:
-    """Return how hard traffic ahead makes the driver brake now, as a share of the budget; 0 most of
-    the time.
+    """Return the braking that traffic ahead demands now, as a share of the budget; 0 most of the
+    time.
     """
     window = int(t / ALERT_S)
     if t - window * ALERT_S > ALERT_LENGTH_S or uniform(key, 2 * window) > ALERT_SHARE:

@@ -283,8 +283,8 @@ class SimulatedFleet:
 
 
 def rough_ones(vehicles: int, share: float) -> BoolArray:
-    """Return which vehicles are rough, (N,): evenly spread; the answer for vehicle k does not
-    depend on the number of vehicles.
+    """Return True for rough vehicles, (N,), evenly spread; the value for vehicle k does not depend
+    on the number of vehicles.
     """
     number = np.arange(vehicles)
     return np.asarray(np.floor((number + 1) * share) > np.floor(number * share))

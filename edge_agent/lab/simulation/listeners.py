@@ -24,8 +24,8 @@ EVERY: Final = 10  # blocks between two looks at the route
 
 
 def warned_ones(vehicles: int, share: float) -> BoolArray:
-    """Return which drivers are warned, (N,): spread evenly over those of smooth and of rough
-    vehicles.
+    """Return True for drivers that are warned, (N,), spread evenly over those of smooth and of
+    rough vehicles.
 
     Raises:
         InputError: the share is not between 0 and 1.

@@ -107,7 +107,9 @@ COLUMNS: Final = int(Misaligned.TORQUELESS) + 1
 
 
 def memory_of(rows: FloatArray, rate_hz: float) -> int:
-    """Return how many samples back the latest clock of the rows (N, COLUMNS) reaches, plus one."""
+    """Return the largest delay of any clock in the rows (N, COLUMNS), in samples, plus one; 0
+    without delay.
+    """
     lag = float(rows[:, Misaligned.LAG : Misaligned.LAG + DEVICES].max())
     return math.ceil(lag * rate_hz) + 1 if lag > 0.0 else 0
 

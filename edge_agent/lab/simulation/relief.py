@@ -95,8 +95,8 @@ class WaveColumn(IntEnum):
 
 @compiled
 def cross_slope(table: FloatArray, curvature: float) -> float:
-    """Return how much a lane of that `curvature` [1/m] rises to its left [1]: the crossfall, and
-    less in a bend to the left.
+    """Return the cross slope of a lane of this `curvature` [1/m], positive if it rises to the left
+    [1]: the crossfall, and less in a bend to the left.
     """
     return float(table[0, 0] - table[0, 1] * curvature)
 

@@ -158,8 +158,9 @@ def _make_column(f: pa.Field[Any], rows: Rows) -> pa.Array[Any]:
 
 
 def is_value(mu: Float32Array, used: Float32Array) -> BoolArray:
-    """Return which rows give a value of mu and not only a bound, (n,): they used EXCITED_SHARE of
-    it. NaN gives nothing."""
+    """Return True for rows (n,) that give a value of mu and not only a bound: their vehicles used
+    EXCITED_SHARE of it. The result for NaN is False.
+    """
     return np.asarray(used.astype(np.float64) >= (EXCITED_SHARE - NEARLY) * mu.astype(np.float64))
 
 

@@ -112,7 +112,7 @@ def read_erasures(folder: Path) -> ErasedData:
 
 
 def in_spans(spans: Sequence[Span], time: IntArray) -> BoolArray:
-    """Return which times (n,) [ns] lie in one of the spans."""
+    """Return True for times (n,) [ns] in one of the spans."""
     out = np.zeros(len(time), bool)
     for begin, until in spans:
         out |= (time >= begin) & (time < until)

@@ -244,7 +244,7 @@ def _thin_snapshot(root: Path, path: Path, cells: set[int]) -> bool:
 
 
 def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
-    """Return how many rows `forget_vehicle` would remove; change nothing.
+    """Return the number of rows that `forget_vehicle` would remove, without removing them.
 
     Raises:
         InputError: the month's key does not exist.

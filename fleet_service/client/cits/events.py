@@ -148,7 +148,9 @@ class EventBook:
         )
 
     def _common_fields(self, event: OpenEvent, now: int, termination: Termination | None) -> Denm:
-        """Return what all messages of an event have; an update and the end are detected now."""
+        """Return the fields common to all messages of an event; the detection time of an update or
+        end is now.
+        """
         return Denm(
             self.station,
             event.sequence,
