@@ -90,8 +90,8 @@ class WeatherInbox:
         return self._archive_reports(found, now) if found else None
 
     def begin(self, path: Path, known: Reports, now: int) -> Reports | None:
-        """Archive the reports of a file that may still act and are not `known`; return them for the
-        map.
+        """Archive the reports of a file that may still affect the map and are not `known`; return
+        them.
 
         Raises:
             InputError: the file cannot be read, or a row breaks a rule.

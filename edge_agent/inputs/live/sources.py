@@ -50,7 +50,7 @@ def open_sources(
     share.
 
     Args:
-        sources: as they are asked for.
+        sources: as named on the command line.
         profile_name: a file, or the name of a shipped one; a databroker alone needs none.
         dbc: CAN database; else the profile's.
 

@@ -26,8 +26,8 @@ SHARE: Final = "1"
 
 
 class DetectionBar(NamedTuple):
-    """A figure of the detection judge: which drives it is of, how it is read, its unit, and bars
-    for both KINDS.
+    """A figure of the detection judge: its drives, the function that reads it, its unit, and the
+    bars for both KINDS.
 
     `length`: one of LENGTHS, or "" for both together.
     """
