@@ -157,17 +157,17 @@ def all_metrics(root: Path) -> Shown:
         failures=0,
     )
     publisher: Any = SimpleNamespace(
-        unanswered=0,
+        unanswered_records=0,
         clock_behind_s=0.0,
         counts=counts,
-        dropped=0,
-        damage=(0, 0),
-        stranded=0,
+        dropped_records=0,
+        damage_counts=(0, 0),
+        stranded_records=0,
         unanswered_s=0.0,
-        fill=0.0,
+        fill_share=0.0,
         links=1,
         link_watches=[],
-        unsettled=lambda: 0,
+        count_unsettled=lambda: 0,
     )
     progress: Any = SimpleNamespace(behind=0, now_s=0.0, lag_s=0.0)
     return {"service": of_service, "agent": agent_metrics.agent_metrics(publisher, progress)}
