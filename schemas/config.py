@@ -52,7 +52,7 @@ class MonitoringSettings(Settings):
     )
     metrics_host: str = Field(
         default="127.0.0.1",
-        description="listen address for both; everyone who can reach it may read",
+        description="listen address for both; every client that reaches it may read",
     )
     log: Literal["text", "json"] = Field(
         default="text", description="form of log lines: text, or JSON"
@@ -72,8 +72,12 @@ class AgentConfig(MonitoringSettings):
     slippery_mu: Positive = Field(
         default=SLIPPERY_MU, description="a visit with an upper bound below this is sent at once"
     )
-    position_std: Positive = Field(default=1.5, description="[m] of the satellite receiver")
-    yaw_std: Positive = Field(default=0.02, description="[rad] of the satellite receiver")
+    position_std: Positive = Field(
+        default=1.5, description="standard deviation of the satellite receiver's position [m]"
+    )
+    yaw_std: Positive = Field(
+        default=0.02, description="standard deviation of the satellite receiver's course [rad]"
+    )
     spool: Path = Field(
         default=Path("spool.sqlite"),
         description="file of the outbox; {name} in it is the vehicle's name",
@@ -91,13 +95,13 @@ class AgentConfig(MonitoringSettings):
         default=0.0,
         ge=0.0,
         allow_inf_nan=False,
-        description="[m] at both ends of a trip that are not published",
+        description="length at both ends of a trip that is not published [m]",
     )
     trip_end_s: float = Field(
         default=0.0,
         ge=0.0,
         allow_inf_nan=False,
-        description="[s] at both ends of a trip that are not published; both limits apply",
+        description="time at both ends of a trip that is not published [s]; both limits apply",
     )
     tyre_season: int = Field(
         default=0, ge=0, le=3, description="0 unknown, 1 summer, 2 winter, 3 all-season"
@@ -117,14 +121,14 @@ class ArchiveSettings(Settings):
     second: str | None = Field(
         default=None,
         alias="copy",
-        description="bucket that holds all of it too, e.g. s3://bucket/folder; what is not there "
-        "is not acknowledged",
+        description="bucket that holds a copy, e.g. s3://bucket/folder; reports are acknowledged "
+        "only after they are in the copy",
     )
     store: dict[str, SecretStr] = Field(
         default_factory=dict,
         description="how obstore reaches the bucket: endpoint, region, access_key_id, "
-        "secret_access_key …; what is not "
-        "here comes from the environment (AWS_…)",
+        "secret_access_key …; missing "
+        "options come from the environment (AWS_…)",
     )
 
     @property
@@ -148,7 +152,7 @@ class ServiceConfig(MonitoringSettings):
         "digits)",
     )
     archive: ArchiveSettings = Field(
-        default=ArchiveSettings(), description="a folder, or where the archive and its copy are"
+        default=ArchiveSettings(), description="location of the archive and of its copy"
     )
     standby: bool = Field(
         default=False,
@@ -164,7 +168,8 @@ class ServiceConfig(MonitoringSettings):
         default=1.0, description="minimum time between two publications of one tile"
     )
     lateness_s: Positive = Field(
-        default=120.0, description="observations older than this are fused as old news"
+        default=120.0,
+        description="observations older than this count as late: the fusion ages them",
     )
     weather: Path | None = Field(
         default=None,
@@ -206,7 +211,8 @@ class ServiceConfig(MonitoringSettings):
     raw_days: int = Field(
         default=0,
         ge=0,
-        description="days of raw rows that stay in the archive, 31 at least; roll-ups stay; 0: all",
+        description="number of days for which raw rows are kept, at least 31; roll-ups are "
+        "always kept; 0: keep all",
     )
     put_to: str | None = Field(
         default=None, description="URI to which compacted files are copied, e.g. s3://bucket/a"
@@ -219,24 +225,24 @@ class ServiceConfig(MonitoringSettings):
     )
     vehicle_kb_s: Positive = Field(
         default=40.0,
-        description="[kB/s] that a vehicle may send in the long run, 250 records; more waits with "
-        "it",
+        description="long-run rate at which a vehicle may send [kB/s], 250 records; more waits in "
+        "the vehicle",
     )
     vehicle_burst_kb: Positive = Field(
         default=2000.0,
         ge=64.0,
-        description="[kB] at once, for example after an outage of an hour; the largest batch must "
-        "fit",
+        description="amount that a vehicle may send at once [kB], e.g. after an outage of an hour; "
+        "at least the largest batch",
     )
     publishers: list[VehicleName] = Field(
         default=[],
-        description="senders that report many places at once, such as the witness of "
-        "`fleet-service cits`: they have no path",
+        description="senders that report many places at once and have no path, such as the "
+        "witness of `fleet-service cits`",
     )
     fleet: Path | None = Field(
         default=None,
-        description="enrolment file; reports of other vehicles are ignored, and an unknown one of "
-        "these has its whole weight",
+        description="enrolment file; reports of other vehicles are ignored, and an enrolled "
+        "vehicle has full weight from its first report",
     )
 
     @field_validator("archive", mode="before")
@@ -259,7 +265,7 @@ def moment(text: str, field: str) -> int:
         found = nanoseconds(datetime.fromisoformat(text))
     except ValueError as error:
         raise InputError(
-            field, f"{text[:60]!r} is no time", "write it like 2026-01-31T07:00:00Z"
+            field, f"{text[:60]!r} is not a time", "write it like 2026-01-31T07:00:00Z"
         ) from error
     if not 0 <= found < 1 << 63:
         raise InputError(

@@ -185,12 +185,14 @@ def parse(key: str) -> Parsed:
     topic = TOPICS.get(head)
     if not key.startswith(ROOT + "/") or topic is None:
         raise InputError(
-            "key", f"{key[:80]!r} is none of ours", f"use {ROOT}/ and one of {', '.join(TOPICS)}"
+            "key",
+            f"{key[:80]!r} is not a GripMap key",
+            f"use {ROOT}/ and one of {', '.join(TOPICS)}",
         )
     parts = rest.split("/")
     name = parts.pop() if topic.named else None
     if name is not None and not re.fullmatch(NAME_PATTERN, name):
-        raise InputError("key", f"{name[:80]!r} is no name", f"use {NAME_PATTERN}")
+        raise InputError("key", f"{name[:80]!r} is not a name", f"use {NAME_PATTERN}")
     digits = "".join(parts)
     sizes = _CHUNKS[: len(parts)] if topic.zoom else ()
     if (
@@ -200,7 +202,7 @@ def parse(key: str) -> Parsed:
     ):
         raise InputError(
             "key",
-            f"{key[:80]!r} names no place",
-            f"cut {topic.zoom or 0} quadkey digits by {_CHUNKS}",
+            f"{key[:80]!r} has no valid quadkey",
+            f"give {topic.zoom or 0} quadkey digits in chunks of {_CHUNKS}",
         )
     return Parsed(topic, grid.from_quadkey(digits) if topic.zoom else None, name)

@@ -96,7 +96,7 @@ def parse(parameters: Mapping[str, str]) -> MapQuery:
         InputError: a parameter is unknown or not valid; names it and the fix.
     """
     if sum(len(name) + len(value) for name, value in parameters.items()) > MAX_TEXT:
-        raise InputError("query", f"is longer than {MAX_TEXT} characters", "ask for less at once")
+        raise InputError("query", f"is longer than {MAX_TEXT} characters", "shorten the query")
     try:
         return MapQuery.model_validate(dict(parameters))
     except ValidationError as error:
@@ -108,11 +108,11 @@ def parse(parameters: Mapping[str, str]) -> MapQuery:
         if not unknown and "&" in parameters[name]:
             raise InputError(
                 name[:60],
-                "holds a '&'",
-                "part the parameters by ';', as in bbox=W,S,E,N;format=json",
+                "contains '&'",
+                "separate the parameters by ';', as in bbox=W,S,E,N;format=json",
             ) from error
         problem = (
-            "is no parameter" if unknown else f"{parameters[name][:60]!r} is not usable{because}"
+            "is not a parameter" if unknown else f"{parameters[name][:60]!r} is not usable{because}"
         )
         raise InputError(
             name[:60], problem, _FIXES.get(name, f"use {', '.join(MapQuery.model_fields)}")

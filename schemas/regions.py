@@ -108,7 +108,7 @@ def keys_along(route: Sequence[tuple[float, float]]) -> IntArray:
         raise InputError(
             "route",
             f"is {lengths.sum() / 1e3:.0f} km long",
-            f"ask for {ROUTE_MOST_M / 1e3:.0f} km at most",
+            f"give at most {ROUTE_MOST_M / 1e3:.0f} km",
         )
     counts = np.maximum(np.ceil(lengths / ROUTE_STEP_M), 1).astype(np.int64)
     leg = np.repeat(np.arange(len(counts)), counts)

@@ -33,35 +33,45 @@ class Calibration(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     version: Literal[1] = 1
-    drives: Annotated[int, Field(ge=1, description="that it was learned from")]
+    drives: Annotated[int, Field(ge=1, description="amount of driving that it was learned from")]
     radius_fl: Annotated[
-        Learned | None, Field(description="turns faster than the mean of the four [1]")
+        Learned | None,
+        Field(description="relative excess of its speed over the mean of the four wheels [1]"),
     ] = None
-    radius_fr: Annotated[Learned | None, Field(description="likewise")] = None
-    radius_rl: Annotated[Learned | None, Field(description="likewise")] = None
-    radius_rr: Annotated[Learned | None, Field(description="likewise")] = None
+    radius_fr: Annotated[Learned | None, Field(description="as radius_fl")] = None
+    radius_rl: Annotated[Learned | None, Field(description="as radius_fl")] = None
+    radius_rr: Annotated[Learned | None, Field(description="as radius_fl")] = None
     ax: Annotated[
-        Learned | None, Field(description="[m/s^2] read on level road at constant speed")
+        Learned | None, Field(description="reading on a level road at constant speed [m/s^2]")
     ] = None
-    ay: Annotated[Learned | None, Field(description="[m/s^2] likewise")] = None
-    yaw_rate: Annotated[Learned | None, Field(description="[rad/s] read straight on")] = None
-    steer_offset: Annotated[Learned | None, Field(description="[rad] read straight on")] = None
+    ay: Annotated[Learned | None, Field(description="as ax [m/s^2]")] = None
+    yaw_rate: Annotated[
+        Learned | None, Field(description="reading when driving straight [rad/s]")
+    ] = None
+    steer_offset: Annotated[
+        Learned | None, Field(description="reading when driving straight [rad]")
+    ] = None
     steer_gain: Annotated[
-        Learned | None, Field(description="reading over the road wheels' true angle [1]")
+        Learned | None, Field(description="ratio of the reading to the road wheels' true angle [1]")
     ] = None
     force_gain: Annotated[
         Learned | None,
-        Field(description="torque over radius, over what moves the file's mass [1]"),
+        Field(
+            description="ratio of torque over radius to the force that accelerates the file's "
+            "mass [1]"
+        ),
     ] = None
     wheel_lag: Annotated[
         Learned | None,
-        Field(description="[s] by which wheel speeds speak later than the inertial unit"),
+        Field(description="delay of the wheel speeds behind the inertial unit [s]"),
     ] = None
-    steer_lag: Annotated[Learned | None, Field(description="[s] likewise, the steering angle")] = (
-        None
-    )
+    steer_lag: Annotated[
+        Learned | None,
+        Field(description="delay of the steering angle behind the inertial unit [s]"),
+    ] = None
     understeer: Annotated[
-        Learned | None, Field(description="[rad per m/s^2] that steering needs beyond L r/v")
+        Learned | None,
+        Field(description="steering angle needed in addition to L r/v [rad per m/s^2]"),
     ] = None
 
 
@@ -70,9 +80,7 @@ class Vehicle(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
-    name: Annotated[
-        str, Field(min_length=1, max_length=64, description="what the vehicle is called")
-    ]
+    name: Annotated[str, Field(min_length=1, max_length=64, description="name of the vehicle")]
     mass: Annotated[float, Field(gt=0.0, lt=100_000.0, allow_inf_nan=False, description="[kg]")]
     yaw_inertia: Annotated[
         float, Field(gt=0.0, lt=1e7, allow_inf_nan=False, description="[kg m^2]")
@@ -104,24 +112,27 @@ class Vehicle(BaseModel):
     wheel_radius_front: Annotated[
         Metres | None, Field(description="[m], where the axles' tyres differ")
     ] = None
-    wheel_radius_rear: Annotated[Metres | None, Field(description="[m], likewise")] = None
+    wheel_radius_rear: Annotated[Metres | None, Field(description="[m], as wheel_radius_front")] = (
+        None
+    )
     cornering_stiffness_front: Annotated[
         float | None,
         Field(gt=0.0, lt=1e7, description="[N/rad], one front wheel, bushes and steering included"),
     ] = None
     cornering_stiffness_rear: Annotated[
-        float | None, Field(gt=0.0, lt=1e7, description="[N/rad], one rear wheel, likewise")
+        float | None,
+        Field(gt=0.0, lt=1e7, description="[N/rad], one rear wheel, bushes and steering included"),
     ] = None
     steering_compliance: Annotated[
         float | None,
         Field(
             ge=-0.1,
             le=0.1,
-            description="[rad per g] that the front wheels lose to steering, bushes and roll",
+            description="angle that the front wheels lose to steering, bushes and roll [rad per g]",
         ),
     ] = None
     rear_axle_locked: Annotated[
-        bool, Field(description="whether the rear wheels turn as one: no differential")
+        bool, Field(description="true if the rear wheels turn as one (no differential)")
     ] = False
     drive_split_front: Annotated[
         float | None,
@@ -134,7 +145,7 @@ class Vehicle(BaseModel):
         Field(
             gt=1.0,
             lt=60.0,
-            description="angle of the steering wheel over the road wheels', where known",
+            description="ratio of the steering wheel's angle to the road wheels', where known",
         ),
     ] = None
     calibration: Annotated[

@@ -68,11 +68,11 @@ def broken(values: dict[str, float], prior: NDArray[np.float64] | None) -> WireE
             return WireError(
                 name,
                 f"{values[name]:g} lies outside [{least:g}, {most:g}]",
-                "leave out what is unknown",
+                "omit unknown values",
             )
     if prior is None:
         if all(np.isnan(value) for value in values.values()):
-            return WireError("weather", "says nothing", f"give one of {', '.join(RANGES)} or prior")
+            return WireError("weather", "has no value", f"give one of {', '.join(RANGES)} or prior")
         return None
     if prior.shape != (mugrid.BINS,):
         return WireError(
@@ -85,5 +85,7 @@ def broken(values: dict[str, float], prior: NDArray[np.float64] | None) -> WireE
         and (prior >= 0.0).all()
         and abs(prior.sum() - 1.0) <= PRIOR_SUM_ERROR
     ):
-        return WireError("prior", "is no probability", "give finite numbers from 0 that sum to 1")
+        return WireError(
+            "prior", "is not a probability distribution", "give finite numbers from 0 that sum to 1"
+        )
     return None

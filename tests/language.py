@@ -120,6 +120,25 @@ def functions(package: str) -> Iterator[Named]:
                 yield Named(f"{path.relative_to(ROOT)}:{node.lineno}", node.name)
 
 
+def user_texts(package: str) -> Iterator[Docstring]:
+    """Yield the texts of a package that users meet: help texts, descriptions of settings, and
+    messages of errors.
+    """
+    for path in list_sources(ROOT, package):
+        for node in ast.walk(parse(path)):
+            if not isinstance(node, ast.Call):
+                continue
+            called = ast.unparse(node.func).rpartition(".")[2]
+            shown = [word.value for word in node.keywords if word.arg in ("help", "description")]
+            for part in [*node.args, *shown] if called.endswith("Error") else shown:
+                words = [
+                    one.value
+                    for one in ast.walk(part)
+                    if isinstance(one, ast.Constant) and isinstance(one.value, str)
+                ]
+                yield Docstring(f"{path.relative_to(ROOT)}:{part.lineno}", " … ".join(words))
+
+
 def is_participle(name: str) -> bool:
     """Return True if a name is a lone participle, such as `joined` or `kept`."""
     word = name.strip("_")
@@ -141,20 +160,23 @@ def measure_package(package: str) -> dict[str, float]:
     """Return the figures of a package; less is better for each.
 
     Keys: `openings` (docstrings that begin with What, Who, Whether, Of or How), `stop_words` (in
-    docstrings), `free_relatives` (per 1,000 docstring words), `participles` and `one_word` (percent
-    of function names), `long_test_names` (percent of test functions).
+    docstrings), `free_relatives` (per 1,000 docstring words), `user_texts` (stop words and free
+    relatives in them), `participles` and `one_word` (percent of function names), `long_test_names`
+    (percent of test functions).
     """
     texts = [docstring.text for docstring in docstrings(package)]
     names = [function.name for function in functions(package)]
     tests = [name for name in names if name.startswith("test_")]
     others = [name for name in names if not name.startswith("test_")]
     words = sum(len(text.split()) for text in texts)
+    shown = [one.text for one in user_texts(package)]
     return {
         "openings": float(sum(bool(OPENING.match(text)) for text in texts)),
         "stop_words": float(sum(len(stop_words(text)) for text in texts)),
         "free_relatives": round_up(
             1e3 * sum(len(free_relatives(text)) for text in texts) / max(words, 1)
         ),
+        "user_texts": float(sum(len(stop_words(one) + free_relatives(one)) for one in shown)),
         "participles": round_up(100 * sum(map(is_participle, others)) / max(len(others), 1)),
         "one_word": round_up(
             100 * sum("_" not in name.strip("_") for name in others) / max(len(others), 1)
@@ -270,6 +292,9 @@ def print_faults(rule: str) -> None:
             if rule == "stop_words" and (found := stop_words(text)):
                 print(f"{place}: {', '.join(found)}")
             if rule == "free_relatives" and (found := free_relatives(text)):
+                print(f"{place}: {', '.join(found)}")
+        for place, text in user_texts(package):
+            if rule == "user_texts" and (found := stop_words(text) + free_relatives(text)):
                 print(f"{place}: {', '.join(found)}")
         for place, name in functions(package):
             if rule == "participles" and is_participle(name):

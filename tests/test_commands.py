@@ -131,7 +131,7 @@ def test_what_destroys_can_be_tried_and_asks_on_a_terminal(
     assert "would be" in capsys.readouterr().out
     assert list_files(archive) == before
     said = on_terminal([sys.executable, "-m", "fleet_service.cli", *command], "n\n")
-    assert "Go on? [y/N]" in said
+    assert "Continue? [y/N]" in said
     assert "nothing" in said
     assert list_files(archive) == before
     assert fleet_service.cli.main([*command, "--yes"]) == 0
@@ -208,7 +208,7 @@ def test_what_waits_in_the_log_is_counted(archive: Path, capsys: Capture) -> Non
         (["grip", "--out", "nowhere/at/all.csv"], "error: out: cannot write"),
         (
             ["weather", "--stations", "{stations}"],
-            "error: stations: german.csv has a value that is none",
+            "error: stations: german.csv has an invalid value",
         ),
     ],
 )
@@ -232,7 +232,7 @@ def test_a_recording_is_never_replaced_by_its_estimates(tmp_path: Path, capsys: 
         assert (
             edge_agent.cli.main(["replay", str(log), "--out", str(out), "--estimator", "ckf"]) == 2
         )
-        assert "would replace" in capsys.readouterr().err
+        assert "would overwrite" in capsys.readouterr().err
     assert log.read_bytes() == before
 
 

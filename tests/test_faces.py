@@ -36,7 +36,7 @@ def test_every_name_of_a_face_is_there_and_documented(face: object) -> None:
         found = getattr(face, name)
         assert isinstance(found, (dict, tuple)) or (found.__doc__ or "").strip(), name
         assert getattr(gripmap, name) is found
-    with pytest.raises(AttributeError, match="its face is"):
+    with pytest.raises(AttributeError, match="its public names are"):
         _ = face.no_such_name  # type: ignore[attr-defined]
     assert set(names) <= set(dir(gripmap))
     folder = Path(str(face.__file__)).parent  # type: ignore[attr-defined]

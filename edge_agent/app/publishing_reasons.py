@@ -116,7 +116,8 @@ def reasons_not_publishing(
         )
     elif publisher.cut_off:
         found.append(
-            f"the router at {where} does not answer: records wait on disk and are sent when it returns"
+            f"the router at {where} does not answer: records wait on disk and are sent when it "
+            f"returns"
         )
     elif publisher.unanswered_s > UNANSWERED_S:
         found.append(

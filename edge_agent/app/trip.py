@@ -50,7 +50,7 @@ class Known(BaseModel):
     of: Annotated[
         str,
         Field(
-            description="hash of vehicle file and profile; another hash discards what was learned"
+            description="hash of vehicle file and profile; another hash discards the learned values"
         ),
     ]
     passed: bool = False

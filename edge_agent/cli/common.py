@@ -104,7 +104,8 @@ def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
         print(f"warning: {fault.channel} {fault.kind}: {fault.words}", file=sys.stderr)
     if found:
         print(
-            "warning: the estimates below are invalid until this is corrected; run edge-agent check",
+            "warning: the estimates below are invalid until this is corrected; run edge-agent "
+            "check",
             file=sys.stderr,
         )
     notes = []

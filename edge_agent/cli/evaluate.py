@@ -45,7 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--only",
         choices=ONLY,
-        help="run one other campaign instead: inputs: readers, signal doctor, calibration, live sources; "
+        help="run one other campaign instead: inputs: readers, signal doctor, calibration, "
+        "live sources; "
         "ahead: warnings, their cost and delay, the map as a prior; "
         "detection: slippery road found, missed and falsely reported, in short and long drives; "
         "searches: ant colony, ACO_R, (1+1)-ES and random search with equal budgets; "

@@ -97,7 +97,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--study",
         type=Path,
         metavar="DIR",
-        help="run the study of paper 004's filter instead: figures.json, study.md, convergence.png, "
+        help="run the study of paper 004's filter instead: figures.json, study.md, "
+        "convergence.png, "
         "paper-aco-fckf.json",
     )
     parser.add_argument(

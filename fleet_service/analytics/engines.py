@@ -90,7 +90,9 @@ class QueryEngine:
         paths = self.files("observations")
         if not paths:
             problem = f"no compacted observations in {self.root} for these days"
-            raise InputError("archive", problem, "run fleet-service compact, or give other times")
+            raise InputError(
+                "archive", problem, "run fleet-service compact, or choose another period"
+            )
         t = self._read("observations", paths, "leave_time", "time")
         t = t.mutate(day=t.date.cast("date"))
         t = t.filter(t.time >= self.part.since // NS, t.time < -(-self.part.until // NS))
@@ -110,7 +112,9 @@ class QueryEngine:
         paths = self.files("map")
         if not paths:
             raise InputError(
-                "archive", f"no snapshots of the map in {self.root}", "let the service take some"
+                "archive",
+                f"no snapshots of the map in {self.root}",
+                "let the service write hourly snapshots (service.snapshot_s above 0)",
             )
         return self._read("map", paths, "snapshot_time", "snapshot", _MAP_COLUMNS)
 

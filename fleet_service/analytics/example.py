@@ -60,10 +60,8 @@ def draw_figures(root: Path, folder: Path) -> dict[str, pa.Table]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the example."""
     parser = argparse.ArgumentParser(prog="python -m fleet_service.analytics.example")
-    parser.add_argument(
-        "--archive", type=Path, help="a compacted one; without it, one that nobody drove is made"
-    )
-    parser.add_argument("--out", type=Path, required=True, help="folder for the figures")
+    parser.add_argument("--archive", type=Path, help="compacted archive (default: a synthetic one)")
+    parser.add_argument("--out", type=Path, required=True, help="output folder for the figures")
     arguments = parser.parse_args(argv)
     root = arguments.archive
     if root is None:

@@ -110,7 +110,7 @@ def write(table: pa.Table, question: Question, path: Path) -> None:
     """Write an answer in the format of the name's ending.
 
     Raises:
-        InputError: the ending is unknown, the answer has no place, or the file cannot be written.
+        InputError: the ending is unknown, the answer has no coordinates, or the file cannot be written.
     """
     table = order_rows(table, question)
     with commandline.report_write_errors(path):
@@ -160,7 +160,9 @@ def add_geometry(table: pa.Table, question: Question) -> pa.Table:
     """Return an answer with the polygons of its cells, or of its boxes."""
     if "cell" not in table.schema.names:
         raise InputError(
-            "out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png"
+            "out",
+            f"the answer of {question.name} has no coordinates",
+            "write .parquet, .csv or .png",
         )
     return (
         geo.with_stretches(table, _row_cells(table))
@@ -196,7 +198,9 @@ def make_page(table: pa.Table, question: Question) -> str:
     """
     if question.colour is None or "cell" not in table.schema.names:
         raise InputError(
-            "out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png"
+            "out",
+            f"the answer of {question.name} has no coordinates",
+            "write .parquet, .csv or .png",
         )
     rest = max(table.num_rows - MAP_CELLS, 0)
     table = table.slice(0, MAP_CELLS)
@@ -226,9 +230,7 @@ def make_page(table: pa.Table, question: Question) -> str:
     drawn = DrawnCells(
         boxes, sector, {"": values}, names, rows, part, known or [""], frame, lasting
     )
-    about = (
-        f"{rest:,} rows more are not drawn: ask for a smaller box or fewer days." if rest else ""
-    )
+    about = f"{rest:,} more rows are not drawn: choose a smaller box or fewer days." if rest else ""
     return render(question.about, drawn, _colour_scale(question, values), about=about)
 
 
@@ -237,7 +239,7 @@ def _colour_scale(question: Question, values: list[Value]) -> Scale:
         return GRIP_SCALE
     top = max((v for v in values if v is not None), default=1.0) or 1.0
     label = (
-        f"{question.colour}, the darker the longer"
+        f"{question.colour}, darker is longer"
         if question.colour == "duration_s"
         else str(question.colour)
     )

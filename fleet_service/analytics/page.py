@@ -39,7 +39,7 @@ class Scale:
 
 
 GRIP_SCALE: Final = Scale(
-    "peak adhesion mu [1], the darker the more slippery",
+    "peak adhesion mu [1], darker is more slippery",
     *GRIP_RANGE,
     [(mu, f"{mu:g} {name}") for name, mu in SURFACES.items()],
 )

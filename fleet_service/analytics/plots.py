@@ -96,7 +96,7 @@ def _draw_grip(figure: Figure, table: pa.Table) -> None:
                 axes,
                 k,
                 np.quantile(own, (0.1, 0.5, 0.9)),
-                "tenth, middle and nine tenths of the cells" if not k else None,
+                "10 %, 50 % and 90 % quantiles of the cells" if not k else None,
             )
         axes.annotate(f"{len(own)} measured\n{bounded} bounded", (k, 0.02), ha="center", fontsize=8)
     axes.axhline(SLIPPERY_MU, color=_MARK, linewidth=1, label=f"slippery below {SLIPPERY_MU}")
@@ -231,7 +231,7 @@ def _draw_vehicles(figure: Figure, table: pa.Table) -> None:
     axes.set(
         xlabel="bias of μ [1]",
         ylabel="vehicle",
-        title=f"the {len(rows)} surest of {table.num_rows}",
+        title=f"the {len(rows)} most certain of {table.num_rows}",
     )
     axes.legend(fontsize=8)
 

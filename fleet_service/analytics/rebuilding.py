@@ -80,7 +80,7 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
         OSError: something cannot be read or written.
     """
     if engine not in ENGINES:
-        raise InputError("engine", f"{engine!r} is none", f"use one of {', '.join(ENGINES)}")
+        raise InputError("engine", f"{engine!r} is unknown", f"use one of {', '.join(ENGINES)}")
     zones = zones_of(wanted.root)
     if not zones:
         raise InputError(

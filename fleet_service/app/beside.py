@@ -38,6 +38,6 @@ def run_module(
                     return None
     if child.returncode:
         raise InputError(
-            what, errors.strip() or f"ended with {child.returncode}", "it is tried again"
+            what, errors.strip() or f"ended with {child.returncode}", "the service tries it again"
         )
     return output.strip()

@@ -62,7 +62,7 @@ def archive_jobs(
         if (
             engine.copy is not None and engine.settlement.failing
         ):  # compacted, its segments would never be put as such
-            return "compaction waits for the copy"
+            return "compaction waits for the archive's copy"
         disk_reserve.allocate(root)
         weather.join_daily_files(root)
         if not config.put_to and not any(segments.list_segments(root, kind) for kind in Kind):
@@ -95,7 +95,7 @@ def archive_jobs(
 
     def old_cells(stop: threading.Event) -> str | None:
         dropped = engine.settlement.run_between_segments(engine.drop_old, stop)
-        return f"dropped: {dropped} cells that nobody visited for a week" if dropped else None
+        return f"dropped: {dropped} cells without a visit for a week" if dropped else None
 
     def inventory(_: threading.Event) -> str | None:
         engine.counts["files_set_aside"] = count_set_aside(root)
@@ -174,7 +174,7 @@ class BackgroundJobs:
         if busy is not None and time.monotonic() - busy[1] > HANGS_S:
             found.append(f"{busy[0]} has not ended for {time.monotonic() - busy[1]:.0f} s")
         if self.has_ended:
-            found.append("background jobs have ended; restart the service")
+            found.append("the thread of background jobs has ended; restart the service")
         return found
 
     @property

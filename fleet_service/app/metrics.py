@@ -20,20 +20,26 @@ _FAMILIES: Final = (  # prefix of the counts, name, label, text
     ("bad_queries.", "bad_queries", "field", "queries that were refused, by parameter"),
 )
 _SINGLE: Final = {
-    "key_failures": "batches without a key for their month: it is damaged, or cannot be written",
-    "witnesses_damaged": "lines of keys/MONTH.witnesses that were damaged when the service began",
-    "too_many_gaps": "batches with too many missing before them",
-    "too_many_streams": "batches that wait with a vehicle that opened too many streams",
-    "too_many_places": "observations archived and not fused: too many new places of their vehicle",
-    "implausible_moves": "observations archived and not fused: their vehicle cannot be there",
-    "refused_queries": "queries told to come again, since too many waited",
-    "clock_doubted": "batches neither let in nor refused, since the time is in doubt",
-    "checkpoints_refused": "checkpoints that were damaged, of another version, or died of",
-    "duplicates": "batches that came again",
+    "key_failures": "batches refused because the key of their month is damaged or cannot be "
+    "written",
+    "witnesses_damaged": "damaged lines in keys/MONTH.witnesses at the start of the service",
+    "too_many_gaps": "batches refused because too many earlier batches of their stream are missing",
+    "too_many_streams": "batches not accepted because their vehicle opened too many streams; "
+    "the vehicle keeps them",
+    "too_many_places": "observations archived but not fused because their vehicle reported "
+    "too many new places",
+    "implausible_moves": "observations archived but not fused because their vehicle cannot "
+    "have reached the place",
+    "refused_queries": "queries refused because too many were waiting; the client may retry",
+    "clock_doubted": "batches neither admitted nor refused because the service's time is uncertain",
+    "checkpoints_refused": "checkpoints not used: damaged, of another version, or fatal to a "
+    "former start",
+    "duplicates": "duplicate batches",
     "overload": "messages dropped because the queue was full",
-    "limited": "messages dropped because their vehicle sent too much",
-    "late": "observations archived and not fused",
-    "tile_rounds_skipped": "rounds of tiles left out, since the one before was not done",
+    "limited": "messages dropped because their vehicle exceeded its rate limit",
+    "late": "observations archived but not fused",
+    "tile_rounds_skipped": "publications of tiles skipped because the previous one was not "
+    "finished",
     "queries": "queries",
 }
 
@@ -69,7 +75,13 @@ def collect_metrics(
     return [
         *found,
         Metric("rows", "counter", "rows admitted", kinds, "kind"),
-        Metric("failures", "counter", "failed work, which is tried again", failures, "work"),
+        Metric(
+            "failures",
+            "counter",
+            "failed operations, which the service tries again",
+            failures,
+            "work",
+        ),
         Metric("runs", "counter", "runs of background jobs", runs, "work"),
         Metric(
             "segments",

@@ -143,7 +143,7 @@ class _Process:
         """Return the head of the next reply; ChildProcessError if the process has ended."""
         head = self.out.read(_HEAD.size)
         if len(head) < _HEAD.size:
-            raise ChildProcessError(f"the past could not be rebuilt ({self._child.wait()})")
+            raise ChildProcessError(f"the past map could not be rebuilt ({self._child.wait()})")
         return head
 
     def end(self) -> None:

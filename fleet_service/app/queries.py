@@ -82,7 +82,7 @@ class Queries:
             return answer_query(self._shared.tiles, query, wanted, now, only)
         at = nanoseconds(query.at)
         if at > now:
-            raise InputError("at", "lies in the future", "give a time that has been")
+            raise InputError("at", "lies in the future", "give a time in the past")
         past = PastQuery(query, at, self._config.lateness_s, only, self._config.public_vehicles)
         return self._past.ask(past, wanted)
 

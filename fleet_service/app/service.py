@@ -358,7 +358,7 @@ class Service:
             + (f"; {rest}" if rest else "")
             + (f"; the system clock is {behind:.0f} s behind" if behind >= LAG_S else "")
             + (
-                f"; the system clock jumped {-behind:.0f} s ahead, no report confirms it"
+                f"; the system clock jumped {-behind:.0f} s ahead, and no report confirms this"
                 if behind <= -LAG_S
                 else ""
             )

@@ -13,7 +13,7 @@ from schemas import grid, wire
 from schemas.numeric import IntArray
 from schemas.wire import Alert
 
-ERASED: Final = "what it was raised on was erased"
+ERASED: Final = "the reports behind the alert were erased"
 
 
 class StandingAlerts:

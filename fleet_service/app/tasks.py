@@ -41,7 +41,7 @@ class Tasks:
             if (stop.is_set() or time.monotonic() > deadline) and done.cancel():
                 if stop.is_set():
                     return None
-                raise OSError("no segment could be written for so long")
+                raise OSError("no segment could be written within the time limit")
 
     def do(self) -> None:
         """Do all queued work; called by the worker."""

@@ -30,7 +30,7 @@ COMMANDS: Final = (
     Command(
         "query",
         "fleet_service.cli.query",
-        "query the map once",
+        "query the map of the fleet once",
         "fleet-service query --bbox -0.5,51.2,0.3,51.7 --out map.geojson",
     ),
     Command(
@@ -48,7 +48,7 @@ COMMANDS: Final = (
     Command(
         "cits",
         "fleet_service.cli.cits",
-        "send alerts as DENM to an AMQP interchange, and take foreign ones",
+        "send alerts as DENM to an AMQP interchange, and receive foreign DENM",
         "fleet-service cits --amqp amqps://host:5671 --from subscriptions --witness cits-se",
     ),
     Command(
@@ -96,7 +96,7 @@ COMMANDS: Final = (
     Command(
         "analyze",
         "fleet_service.cli.analyze",
-        "ask the archive: grip, worst, spells, before-after, vehicles, calibration, weather, "
+        "analyse the archive: grip, worst, spells, before-after, vehicles, calibration, weather, "
         "change-rates, "
         "contract, replay",
         "fleet-service analyze worst --archive archive --from 2026-01-01 --out worst.html",
@@ -116,7 +116,7 @@ COMMANDS: Final = (
     Command(
         "evaluate",
         "fleet_service.cli.evaluate",
-        "evaluate the fusion on simulated fleets, against truth and simple rules",
+        "evaluate the fusion on simulated fleets: compare it with the truth and with simple rules",
         "fleet-service evaluate --quick --out evaluation",
     ),
     Command(
@@ -126,7 +126,11 @@ COMMANDS: Final = (
         "fleet-service completion bash > ~/.local/share/bash-completion/completions/fleet-service",
     ),
 )
-LINE: Final = ("fleet-service", "One live map of grip from many vehicles.", COMMANDS)
+LINE: Final = (
+    "fleet-service",
+    "Fuse the reports of many vehicles into one live map of grip.",
+    COMMANDS,
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -41,10 +41,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         type=Path,
         required=True,
-        help="archive; segments waiting in its log are compacted first",
+        help="archive of a service; segments in its log are compacted first",
     )
     add_part(parser)
-    parser.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}")
+    parser.add_argument(
+        "--out", metavar="FILE", type=Path, help=f"output file ({', '.join(ENDINGS)})"
+    )
     parser.add_argument(
         "--engine", default="duckdb", metavar="duckdb|spark", help="default %(default)s"
     )
@@ -65,7 +67,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--roads", metavar="FILE", type=Path, help="contract: file written by `fleet-service roads`"
     )
-    parser.add_argument("--level", metavar="MU", type=float, help="contract: agreed grip, e.g. .35")
+    parser.add_argument(
+        "--level", metavar="MU", type=float, help="contract: agreed friction, e.g. .35"
+    )
     parser.add_argument(
         "--within",
         metavar="TIME",
@@ -89,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.engine not in engines.ENGINES:
         raise InputError(
-            "engine", f"{arguments.engine!r} is none", f"use one of {', '.join(engines.ENGINES)}"
+            "engine", f"{arguments.engine!r} is unknown", f"use one of {', '.join(engines.ENGINES)}"
         )
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
     part = Extract(*time_span(arguments), bbox)
@@ -137,14 +141,16 @@ def _checked_question(arguments: argparse.Namespace) -> Question:
             (".html", ".geojson", ".geo.parquet")
         ):
             raise InputError(
-                "out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png"
+                "out",
+                f"the answer of {question.name} has no coordinates",
+                "write .parquet, .csv or .png",
             )
     for name, takers in FOR.items():
         if getattr(arguments, name) is not None and question.name not in takers:
             raise InputError(
                 name.replace("_", "-"),
-                f"is not for {question.name}",
-                f"it is for {', '.join(takers)}",
+                f"does not apply to {question.name}",
+                f"it applies to {', '.join(takers)}",
             )
     if arguments.level is not None and not mugrid.LOWER < arguments.level < mugrid.UPPER:
         problem = f"{arguments.level} lies outside {mugrid.LOWER} to {mugrid.UPPER}"

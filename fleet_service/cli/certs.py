@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--revoke",
         metavar="N",
         type=int,
-        help=f"revoke so many names; more than {ASKED} want it said",
+        help=f"confirm that N certificates are revoked; required for more than {ASKED}",
     )
     parser.add_argument(
         "--dry-run", action="store_true", help="only print the names that would be revoked"
@@ -75,7 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
     for name, value in zip(("days", "ca-days", "renew-days"), days, strict=True):
         if not 0.0 < value <= LONGEST_DAYS:
             raise InputError(
-                name, f"{value:g} is no time", f"give more than 0 and at most {LONGEST_DAYS:g} days"
+                name,
+                f"{value:g} is not a valid duration",
+                f"give more than 0 and at most {LONGEST_DAYS:g} days",
             )
     if days[2] >= days[0]:
         raise InputError(
@@ -92,18 +94,20 @@ def run(arguments: argparse.Namespace) -> int:
         registry = Registry(out, Terms(*days), datetime.now(UTC), arguments.at)
         leaving = registry.leaving(fleet)
         if arguments.dry_run:
-            print(f"would revoke {len(leaving)}: {', '.join(leaving) or 'nobody'}")
+            print(f"would revoke {len(leaving)}: {', '.join(leaving) or 'none'}")
             return 0
         if len(leaving) > (ASKED if arguments.revoke is None else arguments.revoke):
             shown = ", ".join(leaving[:SHOWN]) + (" …" if len(leaving) > SHOWN else "")
             fix = f"put them back on the list, or add --revoke {len(leaving)}"
             raise InputError(
-                "fleet", f"{len(leaving)} names with a certificate are not on it: {shown}", fix
+                "fleet",
+                f"{len(leaving)} names with a certificate are not on the list: {shown}",
+                fix,
             )
         done = registry.enrol(fleet, arguments.ca)
     except OSError as error:
         problem = f"cannot write {error.filename or out} ({error.strerror})"
-        raise InputError("out", problem, "give a folder you may write") from error
+        raise InputError("out", problem, "give a folder that you may write to") from error
     for word, names in (("issued", done.made), ("kept", done.kept), ("revoked", done.revoked)):
         if names:
             more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""

@@ -20,13 +20,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--amqp", metavar="URL", required=True, help="interchange, e.g. amqps://host:5671"
     )
     parser.add_argument(
-        "--to", metavar="ADDRESS", help="where our DENM go, e.g. a queue of deliveries"
+        "--to",
+        metavar="ADDRESS",
+        help="address to which our DENM are sent, e.g. a queue of deliveries",
     )
     parser.add_argument(
-        "--from", dest="source", metavar="ADDRESS", help="where foreign DENM come from"
+        "--from",
+        dest="source",
+        metavar="ADDRESS",
+        help="address from which foreign DENM are received",
     )
     parser.add_argument(
-        "--selector", default="messageType = 'DENM'", help="of foreign messages, in AMQP's language"
+        "--selector",
+        default="messageType = 'DENM'",
+        help="filter for foreign messages, an AMQP selector",
     )
     parser.add_argument(
         "--witness", metavar="NAME", help="name of foreign DENM in the map; enrolled like a vehicle"
@@ -34,10 +41,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--station", metavar="N", type=int, help="identifier of the originating station"
     )
-    parser.add_argument("--country", metavar="CC", help="of the publisher, e.g. SE")
-    parser.add_argument("--publisher", metavar="ID", help="at the interchange, e.g. SE00001")
+    parser.add_argument("--country", metavar="CC", help="country of the publisher, e.g. SE")
     parser.add_argument(
-        "--state", metavar="FILE", type=Path, help="open events and unsent messages; keep it"
+        "--publisher",
+        metavar="ID",
+        help="identifier of the publisher at the interchange, e.g. SE00001",
+    )
+    parser.add_argument(
+        "--state",
+        metavar="FILE",
+        type=Path,
+        help="file for open events and unsent messages; keep it between runs",
     )
 
 
@@ -48,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     from fleet_service.client.map_client import connection_settings
 
     if arguments.to is None and arguments.source is None:
-        raise InputError("to", "nothing is sent or received", "give --to, --from or both")
+        raise InputError("to", "there is nothing to send or receive", "give --to, --from or both")
     needed = {"to": ("station", "country", "publisher", "state"), "source": ("witness",)}
     for way, names in needed.items():
         missing = [

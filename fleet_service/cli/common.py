@@ -37,7 +37,9 @@ def stop_on_signals() -> threading.Event:
 def add_connection(parser: argparse.ArgumentParser) -> None:
     """Declare how to reach the map."""
     parser.add_argument("--connect", metavar="ENDPOINT", help="router, e.g. tcp/127.0.0.1:7447")
-    parser.add_argument("--config", metavar="FILE", help="JSON with a `zenoh` section, as for run")
+    parser.add_argument(
+        "--config", metavar="FILE", help="JSON file with a `zenoh` section, as for run"
+    )
 
 
 def add_supplier(parser: argparse.ArgumentParser) -> None:
@@ -73,10 +75,15 @@ def supplier_of(arguments: argparse.Namespace) -> Supplier:
 def add_part(parser: argparse.ArgumentParser) -> None:
     """Declare the options that select a part of the archive."""
     parser.add_argument(
-        "--from", dest="since", metavar="TIME", help="e.g. 2026-01-31 or 2026-01-31T07:00:00Z, UTC"
+        "--from",
+        dest="since",
+        metavar="TIME",
+        help="start, e.g. 2026-01-31 or 2026-01-31T07:00:00Z, UTC",
     )
     parser.add_argument(
-        "--last", metavar="TIME", help="instead of --from: so long until now, e.g. 12h, 90min or 7d"
+        "--last",
+        metavar="TIME",
+        help="instead of --from: length of the period until now, e.g. 12h, 90min or 7d",
     )
     parser.add_argument(
         "--to", dest="until", metavar="TIME", help="end, excluded, in the same form (default: now)"
@@ -98,7 +105,7 @@ def add_archive(parser: argparse.ArgumentParser, *, required: bool = True) -> No
 
 def add_dry_run(parser: argparse.ArgumentParser) -> None:
     """Declare the safety options of a destructive command."""
-    parser.add_argument("--dry-run", action="store_true", help="only print what would be done")
+    parser.add_argument("--dry-run", action="store_true", help="only print the planned changes")
     parser.add_argument("--yes", action="store_true", help="do not ask for confirmation")
 
 
@@ -107,7 +114,7 @@ def confirm(arguments: argparse.Namespace, what: str) -> bool:
     if arguments.yes or not sys.stdin.isatty():
         return True
     progress_messages.stop_status()
-    print(f"{what}. This cannot be undone. Go on? [y/N] ", end="", file=sys.stderr, flush=True)
+    print(f"{what}. This cannot be undone. Continue? [y/N] ", end="", file=sys.stderr, flush=True)
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
@@ -119,9 +126,7 @@ def duration_s(field: str, text: str) -> float:
     """
     found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)(s|min|h|d)", text)
     if found is None:
-        raise InputError(
-            field, f"{text[:20]!r} is no length of time", "write it like 4h, 90min or 1d"
-        )
+        raise InputError(field, f"{text[:20]!r} is not a duration", "write it like 4h, 90min or 1d")
     return float(found[1]) * UNITS[found[2]]
 
 
@@ -129,13 +134,15 @@ def time_span(arguments: argparse.Namespace) -> tuple[int, int]:
     """Return begin and end [ns] from the options of `add_part`.
 
     Raises:
-        InputError: one of them is no time, or the end is not after the begin.
+        InputError: one of them is not a time, or the end is not after the begin.
     """
     since = 0 if arguments.since is None else moment(arguments.since, "from")
     if arguments.last is not None:
         if arguments.since is not None or arguments.until is not None:
             raise InputError(
-                "last", "does not go together with --from or --to", "give one or the other"
+                "last",
+                "cannot be combined with --from or --to",
+                "give either --last or --from and --to",
             )
         since = time.time_ns() - round(duration_s("last", arguments.last) * NS)
     until = time.time_ns() if arguments.until is None else moment(arguments.until, "to")
@@ -200,4 +207,4 @@ def compact_first(root: Path) -> None:
         done = compact(root)
         progress_messages.report(f"compacted first: {done.rows:,} rows of {done.segments} segments")
     except (OSError, InputError) as error:
-        print(f"warning: {waiting} segments of the log are not counted: {error}", file=sys.stderr)
+        print(f"warning: {waiting} segments of the log are not included: {error}", file=sys.stderr)

@@ -18,13 +18,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--to",
         dest="to",
         metavar="URI",
-        help="then copy new files there, e.g. s3://bucket/folder",
+        help="URI to which new files are copied afterwards, e.g. s3://bucket/folder",
     )  # --to: its name until 0.2
     parser.add_argument(
         "--round-rows",
         metavar="N",
         type=int,
-        help="rows in memory at once; default a million, half a gigabyte",
+        help="maximum number of rows in memory (default: one million, about half a gigabyte)",
     )
 
 
@@ -40,7 +40,7 @@ def _compact_archive(arguments: argparse.Namespace) -> ArchiveReport:
 
     rows = ROUND_ROWS if arguments.round_rows is None else arguments.round_rows
     if rows < 1:
-        raise InputError("round-rows", f"{rows} is below 1", "give the rows of one round")
+        raise InputError("round-rows", f"{rows} is below 1", "give the number of rows of one round")
     done = compact(arguments.archive, rows)
     parts = rollup.complete_parts(arguments.archive)
     summary = (

@@ -9,7 +9,7 @@ from schemas.runtime import commandline
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("shell", metavar="|".join(commandline.SHELLS), help="which shell")
+    parser.add_argument("shell", metavar="|".join(commandline.SHELLS), help="shell to complete for")
 
 
 def run(arguments: argparse.Namespace) -> int:

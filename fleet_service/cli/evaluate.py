@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", metavar="DIR", type=Path, required=True, help="folder for figures, table and plots"
     )
     parser.add_argument(
-        "--quick", action="store_true", help="one seed, to check that it runs; judges nothing"
+        "--quick", action="store_true", help="one seed, as a smoke test; checks no bars"
     )
     # the second names are those of earlier versions
     way = parser.add_mutually_exclusive_group()
@@ -42,16 +42,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--end-to-end",
         "--whole-way",
         action="store_true",
-        help="only those, in a level town and on hills",
+        help="only the vehicles with real estimators, in a level town and on hills",
     )
     way.add_argument(
         "--only",
         choices=PARTS,
         help="one part; "
-        "exact: order of arrival and replay change nothing; ice: ice that comes and goes; "
-        "fleets: with and without misbehaving vehicles; attacks: reports that are meant to harm; "
-        "models: fleets that err otherwise; fading: how long a dry road stays dry; "
-        "third-party: vehicles of another make; value: alerts and known roads next to two rules; "
+        "exact: independence of arrival order and replay; ice: ice that appears and disappears; "
+        "fleets: with and without misbehaving vehicles; attacks: malicious reports; "
+        "models: fleets with other error models; fading: ageing of the belief on a dry road; "
+        "third-party: vehicles of another make; value: alerts and known roads, compared with "
+        "two simple rules; "
         "situations: bounds, a backlog, gentle drivers, a wet curve; "
         "end-to-end: the same as --end-to-end",
     )
@@ -73,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
         found = campaign.run(arguments.out, arguments.quick, drives, log_line, only=only)
     except OSError as error:
         raise InputError(
-            "out", f"cannot write {error.filename} ({error.strerror})", "give another folder"
+            "out", f"cannot write {error.filename} ({error.strerror})", "choose another folder"
         ) from error
     print(f"\n{figures.markdown([figure for figure in found if figure.bar is not None])}\n")
     return 0 if arguments.quick or campaign.all_hold(found) else 1

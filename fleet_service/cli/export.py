@@ -60,10 +60,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "what",
         choices=(*WHAT, DATEX, ICEBERG, *ROUTERS),
         metavar="|".join((*WHAT, DATEX, ICEBERG, *ROUTERS)),
-        help="the part of the archive, or of the live map",
+        help="part of the archive or of the live map to export",
     )
     parser.add_argument(
-        "--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}; datex: in .xml"
+        "--out", metavar="FILE", type=Path, help=f"output file ({', '.join(ENDINGS)}; datex: .xml)"
     )
     add_part(parser)
     parser.add_argument(
@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--snapshot",
         action="store_true",
-        help="map: use the service's last hourly snapshot, at once",
+        help="map: use the service's last hourly snapshot instead of a replay",
     )
     add_connection(parser)
     add_supplier(parser)
@@ -89,7 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--exclude-ice",
         action="store_true",
-        help="valhalla: forbid sure ice, not only make it dear",
+        help="valhalla: exclude roads with certain ice instead of raising their cost",
     )
     parser.add_argument(
         "--follow", action="store_true", help="datex: keep the file current until a signal"
@@ -118,7 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
     for name in _NOT[arguments.what]:
         if getattr(arguments, name):
             option = {"since": "from", "until": "to"}.get(name, name)
-            raise InputError(option, f"says nothing to export {arguments.what}", "leave it out")
+            raise InputError(option, f"has no effect on export {arguments.what}", "leave it out")
     for name in _NEEDS[arguments.what]:
         if getattr(arguments, name) is None:
             raise InputError(name, f"is missing for export {arguments.what}", f"give --{name}")

@@ -26,9 +26,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser)
     parser.add_argument("--period", metavar="MONTH", required=True, help="e.g. 2026-01")
-    parser.add_argument("--vehicle", metavar="NAME", help="remove only the rows of this vehicle")
+    parser.add_argument("--vehicle", metavar="NAME", help="remove only this vehicle's rows")
     parser.add_argument(
-        "--config", metavar="FILE", help="the service's configuration, with the archive's copy"
+        "--config",
+        metavar="FILE",
+        help="the service's configuration, which names the archive's copy",
     )
     parser.add_argument(
         "--put-to", metavar="URI", help="mirror to which rewritten files are copied again"
@@ -59,12 +61,12 @@ def _forget_data(arguments: argparse.Namespace) -> ArchiveReport:
     if arguments.dry_run:
         return ArchiveReport(f"would be done: {what}", {"rows": 0, "key": False})
     if not confirm(arguments, what):
-        return ArchiveReport("nothing forgotten", {"rows": 0, "key": False})
+        return ArchiveReport("nothing removed", {"rows": 0, "key": False})
     done = _erase_or_request(root, Erasure(month, vehicle), arguments.config)
     still = (
         ""
         if done.kept is None
-        else f"; the copy holds it still, and the service tries again ({done.kept})"
+        else f"; the copy still contains them, and the service tries again ({done.kept})"
     )
     if vehicle is None:
         return ArchiveReport(what + still, {"rows": 0, "key": True, "copy": done.kept})
@@ -140,7 +142,7 @@ def _sync_copy(root: Path, path: str | None) -> Iterator[None]:
     if config.archive.second is None:
         fix = "give --config with the service's configuration"
         raise InputError(
-            "config", f"the archive has a copy at {url}, where it is to be forgotten too", fix
+            "config", f"the archive has a copy at {url}, where the data must be removed too", fix
         )
     with closing(BucketReplica(root, url, config.archive.options)) as copy:
         copy.sync_without_lease(
@@ -150,7 +152,7 @@ def _sync_copy(root: Path, path: str | None) -> Iterator[None]:
         try:
             copy.sync()
         except OSError as error:
-            fix = "start the service, which goes on with it, when the copy is reached"
+            fix = "start the service when the copy can be reached; it finishes the removal"
             raise InputError(
-                "archive.copy", f"it is forgotten here, and not yet at {url} ({error})", fix
+                "archive.copy", f"the data are removed here, but not yet at {url} ({error})", fix
             ) from error

@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not re.fullmatch(REGION_PATTERN, arguments.region):
         raise InputError(
             "region",
-            f"{arguments.region!r} is none",
+            f"{arguments.region!r} is not a region",
             "give chunks of 4, 3 and 3 digits, or * for all",
         )
     with map_client.open_connected(
@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     ) as session:
         moved = hand_over(session, arguments.region, arguments.to, print)
     if moved is None:
-        print(f"{arguments.to} serves {arguments.region} already")
+        print(f"{arguments.to} already serves {arguments.region}")
     else:
-        print(f"{arguments.to} serves {arguments.region}; nobody did for {moved.pause_s:.1f} s")
+        print(f"{arguments.to} serves {arguments.region}; the handover took {moved.pause_s:.1f} s")
     return 0

@@ -21,10 +21,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--archive",
         metavar="DIR",
         type=Path,
-        help="archive of a service on this machine, for past and history",
+        help="archive of a service on this machine; enables the past and the history",
     )
     parser.add_argument(
-        "--host", default="127.0.0.1", help="where to listen (default 127.0.0.1: this machine only)"
+        "--host", default="127.0.0.1", help="listen address (default 127.0.0.1: this machine only)"
     )
     parser.add_argument(
         "--port", type=int, default=8080, help="port; 0 selects a free one (default 8080)"
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="map below the roads: .pmtiles or .mbtiles, or URL with {z}, {x}, {y}",
     )
     parser.add_argument(
-        "--attribution", metavar="TEXT", help="of the base map (default: what its file says)"
+        "--attribution", metavar="TEXT", help="attribution of the base map (default: from its file)"
     )
     parser.add_argument(
         "--roads",
@@ -124,7 +124,7 @@ def _datex_file(arguments: argparse.Namespace) -> DatexFile | None:
     if arguments.datex is None:
         for name in ("country", "supplier"):
             if getattr(arguments, name) is not None:
-                raise InputError(name, "is of no use without --datex", "give both, or neither")
+                raise InputError(name, "needs --datex", "give both, or neither")
         return None
     from fleet_service.client.datex_feed import DatexFile
 

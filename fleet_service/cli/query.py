@@ -26,7 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--bbox", metavar="W,S,E,N", help="box in degrees (default: everything)")
     parser.add_argument(
-        "--route", metavar="LON,LAT|LON,LAT", help="route; returns the cells ahead in driving order"
+        "--route",
+        metavar="LON,LAT|LON,LAT",
+        help="route; the answer has its cells in driving order",
     )
     parser.add_argument("--min-vehicles", metavar="K", help="only cells with at least K vehicles")
     parser.add_argument(
@@ -46,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         metavar="FILE",
         type=Path,
-        help=f"write it there, as the ending says: {', '.join(FORMS)}",
+        help=f"output file; its ending selects the form: {', '.join(FORMS)}",
     )
     add_connection(parser)
 
@@ -67,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     if not answer.served:
         print(
-            "no service answers for the map: start one; that is not the same as an empty map",
+            "no service answers for the map: start one; this is not the same as an empty map",
             file=sys.stderr,
         )
         return NOBODY
@@ -126,6 +128,8 @@ def _output_format(out: Path | None, given: str | None) -> str | None:
     form = FORMS[commandline.ending_of("out", out, tuple(FORMS))]
     if given not in (None, form):
         raise InputError(
-            "format", f"{given} does not go into {out.name}", f"leave --format out: it is {form}"
+            "format",
+            f"{given} does not match {out.name}",
+            f"omit --format: the ending implies {form}",
         )
     return form

@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         type=Path,
         required=True,
-        help="a new folder: map/ and rollup/ by zone",
+        help="new folder, which gets map/ and rollup/ by zone",
     )
     parser.add_argument(
         "--to", dest="until", metavar="TIME", help="moment of the map (default: now)"

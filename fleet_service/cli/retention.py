@@ -12,7 +12,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser)
     parser.add_argument(
-        "--raw-days", metavar="N", type=int, required=True, help="days for which raw rows stay"
+        "--raw-days",
+        metavar="N",
+        type=int,
+        required=True,
+        help="number of days for which raw rows are kept",
     )
     add_dry_run(parser)
 

@@ -18,12 +18,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help=".osm.pbf, .osm, or lines: .gpkg, .geojson, .shp",
     )
-    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="ends in .parquet")
     parser.add_argument(
-        "--id", metavar="COLUMN", default="id", help="of lines: the link's id; default %(default)s"
+        "--out", metavar="FILE", type=Path, required=True, help="output file (.parquet)"
     )
     parser.add_argument(
-        "--name", metavar="COLUMN", default="name", help="of lines: its name; default %(default)s"
+        "--id",
+        metavar="COLUMN",
+        default="id",
+        help="files of lines: column of the link's id (default %(default)s)",
+    )
+    parser.add_argument(
+        "--name",
+        metavar="COLUMN",
+        default="name",
+        help="files of lines: column of the link's name (default %(default)s)",
     )
 
 

@@ -32,7 +32,9 @@ FREEING_S = 0.4  # of them, for a bucket to take a word
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--config", metavar="FILE", help="JSON; every setting has a default")
+    parser.add_argument(
+        "--config", metavar="FILE", help="configuration file (JSON); every setting has a default"
+    )
     parser.add_argument(
         "--archive",
         metavar="DIR",
@@ -88,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
             raise
     except OSError as error:
         problem = f"cannot use {error.filename} ({error.strerror})"
-        raise InputError("archive", problem, "give a folder you may read and write") from error
+        raise InputError("archive", problem, "give a folder that you may read and write") from error
     sys.setswitchinterval(SWITCH_S)
     gc.collect()
     # what came from the archive stays: looking through it takes longer than an alert may

@@ -21,11 +21,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--alerts",
         action="store_true",
-        help="only alerts: one per stretch, with length and direction",
+        help="print only alerts: one per stretch, with length and direction",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object per line")
     parser.add_argument(
-        "--webhook", metavar="URL", help="also send alerts there, in Alertmanager's format"
+        "--webhook",
+        metavar="URL",
+        help="URL to which alerts are also sent, in Alertmanager's format",
     )
     parser.add_argument(
         "--webhook-queue",
@@ -54,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.webhook is None:
         for name in ("webhook_queue", "health_port"):
             if getattr(arguments, name) is not None:
-                raise InputError(name, "has no meaning without a webhook", "add --webhook URL")
+                raise InputError(name, "needs a webhook", "add --webhook URL")
         watching.watch_map(settings, wishes, stop, _print_line)
         return 0
     return _watch_with_webhook(

@@ -42,7 +42,7 @@ class AlertQueue:
         except (sqlite3.Error, OSError) as error:
             problem = f"{path} cannot be used ({error})"
             raise InputError(
-                "webhook_queue", problem, "give another file; each watch needs its own"
+                "webhook_queue", problem, "give another file; every watch needs its own file"
             ) from error
 
     def __len__(self) -> int:

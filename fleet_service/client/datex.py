@@ -65,7 +65,7 @@ class Supplier:
         """Check country and name."""
         if not re.fullmatch("[a-z]{2}", self.country):
             raise InputError(
-                "country", f"{self.country!r} is no country", "give two letters, e.g. se"
+                "country", f"{self.country!r} is not a country code", "give two letters, e.g. se"
             )
         if not self.name.strip():
             raise InputError("supplier", "is empty", "give the supplier's name at the access point")
@@ -160,7 +160,7 @@ def _make_record(alert: StretchAlert, name: str, now: int) -> ET.Element:
     _add_text(record, "sit:safetyRelatedMessage", "true")
     source = ET.SubElement(record, _qualified_name("sit:source"))
     _add_english_text(
-        source, "com:sourceName", "GripMap: peak friction that vehicles' own dynamics showed"
+        source, "com:sourceName", "GripMap: peak friction estimated from the motion of vehicles"
     )
     _add_text(source, "com:sourceType", "vehicleProbeMeasurement")
     validity = ET.SubElement(record, _qualified_name("sit:validity"))
@@ -284,9 +284,7 @@ def _cell_coordinates(record: ET.Element) -> set[str]:
 
 def _parse_records(document: bytes) -> dict[str, ET.Element]:
     """Return the records of a publication by id."""
-    problem = InputError(
-        "out", "holds something else than a publication of this command", "name another file"
-    )
+    problem = InputError("out", "is not a publication of this command", "name another file")
     try:
         root = ET.fromstring(document)
     except ET.ParseError as error:
@@ -336,7 +334,7 @@ def _add_text(parent: ET.Element, tag: str, text: str) -> None:
 def _find_element(element: ET.Element, path: str) -> ET.Element:
     found = element.find(path, _SPACES)
     if found is None:
-        raise InputError("out", f"holds a record without {path}", "name another file")
+        raise InputError("out", f"contains a record without {path}", "name another file")
     return found
 
 

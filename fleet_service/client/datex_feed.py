@@ -159,7 +159,7 @@ def publish_alerts(
             raise InputError(
                 "connect",
                 "no service answers for the map",
-                "start one; its silence ends no situation",
+                "start one; published situations stay until a service answers",
             )
         feed.query_alerts(session)
         feed.write_if_due()

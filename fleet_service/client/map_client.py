@@ -69,9 +69,8 @@ class Answer:
         if not self.missing:
             return None
         more = f" and {len(self.missing) - NAMED} more" if len(self.missing) > NAMED else ""
-        return (
-            f"nobody serves {', '.join(self.missing[:NAMED])}{more}: what is not there is not known"
-        )
+        names = ", ".join(self.missing[:NAMED])
+        return f"no service answers for {names}{more}: the map is unknown there"
 
 
 def connection_settings(connect: str | None, config: Path | str | None) -> ZenohSettings:
@@ -153,7 +152,7 @@ def served_table(answer: Answer) -> pa.Table:
         raise InputError(
             "connect",
             "no service answers for the map",
-            "start one; that is not the same as an empty map",
+            "start one; this is not the same as an empty map",
         )
     if answer.gap_description is None:
         return answer.table
@@ -161,7 +160,7 @@ def served_table(answer: Answer) -> pa.Table:
         raise InputError(
             "connect",
             answer.gap_description,
-            "start its service; that is not the same as an empty map",
+            "start its service; this is not the same as an empty map",
         )
     log.warning("%s", answer.gap_description)
     return answer.table.replace_schema_metadata({"missing": ",".join(answer.missing)})

@@ -130,7 +130,11 @@ def _say_regions(
             say(json.dumps({"event": event, "regions": sorted(found)}))
         elif found:
             names = ", ".join(sorted(found))
-            say(f"nobody serves {names}" if event == "away" else f"{names} is served again")
+            say(
+                f"no service answers for {names}"
+                if event == "away"
+                else f"{names} has a service again"
+            )
 
 
 def _tile_line(tile: int, table: pa.Table, as_json: bool) -> str:

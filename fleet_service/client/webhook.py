@@ -166,7 +166,7 @@ class Webhook:
         self._undelivered = len(self._queue)
         self._is_closed = True
         if self._undelivered:
-            self._say(f"webhook: {self._undelivered} alerts wait in the queue for the next watch")
+            self._say(f"webhook: {self._undelivered} alerts remain in the queue for the next watch")
         if self.lost_count:
             self._say(f"webhook: {self.lost_count} alerts were lost")
         if not self._thread.is_alive():
@@ -215,7 +215,7 @@ class Webhook:
             failure = f"{type(error).__name__} {error}".strip()
         self.counts["failures"] += 1
         if not self._failure:
-            self._say(f"webhook: {self._name} does not take alerts ({failure}); they wait")
+            self._say(f"webhook: {self._name} does not accept alerts ({failure}); they wait")
         self._failure = failure
         return failure
 
@@ -251,7 +251,7 @@ def check_url(url: str) -> None:
         is_valid = False
     if not is_valid:
         raise InputError(
-            "webhook", f"{url!r} is no URL", "give http://HOST/PATH or https://HOST/PATH"
+            "webhook", f"{url!r} is not a URL", "give http://HOST/PATH or https://HOST/PATH"
         )
     try:
         import httpx  # noqa: F401

@@ -71,7 +71,7 @@ def read_pair(stem: Path) -> KeyPair | None:
         key = serialization.load_pem_private_key(path.read_bytes(), None)
     except (ValueError, TypeError) as error:
         raise InputError(
-            "out", f"{path} is no private key", "move it away; it will be made anew"
+            "out", f"{path} is not a private key", "move it away; it will be created again"
         ) from error
     if not isinstance(key, Key) or key.public_key() != certificate.public_key():
         return None
@@ -90,7 +90,7 @@ def read_certificate(path: Path) -> x509.Certificate | None:
         return x509.load_pem_x509_certificate(path.read_bytes())
     except ValueError as error:
         raise InputError(
-            "out", f"{path} is no certificate", "move it away; it will be made anew"
+            "out", f"{path} is not a certificate", "move it away; it will be created again"
         ) from error
 
 
@@ -120,8 +120,8 @@ def issue_certificate(
         end = authority.certificate.not_valid_after_utc
         raise InputError(
             "days",
-            f"the authority ends before, on {end:%Y-%m-%d}",
-            "give fewer, or bring in another (--ca next)",
+            f"the authority's certificate ends earlier, on {end:%Y-%m-%d}",
+            "give fewer days, or introduce a new authority (--ca next)",
         )
     key = ec.generate_private_key(ec.SECP256R1())
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]

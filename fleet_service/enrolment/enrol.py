@@ -127,7 +127,7 @@ class Registry:
             raise InputError(
                 "ca",
                 "there is no next authority",
-                "begin with --ca next, and bring trust.pem to all",
+                "begin with --ca next, and distribute trust.pem to everyone",
             )
         if leaving != following.certificate:
             ca.write_atomically(self._authority / "old.pem", ca.to_pem(leaving), 0o644)
@@ -162,7 +162,7 @@ class Registry:
         until = f"{lost.not_valid_after_utc:%Y-%m-%d}"
         raise InputError(
             "fleet",
-            f"{name!r} was revoked and its certificate is good until {until}",
+            f"{name!r} was revoked and its certificate is valid until {until}",
             "give another name",
         )
 

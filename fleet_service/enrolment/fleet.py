@@ -24,7 +24,7 @@ def _checked_host(host: str) -> str:
         ipaddress.ip_address(host)
     except ValueError:
         if len(host) > 253 or not _HOST.fullmatch(host):
-            raise ValueError(f"{host[:60]!r} is no host name and no address") from None
+            raise ValueError(f"{host[:60]!r} is neither a host name nor an address") from None
     return host
 
 
@@ -38,21 +38,22 @@ class Router(Settings):
     hosts: list[Host] = Field(
         default=["127.0.0.1", "localhost"],
         min_length=1,
-        description="names and addresses by which others reach it",
+        description="host names and addresses of the router",
     )
-    listen: Host = Field(
-        default="127.0.0.1", description="address that it listens on; :: for every one"
-    )
+    listen: Host = Field(default="127.0.0.1", description="listen address; :: for all")
     port: int = Field(
-        default=7447, ge=1, le=65535, description="of both transports: QUIC over UDP, TLS over TCP"
+        default=7447,
+        ge=1,
+        le=65535,
+        description="port of both transports: QUIC over UDP, TLS over TCP",
     )
     quic: bool = Field(
         default=True, description="listen on QUIC too; false where UDP cannot reach the router"
     )
     vehicle_interfaces: list[str] = Field(
         default=[],
-        description="network interfaces on which no other router arrives; sessions over TLS are "
-        "capped there as well",
+        description="network interfaces on which no other router connects; TLS sessions are "
+        "limited there too",
     )
 
     @property
@@ -88,22 +89,20 @@ class Enrolment(Settings):
     """Names by role. A name has one role, because the certificate contains only the name."""
 
     routers: dict[VehicleName, Router] = Field(
-        min_length=1, description="each connects to those before it"
+        min_length=1, description="routers; each connects to those before it"
     )
     services: list[VehicleName] = Field(
-        default=["shard-0"], description="everything under gripmap/"
+        default=["shard-0"], description="services; may read and write everything under gripmap/"
     )
-    readers: list[VehicleName] = Field(default=[], description="map and alerts, nothing else")
-    weather: list[VehicleName] = Field(
-        default=[], description="who puts road weather, and does nothing else"
-    )
+    readers: list[VehicleName] = Field(default=[], description="readers of map and alerts only")
+    weather: list[VehicleName] = Field(default=[], description="writers of road weather only")
     vehicles: list[VehicleName] = Field(
-        default=[], description="their own keys; map and alerts to read"
+        default=[], description="vehicles; may write their own keys and read map and alerts"
     )
     owners: dict[VehicleName, list[VehicleName]] = Field(
         default={},
-        description="who may see what lies ahead of and under which vehicles, and read as a reader "
-        "does",
+        description="owners; may read what their vehicles publish about the road ahead and below, "
+        "and all that readers may",
     )
 
     @property
@@ -122,10 +121,10 @@ class Enrolment(Settings):
     def _one_role_each(self) -> Enrolment:
         twice = [name for name, times in Counter(self.names).items() if times > 1]
         if twice:
-            raise ValueError(f"{twice[0]!r} is there twice, and a name has one role")
+            raise ValueError(f"{twice[0]!r} occurs twice, but a name has only one role")
         strange = [
             name for owned in self.owners.values() for name in owned if name not in self.vehicles
         ]
         if strange:
-            raise ValueError(f"{strange[0]!r} has an owner and is no vehicle")
+            raise ValueError(f"{strange[0]!r} has an owner but is not a vehicle")
         return self

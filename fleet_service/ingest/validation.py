@@ -124,14 +124,20 @@ def check_heads(
 
 
 _HEAD_RULES: Final = (
-    Refusal("vehicle", BATCH, "vehicle: is not the one of the key; publish on your own key"),
-    Refusal("region", BATCH, "region: is not the one of the key; never let a batch span regions"),
+    Refusal(
+        "vehicle",
+        BATCH,
+        "vehicle: is not the vehicle of the key; publish on the key of this vehicle",
+    ),
+    Refusal(
+        "region", BATCH, "region: is not the region of the key; start a new batch for each region"
+    ),
     Refusal(
         "seq",
         BATCH,
         "seq: boot >= 0 and 1 <= first_held <= seq do not hold; count from 1 without gaps",
     ),
-    Refusal("estimator", BATCH, "estimator: is no name; use up to 64 of a-z, 0-9 and -"),
+    Refusal("estimator", BATCH, "estimator: is not a name; use up to 64 of a-z, 0-9 and -"),
     Refusal("time", 0, "time: too old or in the future; set the clock"),
 )
 
@@ -185,7 +191,7 @@ def check_rows(
         (
             grid.region_of(cell) != region,
             "region",
-            "cell: lies outside the batch's region; start a batch",
+            "cell: lies outside the batch's region; start a new batch",
         )
     )
     broken += [rows for rows, _, _ in extra]
@@ -264,23 +270,23 @@ def _broken_observation(columns: Columns, clock: Clock) -> list[tuple[NDArray[np
         (
             (leave < enter) | (leave - enter > MAX_VISIT_NS),
             "time",
-            "leave_time: before or long after enter_time; mend",
+            "leave_time: before or long after enter_time; correct it at the source",
         ),
         (
             wrong_cell,
             "cell",
-            "cell: is not at the pose; use the z21 quadint of latitude and longitude",
+            "cell: does not contain the position; use the z21 quadint of latitude and longitude",
         ),
-        (turned, "sector", "sector: is not the yaw's; 0 east, 1 north, 2 west, 3 south"),
+        (turned, "sector", "sector: does not match the yaw; use 0 east, 1 north, 2 west, 3 south"),
         (
             no_peak,
             "log_likelihood",
-            "log_likelihood: has no maximum; give steps below it, so that it reads 0",
+            "log_likelihood: has no maximum; give steps below it, so that the maximum is 0",
         ),
         (
             (lower > mu) | (mu > upper) | (lower > upper),
             "mu",
-            "mu: not mu_lower <= mu <= mu_upper; correct it",
+            "mu: mu_lower <= mu <= mu_upper does not hold; correct it at the source",
         ),
     ]
 

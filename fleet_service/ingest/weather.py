@@ -256,7 +256,7 @@ def read_file(path: Path) -> list[tuple[int, Report]]:
 def _parse_row(number: int, row: dict[str, Any]) -> tuple[int, Report]:
     fix = f"give region, time and any of {', '.join(COLUMNS[2:])}"
     if unknown := row.keys() - set(COLUMNS):
-        raise InputError("weather", f"{sorted(unknown)[0]} is no column of it", fix)
+        raise InputError("weather", f"{sorted(unknown)[0]} is not a column of road weather", fix)
     try:
         region = row["region"]
         at = row["time"]
@@ -271,9 +271,13 @@ def _parse_row(number: int, row: dict[str, Any]) -> tuple[int, Report]:
         }
         prior = None if row.get("prior") is None else np.array(row["prior"], np.float64)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError("weather", f"row {number}: no region, time and numbers", fix) from error
+        raise InputError(
+            "weather", f"row {number}: region, time or a number is missing", fix
+        ) from error
     problem = weather.broken(values, prior)
     if problem is not None or not 0 <= region < 1 << (2 * grid.REGION_ZOOM):
-        refusal = problem or InputError("region", "is no z10 region", "use its quadint or quadkey")
+        refusal = problem or InputError(
+            "region", "is not a z10 region", "use its quadint or quadkey"
+        )
         raise InputError(f"weather row {number}, {refusal.field}", refusal.problem, refusal.fix)
     return region, Report(when, prior=prior, **values)

@@ -37,7 +37,7 @@ def parse_tiles(request: Request) -> list[int]:
     """Return z14 quadints, at most some hundred."""
     words = request.query_params.get("tiles", "").split(",")
     if len(words) > MOST_TILES:
-        raise InputError("tiles", f"are {len(words)}", f"ask for {MOST_TILES} at once")
+        raise InputError("tiles", f"are {len(words)}", f"request at most {MOST_TILES} at once")
     return [_parse_whole("tiles", word, 0, 4**grid.TILE_ZOOM - 1) for word in words if word]
 
 
@@ -56,7 +56,7 @@ def parse_features(request: Request, now: int) -> FeatureQuestion:
     """
     given = request.query_params
     if unknown := [name for name in given if name not in _OF_FEATURES]:
-        raise InputError(unknown[0][:40], "is no parameter", f"use {', '.join(_OF_FEATURES)}")
+        raise InputError(unknown[0][:40], "is not a parameter", f"use {', '.join(_OF_FEATURES)}")
     box = query.parse({"bbox": given["bbox"]}).bbox if "bbox" in given else None
     since, at = _parse_interval(given.get("datetime", "../.."), now)
     limit = _parse_whole("limit", given["limit"], 1, 1 << 31) if "limit" in given else FEW
@@ -83,7 +83,7 @@ def _parse_interval(text: str, now: int) -> tuple[int, int | None]:
     if begin is None and end is None and not is_interval:
         raise InputError(
             "datetime",
-            f"{text[:40]!r} is no time",
+            f"{text[:40]!r} is not a time",
             "give 2026-01-31T07:00:00Z, or two with / between",
         )
     if begin is not None and end is not None and begin > end:
@@ -126,7 +126,7 @@ def _parse_whole(name: str, text: str, least: int, most: int) -> int:
         found = reading(text)
     except ValueError as error:
         raise InputError(
-            name, f"{text[:40]!r} is no whole number", f"give {least} to {most}"
+            name, f"{text[:40]!r} is not a whole number", f"give {least} to {most}"
         ) from error
     if not least <= found <= most:
         raise InputError(name, f"{text[:40]} is out of range", f"give {least} to {most}")

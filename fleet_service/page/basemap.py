@@ -60,7 +60,7 @@ class TileFile:
     def __init__(self, path: Path) -> None:
         self._lock = threading.Lock()
         if not path.is_file():
-            raise _base_map_error(f"{path} is not there")
+            raise _base_map_error(f"{path} does not exist")
         try:
             self._table = sqlite3.connect(
                 f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False
@@ -76,7 +76,7 @@ class TileFile:
         form = str(self.metadata.get("format"))
         if form not in KINDS or least is None:
             raise _base_map_error(
-                f"{path} holds {form} tiles" if least is not None else f"{path} holds no tile"
+                f"{path} contains {form} tiles" if least is not None else f"{path} holds no tile"
             )
         self.kind = KINDS[form]
         self.zooms = (int(least), int(most))
@@ -148,7 +148,7 @@ def base_map(text: str, attribution: str | None = None) -> BaseMap:
         mark in text for mark in " ;,'\""
     )
     if not whole or not text.startswith(("http://", "https://", "/")):
-        raise _base_map_error(f"{text[:60]!r} is no address of tiles")
+        raise _base_map_error(f"{text[:60]!r} is not a URL of tiles")
     return BaseMap(text, attribution=attribution or "")
 
 

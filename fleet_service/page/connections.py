@@ -82,6 +82,6 @@ class LoopErrors:
             self._more += 1
             return
         problem = context.get("exception") or context.get("message")
-        log.warning("web server: %s (and %d more since the last line)", problem, self._more)
+        log.warning("web server: %s (and %d more since the last message)", problem, self._more)
         self._logged_at = time.monotonic()
         self._more = 0

@@ -31,11 +31,11 @@ TITLE: Final = "Grip of the road, measured by vehicles"
 ABOUT: Final = (
     "Peak tyre-road friction per cell of some ten metres and heading, with its 5 % and 95 % "
     "quantiles. basis: "
-    "measured, or bound where only a lower bound is known; a bound has no mu. Where nobody was "
-    "there is no feature: "
-    "that is unknown, not dry. datetime: an instant is the map as it was then; of an interval, the "
-    "map as it was at "
-    "its end, and of that what was observed since its begin."
+    "measured, or bound where only a lower bound is known; a bound has no mu. A place that no "
+    "vehicle "
+    "visited has no feature: its grip is unknown, which does not mean dry. datetime: an "
+    "instant is the map as it was then; an interval is the map as it was at its end, restricted to "
+    "cells observed since its begin."
 )
 # Columns that are not told: the geometry says them.
 _PLACE: Final = ("latitude", "longitude", "west", "south", "east", "north")
@@ -85,7 +85,7 @@ def landing_document(base: str) -> dict[str, Any]:
             _make_link(f"{base}/?f=json", "self", JSON, "this document"),
             _make_link(f"{base}/", "alternate", "text/html", "the live page"),
             _make_link(f"{base}/api", "service-desc", OPENAPI, "the definition of this interface"),
-            _make_link(f"{base}/conformance", "conformance", JSON, "what it conforms to"),
+            _make_link(f"{base}/conformance", "conformance", JSON, "conformance classes"),
             _make_link(f"{base}/collections", "data", JSON, "the collections"),
         ],
     }
@@ -147,7 +147,7 @@ def api_definition(base: str) -> dict[str, Any]:
     def describe_route(summary: str, *parameters: dict[str, Any]) -> dict[str, Any]:
         answers = {
             "200": {"description": "the document"},
-            "400": {"description": "what was wrong, and how to mend it"},
+            "400": {"description": "the problem and how to correct it"},
         }
         return {"get": {"summary": summary, "parameters": list(parameters), "responses": answers}}
 
@@ -173,10 +173,19 @@ def api_definition(base: str) -> dict[str, Any]:
         | {"style": "form", "explode": False},
         describe_parameter("datetime", "query", "instant or interval, RFC 3339", type="string"),
         describe_parameter(
-            "limit", "query", "of one answer", type="integer", minimum=1, maximum=MOST, default=FEW
+            "limit",
+            "query",
+            "maximum number of features in one answer",
+            type="integer",
+            minimum=1,
+            maximum=MOST,
+            default=FEW,
         ),
         describe_parameter(
-            "after", "query", "id after which to go on; links say it", type="string"
+            "after",
+            "query",
+            "id after which the page of results begins; taken from a link",
+            type="string",
         ),
     )
     one = describe_parameter("featureId", "path", "CELL-SECTOR", type="string")
@@ -186,8 +195,8 @@ def api_definition(base: str) -> dict[str, Any]:
         "info": {"title": TITLE, "version": "1.0.0", "description": ABOUT},
         "servers": [{"url": base}],
         "paths": {
-            "/": describe_route("what there is"),
-            "/conformance": describe_route("what it conforms to"),
+            "/": describe_route("landing page"),
+            "/conformance": describe_route("conformance classes"),
             "/collections": describe_route("the collections"),
             own: describe_route("the collection"),
             f"{own}/schema": describe_route("the columns"),
@@ -212,7 +221,7 @@ def page_of(
     found = list(features)
     links = [_make_link(address, "self", GEOJSON, "this document")]
     if more:
-        links.append(_make_link(following, "next", GEOJSON, "what follows"))
+        links.append(_make_link(following, "next", GEOJSON, "next page"))
     return {
         "type": "FeatureCollection",
         "timeStamp": stamp,

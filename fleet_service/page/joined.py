@@ -60,5 +60,5 @@ def _strip_imports(text: str) -> str:
         lambda m: f"const {{ {m[1].replace(' as ', ': ')} }} = from_{m[2]};", _EXPORT.sub("", text)
     )
     if other := _OTHER.search(text):
-        raise ValueError(f"{other[0]!r} cannot be joined")
+        raise ValueError(f"{other[0]!r} cannot be joined into one script")
     return text

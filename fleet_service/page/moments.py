@@ -131,7 +131,7 @@ class Moments:
             table = pq.read_table(path, columns=list(_COLUMNS), partitioning=None)
         except (KeyError, OSError, pa.ArrowException) as error:
             raise InputError(
-                "at", f"there is no snapshot of {moment}", "take one of /moments"
+                "at", f"there is no snapshot of {moment}", "choose one of /moments"
             ) from error
         last = table["last_time"].cast(pa.timestamp("ns", "UTC"), safe=False)
         table = table.set_column(table.schema.get_field_index("last_time"), "last_time", last)

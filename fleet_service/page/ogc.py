@@ -90,7 +90,7 @@ class FeatureRoutes:
         """
         question = asked.parse_features(request, time.time_ns())
         if not self._reader.is_served:
-            message = "no service answers for the map; that is no empty map\n"
+            message = "no service answers for the map; this is not the same as an empty map\n"
             return PlainTextResponse(message, 503, headers={"Retry-After": "10"})
         if question.at is None:
             return await run_in_threadpool(self._items, request, question)
@@ -98,7 +98,7 @@ class FeatureRoutes:
             async with self._turns.take(request.client.host if request.client else ""):
                 return await run_in_threadpool(self._items, request, question)
         except TooManyQuestionsError:
-            message = "other questions about the past of this client wait already\n"
+            message = "this client already has other queries about the past waiting\n"
             return PlainTextResponse(message, 429, headers={"Retry-After": "5"})
 
     def _items(self, request: Request, question: FeatureQuestion) -> Response:
@@ -143,7 +143,7 @@ class FeatureRoutes:
                 }
             ]
             return JSONResponse({**found, "links": links}, media_type=GEOJSON)
-        return PlainTextResponse("nobody was there: nothing is known\n", 404)
+        return PlainTextResponse("no vehicle has visited this place: its grip is unknown\n", 404)
 
     def _cells(self, question: FeatureQuestion) -> pa.Table:
         """Return the rows by place, with one more than requested if there are more.

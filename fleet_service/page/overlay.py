@@ -26,7 +26,9 @@ def read_overlay(path: Path | None) -> dict[str, list[Any]] | None:
         table = pq.read_table(path, columns=["cell", "sector", "mu"], partitioning=None)
     except (OSError, pa.ArrowException) as error:
         raise InputError(
-            "overlay", f"{path.name} has no cell, sector and mu", "give a file that has"
+            "overlay",
+            f"{path.name} lacks the columns cell, sector and mu",
+            "give a file with these columns",
         ) from error
     found = table.group_by(["cell", "sector"]).aggregate([("mu", "mean")])
     return {

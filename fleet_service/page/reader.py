@@ -146,7 +146,7 @@ class Reader:
         """
         session = self._session
         if session is None:
-            raise InputError("connect", "no router answers", "see that one runs")
+            raise InputError("connect", "no router answers", "start one, or correct --connect")
         for key, payload in map_client.query_replies(session, selector, parameters):
             tile = keys.parse(key).quadint
             if tile is not None:
@@ -176,7 +176,7 @@ class Reader:
             for tile, table in self.ask(map_client.EVERYWHERE, {}):
                 self._world.take_tile(tile, table, time.time())
         except (InputError, WireError) as error:
-            log.warning("the map was not told: %s", error)
+            log.warning("the map could not be read: %s", error)
         self._ask_standing(session)
 
     def _ask_standing(self, session: zenoh.Session) -> None:
@@ -206,7 +206,7 @@ class Reader:
                     self._world.take_tile(answered, table, now)
                     found = True
             except (InputError, WireError) as error:
-                log.warning("a tile was not told: %s", error)
+                log.warning("a tile could not be read: %s", error)
             if found:
                 continue
             if self._answers(int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM))):

@@ -79,7 +79,7 @@ def read_roads(path: Path) -> RoadMap:
         ) from error
     if not found.lines or len(found.lines) > MOST_LINES:
         raise InputError(
-            "roads", f"{path} holds {len(found.lines)} lines", f"give 1 to {MOST_LINES}"
+            "roads", f"{path} contains {len(found.lines)} lines", f"give 1 to {MOST_LINES}"
         )
     return found
 

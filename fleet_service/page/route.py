@@ -104,7 +104,7 @@ def _sample_route(points: Points) -> tuple[Any, Any, Any, Any]:
         raise InputError(
             "route",
             f"is {lengths.sum() / 1e3:.1f} km long",
-            f"show up to {MOST_M / 1e3:.0f} km at once",
+            f"draw at most {MOST_M / 1e3:.0f} km",
         )
     counts = np.maximum(np.ceil(lengths / STEP_M), 1).astype(np.int64)
     leg = np.append(np.repeat(np.arange(len(counts)), counts), len(counts) - 1)

@@ -158,17 +158,17 @@ class PmtilesFile:
         except OSError as error:
             raise _refusal_of(f"{path} cannot be read ({error.strerror})") from error
         if len(head) < 127 or not head.startswith(_MAGIC):
-            raise _refusal_of(f"{path} is no PMTiles of version 3")
+            raise _refusal_of(f"{path} is not a PMTiles file of version 3")
         fields = _HEAD.unpack(head[: _HEAD.size])
         (self._root, self._root_size, about, about_size, self._leaves, _, self._data, *_) = fields[
             2:
         ]
         _, self._packing, tile_packing, kind, least, most = fields[-6:]
         if kind != _MVT:
-            raise _refusal_of(f"{path} holds images; give an .mbtiles of them")
+            raise _refusal_of(f"{path} contains images; give them as .mbtiles")
         packings = (_NO_COMPRESSION, _GZIP_COMPRESSION)
         if self._packing not in packings or tile_packing not in packings:
-            raise _refusal_of(f"{path} is packed in a way that is not known here (gzip is)")
+            raise _refusal_of(f"{path} uses an unsupported compression (gzip is supported)")
         self.zooms = (int(least), int(most))
         try:
             about_map = json.loads(self._part(about, about_size) or b"{}")
@@ -269,5 +269,7 @@ def _hilbert_number(zoom: int, x: int, y: int) -> int:
 
 def _refusal_of(problem: str) -> InputError:
     return InputError(
-        "base_map", problem, "make one with `pmtiles extract`, see the how-to of the live page"
+        "base_map",
+        problem,
+        "create one with `pmtiles extract`, see the how-to guide of the live page",
     )

@@ -163,7 +163,7 @@ class Routes:
         """Return a tile of the operator's file; empty if there is none."""
         file = self._of.base_map and self._of.base_map.file
         if not file:
-            return PlainTextResponse("this page has no tiles of its own; see --base-map\n", 404)
+            return PlainTextResponse("this page serves no tiles; see --base-map\n", 404)
         found = await run_in_threadpool(
             file.picture, *(request.path_params[name] for name in "zxy")
         )
@@ -218,7 +218,9 @@ class Routes:
                 asked.parse_view(request), request.client.host if request.client else ""
             )
         except TooManyWatchersError:
-            return PlainTextResponse("too many watch already\n", 503, headers={"Retry-After": "10"})
+            return PlainTextResponse(
+                "too many live connections are open\n", 503, headers={"Retry-After": "10"}
+            )
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
@@ -287,7 +289,7 @@ class Routes:
         if self._of.datex is None:
             return PlainTextResponse("this page publishes no situations; see --datex\n", 404)
         if self._of.datex.document is None:
-            message = "no service has answered yet; that is no dry road\n"
+            message = "no service has answered yet; this does not mean that roads are dry\n"
             return PlainTextResponse(message, 503, headers={"Retry-After": "10"})
         return Response(
             self._of.datex.document,
@@ -344,7 +346,7 @@ class Guarded:
 
         if scope["type"] == "http" and self._hosts and _host_name(scope) not in self._hosts:
             refusal = PlainTextResponse(
-                "this page is not served under that name; see --name\n", 421
+                "this page is not served under this host name; see --name\n", 421
             )
             await refusal(scope, receive, send_with_headers)
         else:

@@ -68,5 +68,5 @@ def fusion_from(tables: dict[str, pa.Table], lateness_s: float) -> Fusion:
         return fusion_of(image, lateness_s)
     except (KeyError, ValueError) as error:
         raise InputError(
-            "checkpoint", f"is not whole ({error})", "replay the archive instead"
+            "checkpoint", f"is incomplete ({error})", "replay the archive instead"
         ) from error

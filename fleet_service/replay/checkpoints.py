@@ -100,15 +100,13 @@ def load_checkpoint(path: Path) -> Taken:
         content: dict[str, Any] = manifest["content"]
         right = manifest["digest"] == _digest_of(content)
     except (ValueError, KeyError, TypeError, FileNotFoundError) as error:
-        raise _checkpoint_error(path, "has no manifest that can be read") from error
+        raise _checkpoint_error(path, "has no readable manifest") from error
     if not right or any(
         file_digest(path / name) != wanted for name, wanted in content["files"].items()
     ):
         raise _checkpoint_error(path, "is damaged")
     if _count_tries(path) >= TRIES:
-        raise _checkpoint_error(
-            path, f"was begun from {TRIES} times by a service that died at once"
-        )
+        raise _checkpoint_error(path, f"made the service fail at {TRIES} starts")
     tables = {}
     for name in content["files"]:
         with pa.memory_map(str(path / name)) as source:
@@ -151,7 +149,7 @@ def _digest_of(content: Sequence[Any] | dict[str, Any]) -> str:
 
 def _checkpoint_error(path: Path, problem: str) -> InputError:
     return InputError(
-        "checkpoint", f"{path.name} {problem}", "the one before it, or the log, is taken instead"
+        "checkpoint", f"{path.name} {problem}", "the service uses the previous one, or the log"
     )
 
 

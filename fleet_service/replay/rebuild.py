@@ -164,7 +164,7 @@ def ignore_observations(_: Observations) -> AbstractContextManager[None]:
 
 def too_much() -> InputError:
     """Return the error for a past map that needs too many rows."""
-    return InputError("at", "would have to read too much of the archive", "narrow bbox")
+    return InputError("at", "the query would read too much of the archive", "use a smaller bbox")
 
 
 def fusion_with_weather(root: Path, lateness_s: float, until: int) -> Fusion:

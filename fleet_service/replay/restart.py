@@ -71,7 +71,7 @@ def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()
             }
             fusion = fusion_from(tables, lateness_s)
         except Exception as error:  # noqa: BLE001 whatever is wrong with it, the log has it all
-            log.warning("checkpoint %s is not begun from: %s", path.name, error)
+            log.warning("checkpoint %s is not used: %s", path.name, error)
             refused += 1
             continue
         checkpoints.mark_begun(path)

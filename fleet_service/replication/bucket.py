@@ -52,7 +52,9 @@ class ObjectBucket:
     ) -> None:
         if SCHEMES.match(url) is None:
             raise InputError(
-                "archive.copy", f"{url} is no bucket", "give a URL such as s3://bucket/folder"
+                "archive.copy",
+                f"{url} is not the URL of a bucket",
+                "give a URL such as s3://bucket/folder",
             )
         try:
             import obstore
@@ -87,7 +89,7 @@ class ObjectBucket:
         except (BaseError, ValueError, TypeError) as error:
             fix = "see `store` in the settings; credentials may come from the environment"
             raise InputError(
-                "archive.store", f"is not as {url} wants it ({error_summary(error)})", fix
+                "archive.store", f"does not fit {url} ({error_summary(error)})", fix
             ) from error
 
     def put(self, name: str, content: bytes | Path) -> None:
@@ -113,7 +115,7 @@ class ObjectBucket:
             except self._known:
                 if self.get(name) != content:
                     raise CopyError(
-                        f"{name}: another service has put an object of this name"
+                        f"{name}: another service has written an object of this name"
                     ) from None
 
     def create(self, name: str, content: bytes) -> bool:

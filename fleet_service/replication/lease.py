@@ -280,7 +280,7 @@ class Lease:
                     mine.name, mine._replace(released=True, turn=mine.turn + 1, to=to).content
                 )
             except CopyError as error:
-                log.warning("the lease runs out by itself: %s", error)
+                log.warning("the lease was not released and expires by itself: %s", error)
 
     def make_new_lease(self) -> Lease:
         """Return a new lease to wait for, after this one was lost."""
@@ -306,7 +306,7 @@ class Lease:
                 if self.serves():
                     self.renew()
             except CopyError as error:
-                log.warning("the lease is not renewed: %s", error)
+                log.warning("the lease could not be renewed: %s", error)
             if self.lost:
                 return
 

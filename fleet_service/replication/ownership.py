@@ -138,7 +138,7 @@ def acquire_archive(
             raise InputError(
                 "standby",
                 "needs archive.copy",
-                "name the bucket of the service that it is to follow",
+                "set archive.copy to the bucket of the active service",
             )
         return open_exclusive(config, root)
     lock_file = lock_archive(root)
@@ -175,7 +175,7 @@ def _acquire_under_lease(
             if lease.succeeds and not mirrors:
                 raise InputError(
                     "archive.path",
-                    f"{root} is no archive of {url}",
+                    f"{root} is not the archive of {url}",
                     "give the service an empty folder",
                 )
             copy.attach_lease(partial(_may_acknowledge, lease), lease.assert_not_superseded)
@@ -189,8 +189,8 @@ def _acquire_under_lease(
     except CopyError as error:
         _release_and_close(lease, copy)
         fix = (
-            "see that it is reached, and endpoint, region and credentials; start again, nothing "
-            "is lost"
+            "check the network, endpoint, region and credentials, "
+            "then start again; no data are lost"
         )
         raise InputError("archive.copy", f"{url} cannot be used ({error})", fix) from error
     except BaseException:

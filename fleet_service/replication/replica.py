@@ -121,7 +121,7 @@ class BucketReplica:
         if self._since is None:
             return None
         waits = f"nothing is acknowledged for {self.away_s:.0f} s"
-        return f"the copy at {self._url} does not take segments, {waits}: {self._error}"
+        return f"the copy at {self._url} does not accept segments, {waits}: {self._error}"
 
     def sync_without_lease(self, service: str) -> int:
         """Synchronise folder and bucket in both directions; return the number of downloaded files.
@@ -135,8 +135,8 @@ class BucketReplica:
             return self.sync_under_lease(service)
         except CopyError as error:
             fix = (
-                "see that it is reached, and endpoint, region and credentials; start again, "
-                "nothing is lost"
+                "check the network, endpoint, region and credentials, "
+                "then start again; no data are lost"
             )
             raise InputError(
                 "archive.copy", f"{self._url} cannot be used ({error})", fix
@@ -233,7 +233,7 @@ class BucketReplica:
                 failure there is a pause, which grows with each further failure.
         """
         if time.monotonic() < self._not_before:
-            raise CopyError(f"is tried again: {self._error}")
+            raise CopyError(f"the upload fails and is tried again: {self._error}")
         try:
             missing = [
                 path
@@ -275,7 +275,7 @@ class BucketReplica:
         deadline = time.monotonic() + TURN_S
         for first in range(0, len(paths), _AT_ONCE):
             if time.monotonic() > deadline:
-                raise CopyError(f"{len(paths) - first} segments are still to be put")
+                raise CopyError(f"{len(paths) - first} segments are not uploaded yet")
             some = paths[first : first + _AT_ONCE]
             try:
                 if len(some) == 1:
@@ -288,9 +288,9 @@ class BucketReplica:
 
     def _upload_changes(self, *, with_log: bool) -> int:
         if not self._may():
-            raise CopyError("the lease is not held for sure")
+            raise CopyError("this service may have lost the lease")
         if not self._following.acquire(timeout=QUICK_S):
-            raise CopyError("compacted files are being put")
+            raise CopyError("compacted files are being uploaded")
         try:
             known = (
                 self._copied.copy_stamps()
@@ -375,7 +375,7 @@ class BucketReplica:
                 f"{self._url} is the copy of another service, {there.decode(errors='replace')[:60]}"
             )
             raise InputError(
-                "archive.copy", problem, "give each service a folder of its own in the bucket"
+                "archive.copy", problem, "give each service its own folder in the bucket"
             )
 
     def _download_missing(self, there: Mapping[str, int]) -> int:

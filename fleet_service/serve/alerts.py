@@ -99,7 +99,7 @@ class Alerts:
                 out.append(self._standing[slot])
         gripping = np.flatnonzero((slippery < CLEAR_BELOW) & standing)
         gripping = gripping[self._have_witnesses(slots[gripping], GRIP, time[gripping])]
-        reason = "later visits found grip"
+        reason = "later visits measured good grip"
         return out + [self._clear(int(slots[k]), int(time[k]), reason) for k in gripping.tolist()]
 
     def _is_admitted(self, slot: int, time: int) -> bool:
@@ -135,7 +135,7 @@ class Alerts:
         slots = np.array(sorted(self._standing), np.int64)
         forgotten = self._fusion.sources(slots, ICE, now - QUIET_NS)[:, 0] == 0
         faded = (self._fusion.beliefs(slots, now) @ SLIPPERY_SHARE < FADE_BELOW) & forgotten
-        reason = "no visit has confirmed it for too long"
+        reason = "no recent visit has confirmed the alert"
         return [self._clear(int(slot), now, reason) for slot in slots[faded]]
 
     def _clear(self, slot: int, time: int, reason: str) -> Alert:

@@ -52,7 +52,7 @@ PAST_WAIT_S: Final = 4.0  # for their turn; a reader waits longer
 
 
 def _past_is_busy() -> InputError:
-    return InputError("at", "other pasts are being rebuilt", "ask again later")
+    return InputError("at", "too many past maps are being rebuilt", "ask again later")
 
 
 class Answering(NamedTuple):
@@ -152,9 +152,9 @@ class MapQueryable:
                 cost = asked.cells * COST[wanted.format]
                 if cost > MOST:
                     fix = (
-                        "narrow bbox, or take format=arrow"
+                        "use a smaller bbox, or format=arrow"
                         if COST[wanted.format] > 1
-                        else "narrow bbox"
+                        else "use a smaller bbox"
                     )
                     raise InputError("bbox", "the answer would be too large", fix)
                 cost += asked.tiles * TILE_COST
@@ -207,7 +207,11 @@ class MapQueryable:
             self._counts["refused_queries"] += 1
             self._refuse(
                 dropped.request,
-                InputError("query", "too many ask for as much", "ask again later, or for less"),
+                InputError(
+                    "query",
+                    "too many large queries are waiting",
+                    "ask again later, or query a smaller area",
+                ),
             )
 
     def _work(self) -> None:
@@ -262,10 +266,10 @@ class MapQueryable:
         ) as error:  # whatever it is: a query that ends without a reply says that there is no data
             answered.whole = True
             self._counts["answer_failures"] += 1
-            log.exception("a query could not be answered")
+            log.exception("a query failed")
             with suppress(zenoh.ZError):
                 request.reply_err(
-                    f"query: could not be answered ({type(error).__name__}); ask again later",
+                    f"query: failed in the service ({type(error).__name__}); ask again later",
                     encoding=TEXT,
                 )
         if answered.whole:

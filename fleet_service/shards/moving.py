@@ -80,10 +80,10 @@ def hand_over(
     with tokens.track_tokens(session) as there:
         service = _find_server(there, region)
         if service is None:
-            raise InputError("region", f"nobody serves {region}", "see `fleet-service watch`")
+            raise InputError("region", f"no service serves {region}", "see `fleet-service watch`")
         if service == to:
             return None
-        say(f"{service} hands over {_request_handover(session, service, to)}")
+        say(f"{service} hands over: {_request_handover(session, service, to)}")
         end = time.monotonic() + MOVED_S
         absent_since = 0.0
         while (now := _find_server(there, region)) != to:
@@ -91,7 +91,7 @@ def hand_over(
             if time.monotonic() > end or now not in (None, service):
                 raise InputError(
                     "to",
-                    f"{to} does not serve {region}, but {now or 'nobody'} does",
+                    f"{to} does not serve {region}, but {now or 'no service'} does",
                     "see their logs",
                 )
             time.sleep(LOOK_S)

@@ -107,7 +107,7 @@ def _claim_regions(
                 break
             waited += LOOK_S
         if others:
-            problem = f"{others[0].region} is served by {others[0].service} already"
+            problem = f"{others[0].region} is already served by {others[0].service}"
             raise InputError("regions", problem, "stop that service, or give each its own regions")
         held = _declare_tokens(session, mine, CLAIMS)
         if not others_there():
@@ -116,7 +116,9 @@ def _claim_regions(
             token.undeclare()
         stop.wait(secrets.randbelow(1000) * 1e-3)
     raise InputError(
-        "regions", "others start for them at the same time", "start one service for each region"
+        "regions",
+        "other services start for the same regions at the same time",
+        "start one service for each region",
     )
 
 

@@ -82,8 +82,10 @@ def add_command(commands: Any, name: str, about: str, example: str) -> argparse.
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     louder = parser.add_mutually_exclusive_group()
-    louder.add_argument("-v", "--verbose", action="store_true", help="say what libraries say too")
-    louder.add_argument("-q", "--quiet", action="store_true", help="errors only")
+    louder.add_argument(
+        "-v", "--verbose", action="store_true", help="also show the log messages of libraries"
+    )
+    louder.add_argument("-q", "--quiet", action="store_true", help="show errors only")
     return parser
 
 
@@ -100,7 +102,7 @@ class VersionAction(argparse.Action):
             option_strings,
             dest,
             nargs=0,
-            help="show the version and leave",
+            help="show the version and exit",
             default=argparse.SUPPRESS,
         )
 
@@ -151,7 +153,7 @@ def out_folder(field: str, path: Path) -> Path:
         raise InputError(
             field,
             f"cannot write {path} (No such file or directory)",
-            "name a file in a folder that is there",
+            "name a file in an existing folder",
         )
     return path
 
@@ -167,7 +169,7 @@ def report_write_errors(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(
-            "out", f"cannot write {path} ({error.strerror})", "name a file you may write"
+            "out", f"cannot write {path} ({error.strerror})", "name a file that you may write"
         ) from error
 
 
@@ -193,7 +195,7 @@ def refuse_input_path(field: str, out: Path, inputs: Sequence[Path]) -> None:
     """
     for source in inputs:
         if out.resolve() == source.resolve():
-            raise InputError(field, f"would replace {source}, which is read", "name another file")
+            raise InputError(field, f"would overwrite the input {source}", "name another file")
 
 
 def completion(parser: argparse.ArgumentParser, shell: str) -> str:
@@ -203,7 +205,7 @@ def completion(parser: argparse.ArgumentParser, shell: str) -> str:
         InputError: the shell is not supported.
     """
     if shell not in SHELLS:
-        raise InputError("shell", f"{shell!r} is none", f"use one of {', '.join(SHELLS)}")
+        raise InputError("shell", f"{shell!r} is unknown", f"use one of {', '.join(SHELLS)}")
     import shtab
 
     script: Any = shtab.complete(parser, shell)

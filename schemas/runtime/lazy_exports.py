@@ -22,7 +22,9 @@ def lazy_exports(
 
     def look_up(name: str) -> Any:  # noqa: ANN401 whatever stands behind a name
         if name not in names:
-            raise AttributeError(f"{package} has no {name!r}; its face is {', '.join(face)}")
+            raise AttributeError(
+                f"{package} has no {name!r}; its public names are {', '.join(face)}"
+            )
         return getattr(import_module(names[name]), name)
 
     return face, look_up, lambda: face

@@ -115,7 +115,7 @@ def link_metrics(watches: Sequence[LinkWatch]) -> list[Metric]:
         Metric(
             "links_lost",
             "counter",
-            "losses of a router",
+            "connections to a router that were lost",
             {"": sum(watch.lost for watch in watches)},
         ),
     ]

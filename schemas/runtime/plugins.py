@@ -47,5 +47,5 @@ def load_entry_point(group: str, name: str) -> Any:  # noqa: ANN401 whatever sta
         raise InputError(
             field,
             f"{name!r} cannot be loaded from {where} ({str(error) or type(error).__name__})",
-            "mend or remove it",
+            "correct or remove the plug-in",
         ) from error

@@ -89,7 +89,9 @@ class _Without(MetaPathFinder):
 
     def find_spec(self, fullname: str, path: object, target: object = None) -> None:  # noqa: ARG002 as finders have it
         if fullname in self._names:
-            raise ModuleNotFoundError(f"{fullname} is kept out of this process", name=fullname)
+            raise ModuleNotFoundError(
+                f"{fullname} must not be imported in this process", name=fullname
+            )
 
 
 def print_line(line: str, stream: TextIO) -> None:

@@ -20,8 +20,7 @@ from schemas.runtime.process import print_line
 PATIENCE_S: Final = 0.8  # after which a person asks whether it still runs
 TICK_S: Final = 1.0
 COMPILING: Final = (
-    "compiling kernels that this machine does not have yet: seconds to a minute, "
-    "kept for the next start"
+    "compiling kernels for this machine: takes up to a minute, once; the next start reuses them"
 )
 
 

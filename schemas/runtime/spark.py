@@ -50,7 +50,7 @@ def session(*, progress: bool = False) -> Any:  # noqa: ANN401 a package without
         return builder.getOrCreate()
     except PySparkRuntimeError as error:
         raise InputError(
-            "engine", "Spark does not start", "install a Java it knows, 17 or 21, or set JAVA_HOME"
+            "engine", "Spark does not start", "install Java 17 or 21, or set JAVA_HOME"
         ) from error
 
 
@@ -101,7 +101,9 @@ def spread(
     except (PySparkException, Py4JError) as error:
         problem = str(error).strip().partition("\n")[0][:200]
         raise InputError(
-            "engine", f"Spark gave up: {problem}", "its log says why; what is done is done"
+            "engine",
+            f"Spark gave up: {problem}",
+            "its log gives the reason; finished parts are kept",
         ) from error
     outcomes = dict(_unpack_column(answers["task"]))
     for outcome in outcomes.values():

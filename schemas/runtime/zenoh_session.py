@@ -71,7 +71,7 @@ def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
             problem = f"Zenoh refuses {text[:60]}"
             if key == ENDPOINTS:
                 raise InputError(
-                    "connect", f"{', '.join(settings.connect)[:60]} is no endpoint", _FIX
+                    "connect", f"{', '.join(settings.connect)[:60]} is not an endpoint", _FIX
                 ) from error
             raise InputError(
                 f"zenoh.config.{key}", problem, "see Zenoh's configuration reference"

@@ -203,7 +203,9 @@ def _check(message: Any, kind: Kind) -> None:  # noqa: ANN401
         if name == LIKELIHOOD:
             if given not in (0, n * mugrid.BINS):
                 raise WireError(
-                    name, f"{given} bytes for {n} records", f"send {mugrid.BINS} a record, or none"
+                    name,
+                    f"{given} bytes for {n} records",
+                    f"send {mugrid.BINS} per record, or none",
                 )
         elif given != n and (given or name in NEEDED[kind]):
             raise WireError(
@@ -230,7 +232,9 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
             outside = (columns[name] < limits.min) | (columns[name] > limits.max)
             refuse(
                 outside,
-                WireError(name, f"does not fit {dtype}", "use the values that the .proto names"),
+                WireError(
+                    name, f"does not fit {dtype}", "use the values defined in the .proto file"
+                ),
             )
             columns[name] = np.where(outside, 0, columns[name]).astype(dtype)
     placed = sent.records("cell") if kind is Kind.OBSERVATION else np.zeros(len(owner), bool)
@@ -238,7 +242,7 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
     needs_place = ~placed & (region_missing | (kind is Kind.OBSERVATION))
     for name in ("latitude", "longitude"):
         nowhere = ~(np.abs(columns[name]) <= 180.0) & needs_place
-        refuse(nowhere, WireError(name, "is not a position", "send finite degrees"))
+        refuse(nowhere, WireError(name, "has values that are not positions", "send finite degrees"))
         needs_place &= ~nowhere
     if kind is Kind.OBSERVATION:
         _derive(columns, sent, needs_place)

@@ -123,7 +123,9 @@ def encode(batch: Batch) -> bytes:
     if not 1 <= n <= MAX_ROWS:
         raise WireError("rows", f"a batch of {n} records", f"send 1 to {MAX_ROWS}")
     if unknown := batch.columns.keys() - types.keys():
-        raise WireError(sorted(unknown)[0], "is no column of this kind", f"use {', '.join(types)}")
+        raise WireError(
+            sorted(unknown)[0], "is not a column of this kind", f"use {', '.join(types)}"
+        )
     message = MESSAGES[batch.kind](
         vehicle=batch.vehicle,
         boot=batch.boot,
@@ -169,7 +171,7 @@ def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> A
     ) as error:
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         problem = f"is no {message.DESCRIPTOR.name} ({reason})"
-        raise WireError("payload", problem, "encode it as its .proto says") from error
+        raise WireError("payload", problem, "encode it as defined in the .proto file") from error
     raise WireError("encoding", f"{encoding[:80]!r}", f"use {expected} or {JSON}")
 
 
@@ -288,7 +290,7 @@ def decode_standing(payload: bytes) -> list[Alert]:
         message.ParseFromString(payload)
     except DecodeError as error:
         raise WireError(
-            "payload", "is no StandingAlerts", "encode it as its .proto says"
+            "payload", "is no StandingAlerts", "encode it as defined in the .proto file"
         ) from error
     return [_alert(alert) for alert in message.alerts]
 

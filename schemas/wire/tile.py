@@ -38,14 +38,14 @@ def decode_tile(payload: bytes) -> pa.Table:
             if not stream.schema.equals(MAP_SCHEMA):
                 raise WireError(
                     "tile",
-                    "has other columns than the map",
+                    "has columns that differ from the map's",
                     "use the schema of `tables.MAP_SCHEMA`",
                 )
             table = _read_rows(stream)
         table.validate(full=True)
     except (pa.ArrowException, OSError, struct.error, IndexError, UnicodeDecodeError) as error:
         raise WireError(
-            "tile", f"is no Arrow stream ({type(error).__name__})", "write it with Arrow"
+            "tile", f"is not an Arrow stream ({type(error).__name__})", "write it with Arrow"
         ) from error
     return table
 
@@ -71,7 +71,8 @@ def _refuse_compressed(payload: bytes) -> None:
                 raise WireError(
                     "tile",
                     "is compressed",
-                    "send it as it is; a small message may not become a large one",
+                    "send it uncompressed; compressed tiles are refused because they can "
+                    "expand without limit",
                 )
 
 

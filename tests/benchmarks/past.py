@@ -109,7 +109,7 @@ def _time_answer(session: zenoh.Session, selector: str) -> tuple[float, list[pa.
         if not refused:
             payloads = [reply.ok.payload.to_bytes() for reply in replies if reply.ok]
             return seconds, [pa.ipc.open_stream(payload).read_all() for payload in payloads]
-        if "other pasts" not in refused[0]:
+        if "too many past maps" not in refused[0]:
             raise RuntimeError(refused[0])
 
 

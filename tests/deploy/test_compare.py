@@ -182,7 +182,8 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     ]
     assert (
         grip.line()
-        == "On the new ice, after it was known: 1 of 2 warned drivers lost grip, and 1 of 1 unwarned "
+        == "On the new ice, after it was known: 1 of 2 warned drivers lost grip, and 1 of 1 "
+        "unwarned "
         "drivers."
     )
     nobody = compare.lost_grip(driven, [], 10 * S, 0.5)

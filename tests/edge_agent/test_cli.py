@@ -378,7 +378,7 @@ BAD_ARGUMENTS = {
     "no vehicle file": (["--vehicle", "nowhere.json"], "^error: vehicle: cannot read nowhere.json"),
     "broken start": (
         ["--start", "yesterday"],
-        "^error: start: 'yesterday' is no time; write it like 2026",
+        "^error: start: 'yesterday' is not a time; write it like 2026",
     ),
     "no configuration": (["--config", "nowhere.json"], "^error: config: cannot read nowhere.json"),
     "name for no key": (

@@ -228,7 +228,10 @@ def main() -> int:
         "--lease-s", type=float, default=LEASE_S, help="on a machine that has no time for 5 s"
     )
     parser.add_argument(
-        "--out", type=Path, default=Path(".faults/cluster"), help="figures and what was left"
+        "--out",
+        type=Path,
+        default=Path(".faults/cluster"),
+        help="folder for figures and remaining files",
     )
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")
     args = parser.parse_args()

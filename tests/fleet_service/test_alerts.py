@@ -57,7 +57,7 @@ def alert(
         2,
         float(latitude),
         float(longitude),
-        "P(mu < 0.4) = 0.95 > 0.9" if raised else "later visits found grip",
+        "P(mu < 0.4) = 0.95 > 0.9" if raised else "later visits measured good grip",
     )
 
 
@@ -109,7 +109,7 @@ def test_a_stretch_keeps_its_id_while_it_grows_joins_falls_apart_and_ends() -> N
     assert [one.cells for one in apart if one.id == old.id] == [2], "the larger part keeps the name"
     ended = take_alerts(road, *(alert(x, raised=False, at=40) for x in (0, 6, 8)))
     assert {one.state for one in ended} == {"cleared"}
-    assert {one.reason for one in ended} == {"later visits found grip"}
+    assert {one.reason for one in ended} == {"later visits measured good grip"}
     assert take_alerts(road) == []
 
 
@@ -160,7 +160,7 @@ def test_webhook_has_alertmanagers_format_and_order_after_a_refusal(tmp_path: Pa
     assert first["labels"]["alertname"] == "SlipperyRoad"
     assert (first["startsAt"], first["endsAt"]) == ("2027-01-15T08:00:00Z", "0001-01-01T00:00:00Z")
     assert second["endsAt"] == "2027-01-15T08:00:05Z"
-    assert "does not take alerts" in said[0]
+    assert "does not accept alerts" in said[0]
     assert "answers again" in said[1]
 
 
@@ -170,7 +170,7 @@ def test_undelivered_alerts_stay_for_the_next_watch(tmp_path: Path) -> None:
     hook.send(take_alerts(Stretches(), alert(0))[0])
     until(lambda: bool(hook.troubles()))
     hook.close()
-    assert said[-1] == "webhook: 1 alerts wait in the queue for the next watch"
+    assert said[-1] == "webhook: 1 alerts remain in the queue for the next watch"
     assert (hook.waiting_count, hook.lost_count) == (1, 0)
     with receiver() as (url, heard):
         again = Webhook(url, said.append, AlertQueue(tmp_path / "queue"))
@@ -207,7 +207,7 @@ def test_broken_receiver_loses_no_alert_silently(tmp_path: Path, kind: str) -> N
 
 @pytest.mark.parametrize("url", ["ftp://x", "x", "http://", "http://[", "http://a:99999999/"])
 def test_webhook_refuses_what_is_no_url(url: str) -> None:
-    with pytest.raises(InputError, match="is no URL"):
+    with pytest.raises(InputError, match="is not a URL"):
         check_url(url)
 
 
@@ -249,8 +249,6 @@ def test_watch_says_stretches_as_json_and_sends_them(
 
 def test_a_webhook_that_is_no_url_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["watch", "--webhook", "x"]) == 2
-    assert capsys.readouterr().err.startswith("error: webhook: 'x' is no URL")
+    assert capsys.readouterr().err.startswith("error: webhook: 'x' is not a URL")
     assert main(["watch", "--health-port", "1"]) == 2
-    assert capsys.readouterr().err.startswith(
-        "error: health_port: has no meaning without a webhook"
-    )
+    assert capsys.readouterr().err.startswith("error: health_port: needs a webhook")

@@ -51,7 +51,7 @@ def test_every_command_has_help_and_every_option_is_in_the_reference(
 
 def test_the_help_of_analyze_names_every_question() -> None:
     (analyze,) = (command for command in cli.COMMANDS if command.name == "analyze")
-    assert analyze.help == f"ask the archive: {', '.join(QUESTIONS)}"
+    assert analyze.help == f"analyse the archive: {', '.join(QUESTIONS)}"
 
 
 def test_help_comes_without_what_commands_need() -> None:
@@ -128,7 +128,7 @@ def test_an_endpoint_without_a_protocol_is_named(capsys: pytest.CaptureFixture[s
 
 def test_parameters_parted_by_an_ampersand_are_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["query", "--bbox", "1,2,3,4&format=json", "--connect", "tcp/127.0.0.1:1"]) == 2
-    assert "part the parameters by ';'" in capsys.readouterr().err
+    assert "separate the parameters by ';'" in capsys.readouterr().err
 
 
 def test_a_taken_archive_is_said(

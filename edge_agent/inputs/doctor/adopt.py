@@ -57,7 +57,8 @@ def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
     if any(finding.channel == "t" for finding in diagnosis.findings):  # a time in another unit
         return Adopted(log, vehicle, diagnosis, [])
     notes = [
-        f"note: the data of {device} are {abs(seconds):.3f} s {'late' if seconds > 0.0 else 'early'}; "
+        f"note: the data of {device} are {abs(seconds):.3f} s "
+        f"{'late' if seconds > 0.0 else 'early'}; "
         "corrected for this replay"
         for device, seconds in delays.items()
     ]

@@ -55,7 +55,7 @@ class Habits:
         for name in ("alpha", "theta"):
             if getattr(self, name) < 0.0:
                 raise InputError(
-                    name, "negative: the ants would shun what is good", "use 0 or more"
+                    name, "negative: the ants would avoid good choices", "use 0 or more"
                 )
 
 

@@ -47,32 +47,40 @@ QUESTIONS: Final = {
     question.name: question
     for question in (
         Question(
-            "grip", "percentiles of mu per cell and day, and what is not known", "mu_p10", "mu_p50"
+            "grip",
+            "percentiles of mu per cell and day, and the share of unknown cells",
+            "mu_p10",
+            "mu_p50",
         ),
-        Question("worst", "the worst stretches, merged into segments", "-score", "mu"),
+        Question("worst", "the most slippery stretches, merged into segments", "-score", "mu"),
         Question(
             "spells",
             "onset and duration of slippery spells, and the time to an alert",
             "onset",
             "duration_s",
         ),
-        Question("before-after", "what a treatment changed, with interval", "-period", None),
+        Question("before-after", "change of grip by a treatment, with interval", "-period", None),
         Question("vehicles", "bias and sensor health per vehicle", "-z", None),
         Question("calibration", "how often the published interval held", "age_h", None),
-        Question("weather", "grip by temperature of the nearest station", "temperature", None),
+        Question(
+            "weather",
+            "grip as a function of the nearest station's temperature",
+            "temperature",
+            None,
+        ),
         Question(
             "change-rates",
-            "how fast roads turn slippery or back, by temperature and hour",
+            "rates at which roads become slippery or recover, by temperature and hour",
             "by",
             None,
         ),
         Question(
             "contract",
-            "whether agreed grip was kept on each link of a road network",
+            "time below the agreed grip on each link of a road network",
             "-least_s",
             None,
         ),
-        Question("replay", "the map as of a moment, or a day of it", "-p_slippery", "mu"),
+        Question("replay", "the map as of a moment, or frames over a period", "-p_slippery", "mu"),
     )
 }
 
@@ -104,4 +112,6 @@ def question_of(name: str) -> Question:
     if name in plugins.entry_points_of(plugins.QUESTIONS):
         found: Question = plugins.load_entry_point(plugins.QUESTIONS, name)
         return found
-    raise InputError("question", f"{name!r} is none", f"use one of {', '.join(known_questions())}")
+    raise InputError(
+        "question", f"{name!r} is unknown", f"use one of {', '.join(known_questions())}"
+    )

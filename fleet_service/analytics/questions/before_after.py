@@ -65,12 +65,12 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """
     if options.at is None:
         raise InputError(
-            "at", "no moment of the treatment", "give one, e.g. --at 2026-01-31T07:00:00Z"
+            "at", "the time of the treatment is missing", "give it, e.g. --at 2026-01-31T07:00:00Z"
         )
     (row,) = engine.answer(expression(engine.observations(), options.at // NS)).to_pylist()
     if not row["cells"] or row["vehicles"] < 2:
         raise InputError(
-            "at", "no cell was measured in both periods by two vehicles", "give longer periods"
+            "at", "in no cell did two vehicles measure in both periods", "choose longer periods"
         )
     difference = (row["later"] - row["before"]) / row["w"]
     std = float(np.sqrt(row["squares"] * row["vehicles"] / (row["vehicles"] - 1))) / row["w"]

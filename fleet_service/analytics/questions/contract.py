@@ -84,8 +84,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
     if options.roads is None:
         raise InputError(
             "roads",
-            "no table of roads",
-            "make one: fleet-service roads EXTRACT --out roads.parquet",
+            "the table of roads is missing",
+            "create it: fleet-service roads EXTRACT --out roads.parquet",
         )
     if options.level is None or options.within_s is None:
         missing = "level" if options.level is None else "within"

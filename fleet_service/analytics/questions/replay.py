@@ -34,8 +34,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
     if options.step_s is not None and not LEAST_STEP_S <= options.step_s < math.inf:
         raise InputError(
             "step",
-            f"{options.step_s:g} s is no step",
-            "give the seconds between two frames, e.g. 600",
+            f"{options.step_s:g} s is not a valid step",
+            "give the time between two frames in seconds, e.g. 600",
         )
     at = options.at if options.at is not None else engine.part.until
     last = at if options.step_s is None else max(at, engine.part.until)
@@ -84,7 +84,9 @@ def _frames_begin(engine: QueryEngine, first: int, step: int) -> int:
             f"makes {frames} frames from {np.datetime64(begin, 'ns').astype('datetime64[s]')} on"
         )
         raise InputError(
-            "step", problem, f"give a longer one, or --from and --to; {MOST_FRAMES} are the most"
+            "step",
+            problem,
+            f"give a longer step, or --from and --to; the limit is {MOST_FRAMES} frames",
         )
     return begin
 

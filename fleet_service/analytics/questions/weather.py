@@ -81,7 +81,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
     if options.stations is None:
         raise InputError(
             "stations",
-            "no table of readings",
+            "the table of readings is missing",
             f"give a CSV or Parquet file with {', '.join(NEEDED)}",
         )
     stations, readings = read_stations(options.stations)
@@ -111,10 +111,10 @@ def read_stations(path: Path) -> tuple[pa.Table, pa.Table]:
         time = table["time"].cast(pa.timestamp("s")).cast(pa.int64())
         numbers = {name: table[name].cast(pa.float64()) for name in NEEDED[2:]}
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-        problem = f"{path.name} has a value that is none ({str(error).splitlines()[0][:100]})"
+        problem = f"{path.name} has an invalid value ({str(error).splitlines()[0][:100]})"
         fix = (
-            "write times like 2026-01-31T07:00:00, numbers with a point, and leave empty what is "
-            "not known"
+            "write times like 2026-01-31T07:00:00, numbers with a decimal point, and leave "
+            "unknown values empty"
         )
         raise InputError("stations", problem, fix) from error
     for name, column in numbers.items():

@@ -150,7 +150,9 @@ def read_roads(path: Path) -> pa.Table:
     except (OSError, pa.ArrowInvalid, pa.ArrowTypeError, KeyError) as error:
         reason = str(error).splitlines()[0][:100]
         raise InputError(
-            "roads", f"{path} is no such file ({reason})", "make it with fleet-service roads"
+            "roads",
+            f"{path} is not a table of roads ({reason})",
+            "create it with fleet-service roads",
         ) from error
 
 

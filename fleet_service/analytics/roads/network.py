@@ -79,7 +79,7 @@ def read_network(path: Path, identity: str = "id", name: str = "name") -> RoadNe
     """
     if not path.is_file():
         raise InputError(
-            "extract", f"{path} is no file", "name an .osm.pbf, or a GeoPackage of lines"
+            "extract", f"{path} does not exist", "name an .osm.pbf, or a GeoPackage of lines"
         )
     source = {"extract": path.name, "sha256": sha256(path.read_bytes()).hexdigest()}
     if path.name.endswith(EXTRACT):
@@ -89,12 +89,10 @@ def read_network(path: Path, identity: str = "id", name: str = "name") -> RoadNe
         about = {}
     else:
         known = ", ".join((*EXTRACT, *LINES))
-        raise InputError(
-            "extract", f"{path.name} has an ending that is not known", f"give one of {known}"
-        )
+        raise InputError("extract", f"{path.name} has an unknown ending", f"give one of {known}")
     if not links:
         raise InputError(
-            "extract", f"{path.name} holds no road that cars may drive", "name another extract"
+            "extract", f"{path.name} contains no road for cars", "name another extract"
         )
     return RoadNetwork(links, source | about)
 
@@ -128,7 +126,7 @@ def _read_openstreetmap(path: Path) -> tuple[list[DirectedLink], dict[str, str]]
             links += _driven_directions(str(way.id), name, kind, oneway, points)
     except (RuntimeError, ValueError, OSError) as error:
         problem = f"{path.name} cannot be read ({str(error).splitlines()[0][:100]})"
-        raise InputError("extract", problem, "name a whole extract") from error
+        raise InputError("extract", problem, "name a complete extract") from error
     return links, {"date": date, "licence": "ODbL 1.0, © OpenStreetMap contributors"}
 
 
@@ -165,7 +163,9 @@ def _read_lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
         points = np.asarray(about["geometry"].coords)[:, [1, 0]]
         if not (np.isfinite(points).all() and (np.abs(points) <= (90.0, 180.0)).all()):
             raise InputError(
-                "extract", f"{path.name} has points that are no degrees", "give the file its CRS"
+                "extract",
+                f"{path.name} has coordinates that are not degrees",
+                "give the file its CRS",
             )
         called, kind, oneway = (str(about.get(column) or "") for column in (name, "kind", "oneway"))
         links += _driven_directions(str(about[identity]), called, kind, oneway, points)

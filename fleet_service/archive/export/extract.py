@@ -65,7 +65,11 @@ def snapshot_time(root: Path, part: Extract) -> int:
 def _find_snapshot(root: Path, part: Extract) -> Path:
     path = snapshots.newest_snapshot(root, part.until)
     if path is None:
-        raise InputError("to", "there is no snapshot of the map so early", "give a later time")
+        raise InputError(
+            "to",
+            "the archive has no snapshot of the map at or before this time",
+            "give a later time",
+        )
     return path
 
 

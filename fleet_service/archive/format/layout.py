@@ -88,15 +88,17 @@ def require_archive(root: Path) -> None:
     """Raise unless a folder is an archive, because compaction would write into it.
 
     Raises:
-        InputError: it is no folder, or no service created it.
+        InputError: it is not a folder, or no service created it.
     """
     if not root.is_dir():
-        raise InputError("archive", f"{root} is no folder", "give the archive of a service")
+        raise InputError(
+            "archive", f"{root} is not a folder", "give the archive folder of a service"
+        )
     if not any((root / name).is_dir() for name in MARKS):
         raise InputError(
             "archive",
-            f"{root} is no archive: it has no {MARKS[0]}",
-            "give the archive of a service",
+            f"{root} is not an archive: {MARKS[0]} is missing",
+            "give the archive folder of a service",
         )
 
 

@@ -59,14 +59,14 @@ Damaged = Callable[[Path, str], None]
 
 def skip_damaged(path: Path, problem: str) -> None:
     """Leave a damaged file in place and log a warning; for readers."""
-    log.warning("%s is damaged and passed over: %s", path, problem)
+    log.warning("%s is damaged and is ignored: %s", path, problem)
 
 
 def set_aside(path: Path, problem: str) -> None:
     """Rename a damaged file so that it is not read again, and log a warning; for the writer of
     the archive.
     """
-    log.warning("%s is damaged and set aside: %s", path, problem)
+    log.warning("%s is damaged and was set aside: %s", path, problem)
     with suppress(FileNotFoundError):  # another reader of this process saw it at the same time
         path.rename(path.with_name(path.name + BAD))
 

@@ -93,11 +93,14 @@ def check_version(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> 
     """
     if KEY not in entries and DIGEST not in entries:
         if schema_digest(schema, {}) not in FIRST:
-            raise DamagedError(f"columns are not those of version {OLDEST}, and it says no other")
+            raise DamagedError(
+                f"the columns are not those of version {OLDEST}, and the file states no other "
+                f"version"
+            )
         return OLDEST
     others = {key: value for key, value in entries.items() if key != DIGEST}
     if entries.get(DIGEST) != schema_digest(schema, others):
-        raise DamagedError("columns are not those that were written")
+        raise DamagedError("the columns are not those that were written")
     found = parse_version(entries[KEY])
     if found.major > VERSION.major:
         raise InputError(

@@ -96,7 +96,9 @@ def read_request(question: Path) -> Erasure:
             str(record["month"]), None if record.get("vehicle") is None else str(record["vehicle"])
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError("request", f"{question.name} is none", "ask again") from error
+        raise InputError(
+            "request", f"{question.name} is unknown", "send the request again"
+        ) from error
 
 
 def answer_request(question: Path, outcome: dict[str, Any] | InputError) -> None:

@@ -47,7 +47,7 @@ def first_day(month: str) -> date:
     try:
         return date.fromisoformat(f"{month}-01")
     except ValueError as error:
-        raise InputError("period", f"{month!r} is no month", "give one like 2026-01") from error
+        raise InputError("period", f"{month!r} is not a month", "give one like 2026-01") from error
 
 
 def span_of(month: str) -> Span:

@@ -117,7 +117,7 @@ def _read_key(path: Path) -> bytes:
     key = data[:KEY_BYTES]
     check = data[KEY_BYTES:]
     if len(key) < KEY_BYTES or (check and check != _key_digest(key)):
-        raise OSError(errno.EIO, "the key is damaged; bring it back from a copy", str(path))
+        raise OSError(errno.EIO, "the key is damaged; restore it from a backup", str(path))
     return key
 
 

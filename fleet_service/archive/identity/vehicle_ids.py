@@ -70,7 +70,7 @@ class VehicleIds:
                     file.seek(0, os.SEEK_END) // _LINE * _LINE
                 )  # over what a full disk left of a line
                 if file.write(_encode_line(pseudonym, number)) != _LINE:
-                    raise OSError(errno.ENOSPC, "no room for a line", str(path))
+                    raise OSError(errno.ENOSPC, "no space for another line", str(path))
             self._known.add(pseudonym)
         return number
 

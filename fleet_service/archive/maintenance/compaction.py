@@ -48,7 +48,9 @@ def lock_compacted(root: Path) -> BinaryIO:
         InputError: another process adds to them or rewrites them.
     """
     return lock_file(
-        root / "compaction.lock", f"{root} is being compacted", "wait until that has ended"
+        root / "compaction.lock",
+        f"{root} is being compacted",
+        "wait until the other compaction has ended",
     )
 
 

@@ -139,7 +139,7 @@ def _record_registration(root: Path, place: Place) -> None:
             f"files at {before.at}"
         )
         raise InputError(
-            "catalog", problem, f"give these; or drop those tables, then remove {path}"
+            "catalog", problem, f"give the same values; or drop those tables and remove {path}"
         )
     if before is None:
         with open_durably(path) as file:
@@ -242,7 +242,7 @@ def _one_line_errors(place: Place) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # every catalogue has errors of its own
-        fix = "see that it is reached, then run it again"
+        fix = "check that the catalog can be reached, then run the command again"
         raise InputError(
             "catalog", f"{place.catalog}: {type(error).__name__}: {error}", fix
         ) from error

@@ -85,7 +85,7 @@ def _last_to_go(raw_days: int, today: date) -> int:
     if raw_days < LEAST_DAYS:
         raise InputError(
             "raw-days",
-            f"{raw_days} are too few to know a batch again",
+            f"{raw_days} are too few to recognise repeated batches",
             f"give {LEAST_DAYS} or more",
         )
     return (today - timedelta(days=raw_days + 1) - date(1970, 1, 1)).days
@@ -298,7 +298,9 @@ def _remove_vehicle(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[
 def _refuse_damaged(path: Path, problem: str) -> None:
     """Raise for a damaged file, because it may hold rows to be forgotten."""
     raise InputError(
-        "archive", f"{path} is damaged ({problem})", "remove it or bring it back, then forget again"
+        "archive",
+        f"{path} is damaged ({problem})",
+        "remove it or restore it from a backup, then run forget again",
     )
 
 
@@ -312,7 +314,9 @@ def key_of(root: Path, month: str) -> Path:
     path = root / _KEYS / f"{month}.key"
     if not path.exists():
         raise InputError(
-            "period", f"the archive has no key of {month}", "nobody can tell whose its rows are"
+            "period",
+            f"the archive has no key of {month}",
+            "its rows can no longer be assigned to vehicles",
         )
     return path
 

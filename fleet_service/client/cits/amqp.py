@@ -146,7 +146,7 @@ class AmqpLink:
         if not url.startswith(("amqp://", "amqps://")):
             raise InputError(
                 "amqp",
-                f"{url!r} is no address",
+                f"{url!r} is not an address",
                 "write it like amqps://interchange.example.org:5671",
             )
         self.url = url

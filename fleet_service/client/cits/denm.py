@@ -130,7 +130,9 @@ def decode_denm(data: bytes) -> Denm:
         message = compiled_denm().decode("DENM", data)
     except Exception as error:
         raise InputError(
-            "payload", "is no DENM", "send one by unaligned PER, without a security envelope"
+            "payload",
+            "is not a DENM",
+            "send a DENM encoded in unaligned PER, without a security envelope",
         ) from error
     if message["header"]["messageID"] != MESSAGE_ID:
         raise InputError(

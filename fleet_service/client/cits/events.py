@@ -64,7 +64,7 @@ class EventBook:
     def __init__(self, station: int, content: dict[str, Any] | None = None) -> None:
         if not 0 < station < 1 << 32:
             raise InputError(
-                "station", f"{station} is no station identifier", "give 1 to 4294967295"
+                "station", f"{station} is not a station identifier", "give 1 to 4294967295"
             )
         self.station = station
         self._next = 0
@@ -173,14 +173,14 @@ class EventBook:
         raise InputError(
             "events",
             "all 65536 numbers of the station are in use",
-            "use a second station for a part",
+            "use a second station identifier for a part of the alerts",
         )
 
     def _restore_content(self, content: dict[str, Any]) -> None:
         try:
             if content["station"] != self.station:
-                problem = f"the file is of station {content['station']}"
-                raise InputError("station", problem, "give that station, or another file")
+                problem = f"the file belongs to station {content['station']}"
+                raise InputError("station", problem, "give that station or another file")
             self._next = int(content["next"])
             for one in content["events"]:
                 both = {"state": tuple(one["state"]), "position": tuple(one["position"])}
@@ -189,7 +189,7 @@ class EventBook:
         except (KeyError, TypeError, ValueError) as error:
             if isinstance(error, InputError):
                 raise
-            fix = "move it away; events that it held end by their validity"
+            fix = "move it away; its events end when their validity expires"
             raise InputError("state", "the file of events is damaged", fix) from error
 
 

@@ -119,6 +119,6 @@ def _read_state(path: Path) -> dict[str, Any] | None:
             raise TypeError("other content")
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
-            "state", f"{path} is no file of events", "give another, or move it away"
+            "state", f"{path} is not a file of events", "give another, or move it away"
         ) from error
     return found

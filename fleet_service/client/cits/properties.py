@@ -35,7 +35,9 @@ class Originator:
         """Check country and publisher."""
         if not re.fullmatch("[A-Z]{2}", self.country):
             raise InputError(
-                "country", f"{self.country!r} is no country", "give two capital letters, e.g. SE"
+                "country",
+                f"{self.country!r} is not a country code",
+                "give two capital letters, e.g. SE",
             )
         if not self.publisher.strip():
             raise InputError(

@@ -161,7 +161,8 @@ def test_a_simulated_source_hands_its_context_to_the_observations(
     ]
     assert told == [
         (
-            "vehicle 1: abs_active has been on since the start: it is treated as unknown; correct the "
+            "vehicle 1: abs_active has been on since the start: it is treated as unknown; "
+            "correct the "
             "profile"
         )
     ]

@@ -99,12 +99,12 @@ def test_a_day_becomes_a_page_with_frames(
 @pytest.mark.parametrize(
     ("words", "start"),
     [
-        (["colour"], "error: question: 'colour' is none; use one of grip, worst"),
+        (["colour"], "error: question: 'colour' is unknown; use one of grip, worst"),
         (["grip", "--out", "x.xls"], "error: out: x.xls has no known ending"),
-        (["grip", "--engine", "abacus"], "error: engine: 'abacus' is none"),
+        (["grip", "--engine", "abacus"], "error: engine: 'abacus' is unknown"),
         (["grip", "--bbox", "1,2"], "error: bbox: "),
-        (["before-after"], "error: at: no moment"),
-        (["vehicles", "--out", "x.html"], "error: out: the answer of vehicles has no place"),
+        (["before-after"], "error: at: the time of the treatment"),
+        (["vehicles", "--out", "x.html"], "error: out: the answer of vehicles has no coordinates"),
         (["grip", "--out", "/nowhere/at/all.csv"], "error: out: cannot write"),
     ],
 )

@@ -21,7 +21,7 @@ def test_the_example_draws_its_figures(
         "before-after.png",
         "vehicles.png",
     }
-    assert "worst: the worst stretches" in capsys.readouterr().out
+    assert "worst: the most slippery stretches" in capsys.readouterr().out
 
 
 def test_without_an_archive_it_makes_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -90,13 +90,13 @@ def test_pointing_tapping_and_the_keyboard_read_a_cell(tmp_path: Path) -> None:
         found.page.mouse.move(box["x"] + box["width"] / 2 + 5, box["y"] + box["height"] / 2)
         assert found.page.locator("#said").inner_text() == "mu 0.2"
         found.page.mouse.move(box["x"] + 3, box["y"] + 3)
-        assert "nothing is known" in found.page.locator("#said").inner_text()
+        assert "the grip is unknown" in found.page.locator("#said").inner_text()
         canvas.focus()
         found.page.keyboard.press("Enter")
         assert found.page.locator("#said").inner_text() == "mu 0.2"
         for _ in range(30):
             found.page.keyboard.press("ArrowLeft")
-        assert "nothing is known" in found.page.locator("#said").inner_text()
+        assert "the grip is unknown" in found.page.locator("#said").inner_text()
     with open_page(path, phone=True, ratio=3.0) as found:
         assert found.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
         canvas = found.page.locator("canvas.map")

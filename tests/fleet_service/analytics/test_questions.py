@@ -284,9 +284,9 @@ def test_a_day_of_replay_has_a_frame_per_step_within_the_box(asked: Ask) -> None
 @pytest.mark.parametrize(
     ("name", "options", "problem"),
     [
-        ("before-after", {}, "at: no moment"),
-        ("before-after", {"at": START_NS}, "at: no cell was measured in both"),
-        ("weather", {}, "stations: no table"),
+        ("before-after", {}, "at: the time of the treatment"),
+        ("before-after", {"at": START_NS}, "at: in no cell did two vehicles"),
+        ("weather", {}, "stations: the table of readings"),
         ("weather", {"stations": Path("nowhere.csv")}, "stations: cannot read"),
     ],
 )

@@ -109,7 +109,7 @@ def test_rebuild_reports_its_result_and_refuses_a_non_empty_folder(
     assert main(words) == 2
     assert "give a new folder" in capsys.readouterr().err
     assert main([*words[:3], "--out", str(tmp_path / "other"), "--engine", "abacus"]) == 2
-    assert "engine: 'abacus' is none" in capsys.readouterr().err
+    assert "engine: 'abacus' is unknown" in capsys.readouterr().err
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="out: cannot use"):
         require_empty(tmp_path / "file")

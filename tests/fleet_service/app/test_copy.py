@@ -220,10 +220,10 @@ def test_a_bucket_goes_and_comes_back_and_nothing_is_lost_or_doubled(
     during = reports(0.6, BATCHES + 1, 2 * BATCHES)
     with service(router, tmp_path, bucket) as (process, address):
         until(lambda: drive(fleet, before), PATIENCE_S)
-        assert "does not take segments" not in health(address)
+        assert "does not accept segments" not in health(address)
         bucket.take_away(kind)
         until(
-            lambda: not drive(fleet, during) and "does not take segments" in health(address),
+            lambda: not drive(fleet, during) and "does not accept segments" in health(address),
             PATIENCE_S,
         )
         assert SECRET not in health(address)

@@ -183,7 +183,7 @@ def test_a_question_that_cannot_be_done_is_answered_and_taken_away(tmp_path: Pat
         answer_requests(engine, tmp_path)
         with pytest.raises(InputError, match="no key of 1999-01"):
             erasure_requests.answer_to(none)
-        with pytest.raises(InputError, match="other.json is none"):
+        with pytest.raises(InputError, match="other.json is unknown"):
             erasure_requests.answer_to(tmp_path / erasure_requests.FOLDER / "other.json")
         assert not erasure_requests.open_requests(tmp_path)
 

@@ -92,7 +92,10 @@ def test_upkeep_that_has_died_is_known_and_told() -> None:
 
     with BackgroundJobs([Job("fatal", 0.001, work)], Counter(), lambda _: None) as upkeep:
         until(lambda: upkeep.has_ended)
-        assert upkeep.health_problems()[-1] == "background jobs have ended; restart the service"
+        assert (
+            upkeep.health_problems()[-1]
+            == "the thread of background jobs has ended; restart the service"
+        )
     assert not upkeep.has_ended, "it was stopped"
 
 

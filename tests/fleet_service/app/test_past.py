@@ -71,16 +71,16 @@ def test_what_would_read_too_much_is_refused_and_a_narrower_box_is_not(
 ) -> None:
     monkeypatch.setattr(past, "MOST_ROWS", 399)
     with pytest.raises(
-        InputError, match="at: would have to read too much of the archive; narrow bbox"
+        InputError, match="at: the query would read too much of the archive; use a smaller bbox"
     ):
         list(asker.ask(question(), lambda _: True))
     assert list(asker.ask(question(bbox="0,0,1,1"), lambda _: True)) == []
     with pytest.raises(
-        InputError, match="at: would have to read too much of the archive; narrow bbox"
+        InputError, match="at: the query would read too much of the archive; use a smaller bbox"
     ):
         list(past.replies_to(root, question(bbox=NEAR)))  # as many lie in the box itself
     monkeypatch.setattr(past, "LOOKED_ROWS", 399)
-    with pytest.raises(InputError, match="at: would have to read too much"):
+    with pytest.raises(InputError, match="at: the query would read too much"):
         list(asker.ask(question(bbox=NEAR), lambda _: True))
 
 

@@ -248,7 +248,7 @@ def test_ice_raises_an_alert_after_few_passes_and_grip_clears_it(fleet: Fleet) -
     assert (cleared.cell, cleared.raised, cleared.reason) == (
         CELL,
         False,
-        "later visits found grip",
+        "later visits measured good grip",
     )
 
 
@@ -414,7 +414,7 @@ def test_the_map_of_the_past_is_rebuilt_from_the_archive(fleet: Fleet) -> None:
         ("route=1,2", "route: "),
         ("route=0,0|90,0", "route: is 10019 km long"),
         ("at=2999-01-01T00:00:00Z", "at: lies in the future"),
-        ("colour=red", "colour: is no parameter"),
+        ("colour=red", "colour: is not a parameter"),
     ],
 )
 def test_a_bad_query_gets_an_error_that_names_the_field(

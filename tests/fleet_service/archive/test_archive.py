@@ -142,7 +142,7 @@ def test_a_changed_byte_is_noticed_wherever_it_is(
         ]
         assert repr(held) == repr(before) or not held
         assert again.counts["files_set_aside"] == (not held)
-        assert ("is damaged and set aside" in caplog.text) == (not held)
+        assert ("is damaged and was set aside" in caplog.text) == (not held)
         again.intake.ingest([make_message("sim-001", 1)], time.time_ns())
         assert again.counts["duplicates"] == bool(held)
 

@@ -218,7 +218,7 @@ def test_only_one_compacts_at_a_time(tmp_path: Path) -> None:
         pytest.raises(InputError, match="^archive: .* is being compacted; "),
     ):
         compact(tmp_path)
-    with pytest.raises(InputError, match="^archive: .* is no folder; "):
+    with pytest.raises(InputError, match="^archive: .* is not a folder; "):
         compact(tmp_path / "nowhere")
 
 

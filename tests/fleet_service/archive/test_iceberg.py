@@ -182,7 +182,7 @@ def test_two_archives_share_tables(tmp_path: Path, capsys: pytest.CaptureFixture
         (["--archive", "{root}"], "error: catalog: is missing for export iceberg"),
         (
             ["--archive", "{root}", "--catalog", "sqlite:///x.db", "--out", "x.csv"],
-            "error: out: says nothing to export",
+            "error: out: has no effect on export",
         ),
         (
             ["--archive", "{root}", "--catalog", "nobody-knows-it"],

@@ -270,7 +270,7 @@ def test_forgetting_the_current_month_ends_at_its_newest_row(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("period", "problem"), [("2026-13", "is no month"), ("1999-01", "has no key of 1999-01")]
+    ("period", "problem"), [("2026-13", "is not a month"), ("1999-01", "has no key of 1999-01")]
 )
 def test_a_period_that_is_none_is_said(tmp_path: Path, period: str, problem: str) -> None:
     with pytest.raises(InputError, match=f"^period: .*{problem}"):
@@ -334,11 +334,11 @@ def test_parts_are_exported(
 @pytest.mark.parametrize(
     ("words", "start"),
     [
-        (["map", "--snapshot", "--out", "map.parquet"], "error: to: there is no snapshot"),
+        (["map", "--snapshot", "--out", "map.parquet"], "error: to: the archive has no snapshot"),
         (["observations", "--out", "x.xls"], "error: out: x.xls has no known ending"),
         (
             ["observations", "--from", "yesterday", "--out", "x.csv"],
-            "error: from: 'yesterday' is no time",
+            "error: from: 'yesterday' is not a time",
         ),
         (["observations", "--out", "/nowhere/at/all.csv"], "error: out: cannot write"),
     ],

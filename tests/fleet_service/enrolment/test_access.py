@@ -273,7 +273,7 @@ def test_private_keys_of_a_vehicle_are_for_it_and_its_owner_alone(
 
 
 def test_an_owner_of_what_is_no_vehicle_is_refused() -> None:
-    with pytest.raises(ValueError, match="is no vehicle"):
+    with pytest.raises(ValueError, match="is not a vehicle"):
         make_enrolment(owners={"owner-0": ["nobody-1"]})
 
 

@@ -125,7 +125,9 @@ def test_a_step_out_of_order_is_refused(folder: Path) -> None:
 
 
 def test_no_certificate_outlives_its_authority(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"^days: the authority ends before, on 2026-04-10; "):
+    with pytest.raises(
+        InputError, match=r"^days: the authority's certificate ends earlier, on 2026-04-10; "
+    ):
         at(tmp_path, ca_days=40.0).enrol(make_enrolment())
 
 
@@ -151,7 +153,7 @@ def test_names_and_addresses_of_hosts_are_hosts(host: str) -> None:
     "host", ["", "-a", "a-", "a..b", ".a", "a_b", "a" * 64, "a b", "a\n", ".".join(["ab"] * 100)]
 )
 def test_what_is_no_host_is_refused(host: str) -> None:
-    with pytest.raises(ValueError, match="is no host name and no address"):
+    with pytest.raises(ValueError, match="is neither a host name nor an address"):
         make_enrolment(routers={"r-1": {"hosts": [host]}})
 
 
@@ -163,12 +165,12 @@ def test_what_is_no_host_is_refused(host: str) -> None:
         (
             {"routers": {"r-1": {}}, "vehicles": ["shard-0"]},
             [],
-            "error: content: value error, 'shard-0' is there",
+            "error: content: value error, 'shard-0' occurs",
         ),
         (
             {"routers": {"r-1": {"hosts": ["a b"]}}},
             [],
-            "error: routers.r-1.hosts.0: value error, 'a b' is no host",
+            "error: routers.r-1.hosts.0: value error, 'a b' is neither a host name",
         ),
         (
             {"routers": {"r-1": {"hosts": [LONG]}}},
@@ -176,8 +178,8 @@ def test_what_is_no_host_is_refused(host: str) -> None:
             "error: routers.r-1.hosts.0: value error, 'aaaa",
         ),
         ({"routers": {"r-1": {}}, "cars": []}, [], "error: cars: "),
-        ({"routers": {"r-1": {}}}, ["--days", "-1"], "error: days: -1 is no time; "),
-        ({"routers": {"r-1": {}}}, ["--days", "nan"], "error: days: nan is no time; "),
+        ({"routers": {"r-1": {}}}, ["--days", "-1"], "error: days: -1 is not a valid duration; "),
+        ({"routers": {"r-1": {}}}, ["--days", "nan"], "error: days: nan is not a valid duration; "),
         (
             {"routers": {"r-1": {}}},
             ["--days", "20"],
@@ -239,7 +241,7 @@ def test_a_list_that_is_short_by_mistake_revokes_nobody_without_a_word(
     assert main([*words, "--dry-run"]) == 0
     assert capsys.readouterr().out == f"would revoke 4: {', '.join(names[2:])}\n"
     assert main(words) == 2
-    assert "4 names with a certificate are not on it" in capsys.readouterr().err
+    assert "4 names with a certificate are not on the list" in capsys.readouterr().err
     assert len(list((tmp_path / "certs").glob("car-*.pem"))) == 6
     assert main([*words, "--revoke", "4"]) == 0
     assert len(list((tmp_path / "certs").glob("car-*.pem"))) == 2

@@ -85,14 +85,17 @@ def file(path: Path, **columns: object) -> Path:
 @pytest.mark.parametrize(
     ("columns", "complaint"),
     [
-        ({"region": ["1202300230"]}, "row 0: no region, time and numbers"),
-        ({"region": ["1202300230"], "time": [1], "wind": [3.0]}, "wind is no column"),
+        ({"region": ["1202300230"]}, "row 0: region, time or a number is missing"),
+        ({"region": ["1202300230"], "time": [1], "wind": [3.0]}, "wind is not a column"),
         (
             {"region": ["1202300230"], "time": [1], "precipitation": [-9999.0]},
             "row 0, precipitation: -9999 lies outside",
         ),
-        ({"region": [-1], "time": [1], "precipitation": [1.0]}, "row 0, region: is no z10 region"),
-        ({"region": ["12x"], "time": [1], "precipitation": [1.0]}, "row 0: no region"),
+        (
+            {"region": [-1], "time": [1], "precipitation": [1.0]},
+            "row 0, region: is not a z10 region",
+        ),
+        ({"region": ["12x"], "time": [1], "precipitation": [1.0]}, "row 0: region, time"),
     ],
 )
 def test_a_wrong_weather_file_is_refused_with_row_and_column(

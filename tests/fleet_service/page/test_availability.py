@@ -126,5 +126,5 @@ def test_errors_of_the_loop_are_logged_once_in_a_while(caplog: pytest.LogCapture
     for _ in range(100):
         handler(loop, {"message": "accept failed"})
     assert [record.getMessage() for record in caplog.records] == [
-        "web server: accept failed (and 0 more since the last line)"
+        "web server: accept failed (and 0 more since the last message)"
     ]

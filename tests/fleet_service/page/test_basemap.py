@@ -77,7 +77,7 @@ def test_mbtiles_rows_count_from_the_south_and_requests_from_the_north(tmp_path:
 def test_what_is_no_file_of_pictures_is_refused_with_its_fix(tmp_path: Path) -> None:
     (tmp_path / "text.mbtiles").write_text("no table")
     names = {
-        "missing.mbtiles": "is not there",
+        "missing.mbtiles": "does not exist",
         "text.mbtiles": "cannot be read",
         tiles_in(tmp_path / "other.mbtiles", {(0, 0, 0): b"x"}, "svg").name: "holds svg tiles",
         tiles_in(tmp_path / "empty.mbtiles", {}).name: "holds no tile",
@@ -90,7 +90,7 @@ def test_what_is_no_file_of_pictures_is_refused_with_its_fix(tmp_path: Path) -> 
         "ftp://t.example/{z}/{x}/{y}",
         "https://t.example/{z}/{x}/{y};a",
     ):
-        with pytest.raises(InputError, match="no address"):
+        with pytest.raises(InputError, match="not a URL of tiles"):
             base_map(text)
 
 

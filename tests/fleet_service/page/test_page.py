@@ -219,13 +219,14 @@ def test_a_place_says_its_interval_basis_vehicles_and_safe_speed(
             "document.querySelector('[data-value=basis]')?.textContent.startsWith('only passed')",
         )
         told = read(seen, street.EAST)
-        assert told["speed"] == "unknown: nobody measured here"
+        assert told["speed"] == "unknown: no vehicle measured here"
         assert told["grip"].startswith("at least 0.")
         assert "slippery" not in told
         assert seen.page.locator(".chart .density").count() == 0
         seen.page.evaluate("gripmap.choose(0, 0); gripmap.open('cell')")
         assert (
-            seen.page.locator("#panel .nobody").inner_text() == "Nobody was here: nothing is known."
+            seen.page.locator("#panel .nobody").inner_text()
+            == "No vehicle was here: the grip is unknown."
         )
 
 
@@ -347,7 +348,7 @@ def test_a_route_is_clicked_or_dropped_and_tells_what_is_unknown(
         for x in (300, 500):
             seen.page.locator("#map").click(position={"x": x, "y": 300})
         waits(seen, "document.getElementById('route-worst')")
-        assert "nobody knows" in seen.page.locator("#route-worst").inner_text()
+        assert "its grip is unknown" in seen.page.locator("#route-worst").inner_text()
 
 
 _FITTED: Final = """(() => {

@@ -135,7 +135,7 @@ def test_before_any_service_spoke_the_world_is_hatched_and_not_empty(bare: str) 
         seen.page.wait_for_selector(READY, state="attached")
         waits(seen, "gripmap.live.state && !gripmap.frame")
         waits(seen, f"({_ALL})() > 10000")
-        assert seen.page.locator("#live").inner_text() == "○ nothing heard yet"
+        assert seen.page.locator("#live").inner_text() == "○ no update yet"
 
 
 def test_what_one_direction_found_is_not_said_of_the_other(page: RunningPage, drive: Drive) -> None:

@@ -55,5 +55,5 @@ def test_another_version_or_half_a_checkpoint_is_refused() -> None:
     with pytest.raises(InputError, match="not of version"):
         fusion_from(tables | {"used": tables["used"].replace_schema_metadata({})}, LATENESS_S)
     del tables["pairs"]
-    with pytest.raises(InputError, match="not whole"):
+    with pytest.raises(InputError, match="incomplete"):
         fusion_from(tables, LATENESS_S)

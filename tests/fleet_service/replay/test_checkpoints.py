@@ -300,7 +300,7 @@ def test_a_checkpoint_that_a_service_dies_of_is_given_up(tmp_path: Path) -> None
     for _ in range(checkpoints.TRIES):
         checkpoints.load_checkpoint(path)
         checkpoints.mark_begun(path)
-    with pytest.raises(InputError, match="died at once"):
+    with pytest.raises(InputError, match="made the service fail"):
         checkpoints.load_checkpoint(path)
     checkpoints.mark_survived(tmp_path)
     checkpoints.load_checkpoint(path)

@@ -242,7 +242,7 @@ def test_folder_served_without_its_bucket_is_not_synchronised(
     open_exclusive(ServiceConfig(), one.root).close()
     two = Machine(tmp_path / "two", bucket)
     two.close()
-    with pytest.raises(InputError, match="is no archive of"):
+    with pytest.raises(InputError, match="is not the archive of"):
         Machine(one.root, bucket)
     assert len(rows_in(one.root, Kind.OBSERVATION)) == 5
 
@@ -297,7 +297,7 @@ def test_start_without_bucket_ends_or_waits_as_a_standby(
     bucket: BucketServer, tmp_path: Path
 ) -> None:
     bucket.stop()
-    with pytest.raises(InputError, match="cannot be used .* see that it is reached"):
+    with pytest.raises(InputError, match="cannot be used .* check the network"):
         Machine(tmp_path / "one", bucket, standby=False)
     lines: list[str] = []
     made: list[Machine] = []

@@ -91,7 +91,7 @@ def test_an_alert_that_nobody_confirms_ends_by_itself_with_the_reason() -> None:
     assert (ended.cell, ended.raised, ended.reason) == (
         CELL,
         False,
-        "no visit has confirmed it for too long",
+        "no recent visit has confirmed the alert",
     )
     assert not alerts.expire(START + 7 * HOUR)
 
@@ -211,5 +211,5 @@ def test_an_alert_ends_only_when_grip_is_sure() -> None:
         updated = fusion.update(observations([200.0 + 10.0 * vehicle], [vehicle], value([0.85])))
         ended += alerts.update(updated.slots)
     (only,) = ended
-    assert (only.raised, only.reason) == (False, "later visits found grip")
+    assert (only.raised, only.reason) == (False, "later visits measured good grip")
     assert only.p_slippery < 0.05

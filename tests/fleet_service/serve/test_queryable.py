@@ -67,7 +67,7 @@ def test_an_answer_that_fails_midway_is_an_error_and_the_next_works(
     first = texts(session, key + parameters)
     assert first == [
         "a tile",
-        f"query: could not be answered ({type(failure).__name__}); ask again later",
+        f"query: failed in the service ({type(failure).__name__}); ask again later",
     ]
     until(
         lambda: texts(session, key + parameters) == ["a tile"]
@@ -85,7 +85,7 @@ def test_a_query_with_a_too_large_answer_is_refused_with_a_hint(session: zenoh.S
     querier = session.declare_querier(key)
     matched(querier)
     assert texts(session, f"{key}?format=json") == [
-        "bbox: the answer would be too large; narrow bbox, or take format=arrow"
+        "bbox: the answer would be too large; use a smaller bbox, or format=arrow"
     ]
     assert texts(session, key) == []
     assert counts["heavy_queries"] == 1
@@ -213,6 +213,7 @@ def test_where_too_many_ask_the_most_costly_is_told_to_come_again(half: Half) ->
     refused = [answer for answer in answers if "last" not in answer]
     assert len(refused) == half.counts["refused_queries"] < len(large)
     assert all(
-        "query: too many ask for as much; ask again later, or for less" in answer
+        "query: too many large queries are waiting; ask again later, or query a smaller area"
+        in answer
         for answer in refused
     )

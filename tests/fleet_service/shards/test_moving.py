@@ -97,7 +97,7 @@ def test_a_region_is_handed_over_with_all_that_was_known(
         assert main(["hand-over", EVERYWHERE, "--to", "north-b", *connect]) == 0
         told = capsys.readouterr().out.splitlines()
         assert told[0] == f"north-a hands over {EVERYWHERE}"
-        assert told[1].startswith(f"north-b serves {EVERYWHERE}; nobody did for ")
+        assert told[1].startswith(f"north-b serves {EVERYWHERE}; the handover took ")
         former = one.end()
         assert former.exit_code == 0
         until(lambda: two.has_said("ready: "), PATIENCE_S)
@@ -124,7 +124,7 @@ def test_a_region_stays_where_nobody_stands_by_for_it(
 ) -> None:
     words = ["hand-over", EVERYWHERE, "--connect", router.connect[0], "--to"]
     assert main([*words, "north-b"]) == 2
-    assert f"error: region: nobody serves {EVERYWHERE}" in capsys.readouterr().err
+    assert f"error: region: no service serves {EVERYWHERE}" in capsys.readouterr().err
     with machines(router, bucket, tmp_path, "north-a") as (one,):
         one.start("ready: ")
         assert main([*words, "north-b"]) == 2

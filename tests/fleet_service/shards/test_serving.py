@@ -149,7 +149,7 @@ def test_answers_over_three_services_are_ordered_and_name_gaps(
                 b"missing": NAMES[1].encode()
             }
             assert main(["query", "--connect", router.connect[0], "--bbox", dead]) == 1
-            assert f"nobody serves {NAMES[1]}" in capsys.readouterr().err
+            assert f"no service answers for {NAMES[1]}" in capsys.readouterr().err
             until(lambda: {"event": "away", "regions": [NAMES[1]]} in map(json.loads, lines))
             with running(router, tmp_path / "shard-1", name="shard-1", regions=[NAMES[1]]):
                 assert ask(router, bbox=box).gap_description is None
@@ -169,7 +169,7 @@ def test_a_second_service_of_a_region_refuses_to_start(
     def assert_refused(name: str) -> None:
         with (
             pytest.raises(
-                InputError, match=f"{NAMES[1].rpartition('/')[0]}.* is served by first already"
+                InputError, match=f"{NAMES[1].rpartition('/')[0]}.* is already served by first"
             ),
             zenoh_session(router) as other,
             claim_regions(other, name, NAMES[1:2], threading.Event()),

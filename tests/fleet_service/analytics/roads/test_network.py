@@ -108,5 +108,5 @@ def test_a_truncated_extract_is_no_whole_one(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(InputError, match="extract"):
         read_network(path)
-    with pytest.raises(InputError, match="is no file"):
+    with pytest.raises(InputError, match="does not exist"):
         read_network(tmp_path / "none.osm")
