@@ -79,7 +79,7 @@ def test_what_is_no_file_of_pictures_is_refused_with_its_fix(tmp_path: Path) -> 
     names = {
         "missing.mbtiles": "does not exist",
         "text.mbtiles": "cannot be read",
-        tiles_in(tmp_path / "other.mbtiles", {(0, 0, 0): b"x"}, "svg").name: "holds svg tiles",
+        tiles_in(tmp_path / "other.mbtiles", {(0, 0, 0): b"x"}, "svg").name: "contains svg tiles",
         tiles_in(tmp_path / "empty.mbtiles", {}).name: "holds no tile",
     }
     for name, problem in names.items():
