@@ -198,7 +198,7 @@ def test_what_waits_in_the_log_is_counted(archive: Path, capsys: Capture) -> Non
     [
         (
             ["grip", "--at", "2026-01-01"],
-            "error: at: is not for grip; it is for before-after, replay",
+            "error: at: does not apply to grip; it applies to before-after, replay",
         ),
         (["worst", "--min-vehicles", "0"], "error: min-vehicles: 0 is below 1"),
         (

@@ -279,7 +279,7 @@ def test_silence_of_the_server_is_seen_by_the_pages_own_clock(page: RunningPage)
     with open_map(page) as seen:
         waits(seen, "gripmap.live.state")
         seen.page.evaluate("gripmap.live.source.close()")  # no error event comes of that
-        waits(seen, "document.getElementById('live').textContent.startsWith('○ last heard')")
+        waits(seen, "document.getElementById('live').textContent.startsWith('○ last update')")
 
 
 @pytest.mark.campaign

@@ -96,7 +96,7 @@ def test_a_region_is_handed_over_with_all_that_was_known(
         until(make_driver(fleet, sent), PATIENCE_S)
         assert main(["hand-over", EVERYWHERE, "--to", "north-b", *connect]) == 0
         told = capsys.readouterr().out.splitlines()
-        assert told[0] == f"north-a hands over {EVERYWHERE}"
+        assert told[0] == f"north-a hands over: {EVERYWHERE}"
         assert told[1].startswith(f"north-b serves {EVERYWHERE}; the handover took ")
         former = one.end()
         assert former.exit_code == 0
@@ -114,7 +114,7 @@ def test_a_region_is_handed_over_with_all_that_was_known(
         config = tmp_path / "config.json"
         config.write_text(json.dumps({"zenoh": router.model_dump()}))
         assert main(["hand-over", EVERYWHERE, "--to", "north-b", "--config", str(config)]) == 0
-        assert f"north-b serves {EVERYWHERE} already" in capsys.readouterr().out
+        assert f"north-b already serves {EVERYWHERE}" in capsys.readouterr().out
         two.stop.set()
         assert two.end().exit_code == 0
 
