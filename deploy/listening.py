@@ -20,9 +20,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from edge_agent.ahead.hearing import decode_alert_message, decode_cells
+from edge_agent.ahead.cell_decoder import decode_alert_message, decode_cells
 from edge_agent.ahead.horizon import horizon_length, look_ahead
-from edge_agent.ahead.known import LocalMap
+from edge_agent.ahead.local_map import LocalMap
 from edge_agent.ahead.path import Pose
 from edge_agent.ahead.prior import MapPrior
 from edge_agent.ahead.warnings import Active, update_warnings

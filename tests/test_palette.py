@@ -13,7 +13,7 @@ import pytest
 
 from edge_agent.estimators import ESTIMATORS as REGISTERED
 from schemas.runtime.palette import ESTIMATORS, GRIP, GRIP_RANGE, SURFACES, TRUTH, shade
-from tests.sight import SIGHTS, colour_difference, to_lab
+from tests.colour_vision import SIGHTS, colour_difference, to_lab
 
 LEAST = 10.0  # CIEDE2000; 2.3 is just noticed side by side
 

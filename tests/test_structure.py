@@ -120,7 +120,7 @@ PURE = (
 # output either.
 SANS_IO = (
     "edge_agent/publish/batching.py",
-    "edge_agent/ahead/hearing.py",
+    "edge_agent/ahead/cell_decoder.py",
     *(f"fleet_service/ingest/{name}.py" for name in ("acks", "validation")),
     *(f"fleet_service/serve/{name}.py" for name in ("encode", "query", "tile_cache")),
     *(

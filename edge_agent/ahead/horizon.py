@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from edge_agent.ahead.known import MEASURED, UNKNOWN, LocalMap, PlaceBelief
+from edge_agent.ahead.local_map import MEASURED, UNKNOWN, LocalMap, PlaceBelief
 from edge_agent.ahead.path import NONE, Path
 from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray

@@ -16,11 +16,11 @@ from typing import Final
 import numpy as np
 import zenoh
 
-from edge_agent.ahead.asking import FURTHER_M
 from edge_agent.ahead.horizon import Horizon, horizon_length, look_ahead
 from edge_agent.ahead.map_subscriber import MapSubscriber
 from edge_agent.ahead.path import GivenRoute, Path, Pose, straight_path
 from edge_agent.ahead.prior import MapPrior
+from edge_agent.ahead.request_log import FURTHER_M
 from edge_agent.ahead.roads import ways_on
 from edge_agent.ahead.warnings import Active, update_warnings
 from schemas import grid, mugrid

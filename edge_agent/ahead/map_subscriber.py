@@ -16,10 +16,10 @@ from typing import Any, Final
 
 import zenoh
 
-from edge_agent.ahead.asking import Box, RequestLog, Tiles, keys_of
-from edge_agent.ahead.hearing import decode_alert_message, decode_cells, decode_standing_alerts
-from edge_agent.ahead.known import LocalMap
+from edge_agent.ahead.cell_decoder import decode_alert_message, decode_cells, decode_standing_alerts
+from edge_agent.ahead.local_map import LocalMap
 from edge_agent.ahead.path import Path, Pose
+from edge_agent.ahead.request_log import Box, RequestLog, Tiles, keys_of
 from schemas import grid, keys
 from schemas.errors import WireError
 from schemas.runtime.zenoh_session import quality_of

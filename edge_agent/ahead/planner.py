@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 
 from edge_agent.ahead.horizon import COMFORT, MARGIN_M, Horizon, safe_speed
-from edge_agent.ahead.known import MEASURED
+from edge_agent.ahead.local_map import MEASURED
 from schemas.numeric import FloatArray
 from schemas.thresholds import NS
 

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from edge_agent.ahead.horizon import MARGIN_M, Horizon, braking_from, justifies_warning
-from edge_agent.ahead.known import MEASURED, LocalMap
+from edge_agent.ahead.local_map import MEASURED, LocalMap
 from edge_agent.ahead.path import Pose
 from schemas import grid
 from schemas.numeric import BoolArray

@@ -297,7 +297,7 @@ def _evaluate_detection(args: argparse.Namespace, count: int) -> int:
 
 def _measure_inputs(folder: Path, args: argparse.Namespace) -> list[Figure]:
     from edge_agent.lab.evaluation import calibrated, imports, planted
-    from edge_agent.lab.live import judge
+    from edge_agent.lab.live import live_benchmark
     from edge_agent.lab.seeds import FIGURES
     from schemas.runtime.figures import markdown
 
@@ -311,7 +311,9 @@ def _measure_inputs(folder: Path, args: argparse.Namespace) -> list[Figure]:
         lambda: calibrated.widths(
             1 if quick else LEARNED_CARS, FIGURES, 2 * QUICK_S if quick else calibrated.JUDGED_S
         ),
-        lambda: judge.figures(folder, 1.0 if quick else LIVE_S, 1 if quick else judge.KILLS),
+        lambda: live_benchmark.figures(
+            folder, 1.0 if quick else LIVE_S, 1 if quick else live_benchmark.KILLS
+        ),
     ]
     figures: list[Figure] = []
     for row in rows:

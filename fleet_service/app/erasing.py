@@ -22,7 +22,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from fleet_service.app import beside
+from fleet_service.app import subprocess_job
 from fleet_service.app.engine import Engine
 from fleet_service.app.state import load_state
 from fleet_service.archive.format.layout import Cut
@@ -101,7 +101,7 @@ def _run_erasure(
             "cut": cut,
         }
     )
-    output = beside.run_module(
+    output = subprocess_job.run_module(
         "erasure", "fleet_service.app.erasing_process", [str(root)], stop, request
     )
     if output is None:

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from fleet_service.app import beside, erasing
+from fleet_service.app import erasing, subprocess_job
 from fleet_service.app.clock import TimeNow
 from fleet_service.app.engine import Engine
 from fleet_service.archive.format import layout, segments, snapshots
@@ -69,7 +69,7 @@ def archive_jobs(
             return None
         words = ["compact", "--archive", str(root), "--round-rows", str(ROUND_ROWS)]
         words += ["--to", config.put_to] if config.put_to else []
-        output = beside.run_module("compact", "fleet_service.cli", words, stop)
+        output = subprocess_job.run_module("compact", "fleet_service.cli", words, stop)
         return output and f"compacted: {output}"
 
     def snapshot(_: threading.Event) -> str | None:

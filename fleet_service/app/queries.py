@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.app.past import HistoricalMaps, PastQuery
+from fleet_service.app.historical_maps import HistoricalMaps, PastQuery
 from fleet_service.app.state import SLOTS, SharedState
 from fleet_service.serve.encode import batch_of
 from fleet_service.serve.query import AnswerSize, answer_query, size_asked

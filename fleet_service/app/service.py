@@ -28,7 +28,7 @@ from fleet_service.ingest.weather import WeatherMessage
 from fleet_service.replication.ownership import Ownership
 from fleet_service.serve.queryable import Answering, MapQueryable
 from fleet_service.serve.tile_rounds import SHARE_S, TileRounds
-from fleet_service.shards import moving
+from fleet_service.shards import handover
 from fleet_service.shards.serving import announce_regions as serving_regions
 from fleet_service.shards.serving import claim_regions, watch_successors
 from schemas import grid, keys, wire
@@ -245,7 +245,7 @@ class Service:
     def _hand_over(self, query: zenoh.Query, session: zenoh.Session) -> None:
         """Stop in good order, for the named standby."""
         self.engine.holding.to = (
-            moving.answer_request(query, session, self._config.regions) or self.engine.holding.to
+            handover.answer_request(query, session, self._config.regions) or self.engine.holding.to
         )
 
     def _standing(self, asked: zenoh.Query) -> None:

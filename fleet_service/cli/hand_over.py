@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Hand over, and print how long the region had no service."""
     from fleet_service.client import map_client
-    from fleet_service.shards.moving import hand_over
+    from fleet_service.shards.handover import hand_over
     from schemas.config import REGION_PATTERN
     from schemas.errors import InputError
 

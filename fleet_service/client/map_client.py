@@ -19,7 +19,7 @@ from schemas.config import ServiceConfig, ZenohSettings, load
 from schemas.errors import InputError, UnreachableError
 from schemas.numeric import IntArray
 from schemas.query import Format
-from schemas.runtime import commandline, tokens, zenoh_session
+from schemas.runtime import commandline, presence, zenoh_session
 from schemas.wire.tile import decode_tile
 
 log = logging.getLogger(__name__)
@@ -88,7 +88,7 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
         InputError: the query is refused, here or by a service, or no router answers.
     """
     asked = query.parse(parameters)
-    with open_connected(connection) as session, tokens.track_tokens(session) as services:
+    with open_connected(connection) as session, presence.track_tokens(session) as services:
         before = services.active
         payloads = sorted(query_replies(session, EVERYWHERE, parameters))
         time.sleep(FALLS_S)

@@ -16,7 +16,7 @@ from fleet_service.client.map_client import TIMEOUT_S
 from fleet_service.client.stretches import StretchAlert, Stretches
 from schemas import grid, keys, query, regions, wire
 from schemas.config import ZenohSettings
-from schemas.runtime import tokens, zenoh_session
+from schemas.runtime import presence, zenoh_session
 from schemas.wire.tile import decode_tile
 
 GATHER_S: Final = 0.3  # for which alerts of neighbouring cells are gathered into one
@@ -97,7 +97,7 @@ def watch_map(
     session = zenoh_session.open_session(connection, stop)
     if session is None:
         return
-    with session, tokens.track_tokens(session) as services:
+    with session, presence.track_tokens(session) as services:
         if not wishes.only_alerts:
             session.declare_subscriber(f"{keys.ROOT}/map/**", print_tile)
         session.declare_subscriber(f"{keys.ROOT}/alert/**", apply_sample)

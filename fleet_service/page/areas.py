@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from fleet_service.client.stretches import link_cells
-from fleet_service.page.world import MapMirror
+from fleet_service.page.map_mirror import MapMirror
 from schemas import grid
 from schemas.thresholds import METRES_PER_DEGREE
 

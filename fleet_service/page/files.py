@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 from starlette.requests import Request
 from starlette.responses import Response
 
-from fleet_service.page.joined import bundle_modules
+from fleet_service.page.module_bundle import bundle_modules
 
 LEVEL: Final = 9
 ENGLISH: Final = "texts.en.json"

@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from fleet_service.archive.format import layout, snapshots
-from fleet_service.page import records, world
+from fleet_service.page import map_mirror, records
 from fleet_service.page.recent import RecentMoments
 from fleet_service.page.records import Records
 from schemas import grid
@@ -72,7 +72,7 @@ class Moments:
     def encoded(self, moment: int, tile: int, level: int) -> bytes:
         """Return a complete tile at a moment; empty if it had no cells."""
         cells = self._at(moment).get(tile)
-        return b"" if cells is None else world.block_at(level, tile, cells, 1, float(moment))
+        return b"" if cells is None else map_mirror.block_at(level, tile, cells, 1, float(moment))
 
     def history(self, cell: int, sector: int) -> list[dict[str, Any]]:
         """Return the belief about a cell at each moment at which it was public, oldest first."""

@@ -17,11 +17,11 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from fleet_service.archive.export import extract
 from fleet_service.archive.format import geo
 from fleet_service.client import map_client
-from fleet_service.page import asked, features
+from fleet_service.page import features, request_params
 from fleet_service.page.features import COLLECTION, GEOJSON, FeatureQuestion
+from fleet_service.page.map_mirror import MapMirror
 from fleet_service.page.reader import Reader
 from fleet_service.page.turns import PastTurns, TooManyQuestionsError
-from fleet_service.page.world import MapMirror
 from schemas import grid, keys
 from schemas.tables import MAP_SCHEMA
 from schemas.thresholds import NS
@@ -88,7 +88,7 @@ class FeatureRoutes:
         """Return features ordered by place, from `after` on; `next` continues at the same place
         even if features change meanwhile.
         """
-        question = asked.parse_features(request, time.time_ns())
+        question = request_params.parse_features(request, time.time_ns())
         if not self._reader.is_served:
             message = "no service answers for the map; this is not the same as an empty map\n"
             return PlainTextResponse(message, 503, headers={"Retry-After": "10"})
@@ -126,7 +126,7 @@ class FeatureRoutes:
 
     async def item(self, request: Request) -> Response:
         """Return one feature as it is now."""
-        place = asked.parse_feature_id(request.path_params["feature"])
+        place = request_params.parse_feature_id(request.path_params["feature"])
         table = await run_in_threadpool(
             self._cells, FeatureQuestion(_place_box(place), after=place - 1, limit=1)
         )

@@ -18,11 +18,11 @@ import zenoh
 
 from fleet_service.client import map_client
 from fleet_service.client.watching import standing_alerts
-from fleet_service.page.world import MapMirror, box_of
+from fleet_service.page.map_mirror import MapMirror, box_of
 from schemas import grid, keys, regions, tables, wire
 from schemas.config import ZenohSettings
 from schemas.errors import InputError, WireError
-from schemas.runtime import tokens, zenoh_session
+from schemas.runtime import presence, zenoh_session
 from schemas.wire.tile import decode_tile
 
 log = logging.getLogger(__name__)
@@ -63,7 +63,7 @@ class Reader:
         session = zenoh_session.open_session(self._connection, stop)
         if session is None:
             return
-        with session, tokens.track_tokens(session) as services:
+        with session, presence.track_tokens(session) as services:
             self._session = session
             session.declare_subscriber(map_client.EVERYWHERE, self._tile)
             session.declare_subscriber(f"{keys.ROOT}/alert/**", self._alert)
@@ -119,7 +119,7 @@ class Reader:
             for region, since in self._fallen.copy().items()
         ]
 
-    def _note_fallen(self, services: tokens.PresenceTracker) -> None:
+    def _note_fallen(self, services: presence.PresenceTracker) -> None:
         """Record regions that lost their service and have no known cell; others are found
         through their cells.
         """

@@ -24,11 +24,11 @@ from fleet_service.page import web
 from fleet_service.page.basemap import BaseMap
 from fleet_service.page.connections import BoundedProtocol, LoopErrors
 from fleet_service.page.health import ServiceHealth
+from fleet_service.page.map_mirror import MapMirror
 from fleet_service.page.moments import Moments
 from fleet_service.page.reader import Reader
 from fleet_service.page.roads import RoadMap
 from fleet_service.page.watchers import MOST, Watchers
-from fleet_service.page.world import MapMirror
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 

@@ -17,8 +17,8 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from typing import Any, Final, NamedTuple
 
+from fleet_service.page.map_mirror import MapMirror, box_of
 from fleet_service.page.records import CELL_LEVEL, TileBlock
-from fleet_service.page.world import MapMirror, box_of
 from schemas import grid
 
 FLUSH_S: Final = 0.1  # changes of so long are one event

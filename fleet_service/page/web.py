@@ -20,16 +20,16 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from fleet_service.client.datex_feed import DatexFile
-from fleet_service.page import areas, asked, colours, ogc, overlay, records, route
+from fleet_service.page import areas, colours, ogc, overlay, records, request_params, route
 from fleet_service.page.basemap import BaseMap
 from fleet_service.page.files import Files
 from fleet_service.page.health import ServiceHealth
+from fleet_service.page.map_mirror import MapMirror
 from fleet_service.page.moments import Moments
 from fleet_service.page.ogc import FeatureRoutes
 from fleet_service.page.reader import Reader
 from fleet_service.page.roads import RoadMap, learned_lines
 from fleet_service.page.watchers import TooManyWatchersError, Watchers
-from fleet_service.page.world import MapMirror
 from schemas import grid, keys
 from schemas.errors import InputError, WireError
 from schemas.thresholds import NS, REACTION_S
@@ -174,7 +174,7 @@ class Routes:
 
     async def tiles(self, request: Request) -> Response:
         """Return the tiles with cells, now or `at` a moment."""
-        at = asked.parse_moment(request)
+        at = request_params.parse_moment(request)
         found = (
             self._of.world.tiles()
             if at is None
@@ -186,9 +186,9 @@ class Routes:
         """Return blocks of `tiles` at a `level`, now or `at` a moment; with `borrowed`, borrowed
         cells too.
         """
-        wanted = asked.parse_tiles(request)
-        level = asked.parse_level(request)
-        at = asked.parse_moment(request)
+        wanted = request_params.parse_tiles(request)
+        level = request_params.parse_level(request)
+        at = request_params.parse_moment(request)
         if at is not None:
             made = await run_in_threadpool(
                 lambda: [self._of.moments.encoded(at, tile, level) for tile in wanted]
@@ -215,7 +215,7 @@ class Routes:
         """Stream the changes in `bbox` at a `level`, from now on."""
         try:
             stream = self._of.watchers.enter(
-                asked.parse_view(request), request.client.host if request.client else ""
+                request_params.parse_view(request), request.client.host if request.client else ""
             )
         except TooManyWatchersError:
             return PlainTextResponse(
@@ -226,7 +226,7 @@ class Routes:
 
     async def cell(self, request: Request) -> Response:
         """Return one cell and heading as the service knows it now."""
-        cell, sector = asked.parse_place(request)
+        cell, sector = request_params.parse_place(request)
         return JSONResponse(await run_in_threadpool(self._cell, cell, sector))
 
     def _cell(self, cell: int, sector: int) -> dict[str, Any] | None:
@@ -243,7 +243,7 @@ class Routes:
     async def history(self, request: Request) -> Response:
         """Return the belief about a cell at the stored moments."""
         return JSONResponse(
-            await run_in_threadpool(self._of.moments.history, *asked.parse_place(request))
+            await run_in_threadpool(self._of.moments.history, *request_params.parse_place(request))
         )
 
     async def times(self, _: Request) -> Response:
@@ -252,7 +252,7 @@ class Routes:
 
     async def route(self, request: Request) -> Response:
         """Return the grip along `points`."""
-        points, text = asked.parse_route(request)
+        points, text = request_params.parse_route(request)
         return JSONResponse(await run_in_threadpool(self._profile, points, text))
 
     def _profile(self, points: list[tuple[float, float]], text: str) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.keys import CLAIMS, SERVES, WAITS, ServiceToken
 from schemas.regions import overlap
-from schemas.runtime import tokens, zenoh_session
+from schemas.runtime import presence, zenoh_session
 
 # in which the token of a service that froze or lost its host falls: its lease is 3 s
 GONE_S: Final = 5.0
@@ -74,7 +74,7 @@ def watch_successors(
     """Yield a function that returns True if another service took these regions since the block
     began. A service that is cut off from its bucket learns so that it was replaced, and stops
     serving outdated data."""
-    with tokens.track_tokens(session) as there:
+    with presence.track_tokens(session) as there:
         before = there.active
         yield lambda: bool(rival_tokens(mine, there.active - before))
 
@@ -97,7 +97,7 @@ def _claim_regions(
 ) -> list[zenoh.LivelinessToken]:
     def others_there() -> list[ServiceToken]:
         return rival_tokens(
-            mine, tokens.active_tokens(session) | tokens.active_tokens(session, CLAIMS), former
+            mine, presence.active_tokens(session) | presence.active_tokens(session, CLAIMS), former
         )
 
     for _ in range(_TRIES):
@@ -145,7 +145,7 @@ def standby_signs(
     )
     with (
         session,
-        tokens.track_tokens(session) as there,
+        presence.track_tokens(session) as there,
         _hold_tokens(_declare_tokens(session, waits, WAITS)),
     ):
         yield (

@@ -42,8 +42,8 @@ from tests.benchmarks import page_stage
 from tests.benchmarks.page_outside import measure_outside
 from tests.benchmarks.page_stage import CELLS, Stage, open_stage, pin_to_core, seen_town
 from tests.browser import Opened
+from tests.colour_vision import SIGHTS, colour_difference, to_lab
 from tests.fleet_service.page import scan
-from tests.sight import SIGHTS, colour_difference, to_lab
 from tests.waiting import until
 
 T = TypeVar("T")

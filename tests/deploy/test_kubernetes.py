@@ -16,7 +16,7 @@ import zenoh
 
 from fleet_service.enrolment.fleet import Enrolment
 from schemas.config import ServiceConfig, ZenohSettings, load
-from schemas.runtime import tokens
+from schemas.runtime import presence
 from schemas.runtime.zenoh_session import open_session
 from tests.deploy import kubernetes
 from tests.deploy.kubernetes import OVERLAYS, Cluster, Manifest, build_overlay, of_kind
@@ -193,7 +193,7 @@ def test_what_the_pods_start_works_together_and_leaves_in_time(
         with open_reader(running) as session:
             until(
                 lambda: (
-                    len({token.region for token in tokens.active_tokens(session)})
+                    len({token.region for token in presence.active_tokens(session)})
                     == sum(
                         len(json.loads(read_settings(running, f"{name}-0"))["regions"])
                         if overlay == "three-regions"

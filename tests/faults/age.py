@@ -24,7 +24,7 @@ import numpy as np
 
 from fleet_service.analytics import synthetic
 from fleet_service.analytics.synthetic import LATITUDE, LONGITUDE, START_NS, SyntheticFleet
-from fleet_service.app.past import LOOKED_ROWS, PastQuery, box_of, encode_question
+from fleet_service.app.historical_maps import LOOKED_ROWS, PastQuery, box_of, encode_question
 from fleet_service.archive.format import layout
 from fleet_service.archive.format.layout import CHECKPOINTS, DAY_NS, MAP_DAYS
 from fleet_service.archive.format.segments import SCHEMAS, Writer

@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def _answer_past(root: Path) -> dict[str, float]:
-    from fleet_service.app.past import answer_line
+    from fleet_service.app.historical_maps import answer_line
 
     out = BytesIO()
     answer_line(root, sys.stdin.buffer.read(), out)

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Sequence
 from typing import Final
 
-from fleet_service.app import beside, jobs
+from fleet_service.app import jobs, subprocess_job
 from fleet_service.cli import main
 from fleet_service.replication.replica import BucketReplica
 
@@ -20,7 +20,7 @@ BEGINS = "begins"
 ENDS = "ends"
 FOLLOW_S: Final = 3.0
 
-_run = beside.run_module
+_run = subprocess_job.run_module
 _follow = BucketReplica.sync
 _put_there = BucketReplica._upload_if_present
 _copying = threading.local()
@@ -58,7 +58,7 @@ def put_there(copy: BucketReplica, name: str) -> bool:
 
 
 if __name__ == "__main__":
-    beside.run_module = run  # type: ignore[assignment]
+    subprocess_job.run_module = run  # type: ignore[assignment]
     BucketReplica.sync = sync_and_report  # type: ignore[method-assign,assignment]
     BucketReplica._upload_if_present = put_there  # type: ignore[method-assign,assignment]
     jobs.FOLLOW_S = FOLLOW_S  # type: ignore[misc]

@@ -29,7 +29,7 @@ from fleet_service.archive.format.segments import Writer
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.client import map_client
 from fleet_service.replay import checkpoints
-from fleet_service.shards import moving
+from fleet_service.shards import handover
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 from schemas.thresholds import NS
@@ -328,7 +328,7 @@ class Machines:
         former = self.serving
         to = self.waiting[0].root.parent.name
         with map_client.open_connected(router) as session:
-            assert moving.hand_over(session, "*/*/*", to, lambda _: None) is not None
+            assert handover.hand_over(session, "*/*/*", to, lambda _: None) is not None
         self._await_takeover()
         assert former.part.wait(PATIENCE_S) == 0
         self._idle.append(former)

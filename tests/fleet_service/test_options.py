@@ -185,7 +185,7 @@ SHOWN_BELOW: Final = {
         "--connect",
         "--config",
     },
-    "hand-over": {"region", "--to", "--connect", "--config"},  # shards/test_moving.py
+    "hand-over": {"region", "--to", "--connect", "--config"},  # shards/test_handover.py
     "watch": {
         "--bbox",
         "--connect",

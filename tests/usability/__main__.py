@@ -35,12 +35,12 @@ from schemas.runtime.figures import Figure
 from schemas.runtime.palette import ESTIMATORS, GRIP_RANGE, SURFACES, TRUTH, shade
 from tests import reference_pages, results
 from tests.browser import open_page
+from tests.colour_vision import SIGHTS, colour_difference, to_lab
 from tests.faults.processes import Part
 from tests.first_drive import map_first_drive, read_commands
 from tests.fleet_service.conftest import running
 from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import page_of
-from tests.sight import SIGHTS, colour_difference, to_lab
 from tests.structure import ROOT
 from tests.usability import mistakes, waiting
 from tests.usability.wrong_logs import WRONG, find_unnoticed

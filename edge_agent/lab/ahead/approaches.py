@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 
 from edge_agent.ahead.horizon import COMFORT, horizon_length, look_ahead
-from edge_agent.ahead.known import LocalMap
+from edge_agent.ahead.local_map import LocalMap
 from edge_agent.ahead.path import GivenRoute, Path, Pose, straight_path
 from edge_agent.ahead.roads import ways_on
 from edge_agent.ahead.warnings import Active, update_warnings

@@ -13,11 +13,11 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.ahead.asking import FURTHER_M, RequestLog, Tiles, keys_of
-from edge_agent.ahead.hearing import decode_cells
+from edge_agent.ahead.cell_decoder import decode_cells
 from edge_agent.ahead.horizon import horizon_length, look_ahead
-from edge_agent.ahead.known import LocalMap
+from edge_agent.ahead.local_map import LocalMap
 from edge_agent.ahead.path import GivenRoute, Path, Pose, straight_path, to_degrees
+from edge_agent.ahead.request_log import FURTHER_M, RequestLog, Tiles, keys_of
 from edge_agent.ahead.roads import ways_on
 from edge_agent.ahead.warnings import Active, update_warnings
 from edge_agent.lab.ahead.made_up_service import tile_payload

@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.ahead.known import LocalMap
+from edge_agent.ahead.local_map import LocalMap
 from edge_agent.ahead.prior import NOWHERE, MapPrior
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.block import Block, to_utc_ns

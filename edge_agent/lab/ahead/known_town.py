@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge_agent.ahead.known import MEASURED, LocalMap, ReceivedCells, belief_of
+from edge_agent.ahead.local_map import MEASURED, LocalMap, ReceivedCells, belief_of
 from edge_agent.lab.simulation.roads import LanePoint
 from edge_agent.lab.simulation.scenarios import Scenario
 from schemas import grid, mugrid

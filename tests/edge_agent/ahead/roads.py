@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from edge_agent.ahead import known, path
-from edge_agent.ahead.known import LocalMap, ReceivedCells
+from edge_agent.ahead import local_map, path
+from edge_agent.ahead.local_map import LocalMap, ReceivedCells
 from edge_agent.ahead.path import Pose
 from schemas import grid
 from schemas.numeric import FloatArray, IntArray
@@ -33,12 +33,12 @@ def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) ->
 
 
 def cells(
-    key: IntArray, mu: float, *, width: float = 0.1, basis: int = known.MEASURED, at: int = NOW
+    key: IntArray, mu: float, *, width: float = 0.1, basis: int = local_map.MEASURED, at: int = NOW
 ) -> ReceivedCells:
     """HeardCells of one friction."""
     said = np.full(len(key), mu)
     slippery = np.full(len(key), 1.0 if mu + width < 0.4 else 0.0 if mu - width > 0.4 else 0.5)
-    belief = known.belief_of(said - width, said, said + width, slippery)
+    belief = local_map.belief_of(said - width, said, said + width, slippery)
     return ReceivedCells(
         key,
         belief,

@@ -9,8 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from edge_agent.ahead import known
-from edge_agent.ahead.asking import FURTHER_M, RequestLog
+from edge_agent.ahead import local_map
 from edge_agent.ahead.horizon import (
     COMFORT,
     SIGHT_M,
@@ -20,7 +19,7 @@ from edge_agent.ahead.horizon import (
     look_ahead,
     safe_speed,
 )
-from edge_agent.ahead.known import (
+from edge_agent.ahead.local_map import (
     ALERT_HELD_S,
     BORROWED,
     CHANGE_S,
@@ -30,6 +29,7 @@ from edge_agent.ahead.known import (
     belief_of,
 )
 from edge_agent.ahead.path import NONE, GivenRoute, Pose, straight_path, to_degrees
+from edge_agent.ahead.request_log import FURTHER_M, RequestLog
 from edge_agent.ahead.roads import ways_on
 from schemas import grid, mugrid
 from schemas.thresholds import GRAVITY, NS
@@ -120,9 +120,11 @@ def test_unknown_stays_unknown() -> None:
 
 def test_a_bound_is_no_value_and_gives_no_advice() -> None:
     horizon = look_ahead(
-        straight_path(HOME, 100.0), make_local_map([cells(keys_on(), 0.3, basis=known.BOUND)]), NOW
+        straight_path(HOME, 100.0),
+        make_local_map([cells(keys_on(), 0.3, basis=local_map.BOUND)]),
+        NOW,
     )
-    assert (horizon.basis == known.BOUND).any()
+    assert (horizon.basis == local_map.BOUND).any()
     assert np.isnan(horizon.mu).all()
     assert not horizon.slippery.any()
     assert np.isnan(horizon.safe_speed).all()
@@ -134,7 +136,7 @@ def test_what_is_heard_of_a_cell_is_what_it_said() -> None:
     bin_width = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
     for share, value in ((0.05, 0.31), (0.5, 0.5), (0.95, 0.8)):
         assert mugrid.quantiles(belief, share)[0] == pytest.approx(value, abs=bin_width)
-    assert (belief @ known.SLIPPERY_BINS)[0] == pytest.approx(0.17, abs=0.05)
+    assert (belief @ local_map.SLIPPERY_BINS)[0] == pytest.approx(0.17, abs=0.05)
 
 
 def test_without_a_network_the_horizon_fades_to_unknown() -> None:
@@ -143,7 +145,7 @@ def test_without_a_network_the_horizon_fades_to_unknown() -> None:
     fresh, later, gone = (
         look_ahead(path, cache, NOW + round(s * NS)) for s in (0.0, 1800.0, HELD_S + 1.0)
     )
-    seen = fresh.basis == known.MEASURED
+    seen = fresh.basis == local_map.MEASURED
     assert seen.any()
     assert (later.mu_lower[seen] < fresh.mu_lower[seen] - 0.1).all(), "the interval opens"
     assert later.age_s[seen] == pytest.approx(1800.0)
@@ -242,7 +244,7 @@ def test_a_car_without_a_route_knows_the_road_some_way_ahead_all_the_time() -> N
         )
         ways = ways_on(pose, cache.keys(), length + FURTHER_M) or [straight_path(pose, length)]
         horizon = look_ahead(ways[0].first_metres(length), cache, pose.time)
-        known_m.append(int((horizon.basis == known.MEASURED).sum()))
+        known_m.append(int((horizon.basis == local_map.MEASURED).sum()))
         for box in asked.missing_boxes(ways[0], pose, length):
             heard = cells(
                 road[grid.touches(box, grid.bounds(road // grid.SECTORS))], 0.8, at=pose.time
@@ -303,11 +305,11 @@ def test_opposite_alert_warns_until_grip_is_found_on_this_side() -> None:
     assert look_ahead(path, cache, NOW + NS).slippery.sum() == seen.slippery.sum(), (
         "grip that was found before"
     )
-    cache.store_cells(tile, cells(road[2:3], 0.3, basis=known.BOUND, at=NOW + NS), NOW)
+    cache.store_cells(tile, cells(road[2:3], 0.3, basis=local_map.BOUND, at=NOW + NS), NOW)
     assert look_ahead(path, cache, NOW + NS).slippery.sum() == seen.slippery.sum(), (
         "who rolled over it found none"
     )
-    cache.store_cells(tile, cells(road[2:3], 0.6, basis=known.BOUND, at=NOW + NS), NOW)
+    cache.store_cells(tile, cells(road[2:3], 0.6, basis=local_map.BOUND, at=NOW + NS), NOW)
     assert look_ahead(path, cache, NOW + NS).slippery.sum() < seen.slippery.sum(), (
         "who braked there found enough"
     )

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import zenoh
 
-from edge_agent.ahead import known, lookout
-from edge_agent.ahead.asking import LEAVE_S, MOST_TILES, REFRESH_S, RequestLog, Tiles
-from edge_agent.ahead.hearing import decode_alert_message, decode_cells, decode_standing_alerts
+from edge_agent.ahead import local_map, lookout
+from edge_agent.ahead.cell_decoder import decode_alert_message, decode_cells, decode_standing_alerts
 from edge_agent.ahead.lookout import Lookout
 from edge_agent.ahead.path import GivenRoute, Path, Pose, straight_path
+from edge_agent.ahead.request_log import LEAVE_S, MOST_TILES, REFRESH_S, RequestLog, Tiles
 from edge_agent.lab.ahead.made_up_service import MadeUpService, tile_payload
 from schemas import grid, keys, wire
 from schemas.errors import WireError
@@ -154,10 +154,10 @@ def test_the_map_alone_warns_and_what_it_says_lies_on_the_horizon(
     with driving(router) as car:
         warning = car.next_warning()
         assert warning.reason == "the map reports low grip"
-        seen = car.drive_until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
+        seen = car.drive_until(lambda seen: (seen.runs.basis == local_map.MEASURED).sum() > 10)
         assert seen.way == "route"
         dry = seen.runs.start_m < 60.0
-        assert seen.runs.mu[dry & (seen.runs.basis == known.MEASURED)].min() > 0.7
+        assert seen.runs.mu[dry & (seen.runs.basis == local_map.MEASURED)].min() > 0.7
         assert np.isfinite(seen.runs.safe_speed).any()
         assert all("bbox=" in asked for asked in town.asked if "/map/" in asked), (
             "pieces, never the whole map"
@@ -214,9 +214,11 @@ def test_without_a_link_the_horizon_fades_to_unknown_and_the_car_looks_on(
 ) -> None:
     town.mu = {int(key): 0.85 for key in keys_on()}
     with driving(router) as car:
-        car.drive_until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
+        car.drive_until(lambda seen: (seen.runs.basis == local_map.MEASURED).sum() > 10)
         router.stop()
-        car.lookout.see([HOME._replace(time=time.time_ns() + round((known.HELD_S + 60.0) * NS))])
+        car.lookout.see(
+            [HOME._replace(time=time.time_ns() + round((local_map.HELD_S + 60.0) * NS))]
+        )
         looks = car.lookout.counts.looks
         until(lambda: car.lookout.counts.looks > looks + 1)
         seen = car.lookout.outlook(CAR)
@@ -232,7 +234,7 @@ def test_what_was_observed_yesterday_says_how_old_it_is(router: Router) -> None:
     with MadeUpService(router.settings, time.time_ns() - DAY) as town:
         town.mu = {int(key): 0.85 for key in keys_on()}
         with driving(router) as car:
-            seen = car.drive_until(lambda seen: (seen.runs.basis == known.MEASURED).any())
+            seen = car.drive_until(lambda seen: (seen.runs.basis == local_map.MEASURED).any())
             assert np.nanmin(seen.runs.age_s) == pytest.approx(86_400.0, rel=0.01)
 
 
@@ -266,7 +268,7 @@ def test_where_it_is_the_car_believes_its_filter_and_the_map(
     flat = (np.zeros((1, 32)), np.zeros((1, 32)))
     with driving(router) as car:
         car.lookout.believe(np.array([-1]), flat)
-        car.drive_until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
+        car.drive_until(lambda seen: (seen.runs.basis == local_map.MEASURED).sum() > 10)
         assert car.lookout.outlook(CAR).here[0] == pytest.approx(0.625, abs=0.02)  # type: ignore[union-attr]
 
         def is_informed(seen: Outlook) -> bool:

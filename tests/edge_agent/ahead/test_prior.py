@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge_agent.ahead.known import BOUND, HELD_S, belief_of
+from edge_agent.ahead.local_map import BOUND, HELD_S, belief_of
 from edge_agent.ahead.prior import MOST, NOWHERE, SHARE, MapPrior
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.block import Block

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_agent.ahead.horizon import MARGIN_M, UNKNOWN_LOWER, look_ahead
-from edge_agent.ahead.known import BOUND, LocalMap
+from edge_agent.ahead.local_map import BOUND, LocalMap
 from edge_agent.ahead.path import GivenRoute, Pose, straight_path
 from edge_agent.ahead.warnings import ABSENT_S, UPDATE_S, Active, update_warnings
 from schemas.numeric import IntArray

@@ -27,7 +27,7 @@ from edge_agent.inputs.readers.dbc import read_dbc
 from edge_agent.inputs.recording import Series
 from edge_agent.inputs.signal_log import SignalLog, read_log
 from edge_agent.lab.live.databroker import Databroker
-from edge_agent.lab.live.judge import free_port
+from edge_agent.lab.live.live_benchmark import free_port
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.errors import InputError
 from schemas.numeric import FloatArray

@@ -26,7 +26,7 @@ from edge_agent.inputs.live.rows import LiveRows
 from edge_agent.inputs.live.sources import is_live, open_sources
 from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.lab.live.databroker import Databroker
-from edge_agent.lab.live.judge import (
+from edge_agent.lab.live.live_benchmark import (
     COUNTED,
     count_lost,
     free_port,

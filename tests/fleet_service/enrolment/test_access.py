@@ -16,7 +16,7 @@ from fleet_service.enrolment.access import access_control
 from fleet_service.enrolment.enrol import Registry, Terms
 from schemas import keys
 from schemas.errors import InputError
-from schemas.runtime import tokens
+from schemas.runtime import presence
 from schemas.runtime.zenoh_session import configuration
 from tests.faults.attempts import ATTEMPTS
 from tests.faults.ground import HONEST, Ground, open_ground
@@ -153,11 +153,11 @@ def test_reader_and_vehicle_see_who_serves_and_cannot_say_that_they_do(running: 
         token = service.liveliness().declare_token(served.key)
 
         def sees(looks: zenoh.Session) -> bool:
-            return served in tokens.active_tokens(looks)
+            return served in presence.active_tokens(looks)
 
         for looks in (vehicle, reader):
             until(partial(sees, looks))
-        with tokens.track_tokens(reader) as seen:
+        with presence.track_tokens(reader) as seen:
             assert seen.active == {served}
             token.undeclare()
             until(lambda: seen.lost == {served})

@@ -10,9 +10,9 @@ import pytest
 
 from fleet_service.page import connections
 from fleet_service.page.connections import BoundedProtocol, LoopErrors
+from fleet_service.page.map_mirror import MapMirror
 from fleet_service.page.turns import MOST_WAITING, PastTurns, TooManyQuestionsError
 from fleet_service.page.watchers import TooManyWatchersError, View, Watchers
-from fleet_service.page.world import MapMirror
 
 VIEW = View((-180.0, -85.0, 180.0, 85.0), 0)
 

@@ -18,7 +18,7 @@ from schemas.runtime.palette import (
     LITTLE,
     TWO,
 )
-from tests.sight import SIGHTS, colour_difference, to_lab
+from tests.colour_vision import SIGHTS, colour_difference, to_lab
 
 LEAST = 10.0
 STEP = 5.0  # of lightness between two classes that follow each other in danger

@@ -28,9 +28,9 @@ from fleet_service.cli import main
 from fleet_service.fusion import Fusion
 from fleet_service.page.files import Files
 from fleet_service.page.health import parse_metrics
+from fleet_service.page.map_mirror import MapMirror
 from fleet_service.page.records import HEAD
 from fleet_service.page.watchers import WAITING, TooManyWatchersError, View, Watchers
-from fleet_service.page.world import MapMirror
 from fleet_service.serve.encode import cell_table
 from schemas.config import ZenohSettings
 from tests.faults.processes import Part

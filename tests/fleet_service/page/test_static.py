@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fleet_service.page.files import SCRIPT
-from fleet_service.page.joined import bundle_modules
+from fleet_service.page.module_bundle import bundle_modules
 from tests.structure import ROOT
 
 

@@ -26,7 +26,7 @@ from fleet_service.shards.serving import announce_regions, claim_regions, rival_
 from schemas import grid, keys, query, regions
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
-from schemas.runtime import tokens
+from schemas.runtime import presence
 from schemas.wire import Batch, Kind
 from tests.fleet_service.conftest import Running, running
 from tests.fleet_service.examples import SECOND, batch, send
@@ -59,7 +59,7 @@ CARS = 3
 @pytest.fixture(autouse=True)
 def nobody(session: zenoh.Session) -> None:
     """Begin with no token: the router may hear of the end of the test before after that test."""
-    until(lambda: not tokens.active_tokens(session))
+    until(lambda: not presence.active_tokens(session))
 
 
 def visits(vehicle: str) -> list[Batch]:
@@ -187,7 +187,7 @@ def test_a_second_service_of_a_region_refuses_to_start(
         zenoh_session(router) as other,
         claim_regions(other, "second", NAMES[1:2], threading.Event()) as mine,
     ):
-        assert tokens.active_tokens(other) == set()
+        assert presence.active_tokens(other) == set()
         with (
             pytest.raises(InputError, match="already served by second"),
             zenoh_session(router) as third,
@@ -195,8 +195,8 @@ def test_a_second_service_of_a_region_refuses_to_start(
         ):
             pass
         with announce_regions(other, mine):
-            assert tokens.active_tokens(other) == set(mine)
-        assert rival_tokens(mine, tokens.active_tokens(other)) == []
+            assert presence.active_tokens(other) == set(mine)
+        assert rival_tokens(mine, presence.active_tokens(other)) == []
 
 
 def test_region_is_announced_only_while_queries_are_answered(
@@ -208,9 +208,9 @@ def test_region_is_announced_only_while_queries_are_answered(
     @contextmanager
     def record_tokens(service: Service, session: zenoh.Session) -> Iterator[None]:
         with answering(service, session):
-            seen.append(tokens.active_tokens(session))
+            seen.append(presence.active_tokens(session))
             yield
-            until(lambda: not tokens.active_tokens(session))
+            until(lambda: not presence.active_tokens(session))
             seen.append(set())
 
     monkeypatch.setattr(Service, "_declare_inputs", record_tokens)
@@ -218,7 +218,7 @@ def test_region_is_announced_only_while_queries_are_answered(
         running(router, tmp_path / "one", name="first", regions=NAMES[:1]),
         zenoh_session(router) as other,
     ):
-        assert {token.service for token in tokens.active_tokens(other)} == {"first"}
+        assert {token.service for token in presence.active_tokens(other)} == {"first"}
     assert seen == [set(), set()]
 
 
@@ -233,7 +233,7 @@ def test_who_comes_while_it_is_asked_may_not_have_been_asked(
 
         def let_come(*_: object) -> bool:
             coming.__enter__()
-            until(lambda: tokens.active_tokens(third) == mine)
+            until(lambda: presence.active_tokens(third) == mine)
             return True
 
         with monkeypatch.context() as meanwhile:
@@ -291,14 +291,14 @@ def test_a_leaving_service_may_be_asked_instead_of_its_successor(
         held = announce_regions(other, frozen)
         again = announce_regions(other, frozen)
         held.__enter__()
-        until(lambda: len(tokens.active_tokens(third)) == 2)
+        until(lambda: len(presence.active_tokens(third)) == 2)
 
         def replies(*_: object) -> Iterator[tuple[str, bytes]]:
             held.__exit__(None, None, None)
-            until(lambda: len(tokens.active_tokens(third)) == 1)
+            until(lambda: len(presence.active_tokens(third)) == 1)
             if comes_back:  # a frozen one wakes
                 again.__enter__()
-                until(lambda: len(tokens.active_tokens(third)) == 2)
+                until(lambda: len(presence.active_tokens(third)) == 2)
             return iter(())
 
         with monkeypatch.context() as meanwhile:
@@ -316,11 +316,11 @@ def test_token_of_a_killed_service_may_fall_after_the_answer(
     with zenoh_session(router) as other, zenoh_session(router) as third:
         held = announce_regions(other, frozenset({keys.ServiceToken(NAMES[1], "killed", "1f")}))
         held.__enter__()
-        until(lambda: len(tokens.active_tokens(third)) == 1)
+        until(lambda: len(presence.active_tokens(third)) == 1)
 
         def falls(_: float) -> None:
             held.__exit__(None, None, None)
-            until(lambda: not tokens.active_tokens(third))
+            until(lambda: not presence.active_tokens(third))
 
         monkeypatch.setattr(map_client, "query_replies", lambda *_: iter(()))
         monkeypatch.setattr(map_client, "time", SimpleNamespace(sleep=falls))

@@ -21,7 +21,7 @@ import zenoh
 from schemas import keys, regions
 from schemas.config import NAME_PATTERN
 from schemas.errors import InputError
-from schemas.runtime import tokens
+from schemas.runtime import presence
 
 ANSWER_S: Final = 10.0
 MOVED_S: Final = 300.0  # a compaction that is under way is waited for
@@ -48,7 +48,7 @@ def answer_request(query: zenoh.Query, session: zenoh.Session, served: Sequence[
         to = str(query.parameters).removeprefix("to=")
         waiting = {
             token.region
-            for token in tokens.active_tokens(session, keys.WAITS)
+            for token in presence.active_tokens(session, keys.WAITS)
             if token.service == to
         }
         if re.fullmatch(NAME_PATTERN, to) is None or waiting != set(served):
@@ -77,7 +77,7 @@ def hand_over(
     Raises:
         InputError: the region has no service, the standby does not wait, or it did not take over.
     """
-    with tokens.track_tokens(session) as there:
+    with presence.track_tokens(session) as there:
         service = _find_server(there, region)
         if service is None:
             raise InputError("region", f"no service serves {region}", "see `fleet-service watch`")
@@ -98,7 +98,7 @@ def hand_over(
         return HandoverResult(service, time.monotonic() - (absent_since or time.monotonic()))
 
 
-def _find_server(there: tokens.PresenceTracker, region: str) -> str | None:
+def _find_server(there: presence.PresenceTracker, region: str) -> str | None:
     return next(
         (token.service for token in there.active if regions.covers(token.region, region)), None
     )

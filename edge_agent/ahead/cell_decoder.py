@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import pyarrow as pa
 
-from edge_agent.ahead.known import BASES, BOUND, ReceivedCells, belief_of
+from edge_agent.ahead.local_map import BASES, BOUND, ReceivedCells, belief_of
 from schemas import grid, keys, mugrid, wire
 from schemas.errors import InputError, WireError
 from schemas.numeric import BoolArray, FloatArray, IntArray

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
-from fleet_service.app import past
+from fleet_service.app import historical_maps
 from fleet_service.app.engine import Engine
 from fleet_service.archive.format import files, layout, segments
 from fleet_service.archive.format.load import load, load_groups
@@ -49,27 +49,27 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def question(**parameters: str) -> past.PastQuery:
-    return past.PastQuery(query.parse(parameters), time.time_ns(), 120.0, None)
+def question(**parameters: str) -> historical_maps.PastQuery:
+    return historical_maps.PastQuery(query.parse(parameters), time.time_ns(), 120.0, None)
 
 
 @pytest.fixture
-def asker(root: Path) -> Iterator[past.HistoricalMaps]:
-    with closing(past.HistoricalMaps(root)) as asker:
+def asker(root: Path) -> Iterator[historical_maps.HistoricalMaps]:
+    with closing(historical_maps.HistoricalMaps(root)) as asker:
         yield asker
 
 
 def test_rows_are_counted_before_any_is_read(root: Path) -> None:
     now = time.time_ns()
     assert rows_near(root, now, None, 10**6) == 400
-    assert rows_near(root, now, past.box_of(question(bbox=NEAR)), 10**6) == 400
-    assert rows_near(root, now, past.box_of(question(bbox="0,0,1,1")), 10**6) == 0
+    assert rows_near(root, now, historical_maps.box_of(question(bbox=NEAR)), 10**6) == 400
+    assert rows_near(root, now, historical_maps.box_of(question(bbox="0,0,1,1")), 10**6) == 0
 
 
 def test_what_would_read_too_much_is_refused_and_a_narrower_box_is_not(
-    root: Path, asker: past.HistoricalMaps, monkeypatch: pytest.MonkeyPatch
+    root: Path, asker: historical_maps.HistoricalMaps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(past, "MOST_ROWS", 399)
+    monkeypatch.setattr(historical_maps, "MOST_ROWS", 399)
     with pytest.raises(
         InputError, match="at: the query would read too much of the archive; use a smaller bbox"
     ):
@@ -78,8 +78,8 @@ def test_what_would_read_too_much_is_refused_and_a_narrower_box_is_not(
     with pytest.raises(
         InputError, match="at: the query would read too much of the archive; use a smaller bbox"
     ):
-        list(past.replies_to(root, question(bbox=NEAR)))  # as many lie in the box itself
-    monkeypatch.setattr(past, "LOOKED_ROWS", 399)
+        list(historical_maps.replies_to(root, question(bbox=NEAR)))  # as many lie in the box itself
+    monkeypatch.setattr(historical_maps, "LOOKED_ROWS", 399)
     with pytest.raises(InputError, match="at: the query would read too much"):
         list(asker.ask(question(bbox=NEAR), lambda _: True))
 
@@ -124,10 +124,10 @@ def test_a_filter_finds_the_same_rows_however_they_are_grouped(
 
 
 def test_the_answer_of_the_other_process_is_that_of_this_one(
-    root: Path, asker: past.HistoricalMaps
+    root: Path, asker: historical_maps.HistoricalMaps
 ) -> None:
     asked = question(bbox=NEAR)
-    (mine,) = past.replies_to(root, asked)
+    (mine,) = historical_maps.replies_to(root, asked)
     (theirs,) = asker.ask(asked, lambda _: True)
     assert theirs == mine
     assert mine[0] == TILE
@@ -150,7 +150,7 @@ def begun(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
 
 
 def test_a_process_answers_one_question_after_the_other(
-    asker: past.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
+    asker: historical_maps.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
 ) -> None:
     answers = [
         list(asker.ask(question(bbox=box), lambda _: True)) for box in (NEAR, "0,0,1,1", NEAR)
@@ -162,7 +162,7 @@ def test_a_process_answers_one_question_after_the_other(
 
 
 def test_a_process_that_died_while_nobody_asked_is_begun_anew(
-    asker: past.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
+    asker: historical_maps.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
 ) -> None:
     for _ in range(2):
         assert len(list(asker.ask(question(bbox=NEAR), lambda _: True))) == 1
@@ -173,7 +173,7 @@ def test_a_process_that_died_while_nobody_asked_is_begun_anew(
 
 @pytest.mark.campaign
 def test_an_answer_that_nobody_reads_to_its_end_is_not_read_by_the_next(
-    asker: past.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
+    asker: historical_maps.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
 ) -> None:
     left = asker.ask(question(bbox=NEAR), lambda _: True)
     next(left)
