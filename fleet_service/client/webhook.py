@@ -126,7 +126,7 @@ class Webhook:
         """Number of alerts in the queue; after `close`, of those that stayed in it."""
         return self._undelivered if self._is_closed else len(self._queue)
 
-    def troubles(self) -> list[str]:
+    def health_problems(self) -> list[str]:
         """Return one message per problem; empty if every alert is delivered or under way."""
         out = (
             [f"webhook: {self._failure}; {self.waiting_count} alerts wait"] if self._failure else []

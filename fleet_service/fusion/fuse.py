@@ -56,7 +56,7 @@ class Updated(NamedTuple):
     slots: IntArray
 
 
-class Before(NamedTuple):
+class RecordedResult(NamedTuple):
     """Values of `Updated` at the first fusion, used when an archive is replayed."""
 
     late: BoolArray
@@ -141,7 +141,7 @@ class Fusion:
         """First time [ns] that lies after all fused epochs; 0 before the first observation."""
         return 0 if self._epoch is None else (self._epoch + 1) * c.EPOCH_NS
 
-    def update(self, o: Observations, before: Before | None = None) -> Updated:
+    def update(self, o: Observations, before: RecordedResult | None = None) -> Updated:
         """Fuse observations in any order.
 
         A late one is fused at the checkpoint, with its evidence aged to that time
@@ -227,7 +227,7 @@ class Fusion:
         """
         return self._read(KERNELS[shape_class(self._shape.reader)], slots, np.full(len(slots), now))
 
-    def believed(self, slots: IntArray) -> FloatArray:
+    def beliefs_at_last_report(self, slots: IntArray) -> FloatArray:
         """Return the belief about the road of each slot, (k, 32), at its last observation."""
         return self._read(KERNELS[shape_class(self._shape.reader)], slots, self.live.time[slots])
 
@@ -237,7 +237,7 @@ class Fusion:
             self.store.state.live, SLIPPERY_WEIGHTS[shape_class(self._shape.reader)], slots
         )
 
-    def alarming(self, slots: IntArray) -> FloatArray:
+    def beliefs_for_alerts(self, slots: IntArray) -> FloatArray:
         """Return the same as `believed`, but with the upper end of the range of the slope, which
         alarms assume for gentle values; see `shared`.
         """

@@ -63,7 +63,7 @@ def detection_delays(rng: Generator, before: float, after: float) -> IntArray:
 
 def _has_seen(fusion: Fusion, cell: int, ice: bool) -> bool:
     slot = fusion.slots_of(CELL[cell : cell + 1], np.zeros(1, np.int64))[0]
-    slippery = float(fusion.believed(np.array([slot]))[0] @ SLIPPERY_SHARE)
+    slippery = float(fusion.beliefs_at_last_report(np.array([slot]))[0] @ SLIPPERY_SHARE)
     return slippery > RAISE_ABOVE if ice else slippery < CLEAR_BELOW
 
 

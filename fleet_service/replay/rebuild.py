@@ -23,7 +23,7 @@ from fleet_service.archive.identity import vehicle_ids
 from fleet_service.archive.identity.pseudonyms import pseudonym_number
 from fleet_service.fusion import Fusion, Observations, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
-from fleet_service.fusion.fuse import Before
+from fleet_service.fusion.fuse import RecordedResult
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.weather import archived_reports
 from schemas import grid
@@ -245,7 +245,7 @@ def replay(
         columns, where, days, since.begin.after, since.begin.until, since.near()
     )
     waiting: list[
-        tuple[Observations, Before]
+        tuple[Observations, RecordedResult]
     ] = []  # late rows that were fused after the end of their table
     known = vehicle_ids.read_numbers(root / "keys")
     for table in in_order(reading.Listing(root, Kind.OBSERVATION, wanted, damaged), since.most):
@@ -266,12 +266,14 @@ def replay(
         yield from _fuse_epochs(fusion, *waiting[0], heard)
 
 
-def _recorded_result(rows: segments.Rows) -> Before:
+def _recorded_result(rows: segments.Rows) -> RecordedResult:
     """Return lateness and weight of rows as they were used at the first fusion."""
-    return Before(rows["late"].astype(bool), rows["late_by"], rows["weight"])
+    return RecordedResult(rows["late"].astype(bool), rows["late_by"], rows["weight"])
 
 
-def _join_parts(parts: list[tuple[Observations, Before]]) -> tuple[Observations, Before]:
+def _join_parts(
+    parts: list[tuple[Observations, RecordedResult]],
+) -> tuple[Observations, RecordedResult]:
     """Return parts joined in order."""
     of = Observations(
         **{
@@ -280,7 +282,7 @@ def _join_parts(parts: list[tuple[Observations, Before]]) -> tuple[Observations,
         }
     )
     befores = [before for _, before in parts]
-    return of, Before(
+    return of, RecordedResult(
         late=np.concatenate([b.late for b in befores]),
         late_by=np.concatenate([b.late_by for b in befores]),
         weight=np.concatenate([b.weight for b in befores]),
@@ -288,14 +290,16 @@ def _join_parts(parts: list[tuple[Observations, Before]]) -> tuple[Observations,
 
 
 def _select_rows(
-    o: Observations, before: Before, rows: BoolArray | IntArray | slice
-) -> tuple[Observations, Before]:
+    o: Observations, before: RecordedResult, rows: BoolArray | IntArray | slice
+) -> tuple[Observations, RecordedResult]:
     """Return a selection of rows."""
-    return o.take(rows), Before(before.late[rows], before.late_by[rows], before.weight[rows])
+    return o.take(rows), RecordedResult(
+        before.late[rows], before.late_by[rows], before.weight[rows]
+    )
 
 
 def _fuse_epochs(
-    fusion: Fusion, o: Observations, before: Before, heard: Heard
+    fusion: Fusion, o: Observations, before: RecordedResult, heard: Heard
 ) -> Iterator[Updated]:
     """Fuse rows epoch by epoch, by the time at which they were fused originally."""
     time = o.time + before.late_by

@@ -87,8 +87,10 @@ class Alerts:
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
         likely = np.flatnonzero((slippery > LIKELY) & ~standing)
         likely = likely[self._have_witnesses(slots[likely], ICE, time[likely])]
-        likely = likely[self._fusion.alarming(slots[likely]) @ SLIPPERY_SHARE > RAISE_ABOVE]
-        believed = self._fusion.believed(slots[likely]) @ SLIPPERY_SHARE
+        likely = likely[
+            self._fusion.beliefs_for_alerts(slots[likely]) @ SLIPPERY_SHARE > RAISE_ABOVE
+        ]
+        believed = self._fusion.beliefs_at_last_report(slots[likely]) @ SLIPPERY_SHARE
         out = []
         for k, probability in zip(likely.tolist(), believed.tolist(), strict=True):
             slot = int(slots[k])

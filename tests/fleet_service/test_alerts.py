@@ -168,7 +168,7 @@ def test_undelivered_alerts_stay_for_the_next_watch(tmp_path: Path) -> None:
     said: list[str] = []
     hook = Webhook("http://127.0.0.1:9/none", said.append, AlertQueue(tmp_path / "queue"))
     hook.send(take_alerts(Stretches(), alert(0))[0])
-    until(lambda: bool(hook.troubles()))
+    until(lambda: bool(hook.health_problems()))
     hook.close()
     assert said[-1] == "webhook: 1 alerts remain in the queue for the next watch"
     assert (hook.waiting_count, hook.lost_count) == (1, 0)
@@ -176,7 +176,7 @@ def test_undelivered_alerts_stay_for_the_next_watch(tmp_path: Path) -> None:
         again = Webhook(url, said.append, AlertQueue(tmp_path / "queue"))
         until(lambda: again.counts["delivered"] == 1)
         again.close()
-    assert (len(heard), again.waiting_count, again.troubles()) == (1, 0, [])
+    assert (len(heard), again.waiting_count, again.health_problems()) == (1, 0, [])
     assert set(alert_message(take_alerts(Stretches(), alert(0))[0])) >= {
         "receiver",
         "status",
@@ -192,7 +192,7 @@ def test_full_queue_drops_the_oldest_and_reports_it(tmp_path: Path) -> None:
     for one in take_alerts(Stretches(), *(alert(10 * x) for x in range(5))):
         hook.send(one)
     assert hook.counts["dropped"] == 3
-    assert "webhook: 3 alerts were lost" in hook.troubles()
+    assert "webhook: 3 alerts were lost" in hook.health_problems()
     assert {m.name: dict(m.values) for m in hook.metrics()}["webhook_waiting"] == {"": 2.0}
     hook.close()
     assert said[-1] == "webhook: 3 alerts were lost"

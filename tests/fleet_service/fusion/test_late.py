@@ -6,7 +6,7 @@ import numpy as np
 
 from fleet_service.fusion import Fusion, Updated
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.fuse import Before
+from fleet_service.fusion.fuse import RecordedResult
 from tests.fleet_service.examples import CELL, START, belief, observations, slippery, value
 from tests.fleet_service.fusion.test_order import difference, drive
 
@@ -55,7 +55,7 @@ def test_a_replay_fuses_what_was_late_where_it_was_fused() -> None:
     fusion, told = late(np.random.default_rng(2).permutation(400), 5)
     o = drive(7, 400, 3000.0)
     n = 400
-    found = Before(np.zeros(n, bool), np.zeros(n, np.int64), np.zeros(n, np.float32))
+    found = RecordedResult(np.zeros(n, bool), np.zeros(n, np.int64), np.zeros(n, np.float32))
     for rows, updated in told:
         found.late[rows], found.late_by[rows] = updated.late, updated.late_by
         found.weight[rows] = updated.weight

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_service.fusion import Fusion, Observations, Updated
-from fleet_service.fusion.fuse import Before
+from fleet_service.fusion.fuse import RecordedResult
 from schemas import mugrid
 from schemas.numeric import IntArray
 from tests.fleet_service.examples import CELL, at_least, observations, value
@@ -89,7 +89,7 @@ def test_a_replay_with_the_weights_that_were_used_gives_the_same_map() -> None:
     assert 0 < late.sum() < 2000
     assert len(np.unique(weight)) > 5
     again = Fusion(LATENESS_S)
-    again.update(o, Before(late, late_by, weight))
+    again.update(o, RecordedResult(late, late_by, weight))
     assert difference(fusion, again) <= 1e-6
     assert [again.trust(v) for v in range(12)] == pytest.approx(
         [fusion.trust(v) for v in range(12)], abs=1e-6
@@ -131,6 +131,6 @@ def test_stores_grow_without_disturbing_what_they_hold() -> None:
     assert difference(grown, whole) <= 1e-6
     np.testing.assert_array_equal(np.sort(grown.cell[:n]), np.arange(n))
     assert (grown.slots_of(np.array([n + 5]), np.array([0])) == -1).all()
-    assert mugrid.quantiles(grown.believed(np.arange(n)), 0.5) == pytest.approx(
+    assert mugrid.quantiles(grown.beliefs_at_last_report(np.arange(n)), 0.5) == pytest.approx(
         np.full(n, 0.6), abs=0.1
     )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.fuse import Before
+from fleet_service.fusion.fuse import RecordedResult
 from fleet_service.fusion.likelihoods import level_above_used, make_evidence
 from schemas import mugrid
 from tests.fleet_service.examples import (
@@ -177,6 +177,6 @@ def test_flood_of_one_vehicle_is_bounded_and_reported_as_not_fused() -> None:
         np.concatenate(of)
         for of in zip(*((f.late, f.late_by, f.weight) for f in updated), strict=True)
     )
-    again.update(o, Before(*told))
+    again.update(o, RecordedResult(*told))
     again.update(observations([70.0], [8], value([0.5])))
     np.testing.assert_array_equal(belief(again), belief(fusion))

@@ -59,7 +59,7 @@ def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
         )
     alerts = Alerts(fusion)
     slots = np.arange(fusion.size)
-    believed = fusion.believed(slots) @ SLIPPERY_SHARE
+    believed = fusion.beliefs_at_last_report(slots) @ SLIPPERY_SHARE
     assert fusion.slippery(slots) == pytest.approx(believed, abs=1e-9)
     told = {alert.cell: float(alert.reason.split()[4]) for alert in alerts.update(slots)}
     known = {
@@ -162,7 +162,7 @@ def test_neighbours_confirm_two_reports_of_ice_that_outweigh_the_past(
         )
     slots = fusion.slots_of(np.array([here]), np.array([0]))
     own = float(fusion.slippery(slots)[0])
-    believed = float(fusion.believed(slots)[0] @ SLIPPERY_SHARE)
+    believed = float(fusion.beliefs_at_last_report(slots)[0] @ SLIPPERY_SHARE)
     assert own < 0.5
     assert believed > RAISE_ABOVE or not found
     assert bool(Alerts(fusion).update(slots)) is raised is (own > LIKELY and found == 2)
