@@ -215,7 +215,7 @@ def test_of_two_calibrations_the_surer_value_holds() -> None:
 
 def test_a_car_that_stands_teaches_nothing(smooth: Recorded) -> None:
     still = np.zeros_like(smooth.signals[:3000])
-    with pytest.raises(InputError, match="excited"):
+    with pytest.raises(InputError, match="enough excitation"):
         learn_calibration([(smooth.t[:3000], still)], smooth.vehicle)
 
 

@@ -52,7 +52,7 @@ def test_late_device_is_measured_and_corrected(
 ) -> None:
     wrong = replace(log_of(drive), signals=late(drive.signals, columns, 0.15))
     adopted = adopt_measured(wrong, drive.vehicle)
-    assert [note.split()[1] for note in adopted.notes] == [device]
+    assert [note.split()[4] for note in adopted.notes] == [device]
     assert adopted.diagnosis.is_passed
     rows = slice(1000, -1000)
     before = np.nanmean(np.abs(wrong.signals[rows][:, columns] - drive.signals[rows][:, columns]))

@@ -78,7 +78,7 @@ def test_bomb_is_refused_with_a_bounded_memory(
     before = resource.getrlimit(resource.RLIMIT_AS)
     monkeypatch.setattr(bring_in, "bounded_memory", lambda path: bounded_memory(path, MOST))
     monkeypatch.setattr(mdf, "MOST_BYTES", MOST)
-    with pytest.raises(InputError, match=r"bomb\.m.* (needs more than 400 MB|is not a sound)"):
+    with pytest.raises(InputError, match=r"bomb\.m.* (needs more than 400 MB|is not a valid)"):
         bring_in.read_source(path, None, None)
     assert resource.getrlimit(resource.RLIMIT_AS) == before
 

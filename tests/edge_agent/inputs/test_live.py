@@ -180,7 +180,7 @@ def test_databroker_is_queried_and_old_values_are_no_readings(
             paths[1]: [2.0]
         }
         feed.close()
-    assert "does not know Vehicle.AngularVelocity.Yaw" in caplog.text
+    assert "has no signal Vehicle.AngularVelocity.Yaw" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -283,7 +283,7 @@ def test_live_sources_and_a_log_do_not_go_together(
         )
         == 2
     )
-    assert "together" in capsys.readouterr().err
+    assert "cannot be combined" in capsys.readouterr().err
     assert main(["run", "--source", "gpsd:", "--profile", "toyota"]) == 2
     assert "--vehicle" in capsys.readouterr().err
 
