@@ -106,7 +106,7 @@ PURE = (
     "edge_agent/observe",
     *(
         f"edge_agent/ahead/{name}.py"
-        for name in ("path", "known", "horizon", "roads", "warnings", "asking", "prior")
+        for name in ("path", "local_map", "horizon", "roads", "warnings", "request_log", "prior")
     ),
     "edge_agent/inputs/block.py",
     "fleet_service/fusion",
@@ -125,7 +125,7 @@ SANS_IO = (
     *(f"fleet_service/serve/{name}.py" for name in ("encode", "query", "tile_cache")),
     *(
         f"fleet_service/page/{name}.py"
-        for name in ("colours", "features", "joined", "records", "route")
+        for name in ("colours", "features", "module_bundle", "records", "route")
     ),
 )
 IMPURE = {
