@@ -238,8 +238,8 @@ class Fusion:
         )
 
     def beliefs_for_alerts(self, slots: IntArray) -> FloatArray:
-        """Return the same as `believed`, but with the upper end of the range of the slope, which
-        alarms assume for gentle values; see `shared`.
+        """Return the same as `beliefs_at_last_report`, but with the upper end of the range of the
+        slope, which alarms assume for gentle values; see `shared`.
         """
         return self._read(KERNELS[shape_class(self._shape.alarm)], slots, self.live.time[slots])
 

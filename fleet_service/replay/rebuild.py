@@ -448,7 +448,7 @@ def _with_numbers(table: pa.Table) -> pa.Table:
 
 
 def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
-    """Return the maximum number of rows that `past` would read, by footers alone; counting stops
+    """Return the maximum number of rows that `past_fusion` would read, by footers alone; counting stops
     beyond `most`.
 
     Raises:

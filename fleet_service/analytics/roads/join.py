@@ -139,7 +139,7 @@ def join_roads(network: RoadNetwork) -> pa.Table:
 
 
 def read_roads(path: Path) -> pa.Table:
-    """Return a file made by `joined`.
+    """Return a file made by `join_roads`.
 
     Raises:
         InputError: it is not such a file.
