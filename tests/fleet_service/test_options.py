@@ -212,7 +212,7 @@ GIVEN_IN: Final[dict[str, tuple[str, ...]]] = {
     "watch": ("test_alerts",),
     "page": ("page/test_server",),
     "cits": ("client/cits/test_command",),
-    "hand-over": ("shards/test_moving",),
+    "hand-over": ("shards/test_handover",),
 }
 # A campaign takes minutes: tests/fleet_service/lab/test_evaluate.py runs it small.
 CAMPAIGN: Final = {"--out", "--quick", "--skip-end-to-end", "--end-to-end", "--only"}
