@@ -9,8 +9,9 @@ even bits), so that its base-4 digits are the quadkey and a parent is a shift: `
     tile     zoom 14   one map message
     region   zoom 10   one key of observations
     zone     zoom 7    one folder of the archive
-    sector   0 east, 1 north, 2 west, 3 south: quarter of the compass the vehicle heads for, so
-             carriageways do not mix
+    sector   0 east, 1 north, 2 west, 3 south   quarter of the compass that the vehicle heads for
+
+Sectors keep the carriageways of a road apart.
 
 Latitudes are limited to ±85.0511° (Web Mercator). Longitudes wrap at ±180°. Source: the slippy-map
 tile scheme (OpenStreetMap wiki, "Slippy map tilenames") and Bing's quadkeys.
