@@ -42,7 +42,7 @@ class Horizon(NamedTuple):
         mu: median; NaN also where only lower bounds are known. mu_lower, mu_upper: 5 and 95 %.
         p_slippery: P(mu < 0.4).
         age_s: since the last observation.
-        basis: known.UNKNOWN, BOUND, MEASURED, BORROWED.
+        basis: local_map.UNKNOWN, BOUND, MEASURED, BORROWED.
         slippery: True if it justifies a warning.
         alerted: True if an alert stands.
         safe_speed: [m/s]; NaN where unknown, because an unknown road does not allow any speed.

@@ -102,7 +102,7 @@ class LocalMap:
         self._most = most_cells
         self._tiles: OrderedDict[int, ReceivedCells] = OrderedDict()
         self._alerts: dict[int, tuple[Alert, int]] = {}
-        # of all tiles, by key; None when it has to be made anew
+        # of all tiles, by key; None when it must be built again
         self._all: ReceivedCells | None = NOTHING
 
     @property

@@ -326,7 +326,7 @@ class Fusion:
     ) -> tuple[IntArray, BoolArray]:
         rows = rows[
             np.argsort(o.time[rows], kind="stable")
-        ]  # in the order of time nothing has to be computed anew
+        ]  # in the order of time nothing is computed again
         at, keys, share = _spread_votes(o, rows)
         slots = self.store.slots_for(keys)
         self.store.reserve(len(slots))

@@ -200,7 +200,7 @@ class BucketReplica:
         self._put_fence(term, fence)
         self._require_lease()
         for name in self._slow.list_sizes():
-            if not fence.counts_object(name):  # nobody will ever make one of this name again
+            if not fence.counts_object(name):  # no service writes this name again
                 self._slow.delete(name)
 
     def _put_fence(self, term: Term, fence: Fence) -> None:
