@@ -17,7 +17,7 @@ from fleet_service.archive.format.segments import Rows
 from fleet_service.archive.identity.pseudonyms import Pseudonyms
 from fleet_service.archive.segment_log import SegmentLog
 from fleet_service.fusion import observations_of
-from fleet_service.fusion.standing import UNCORRECTED
+from fleet_service.fusion.vote_weights import UNCORRECTED
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.budgets import NewCells

@@ -18,11 +18,11 @@ from fleet_service.fusion.late import LATE_MOST_NS, delay_observations, fused_at
 from fleet_service.fusion.neighbours import road_beliefs
 from fleet_service.fusion.observations import Observations, SmallArray
 from fleet_service.fusion.shared import KERNELS, UNKNOWN_SHAPE, kernel_of, shape_class, shared_parts
-from fleet_service.fusion.standing import Standing, first_standing
 from fleet_service.fusion.store.cells import Cells
 from fleet_service.fusion.store.records import CLAIMED, HEEDED, NOBODY, NONE, USED, Rows
 from fleet_service.fusion.store.store import Store, distinct_values
-from fleet_service.fusion.trust import compute_standing, initial_trust, shape_of
+from fleet_service.fusion.trust import compute_vote_weights, initial_trust, shape_of
+from fleet_service.fusion.vote_weights import VoteWeights, initial_vote_weights
 from fleet_service.fusion.weather import Reports, Weather, no_reports, weather_of
 from fleet_service.fusion.window import Arrivals, Votes, absorb_votes, commit_windows
 from schemas import grid
@@ -76,7 +76,7 @@ class Fusion:
     Attributes:
         enrolled: as above.
         store: cells, windows, pairs and vehicles.
-        standings: of the vehicles, the oldest first.
+        vote_weights: of the vehicles, one record per epoch, the oldest first.
         reports: the weather that a later update may still need.
     """
 
@@ -88,15 +88,15 @@ class Fusion:
         )  # whose trust an observation in time may still need
         self._epoch: int | None = None
         self.store = Store()
-        self.standings: list[Standing] = [first_standing(initial_trust(False))]
+        self.vote_weights: list[VoteWeights] = [initial_vote_weights(initial_trust(False))]
         self.reports: Reports = no_reports()
         self._weather: Weather = weather_of(self.reports)
         self._shape = UNKNOWN_SHAPE
 
-    def resume(self, epoch: int | None, standings: list[Standing], reports: Reports) -> None:
-        """Continue from a checkpoint: its epoch, standings and weather; the caller has set `store`."""
+    def resume(self, epoch: int | None, vote_weights: list[VoteWeights], reports: Reports) -> None:
+        """Continue from a checkpoint: its epoch, vote weights and weather; the caller has set `store`."""
         self._epoch = epoch
-        self.standings = standings
+        self.vote_weights = vote_weights
         self.reports = reports
         self._weather = weather_of(reports)
         self._find_shape()
@@ -175,12 +175,12 @@ class Fusion:
         for e in distinct_values(epoch[~left]).tolist():
             self._advance(e)
             rows = np.flatnonzero((epoch == e) & ~left)
-            standing = self._standing(e)
+            votes = self._vote_weights_at(e)
             limited[rows] = (
-                np.where(standing.heeds(vehicle[rows]), HEEDED, CLAIMED) * o.limited[rows]
+                np.where(votes.may_support_alerts(vehicle[rows]), HEEDED, CLAIMED) * o.limited[rows]
             )
             if before is None:
-                used[rows] = standing.weights(vehicle[rows])
+                used[rows] = votes.weights(vehicle[rows])
             else:
                 used[rows] = before.weight[rows]
             arrivals = _make_arrivals(o, vehicle, used, old)._replace(limited=limited)
@@ -254,7 +254,7 @@ class Fusion:
 
     def trust(self, vehicle: int) -> float:
         """Return the weight of a vehicle's next vote."""
-        return float(self.standings[-1].weights(self._index(vehicle))[0])
+        return float(self.vote_weights[-1].weights(self._index(vehicle))[0])
 
     def _index(self, vehicle: int) -> IntArray:
         index = self.store.known(np.array([vehicle]))
@@ -285,13 +285,15 @@ class Fusion:
         reporters = self.store.state.live.reporters
         who = np.where(row[:, None] == NONE, NOBODY, reporters["source"][row, side])
         when = reporters["source_time"][row, side].astype(np.int64) * NS
-        trusted = self.standings[-1].weights(np.maximum(who, 0)) >= c.SOURCE_TRUST
+        trusted = self.vote_weights[-1].weights(np.maximum(who, 0)) >= c.SOURCE_TRUST
         counted = (who != NOBODY) & trusted & (when > np.reshape(since, (-1, 1)))
         return who, np.where(counted, when, 0)
 
-    def _standing(self, epoch: int) -> Standing:
+    def _vote_weights_at(self, epoch: int) -> VoteWeights:
         return next(
-            found for found in reversed(self.standings) if found.epoch <= epoch or found.epoch < 0
+            found
+            for found in reversed(self.vote_weights)
+            if found.epoch <= epoch or found.epoch < 0
         )
 
     def _advance(self, epoch: int) -> None:
@@ -305,21 +307,21 @@ class Fusion:
             for due in store.due_windows(before):
                 commit_windows(store.state, self._weather, store.peers, store.names, due, before)
             store.forget(before // NS)
-            last = self.standings[-1]
+            last = self.vote_weights[-1]
             joined = store.vehicles - len(last.weight)
             weight = np.append(last.weight, np.full(joined, initial_trust(False), np.float32))
-            standing = compute_standing(
+            votes = compute_vote_weights(
                 store.peers, last._replace(weight=weight), self._epoch, enrolled=self.enrolled
             )
-            self.standings = [
-                self.standings[0],
-                *self.standings[1:][-self._kept_epochs :],
-                standing,
+            self.vote_weights = [
+                self.vote_weights[0],
+                *self.vote_weights[1:][-self._kept_epochs :],
+                votes,
             ]
             self._find_shape()
 
     def _find_shape(self) -> None:
-        self._shape = shape_of(self.store.peers, self.standings[-1].weight)
+        self._shape = shape_of(self.store.peers, self.vote_weights[-1].weight)
 
     def _absorb(
         self, o: Observations, rows: IntArray, arrivals: Arrivals, most: int

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion.belief import PackedArray
 from fleet_service.fusion.fuse import Fusion
-from fleet_service.fusion.standing import Standing
 from fleet_service.fusion.store.cells import no_beliefs, rows_of_lines
 from fleet_service.fusion.store.records import (
     CELL,
@@ -35,6 +34,7 @@ from fleet_service.fusion.store.records import (
     State,
 )
 from fleet_service.fusion.store.store import Store
+from fleet_service.fusion.vote_weights import VoteWeights
 from fleet_service.fusion.weather import Reports
 from schemas import mugrid
 from schemas.numeric import ByteArray
@@ -87,15 +87,15 @@ def image_of(fusion: Fusion) -> Image:
     }
     image["trust"] = {
         "epoch": np.concatenate(
-            [np.full(len(standing.weight), standing.epoch) for standing in fusion.standings]
+            [np.full(len(votes.weight), votes.epoch) for votes in fusion.vote_weights]
         ),
-        "weight": np.concatenate([standing.weight for standing in fusion.standings]),
-        "heeded": np.concatenate([standing.heeded for standing in fusion.standings]),
+        "weight": np.concatenate([votes.weight for votes in fusion.vote_weights]),
+        "heeded": np.concatenate([votes.heeded for votes in fusion.vote_weights]),
     }
     image["trusts"] = {
-        "epoch": np.array([standing.epoch for standing in fusion.standings]),
-        "vehicles": np.array([len(standing.weight) for standing in fusion.standings]),
-        "newcomer": np.array([standing.initial for standing in fusion.standings]),
+        "epoch": np.array([votes.epoch for votes in fusion.vote_weights]),
+        "vehicles": np.array([len(votes.weight) for votes in fusion.vote_weights]),
+        "newcomer": np.array([votes.initial for votes in fusion.vote_weights]),
     }
     reports = fusion.reports
     image["weather"] = {f.name: getattr(reports, f.name).reshape(-1) for f in fields(Reports)}
@@ -133,10 +133,10 @@ def fusion_of(image: Image, lateness_s: float) -> Fusion:
     heeded = np.split(image["trust"]["heeded"].astype(np.bool_), ends)
     epochs = image["trusts"]["epoch"].tolist()
     newcomers = image["trusts"]["newcomer"].tolist()
-    standings = [Standing(*of) for of in zip(epochs, weights, newcomers, heeded, strict=True)]
+    vote_weights = [VoteWeights(*of) for of in zip(epochs, weights, newcomers, heeded, strict=True)]
     columns = {f.name: image["weather"][f.name] for f in fields(Reports)}
     columns["prior"] = columns["prior"].reshape(-1, mugrid.BINS)
-    fusion.resume(None if epoch < 0 else epoch, standings, Reports(**columns))
+    fusion.resume(None if epoch < 0 else epoch, vote_weights, Reports(**columns))
     return fusion
 
 

@@ -29,8 +29,8 @@ import numpy as np
 
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.shared import Shape
-from fleet_service.fusion.standing import Standing
 from fleet_service.fusion.store.records import NOBODY, USED
+from fleet_service.fusion.vote_weights import VoteWeights
 from schemas import mugrid
 from schemas.numeric import BoolArray, Float32Array
 from schemas.runtime.jit import compiled, refcount_free
@@ -195,18 +195,20 @@ def _record_meeting(
         this.met[place] *= 0.5
 
 
-def compute_standing(
-    peers: RecordArray, before: Standing, epoch: int, *, enrolled: bool
-) -> Standing:
-    """Return the standing of the vehicles (V,) from an epoch on, from their meetings and the
-    standing of the vehicles they met, `before`.
+def compute_vote_weights(
+    peers: RecordArray, before: VoteWeights, epoch: int, *, enrolled: bool
+) -> VoteWeights:
+    """Return the vote weights of the vehicles (V,) from an epoch on, computed from their meetings
+    and the earlier weights `before` of the vehicles that they met.
 
     In an established service, a vehicle that has met few trusted vehicles is a newcomer. If only
     `enrolled` vehicles are fused, no vehicle can take a new name, so there are no newcomers.
     """
     weight = np.empty(len(before.weight), np.float32)
     established = _update_weights(peers, before.weight, weight, enrolled)
-    return Standing(epoch, weight, initial_trust(established), heeded_flags(peers[: len(weight)]))
+    return VoteWeights(
+        epoch, weight, initial_trust(established), heeded_flags(peers[: len(weight)])
+    )
 
 
 @compiled

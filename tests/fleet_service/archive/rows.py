@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet_service.archive.format import reading
 from fleet_service.archive.format.segments import SCHEMAS, Rows, Writer, round_to_steps
-from fleet_service.fusion.standing import UNCORRECTED
+from fleet_service.fusion.vote_weights import UNCORRECTED
 from schemas import grid, mugrid, tables
 from schemas.wire import Kind
 

@@ -58,7 +58,7 @@ def test_controller_is_the_second_witness_of_ice() -> None:
 
 def test_flag_that_is_always_on_supports_no_alert() -> None:
     fusion = make_acquainted(claims_on_dry=True)
-    assert fusion.standings[-1].heeded.sum() == 11
+    assert fusion.vote_weights[-1].heeded.sum() == 11
     assert not ice_with(fusion, flag=True)
 
 

@@ -1,4 +1,4 @@
-"""Standing of the vehicles from an epoch on: the weight of each one's votes. Pure."""
+"""Weight of each vehicle's votes from an epoch on. Pure."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from schemas.numeric import BoolArray, Float32Array, IntArray
 UNCORRECTED: Final = {"bias": 0.0, "bias_std": c.BIAS_RELATIVE, "spread": 1.0, "slope": 0.0}
 
 
-class Standing(NamedTuple):
-    """Standing of the vehicles from an epoch on.
+class VoteWeights(NamedTuple):
+    """Weight of each vehicle's votes from an epoch on.
 
     Attributes:
-        epoch: from which it acts; -1: from the beginning.
+        epoch: first epoch in which the weights are used; -1: from the beginning.
         weight: weight of each vehicle's votes, (V,); more than 1 after agreement with many others.
-        initial: weight of a vehicle that is not among them.
+        initial: weight of a vehicle that the service does not know yet.
         heeded: whether each vehicle's slip controllers may support an alert, (V,).
     """
 
@@ -33,7 +33,7 @@ class Standing(NamedTuple):
         known = np.append(self.weight, np.float32(self.initial))
         return np.asarray(known[np.minimum(vehicle, len(self.weight))])
 
-    def heeds(self, vehicle: IntArray) -> BoolArray:
+    def may_support_alerts(self, vehicle: IntArray) -> BoolArray:
         """Return True for vehicles (n,) whose slip controllers may support an alert; also True for
         unknown vehicles.
         """
@@ -41,6 +41,6 @@ class Standing(NamedTuple):
         return np.asarray(known[np.minimum(vehicle, len(self.heeded))])
 
 
-def first_standing(initial: float) -> Standing:
-    """Return the standing in a service that knows no vehicle."""
-    return Standing(-1, np.zeros(0, np.float32), initial, np.zeros(0, np.bool_))
+def initial_vote_weights(initial: float) -> VoteWeights:
+    """Return the weights in a service that knows no vehicle."""
+    return VoteWeights(-1, np.zeros(0, np.float32), initial, np.zeros(0, np.bool_))

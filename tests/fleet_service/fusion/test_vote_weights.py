@@ -45,7 +45,7 @@ def make_acquainted(
 
 
 def learned_slope(fusion: Fusion) -> float:
-    return shape_of(fusion.store.peers, fusion.standings[-1].weight).slope
+    return shape_of(fusion.store.peers, fusion.vote_weights[-1].weight).slope
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.5])
@@ -99,11 +99,11 @@ def test_doubt_of_an_alarm_ends_once_the_shape_is_known() -> None:
     unknown = shared.UNKNOWN_SHAPE
     assert unknown.alarm == pytest.approx(0.5, abs=0.01)
     fusion = make_acquainted(0.0)
-    known = shape_of(fusion.store.peers, fusion.standings[-1].weight)
+    known = shape_of(fusion.store.peers, fusion.vote_weights[-1].weight)
     assert known.std < 0.05
     assert known.alarm < known.reader + 0.08 < unknown.alarm - 0.2
     steep = make_acquainted(0.5)
-    assert shape_of(steep.store.peers, steep.standings[-1].weight).alarm > 0.5
+    assert shape_of(steep.store.peers, steep.vote_weights[-1].weight).alarm > 0.5
 
 
 def test_vehicle_with_a_record_sharpens_a_cell_and_a_newcomer_does_not() -> None:
