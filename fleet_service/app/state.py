@@ -34,7 +34,7 @@ from fleet_service.replay.restart import image_of, load_restart
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.idle_roads import IdleRoads
 from fleet_service.serve.map_state import MapState
-from fleet_service.serve.public_cells import PublicCells
+from fleet_service.serve.public_cells import PRESENT, WAITING, PublicCells
 from fleet_service.serve.tile_cache import TileCache
 from fleet_service.serve.visitors import Visitors
 from schemas.config import ServiceConfig
@@ -86,9 +86,9 @@ class ServiceState(NamedTuple):
     def image(self, cut: Cut, weather: Iterable[Path]) -> Taken:
         """Return the content of a checkpoint, which includes everything up to the segment `cut` and
         these weather files."""
-        tables = image_of(self.fusion, self.alerts.standing_alerts, self.streams) | visitor_tables(
-            None if self.public is None else self.public.visitors
-        )
+        tables = image_of(self.fusion, self.alerts.standing_alerts, self.streams)
+        if self.public is not None:
+            tables |= public_tables(self.public)
         return Taken(tables, cut, tuple(path.name for path in weather))
 
 
@@ -116,15 +116,17 @@ class SharedState:
         self.tiles = TileCache(state.map, self.guard, self._public_vehicles, state.public)
 
 
-def visitor_tables(visitors: Visitors | None) -> dict[str, pa.Table]:
-    """Return visitors as tables of a checkpoint: bits and part of the window in columns of one
-    length.
+def public_tables(public: PublicCells) -> dict[str, pa.Table]:
+    """Return public cells as tables of a checkpoint; bits and part of the visitors' window are
+    columns of one length.
     """
-    if visitors is None:
-        return {}
-    columns = visitors.columns()
+    columns = public.visitors.columns()
     part = np.full(len(columns["bits"]), columns["part"][0])
-    return {VISITORS: pa.table({"bits": pa.array(columns["bits"]), "part": pa.array(part)})}
+    tables = {VISITORS: {"bits": columns["bits"], "part": part}} | public.columns()
+    return {
+        name: pa.table({column: pa.array(values) for column, values in table.items()})
+        for name, table in tables.items()
+    }
 
 
 def load_state(
@@ -138,7 +140,7 @@ def load_state(
     Raises:
         OSError: it cannot be read.
     """
-    begin = load_restart(root, config.lateness_s, (VISITORS,))
+    begin = load_restart(root, config.lateness_s, (VISITORS, WAITING, PRESENT))
     fusion = begin.fusion
     fusion.enrolled = config.fleet is not None
     streams = begin.streams
@@ -146,9 +148,10 @@ def load_state(
     if (
         config.public_vehicles > 1
     ):  # after a checkpoint that does not have them nothing is shown until so many came
-        kept = begin.extra_tables.get(VISITORS)
-        visitors = Visitors.of(fusion, kept) if kept and len(kept["bits"]) else Visitors(fusion)
-        public = PublicCells(fusion, visitors, config.public_vehicles)
+        kept = begin.extra_tables
+        known = {VISITORS, WAITING, PRESENT} <= kept.keys() and len(kept[VISITORS]["bits"])
+        visitors = Visitors.of(fusion, kept[VISITORS]) if known else Visitors(fusion)
+        public = PublicCells(fusion, visitors, config.public_vehicles, kept if known else None)
     shown = MapState(fusion)
     alerts = Alerts(fusion, IdleRoads(), is_private=config.public_vehicles > 1)
     alerts.resume(begin.standing)

@@ -221,11 +221,12 @@ class Fusion:
             self.reports = _drop_old_reports(self.reports, self._oldest())
         self._weather = weather_of(self.reports)
 
-    def beliefs(self, slots: IntArray, now: int) -> FloatArray:
+    def beliefs(self, slots: IntArray, now: int, rows: Rows | None = None) -> FloatArray:
         """Return the belief about the road of each slot, (k, 32), predicted to `now` [ns],
-        including the evidence of slippery neighbours.
+        including the evidence of slippery neighbours; of a copy of the live rows if `rows` is one.
         """
-        return self._read(KERNELS[shape_class(self._shape.reader)], slots, np.full(len(slots), now))
+        kernels = KERNELS[shape_class(self._shape.reader)]
+        return self._read(kernels, slots, np.full(len(slots), now), rows)
 
     def beliefs_at_last_report(self, slots: IntArray) -> FloatArray:
         """Return the belief about the road of each slot, (k, 32), at its last observation."""
@@ -243,10 +244,11 @@ class Fusion:
         """
         return self._read(KERNELS[shape_class(self._shape.alarm)], slots, self.live.time[slots])
 
-    def _read(self, kernels: Float32Array, slots: IntArray, now: IntArray) -> FloatArray:
-        return road_beliefs(
-            self.store.state.live, self.store.table, self._weather, kernels, slots, now
-        )
+    def _read(
+        self, kernels: Float32Array, slots: IntArray, now: IntArray, rows: Rows | None = None
+    ) -> FloatArray:
+        rows = self.store.state.live if rows is None else rows
+        return road_beliefs(rows, self.store.table, self._weather, kernels, slots, now)
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
         """Return the slot of each cell and sector, -1 if no vehicle has reported it."""

@@ -13,8 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.fusion import Fusion
-from fleet_service.serve.view import CellView
+from fleet_service.serve.view import CellView, Readable
 from schemas import grid, mugrid
 from schemas.numeric import FloatArray, IntArray
 
@@ -26,7 +25,7 @@ KEPT: Final = 0.8
 
 
 def impute_cells(
-    fusion: Fusion, tile: int, known: IntArray, route: IntArray | None, now: int
+    source: Readable, tile: int, known: IntArray, route: IntArray | None, now: int
 ) -> CellView:
     """Return the cells of a tile that are not `known` next to those of its cells that are, same
     sector; along a route, the cells of its keys.
@@ -35,7 +34,7 @@ def impute_cells(
     greater distance. `vehicles` is the minimum of theirs, so that an imputed value is never more
     public than its sources. Times are the newest and oldest of theirs.
     """
-    live = fusion.live
+    live = source.live
     slots = known[grid.tile_of(live.key[known] // grid.SECTORS) == tile]
     near = grid.neighbours(live.key[slots] // grid.SECTORS).reshape(-1)
     visited = np.repeat(slots, 8)
@@ -43,14 +42,14 @@ def impute_cells(
     free = (
         (near >= 0)
         & (grid.tile_of(near) == tile)
-        & ~np.isin(fusion.slots_of(np.maximum(near, 0), sector), slots)
+        & ~np.isin(source.slots_of(np.maximum(near, 0), sector), slots)
     )
     keys = (near * grid.SECTORS + sector)[free]
     visited = visited[free]
     share = np.full(len(keys), 1.0 - PRIOR_SHARE)
     if route is not None:
         ahead = np.isin(keys, route)
-        along = _route_gaps(fusion, route, tile, known)
+        along = _route_gaps(source, route, tile, known)
         keys, visited, share = (
             np.concatenate([a[ahead], b])
             for a, b in zip((keys, visited, share), along, strict=True)
@@ -59,7 +58,7 @@ def impute_cells(
     belief = np.zeros((len(wanted), mugrid.BINS))
     whole = np.zeros(len(wanted))
     most = np.zeros(len(wanted))
-    np.add.at(belief, group, share[:, None] * fusion.beliefs(visited, now))
+    np.add.at(belief, group, share[:, None] * source.beliefs(visited, now))
     np.add.at(whole, group, share)
     np.maximum.at(most, group, share)
     vehicles = np.full(len(wanted), np.iinfo(np.int64).max)
@@ -82,14 +81,14 @@ def impute_cells(
 
 
 def _route_gaps(
-    fusion: Fusion, route: IntArray, tile: int, known: IntArray
+    source: Readable, route: IntArray, tile: int, known: IntArray
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Return unknown keys of a route in a tile, the slots of the nearest visited ones before and
     behind, and their shares.
 
     A key appears once for each side within REACH; adjacent keys are handled as neighbours.
     """
-    slots = fusion.slots_of(route // grid.SECTORS, route % grid.SECTORS)
+    slots = source.slots_of(route // grid.SECTORS, route % grid.SECTORS)
     slots = np.where(np.isin(slots, known), slots, -1)
     place = np.arange(len(route))
     before = np.maximum.accumulate(np.where(slots >= 0, place, -1))

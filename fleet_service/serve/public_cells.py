@@ -1,21 +1,20 @@
 """Cells that readers may see where persons are kept private: a lone vehicle changes nothing. Pure.
 
-A cell is shown as if the visits since its last publication had not happened, aged to the time of
-reading. It is published again at a moment of a time grid at which LEAST vehicles have visited the
-cell since, and as many have been in its tile within the running hour. So neither a cell nor its
-moment points at one vehicle: one that comes late completes no count that others began. Nothing that
-is more slippery than shown waits: it is published when the map is read next.
+Readers see a copy of the map. A cell is copied at a moment of a time grid at which LEAST vehicles
+have visited the cell since it was last copied, and as many have been in its tile within the running
+hour. So neither a cell nor its moment points at one vehicle: one that comes late completes no count
+that others began. Until then it is shown as if the visits since had not happened, aged to the time
+of reading. Nothing that is more slippery than shown waits: it is copied at once.
 
 Legend
     k        LEAST, `public_vehicles` of the settings
     shown    True if a cell is public
-    pending  vehicles that visited a cell since its publication, as bits
-    held     row of a cell as it was published; NONE if nobody has visited it since
+    pending  vehicles that visited a cell since it was copied, as bits
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Final
 
@@ -23,14 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import Fusion, Observations
-from fleet_service.fusion.belief import SLIPPERY_SHARE, quantiles
+from fleet_service.fusion.belief import FULL, SLIPPERY_SHARE, quantiles
 from fleet_service.fusion.fuse import voted_keys
-from fleet_service.fusion.store.records import CELL, NONE
+from fleet_service.fusion.store.cells import Cells, cells_of, no_beliefs, rows_of_lines
+from fleet_service.fusion.store.records import CELL, Rows
 from fleet_service.serve.map_state import tile_of
-from fleet_service.serve.view import CellView, coarsen_cells, view_cells
 from fleet_service.serve.visitors import Visitors, bit_of
 from schemas import grid, mugrid
-from schemas.numeric import IntArray
+from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import NS
 
 PERIOD_NS: Final = 300 * NS  # of the time grid of publications
@@ -39,6 +38,9 @@ WINDOW_NS: Final = 3600 * NS  # in which enough vehicles must be in a tile
 # Values of visits to one surface scatter less.
 MORE_SLIPPERY: Final = 0.05
 LESS_MU: Final = 0.1
+# names of tables of `columns`
+WAITING: Final = "waiting"
+PRESENT: Final = "present"
 
 
 class PublicCells:
@@ -48,39 +50,59 @@ class PublicCells:
         fusion: owner of the cells.
         visitors: recent vehicles per cell.
         least: minimum number of vehicles of a public cell, at least 2.
+        tables: what `columns` returned when the fusion was saved.
 
     Attributes:
         visitors: see above.
     """
 
-    def __init__(self, fusion: Fusion, visitors: Visitors, least: int) -> None:
+    def __init__(
+        self,
+        fusion: Fusion,
+        visitors: Visitors,
+        least: int,
+        tables: Mapping[str, dict[str, IntArray]] | None = None,
+    ) -> None:
         self._fusion = fusion
         self._least = least
         self.visitors = visitors
+        self._rows = Rows(no_beliefs(0), np.zeros(0, CELL), fusion.store.state.live.reporters)
         self._shown = np.zeros(0, np.bool_)
         self._pending = np.zeros(0, np.uint64)
-        self._held = np.zeros(0, np.int32)
-        self._beliefs = np.zeros((0, mugrid.BINS), np.uint16)
-        self._cells = np.zeros(0, CELL)
-        self._free: list[int] = []
+        self._size = 0  # slots in use
         self._present: dict[int, int] = {}  # vehicles per tile within the hour, as bits
         self._period = 0
         self._published: list[IntArray] = []
-        self._grow()
+        self._add_slots()
         slots = np.arange(fusion.size)
+        self._copy(slots)
         self._shown[slots] = visitors.count(slots, visitors.newest) >= least
+        if tables:
+            self._restore(tables)
+
+    @property
+    def live(self) -> Cells:
+        """Return the cells as they were copied; rows of cells that are not public are not for readers."""
+        self._add_slots()
+        return cells_of(self._rows)
+
+    def beliefs(self, slots: IntArray, now: int) -> FloatArray:
+        """Return the belief about the road of each slot, (k, 32), as readers see it at `now` [ns]."""
+        self._add_slots()
+        return self._fusion.beliefs(slots, now, self._rows)
+
+    def slots_of(self, cell: IntArray, sector: IntArray) -> IntArray:
+        """Return the slot of each cell and sector, -1 if no vehicle has reported it."""
+        return self._fusion.slots_of(cell, sector)
 
     @contextmanager
     def follow(self, o: Observations) -> Iterator[None]:
         """Follow the fusion of observations, which happens within this context."""
         now = int(o.time.max(initial=0))
         self.publish(now)
-        keys = voted_keys(o)
-        before = np.unique(self._fusion.slots_of(keys // grid.SECTORS, keys % grid.SECTORS))
-        self._hold(before[before >= 0], now)
         yield
         self.visitors.add(o)
-        self._grow()
+        self._add_slots()
         bits = bit_of(o.vehicle)
         for sector in (o.sector, o.second):
             slots = self._fusion.slots_of(o.cell, np.maximum(sector, 0))
@@ -90,43 +112,14 @@ class PublicCells:
         for tile in np.unique(tiles).tolist():
             present = int(np.bitwise_or.reduce(bits[tiles == tile]))
             self._present[tile] = self._present.get(tile, 0) | present
+        keys = voted_keys(o)
+        voted = np.unique(self._fusion.slots_of(keys // grid.SECTORS, keys % grid.SECTORS))
+        self._copy_more_slippery(voted[voted >= 0], now)
 
     def select(self, slots: IntArray, now: int) -> IntArray:
         """Return the slots that are public at `now` [ns]."""
         self.publish(now)
-        slots = slots[self._shown[slots]]
-        return slots[self.visitors.count(slots, now) >= self._least]
-
-    def view(self, slots: IntArray, now: int) -> CellView:
-        """Return public cells as readers see them at `now` [ns]; publish those that became more
-        slippery.
-        """
-        waiting = np.flatnonzero(self._held[slots] != NONE)
-        if len(waiting):
-            current = self._fusion.beliefs(slots[waiting], now)
-            with self.as_published(slots):
-                published = self._fusion.beliefs(slots[waiting], now)
-            worse = current @ SLIPPERY_SHARE - published @ SLIPPERY_SHARE >= MORE_SLIPPERY
-            worse |= quantiles(published, (0.5,))[0] - quantiles(current, (0.5,))[0] >= LESS_MU
-            self._release(np.unique(slots[waiting[worse]]))
-        with self.as_published(slots):
-            return coarsen_cells(view_cells(self._fusion, slots, now))
-
-    @contextmanager
-    def as_published(self, slots: IntArray) -> Iterator[None]:
-        """Let the fusion hold these slots as they were published, within this context."""
-        self._grow()
-        slots = np.unique(slots[self._held[slots] != NONE])
-        live = self._fusion.store.state.live
-        beliefs = live.belief[slots].copy()
-        cells = live.cells[slots].copy()
-        live.belief[slots] = self._beliefs[self._held[slots]]
-        live.cells[slots] = self._cells[self._held[slots]]
-        try:
-            yield
-        finally:
-            live.belief[slots] = beliefs
-            live.cells[slots] = cells
+        return slots[self._shown[slots]]
 
     def take_published(self) -> IntArray:
         """Return the slots that were published since the last call."""
@@ -138,19 +131,16 @@ class PublicCells:
         """Update slots after the fusion renumbered them; `place` is the new number, -1 for
         removed ones.
         """
-        self._grow(len(place))
-        self._free_rows(np.flatnonzero(place < 0))
         self.visitors.renumber(place)
-        stay = np.flatnonzero(place >= 0)
-        self._shown = self._shown[stay]
-        self._pending = self._pending[stay]
-        self._held = self._held[stay]
+        stay = np.flatnonzero(place[: self._size] >= 0)
+        self._take_rows(stay)
+        self._size = len(stay)
 
     def publish(self, now: int) -> None:
         """Publish the cells that enough vehicles visited, if a moment of the time grid has passed
         by `now` [ns].
         """
-        self._grow()
+        self._add_slots()
         if now // PERIOD_NS <= self._period:
             return
         is_new_hour = now // WINDOW_NS > self._period * PERIOD_NS // WINDOW_NS
@@ -160,6 +150,8 @@ class PublicCells:
             del self._present[tile]
         if is_new_hour:
             self._present.clear()
+            slots = np.flatnonzero(self._shown)  # the window of the visitors moves
+            self._shown[slots] = self.visitors.count(slots, now) >= self._least
         if ready:
             slots = np.flatnonzero(self._pending)
             slots = slots[np.isin(tile_of(self._fusion, slots), ready)]
@@ -167,52 +159,93 @@ class PublicCells:
             recent = self.visitors.count(slots, now) >= self._least
             slots = slots[np.where(self._shown[slots], since, recent)]
             self._shown[slots] = True
-            self._release(slots)
+            self._pending[slots] = 0
+            self._copy(slots)
             self._published.append(slots)
 
-    def _hold(self, slots: IntArray, now: int) -> None:
-        """Hide slots that too few vehicles visited lately, and hold the others as they are."""
-        self._grow()
-        slots = slots[self._shown[slots]]
-        is_public = self.visitors.count(slots, now) >= self._least
-        self._shown[slots[~is_public]] = False
-        self._free_rows(slots[~is_public])
-        slots = slots[is_public & (self._held[slots] == NONE)]
-        rows = self._take_rows(len(slots))
+    def columns(self) -> dict[str, dict[str, IntArray]]:
+        """Return tables of columns from which a restart goes on, without the visitors: the rows of
+        cells that differ from the fusion's, as numbers, and the vehicles of tiles.
+        """
+        self._add_slots()
+        used = slice(self._size)
         live = self._fusion.store.state.live
-        self._beliefs[rows] = live.belief[slots]
-        self._cells[rows] = live.cells[slots]
-        self._held[slots] = rows
+        waits = self._pending[used] != 0
+        waits |= (self._rows.belief[used] != live.belief[used]).any(axis=1)
+        waits |= self._rows.cells["visits"][used] != live.cells["visits"][used]
+        slots = np.flatnonzero(waits)
+        parts = (
+            slots[:, None],
+            self._shown[slots, None].astype(np.int64),
+            self._pending[slots, None].view(np.int64),
+            self._rows.belief[slots].view(np.int64),
+            self._rows.cells[slots, None].view(np.int64),
+        )
+        tiles = np.array(list(self._present), np.int64)
+        present = {
+            "tile": tiles,
+            "bits": np.array(list(self._present.values()), np.uint64).view(np.int64),
+            "period": np.full(len(tiles), self._period),
+        }
+        return {WAITING: {"rows": np.concatenate(parts, axis=1).reshape(-1)}, PRESENT: present}
 
-    def _release(self, slots: IntArray) -> None:
-        """Publish slots as they are now."""
-        self._free_rows(slots)
-        self._pending[slots] = 0
+    def _restore(self, tables: Mapping[str, dict[str, IntArray]]) -> None:
+        """Restore what `columns` returned."""
+        belief = mugrid.BINS * FULL.itemsize // 8
+        numbers = tables[WAITING]["rows"].reshape(-1, 3 + belief + CELL.itemsize // 8)
+        slots = numbers[:, 0]
+        self._shown[slots] &= numbers[:, 1] > 0
+        self._pending[slots] = numbers[:, 2].view(np.uint64)
+        self._rows.belief[slots] = numbers[:, 3 : 3 + belief].copy().view(np.uint16)
+        self._rows.cells[slots] = numbers[:, 3 + belief :].copy().view(CELL)[:, 0]
+        present = tables[PRESENT]
+        bits = present["bits"].view(np.uint64)
+        self._present = dict(zip(present["tile"].tolist(), bits.tolist(), strict=True))
+        self._period = int(present["period"].max(initial=0))
 
-    def _free_rows(self, slots: IntArray) -> None:
-        rows = self._held[slots]
-        self._free += rows[rows != NONE].tolist()
-        self._held[slots] = NONE
+    def _copy_more_slippery(self, slots: IntArray, now: int) -> None:
+        """Copy those of the slots that are more slippery than shown."""
+        current = self._fusion.beliefs(slots, now)
+        shown = self.beliefs(slots, now)
+        worse = (current - shown) @ SLIPPERY_SHARE >= MORE_SLIPPERY
+        worse |= quantiles(shown, (0.5,))[0] - quantiles(current, (0.5,))[0] >= LESS_MU
+        slots = slots[worse]
+        self._copy(slots)
+        self._pending[slots[self._shown[slots]]] = 0
 
-    def _take_rows(self, count: int) -> IntArray:
-        if len(self._free) < count:
-            known = len(self._cells)
-            more = max(known, count, 64)
-            self._beliefs = np.concatenate([self._beliefs, np.zeros((more, mugrid.BINS), "u2")])
-            self._cells = np.concatenate([self._cells, np.zeros(more, CELL)])
-            self._free += range(known, known + more)
-        return np.array([self._free.pop() for _ in range(count)], np.int64)
+    def _copy(self, slots: IntArray) -> None:
+        """Copy cells as they are now."""
+        live = self._fusion.store.state.live
+        self._rows.belief[slots] = live.belief[slots]
+        self._rows.cells[slots] = live.cells[slots]
 
-    def _grow(self, size: int = 0) -> None:
-        """Make room for new slots; the size doubles, so this is rare."""
-        wanted = max(size, self._fusion.size)
-        if len(self._shown) < wanted:
-            self._shown = _longer(self._shown, 2 * wanted, False)
-            self._pending = _longer(self._pending, 2 * wanted, 0)
-            self._held = _longer(self._held, 2 * wanted, NONE)
+    def _add_slots(self) -> None:
+        """Add the fusion's new slots, as nobody had visited them; room doubles, so that it is rarely
+        made.
+        """
+        if self._size == self._fusion.size:
+            return
+        new = np.arange(self._size, self._fusion.size)
+        if len(self._shown) < self._fusion.size:
+            self._take_rows(np.arange(self._size), 2 * self._fusion.size)
+        live = self._fusion.store.state.live.cells[new]
+        self._rows.belief[new] = FULL
+        self._rows.cells["key"][new] = live["key"]
+        self._rows.cells["time"][new] = live["time"]  # for its age; it has no vehicles
+        self._size = self._fusion.size
+
+    def _take_rows(self, slots: IntArray, room: int | None = None) -> None:
+        """Keep these rows alone, in room for so many."""
+        room = len(slots) if room is None else room
+        rows = Rows(no_beliefs(room), rows_of_lines(room, CELL), self._rows.reporters)
+        rows.belief[: len(slots)] = self._rows.belief[slots]
+        rows.cells[: len(slots)] = self._rows.cells[slots]
+        self._rows = rows
+        self._shown = _resized(self._shown[slots], room)
+        self._pending = _resized(self._pending[slots], room)
 
 
-def _longer(column: NDArray[Any], size: int, value: int) -> NDArray[Any]:
-    out = np.full(size, value, column.dtype)
+def _resized(column: NDArray[Any], size: int) -> NDArray[Any]:
+    out = np.zeros(size, column.dtype)
     out[: len(column)] = column
     return out

@@ -105,8 +105,7 @@ def _view_tile(
                 along = fusion.slots_of(route // grid.SECTORS, route % grid.SECTORS)
                 known = np.union1d(slots, along[along >= 0])
             known = cache.public(known, now)
-            with cache.as_published(known):
-                borrowed = impute_cells(fusion, tile, known, route, now)
+            borrowed = impute_cells(cache.source, tile, known, route, now)
             cells = join_views(cells, cache.coarse(borrowed))
     return used_once(cells, now)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fleet_service.serve.encode import arrow_stream, batch_of
 from fleet_service.serve.map_state import MapState
 from fleet_service.serve.public_cells import PublicCells
-from fleet_service.serve.view import CellView, coarsen_cells, view_cells
+from fleet_service.serve.view import CellView, Readable, coarsen_cells, view_cells
 from schemas import grid
 from schemas.numeric import IntArray
 from schemas.thresholds import NS
@@ -113,13 +113,12 @@ class TileCache:
 
     def seen(self, slots: IntArray, now: int) -> CellView:
         """Return the cells of public slots as readers see them."""
-        if self._public is None:
-            return view_cells(self.state.fusion, slots, now)
-        return self._public.view(slots, now)
+        return self.coarse(view_cells(self.source, slots, now))
 
-    def as_published(self, slots: IntArray) -> AbstractContextManager[None]:
-        """Let the fusion hold these slots as readers see them, within this context."""
-        return nullcontext() if self._public is None else self._public.as_published(slots)
+    @property
+    def source(self) -> Readable:
+        """Return the cells that readers may see."""
+        return self.state.fusion if self._public is None else self._public
 
     def coarse(self, cells: CellView) -> CellView:
         """Return cells with times and counts as readers see them."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.fusion import Fusion
+from fleet_service.fusion.store.cells import Cells
 from schemas import grid, mugrid
 from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
 from schemas.thresholds import NS
@@ -51,16 +51,30 @@ class CellView(NamedTuple):
     imputed: BoolArray
 
 
-def view_cells(fusion: Fusion, slots: IntArray, now: int) -> CellView:
+class Readable(Protocol):
+    """Cells of a map and the beliefs about them: a fusion, or what is public of it."""
+
+    @property
+    def live(self) -> Cells:
+        """Return the cells by columns."""
+
+    def beliefs(self, slots: IntArray, now: int) -> FloatArray:
+        """Return the belief about the road of each slot, (k, 32), predicted to `now` [ns]."""
+
+    def slots_of(self, cell: IntArray, sector: IntArray) -> IntArray:
+        """Return the slot of each cell and sector, -1 for none."""
+
+
+def view_cells(source: Readable, slots: IntArray, now: int) -> CellView:
     """Return the cells of `slots` as believed at `now` [ns]; copies, so that the fusion may
     continue.
     """
-    live = fusion.live
+    live = source.live
     key = live.key[slots]
     return CellView(
         cell=key // grid.SECTORS,
         sector=key % grid.SECTORS,
-        belief=fusion.beliefs(slots, now),
+        belief=source.beliefs(slots, now),
         values=live.values[slots],
         vehicles=live.vehicles[slots],
         observations=live.visits[slots],

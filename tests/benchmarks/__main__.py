@@ -23,6 +23,7 @@ from tests.benchmarks.fusion import fusion
 from tests.benchmarks.growth import growth
 from tests.benchmarks.ingest import ingest
 from tests.benchmarks.measure import SEED
+from tests.benchmarks.public import public
 from tests.benchmarks.service import service
 from tests.benchmarks.shards import shards
 from tests.benchmarks.state import state
@@ -41,6 +42,7 @@ _ALL = (
     growth,
     service,
     tiles,
+    public,
     shards,
     state,
     cluster,

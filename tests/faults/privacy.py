@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import closing, nullcontext
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -24,7 +24,7 @@ import pyarrow as pa
 
 from fleet_service.app.engine import Engine
 from fleet_service.ingest.inbox import Message
-from fleet_service.serve.public_cells import PublicCells
+from fleet_service.serve.tile_cache import TileCache
 from fleet_service.serve.visitors import PART_NS
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig
@@ -264,7 +264,7 @@ def run(site: Site) -> list[Figure]:
 
 def _control(folder: Path) -> float:
     """Return the share of places found over chance if every visit is shown at once."""
-    with patch.object(PublicCells, "as_published", lambda *_: nullcontext()):
+    with patch.object(TileCache, "source", property(lambda tiles: tiles.state.fusion)):
         town = Town(folder, 0)
         with closing(town.engine):
             found = pursue(town, 0)

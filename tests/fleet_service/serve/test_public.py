@@ -193,6 +193,36 @@ def test_a_restart_knows_who_was_there_with_and_without_a_checkpoint(
         drop_checkpoints(tmp_path)
 
 
+@pytest.mark.parametrize("basis", ["checkpoint", "log"])
+def test_a_restart_does_not_show_a_lone_vehicle(start: Start, tmp_path: Path, basis: str) -> None:
+    """Neither in a public cell nor as the vehicle that completes the count of another one."""
+    beside: dict[str, Any] = {
+        "latitude": [LATITUDE + 0.002],
+        "cell": [grid.cell_of(LATITUDE + 0.002, LONGITUDE)],
+    }
+    began = (time.time_ns() // PART_NS - 1) * PART_NS
+    shown = began + PERIOD_NS
+    names = ["lone-1", "lone-2", "lone-3"]
+    engine = start(3)
+    hear(engine, *MORE, now=began)
+    (before,) = rows(engine, shown)
+    hear(engine, "lone-0", now=shown)
+    for k, name in enumerate(names):  # in an hour each
+        now = shown + (k + 1) * 3600 * SECOND
+        one = batch(name, 1, now, [0.8], **beside)
+        engine.intake.ingest([Message(Kind.OBSERVATION, key(name), wire.encode(one), "")], now)
+    at = shown + 4 * 3600 * SECOND
+    expected = rows(engine, at)
+    assert [row["cell"] for row in expected] == [before["cell"]]
+    if basis == "checkpoint":
+        checkpoints.save_checkpoint(tmp_path, taken_from(engine))
+    engine.close()
+    again = rows(start(3), at)
+    assert len(again) == 1
+    for name in ("mu", "mu_lower", "mu_upper", "p_slippery", "vehicles", "observations"):
+        assert again[0][name] == pytest.approx(expected[0][name], abs=1e-6)
+
+
 def taken_from(engine: Engine) -> checkpoints.Taken:
     """A checkpoint, with a worker that flushes."""
     found: list[checkpoints.Taken | None] = []

@@ -38,9 +38,9 @@ class Map:
         slot = self.public.select(self.slots(cell), now)
         if not len(slot):
             return []
-        found = self.public.view(slot, now)
-        share = found.belief.cumsum(axis=1)[0]
-        return [*np.interp((0.05, 0.95), share, np.arange(32)), *(found.belief @ SLIPPERY_SHARE)]
+        found = self.public.beliefs(slot, now)
+        share = found.cumsum(axis=1)[0]
+        return [*np.interp((0.05, 0.95), share, np.arange(32)), *(found @ SLIPPERY_SHARE)]
 
     def slots(self, cell: int = CELL) -> IntArray:
         return self.fusion.slots_of(np.array([cell]), np.array([0]))

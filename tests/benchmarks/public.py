@@ -1,0 +1,81 @@
+"""Cost of keeping persons private, for cells that a lone vehicle visited, over that of a map which
+shows every visit.
+"""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+
+import numpy as np
+
+from fleet_service.fusion import Fusion, Observations
+from fleet_service.serve.map_state import MapState
+from fleet_service.serve.public_cells import PERIOD_NS, PublicCells
+from fleet_service.serve.tile_cache import TileCache
+from fleet_service.serve.visitors import Visitors
+from schemas import grid
+from schemas.numeric import IntArray
+from schemas.runtime.figures import Figure
+from tests.benchmarks.measure import ROUNDS, time_in_turn
+from tests.fleet_service.examples import CELL, SECOND, START, observations, value
+
+CELLS = 10_000
+LEAST = 3
+BATCH = 500  # visits of a turn
+_NOW = START + 10 * PERIOD_NS
+
+
+def public() -> list[Figure]:
+    """Public cells: microseconds per cell that is read, and per visit that is fused."""
+    private, public = _Map(1), _Map(LEAST)
+    seen, plain = (1e6 * s / CELLS for s in time_in_turn(public.read, private.read))
+    # a turn each of warm-up and ROUNDS
+    followed, fused = (1e6 * s / CELLS for s in time_in_turn(public.drive, private.drive, ROUNDS))
+    return [
+        Figure("bench.public.read_us", seen, "us per cell of a tile that one vehicle visited"),
+        Figure(
+            "bench.public.read_ratio", seen / plain, "over that of a map that shows every visit"
+        ),
+        Figure("bench.public.visit_us", followed, "us per visit, fusion included"),
+        Figure("bench.public.visit_ratio", followed / fused, "over that of the fusion alone"),
+    ]
+
+
+class _Map:
+    """Map of CELLS published cells, each visited by one more vehicle since."""
+
+    def __init__(self, least: int) -> None:
+        fusion = Fusion(120.0)
+        self._fusion = fusion
+        self._public = PublicCells(fusion, Visitors(fusion), least) if least > 1 else None
+        self._tiles = TileCache(MapState(fusion), nullcontext(), least, self._public)
+        self._slots = np.arange(CELLS)
+        self._turn = 0
+        x, y = grid.deinterleave(np.int64(CELL))
+        side = int(np.sqrt(CELLS))
+        self._cells: IntArray = grid.interleave(
+            int(x) + self._slots % side, int(y) + self._slots // side
+        )
+        for vehicle in range(1, LEAST + 3):
+            self._visit(vehicle, 0.0)
+        shown = self._tiles.public(self._slots, START + 2 * PERIOD_NS)
+        assert len(shown) == CELLS, "all cells are public"
+        self.drive()
+
+    def read(self) -> None:
+        """Read all cells."""
+        self._tiles.seen(self._slots, _NOW)
+
+    def drive(self) -> None:
+        """Let one vehicle visit all cells once more."""
+        self._turn += 1
+        self._visit(100 + self._turn, 2 * PERIOD_NS / SECOND + self._turn)
+
+    def _visit(self, vehicle: int, second: float) -> None:
+        for cells in np.array_split(self._cells, CELLS // BATCH):
+            n = len(cells)
+            o: Observations = observations(
+                np.full(n, second), np.full(n, vehicle), value(np.full(n, 0.8)), cells
+            )
+            with nullcontext() if self._public is None else self._public.follow(o):
+                self._fusion.update(o)
