@@ -1,8 +1,9 @@
 """Bounded connections of the web server; half-open connections time out.
 
-A connection without a complete request head after HEAD_S is closed. When all places are taken, a
-new connection takes the place of the oldest one without a request. Repeated errors of the event
-loop are logged once per LOG_S.
+A connection that has begun no request, or not ended its head, after HEAD_S is closed. When all
+places are taken, a new connection takes the place of the oldest one without a request, or else of
+the address with the most connections. Repeated messages of the web server are logged once per
+LOG_S.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections import Counter
 from typing import Any, Final
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -23,21 +25,24 @@ LOG_S: Final = 60.0
 class BoundedProtocol(H11Protocol):
     """Connection of one browser."""
 
-    _head_timer: asyncio.TimerHandle | None = None
+    _head_timer: asyncio.TimerHandle | None = None  # None: not accepted
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Accept a connection if there is a place, and wait for its first request."""
-        if len(self.connections) >= MOST and not self._close_oldest_silent():
+        self.host = (transport.get_extra_info("peername") or ("",))[0]
+        if len(self.connections) >= MOST and not self._make_place():
             transport.abort()
             return
         super().connection_made(transport)
         self._made_at = time.monotonic()
-        self._head_timer = self.loop.call_later(HEAD_S, self._close_silent)
+        self._await_request()
 
     def data_received(self, data: bytes) -> None:
-        """Ignore data of a connection that was not accepted."""
+        """Ignore data of a connection that was not accepted; wait for the rest of a request."""
         if self._head_timer is not None:
             super().data_received(data)
+            if self.is_silent and self._head_timer.when() <= self.loop.time():
+                self._await_request()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget the connection, if it was accepted."""
@@ -45,43 +50,68 @@ class BoundedProtocol(H11Protocol):
             self._head_timer.cancel()
             super().connection_lost(exc)
 
-    def _close_oldest_silent(self) -> bool:
-        """Close the oldest connection that has sent no request; return False if there is none."""
-        silent = [
-            one for one in self.connections if isinstance(one, BoundedProtocol) and one.is_silent
-        ]
-        if not silent:
-            return False
-        oldest = min(silent, key=lambda one: one._made_at)
+    def _make_place(self) -> bool:
+        """Close a connection without a request, or one of the address with the most; return False
+        if there is none.
+        """
+        others = [one for one in self.connections if isinstance(one, BoundedProtocol)]
+        found = [one for one in others if one.is_silent]
+        if not found:
+            counts = Counter(one.host for one in others)
+            greedy, most = counts.most_common(1)[0]
+            if most <= counts[self.host] + 1:
+                return False
+            found = [one for one in others if one.host == greedy]
+        oldest = min(found, key=lambda one: one._made_at)
         self.connections.discard(oldest)
         oldest.transport.abort()
         return True
 
     @property
     def is_silent(self) -> bool:
-        """Return True until the first request."""
-        return bool(self.cycle is None)
+        """Return True while no request is answered."""
+        return bool(self.cycle is None or self.cycle.response_complete)
 
-    def _close_silent(self) -> None:
-        if self.is_silent:
+    def _await_request(self) -> None:
+        self._head_timer = self.loop.call_later(HEAD_S, self._close_silent, self.cycle)
+
+    def _close_silent(self, before: object) -> None:
+        """Close the connection if no request has followed the one `before`."""
+        if not self.is_silent:
+            return
+        if self.cycle is before:
             self.transport.abort()
+        else:
+            self._await_request()
 
 
-class LoopErrors:
-    """Handler of errors of the event loop that logs the first, and then at most one per LOG_S
-    with their number.
-    """
+class RareMessages(logging.Filter):
+    """Filter that passes a message once per LOG_S, with the number of equal ones in between."""
 
     def __init__(self) -> None:
-        self._logged_at = -LOG_S
-        self._more = 0
+        super().__init__()
+        self._passed: dict[str, float] = {}
+        self._more: Counter[str] = Counter()
 
-    def __call__(self, _: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Log an error or count it."""
-        if time.monotonic() - self._logged_at < LOG_S:
-            self._more += 1
-            return
-        problem = context.get("exception") or context.get("message")
-        log.warning("web server: %s (and %d more since the last message)", problem, self._more)
-        self._logged_at = time.monotonic()
-        self._more = 0
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return True to log the record."""
+        text = str(record.msg)
+        if time.monotonic() - self._passed.get(text, -LOG_S) < LOG_S:
+            self._more[text] += 1
+            return False
+        self._passed[text] = time.monotonic()
+        if more := self._more.pop(text, 0):
+            record.msg = f"{text} (and {more} more since the last message)"
+        return True
+
+
+def limit_messages() -> None:
+    """Limit the messages of the web server and of its event loop."""
+    rare = RareMessages()
+    for logger in (log, logging.getLogger("uvicorn.error")):
+        logger.addFilter(rare)
+
+
+def report_loop_error(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Log an error of the event loop in one line."""
+    log.warning("web server: %s", context.get("exception") or context.get("message"))

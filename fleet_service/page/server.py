@@ -22,7 +22,7 @@ from fleet_service.client.datex_feed import DatexFile
 from fleet_service.client.watching import GATHER_S
 from fleet_service.page import web
 from fleet_service.page.basemap import BaseMap
-from fleet_service.page.connections import BoundedProtocol, LoopErrors
+from fleet_service.page.connections import BoundedProtocol, limit_messages, report_loop_error
 from fleet_service.page.health import ServiceHealth
 from fleet_service.page.map_mirror import MapMirror
 from fleet_service.page.moments import Moments
@@ -153,7 +153,8 @@ async def _serve_app(
         h11_max_incomplete_event_size=64 * 1024,
         http=BoundedProtocol,
     )
-    asyncio.get_running_loop().set_exception_handler(LoopErrors())
+    limit_messages()
+    asyncio.get_running_loop().set_exception_handler(report_loop_error)
     server = _Server(config)
     serving = asyncio.create_task(server.serve(sockets=[listening]))
     while not server.started and not serving.done():

@@ -29,7 +29,9 @@ from tests.faults.queries import _await_tile, _fill_map, _find_tile
 
 PATIENCE_S: Final = 10.0  # of a person
 ATTACKER: Final = "127.0.0.66"
-HALF_QUESTIONS: Final = 1024
+CONNECTIONS: Final = 1024
+HALF: Final = b"GET / HTTP/1.1\r\nHost: 127"
+REST: Final = b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
 STREAMS: Final = 420
 LOOPS: Final = 3
 ITEMS: Final = "/collections/grip/items"
@@ -186,17 +188,33 @@ def _loop_service(target: Target, query: str) -> Iterator[None]:
 
 
 @contextmanager
-def _hold_half_questions(target: Target) -> Iterator[None]:
-    """Open connections, send half a head on each, and open them again when they are closed."""
+def _hold_connections(target: Target, *parts: bytes) -> Iterator[None]:
+    """Open connections and send these parts on each, reading a little of an answer in between."""
     with ExitStack() as stack:
-        for _ in range(HALF_QUESTIONS):
+        for _ in range(CONNECTIONS):
             with suppress(OSError):
                 one = stack.enter_context(socket.socket())
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
                 one.settimeout(PATIENCE_S)
                 one.bind((ATTACKER, 0))
                 one.connect((target.host, target.port))
-                one.sendall(b"GET / HTTP/1.1\r\nHost: 127")
+                one.sendall(parts[0])
+                for part in parts[1:]:
+                    one.recv(4096)
+                    one.sendall(part)
         yield
+
+
+def _hold_half_questions(target: Target) -> Attack:
+    return _hold_connections(target, HALF)
+
+
+def _hold_second_questions(target: Target) -> Attack:
+    return _hold_connections(target, b"GET /tiles" + REST, HALF)
+
+
+def _hold_unread_answers(target: Target) -> Attack:
+    return _hold_connections(target, (b"GET " + ITEMS.encode() + b"?limit=10000" + REST) * 40)
 
 
 @contextmanager
@@ -218,5 +236,7 @@ ATTACKS: Final[dict[str, tuple[Callable[[Target], Attack], Callable[[Target], bo
     "whole map": (_loop_map, _ask_tile),
     "borrowed tiles": (_loop_borrowed, _ask_cells),
     "half questions": (_hold_half_questions, _ask_start),
+    "half second questions": (_hold_second_questions, _ask_start),
+    "unread answers": (_hold_unread_answers, _ask_start),
     "streams": (_hold_streams, _ask_events),
 }

@@ -117,7 +117,7 @@ BARS: Final = {
     "faults.availability.other_reader_served": Bar(
         "of another reader's requests, next to the worst attacker", 0.95, "more"
     ),
-    "faults.availability.attackers": Bar("kinds of attackers", 7, "more"),
+    "faults.availability.attackers": Bar("kinds of attackers", 9, "more"),
     "faults.availability.log_bytes": Bar("bytes that the page logged meanwhile", 100_000),
     "faults.privacy.position_over_chance": Bar(
         "of the puts a reader finds a lone car within 25 m, over a place drawn at random", 0.05

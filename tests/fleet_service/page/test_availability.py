@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import socket
+from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+import uvicorn
 
 from fleet_service.page import connections
-from fleet_service.page.connections import BoundedProtocol, LoopErrors
+from fleet_service.page.connections import BoundedProtocol, RareMessages, report_loop_error
 from fleet_service.page.map_mirror import MapMirror
 from fleet_service.page.turns import MOST_WAITING, PastTurns, TooManyQuestionsError
 from fleet_service.page.watchers import TooManyWatchersError, View, Watchers
@@ -63,24 +66,27 @@ def test_full_page_takes_a_stream_from_the_client_with_most() -> None:
 class Transport:
     """Connection that records its end."""
 
-    def __init__(self) -> None:
+    def __init__(self, host: str) -> None:
+        self._host = host
         self.is_aborted = False
 
     def abort(self) -> None:
         """End it."""
         self.is_aborted = True
 
-    def get_extra_info(self, _: str) -> Any:  # noqa: ANN401 as asyncio has it
-        """Return nothing."""
-        return None
+    def get_extra_info(self, name: str) -> Any:  # noqa: ANN401 as asyncio has it
+        """Return the peer."""
+        return (self._host, 1) if name == "peername" else None
 
 
-def accept(open_ones: set[Any], timers: list[Any]) -> tuple[BoundedProtocol, Transport]:
+def accept(
+    open_ones: set[Any], timers: list[Any], host: str = ""
+) -> tuple[BoundedProtocol, Transport]:
     """Return a new connection of a server."""
     protocol = BoundedProtocol.__new__(BoundedProtocol)
 
-    def call_later(seconds: float, call: Any) -> Any:  # noqa: ANN401 as asyncio has it
-        timers.append((seconds, call))
+    def call_later(seconds: float, call: Any, *args: Any) -> Any:  # noqa: ANN401 as asyncio has it
+        timers.append((seconds, lambda: call(*args)))
         return SimpleNamespace()
 
     loop = SimpleNamespace(call_later=call_later)
@@ -94,7 +100,7 @@ def accept(open_ones: set[Any], timers: list[Any]) -> tuple[BoundedProtocol, Tra
     }
     for name, value in values.items():
         setattr(protocol, name, value)
-    transport = Transport()
+    transport = Transport(host)
     protocol.connection_made(cast(asyncio.Transport, transport))
     return protocol, transport
 
@@ -114,17 +120,59 @@ def test_silent_connections_are_closed_and_give_way(monkeypatch: pytest.MonkeyPa
     assert (seconds, newest[1].is_aborted) == (connections.HEAD_S, True)
     busy = [others[0][0], others[1][0], newest[0]]
     for one in busy:
-        one.cycle = cast(Any, object())
+        one.cycle = cast(Any, SimpleNamespace(response_complete=False))
     refused = accept(open_ones, timers)
     assert refused[1].is_aborted
     assert refused[0] not in open_ones
+    fair = accept(open_ones, timers, "another")
+    assert others[0][1].is_aborted
+    assert fair[0] in open_ones
 
 
-def test_errors_of_the_loop_are_logged_once_in_a_while(caplog: pytest.LogCaptureFixture) -> None:
-    handler = LoopErrors()
+@pytest.mark.parametrize("rest", [b"GET / HT", b"POST / HTTP/1.1\r\ncontent-length: 99\r\n\r\n"])
+def test_connection_that_does_not_end_its_second_request_is_closed(
+    monkeypatch: pytest.MonkeyPatch, rest: bytes
+) -> None:
+    monkeypatch.setattr(connections, "HEAD_S", 0.2)
+
+    async def answer(_: object, __: object, send: Any) -> None:  # noqa: ANN401 as ASGI has it
+        await send({"type": "http.response.start", "status": 204, "headers": []})
+        await send({"type": "http.response.body"})
+
+    async def run() -> bytes:
+        config = uvicorn.Config(answer, http=BoundedProtocol, lifespan="off", ws="none")
+        server = uvicorn.Server(config)
+        config.load()
+        server.lifespan = config.lifespan_class(config)
+        listening = socket.create_server(("127.0.0.1", 0))
+        await server.startup([listening])
+        reader, writer = await asyncio.open_connection(*listening.getsockname())
+        writer.write(b"GET / HTTP/1.1\r\nhost: a\r\n\r\n")
+        head = await reader.readuntil(b"\r\n\r\n")
+        writer.write(rest)
+        with suppress(ConnectionResetError):
+            await asyncio.wait_for(reader.read(), 5.0)
+        writer.close()
+        await server.shutdown([listening])
+        return head
+
+    assert asyncio.run(run()).startswith(b"HTTP/1.1 204")
+
+
+def test_repeated_messages_are_logged_once_in_a_while(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rare = RareMessages()
     loop = cast(asyncio.AbstractEventLoop, None)
-    for _ in range(100):
-        handler(loop, {"message": "accept failed"})
+    connections.log.addFilter(rare)
+    try:
+        for _ in range(100):
+            report_loop_error(loop, {"message": "accept failed"})
+        monkeypatch.setattr(connections, "LOG_S", 0.0)
+        report_loop_error(loop, {"message": "accept failed"})
+    finally:
+        connections.log.removeFilter(rare)
     assert [record.getMessage() for record in caplog.records] == [
-        "web server: accept failed (and 0 more since the last message)"
+        "web server: accept failed",
+        "web server: accept failed (and 99 more since the last message)",
     ]
