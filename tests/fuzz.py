@@ -11,6 +11,7 @@ to `tests/data/fuzz`.
 from __future__ import annotations
 
 import argparse
+import functools
 import hashlib
 import random
 import sys
@@ -18,12 +19,14 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import CodeType, FrameType
 from typing import Any, Final, NamedTuple, cast
 
 from edge_agent.inputs.readers.dbc import parse_dbc
 from edge_agent.inputs.readers.gnss import parse_gpsd, parse_nmea
 from fleet_service.archive.format.version import parse_version
+from fleet_service.replay.checkpoints import load_checkpoint
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.fence import fence_of
 from fleet_service.replication.lease import _parse_record
@@ -37,7 +40,7 @@ from tests.structure import ROOT
 SEEDS: Final = ROOT / "tests" / "data" / "fuzz"
 # of processor time, for inputs of at most LONGEST bytes, which take milliseconds
 SLOW_S: Final = 5.0
-LONGEST: Final = 4096
+LONGEST: Final = 8192
 CODE: Final = tuple(str(ROOT / name) for name in ("schemas", "edge_agent", "fleet_service"))
 # that readers of lines catch
 GNSS_ERRORS: Final = (ValueError, TypeError, OverflowError, RecursionError)
@@ -88,6 +91,18 @@ def _parse_query(data: bytes) -> object:
     return query.parse({name: value for name, _, value in pairs})
 
 
+@functools.cache
+def _folder() -> TemporaryDirectory[str]:
+    return TemporaryDirectory()
+
+
+def _load_manifest(data: bytes) -> object:
+    path = Path(_folder().name, "0000000001-000000000001")
+    path.mkdir(exist_ok=True)
+    (path / "manifest.json").write_bytes(data)
+    return load_checkpoint(path)
+
+
 class _OneFence:
     """Bucket with one fence object."""
 
@@ -121,6 +136,7 @@ PARSERS: Final = {
     "nmea": Parser(_decode_first(parse_nmea), GNSS_ERRORS),
     "gpsd": Parser(_decode_first(parse_gpsd), GNSS_ERRORS),
     "leases": Parser(lambda data: _parse_record("lease/0000000001.json", data)),
+    "checkpoints": Parser(_load_manifest),
     "fences": Parser(
         lambda data: fence_of(cast(ObjectBucket, _OneFence(data))), (InputError, CopyError)
     ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -43,3 +44,15 @@ def test_a_version_that_is_none_is_refused(
     monkeypatch.setattr("sys.argv", ["release", "soon"])
     assert release.main() == 2
     assert capsys.readouterr().err.startswith("error: version: must be like 0.2.0")
+
+
+def test_every_pinned_version_has_its_hashes() -> None:
+    pinned = re.findall(r"^\S+==\S+", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    hashed = (ROOT / "deploy" / "constraints-hashes.txt").read_text()
+    found = re.findall(r"^(\S+==\S+) \\\n +--hash=sha256:", hashed, re.MULTILINE)
+    assert sorted(map(normalise, pinned)) == sorted(map(normalise, found))
+
+
+def normalise(requirement: str) -> str:
+    name, _, version = requirement.partition("==")
+    return f"{re.sub('[-_.]+', '-', name).lower()}=={version}"

@@ -15,6 +15,7 @@ import zenoh
 
 from deploy.router import open_router
 from fleet_service.enrolment import authority as ca
+from fleet_service.enrolment.access import PRIVATE_BYTES
 from fleet_service.enrolment.enrol import Registry, Terms
 from fleet_service.enrolment.fleet import Enrolment
 from schemas import keys, wire
@@ -333,13 +334,8 @@ def reader_overhears(ground: Ground) -> bool:
 def foreign_liveliness_token(ground: Ground) -> bool:
     session = ground.open_session(ROGUE, ROUTERS[1])
     false = keys.ServiceToken("1202/310/*", ROGUE, "1f").key
-    foreign = (
-        keys.alive_key(HONEST),
-        keys.shard_key(ROGUE),
-        f"{keys.ROOT}/alive/{ROGUE}/more",
-        false,
-    )
-    places = (*foreign, keys.alive_key(ROGUE))
+    foreign = (keys.alive_key(HONEST), keys.shard_key(ROGUE), f"{keys.ROOT}/alive/{ROGUE}/more")
+    places = (*foreign, false, keys.alive_key(ROGUE))
     tokens = [session.liveliness().declare_token(place) for place in places]
 
     def list_tokens() -> list[str]:
@@ -470,6 +466,20 @@ def batch_that_is_too_large_travels(ground: Ground) -> bool:
     session.put(key(ROGUE), SECRET + bytes(wire.MAX_BYTES))
     ground.await_effects(session)
     return ground.monitor.has_payload(SECRET)
+
+
+@register_attempt
+def private_message_that_is_too_large_travels(ground: Ground) -> bool:
+    session = ground.open_session(ROGUE, ROUTERS[1])
+    listener = Listener(ground.open_session(ROGUE), (keys.ahead_key(ROGUE),))
+
+    def put_both() -> bool:
+        session.put(keys.ahead_key(ROGUE), b"small")
+        session.put(keys.ahead_key(ROGUE), SECRET + bytes(PRIVATE_BYTES))
+        return len(listener.heard) > 1
+
+    until(put_both)
+    return listener.has_payload(SECRET)
 
 
 @register_attempt

@@ -18,6 +18,7 @@ from tests.faults import (
     fuzz,
     fuzz_parsers,
     fuzz_wire,
+    handover,
     insider,
     kill,
     lease,
@@ -258,6 +259,15 @@ CAMPAIGNS: Final = (
         "flood",
         flood.run,
         ("faults.flood.honest_delay_s", "faults.flood.map_difference", "faults.flood.rate"),
+    ),
+    Campaign(
+        "hand-over",
+        handover.run,
+        (
+            *("faults.handover.lost", "faults.handover.doubled", "faults.handover.pause_s"),
+            *("faults.handover.handovers", "faults.handover.acknowledged"),
+        ),
+        in_quick=False,  # a hand-over takes seconds
     ),
     Campaign(
         "link", link.measure, link.OWES, in_quick=False

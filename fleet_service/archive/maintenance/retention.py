@@ -227,18 +227,22 @@ def _pseudonym_of(root: Path, vehicle: str, month: str) -> str:
 
 
 def _thin_snapshot(root: Path, path: Path, cells: set[int]) -> bool:
-    """Remove lines of these cells with fewer than ANONYMOUS vehicles from a snapshot; return
-    True if there were any.
+    """Remove lines of these cells with fewer than ANONYMOUS vehicles from a snapshot, and round the
+    times of the others to hours; return True if there were any.
     """
     found = read_content(path, _refuse_damaged)
-    if found is None or not cells:
+    if found is None:
         return False
-    lines = np.isin(found.table["cell"].to_numpy(), sorted(cells)) & (
-        found.table["vehicles"].to_numpy() < ANONYMOUS
-    )
-    if not lines.any():
+    touched = np.isin(found.table["cell"].to_numpy(), sorted(cells))
+    lines = touched & (found.table["vehicles"].to_numpy() < ANONYMOUS)
+    if not touched.any():
         return False
-    stay = found.table.filter(pa.array(~lines))
+    stay = found.table
+    for name in ("first_time", "last_time"):
+        rounded = pc.floor_temporal(stay[name], unit="hour")
+        column = pc.if_else(pa.array(touched), rounded, stay[name])
+        stay = stay.set_column(stay.column_names.index(name), stay.field(name), column)
+    stay = stay.filter(pa.array(~lines))
     put_in_place(root, stay, path, MAP, {KEY: str(found.version), **found.entries})
     return True
 

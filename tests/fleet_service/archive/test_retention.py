@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
@@ -137,6 +138,9 @@ def test_traces_of_a_forgotten_vehicle_are_removed_in_the_mirror_too(tmp_path: P
         for folder in (root, there):
             table = pq.read_table(folder / snapshot.relative_to(root), partitioning=None)
             assert (table.num_rows, b"geo" in (table.schema.metadata or {})) == (cells, True)
+            shared = table.filter(pc.field("vehicles") > 1)
+            for name in ("first_time", "last_time"):  # of a line that the vehicle was in
+                assert shared[name][0].value % (3600 * 10**6) == 0
             gone = Pseudonyms(root / "keys").of(vehicle, now).encode()
             assert not [path for path in folder.rglob("*.parquet") if gone in path.read_bytes()]
     assert not list(root.rglob(f"*{BAD}"))
