@@ -46,7 +46,7 @@ FLAGS: Final = (
 CONTEXT_UNITS: Final = {
     **dict.fromkeys(FLAGS, "0 no, 1 yes"),
     "air_temperature": "degC outside",
-    "wiper": "0 still, 1 wiping without a pause",
+    "wiper": "0 off, 1 continuous",
 }
 CONTEXT: Final = tuple(CONTEXT_UNITS)
 

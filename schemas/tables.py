@@ -18,11 +18,11 @@ class Field(NamedTuple):
 
     Attributes:
         name, type, unit, meaning: of the column.
-        step: the service keeps floats as multiples of it, where there is one. It is a power of two
-            far below the value's own uncertainty; finer digits are noise, and a quarter of the
-            bytes.
-        range: least and largest value that a report may carry, where the table is reported; NaN is
-            'absent'.
+        step: the service stores the value as a multiple of it; None to store it unchanged. It is a
+            power of two far below the value's uncertainty. Finer digits are noise and would take a
+            quarter more bytes.
+        range: smallest and largest value that a report may carry; NaN means 'absent'. None for
+            columns that are not reported.
     """
 
     name: str
@@ -34,7 +34,7 @@ class Field(NamedTuple):
 
 
 NS = pa.timestamp("ns", tz="UTC")
-US = pa.timestamp("us", tz="UTC")  # what is kept on disk: Spark refuses nanoseconds in Parquet
+US = pa.timestamp("us", tz="UTC")  # unit of the archive: Spark refuses nanoseconds in Parquet
 US_STEP: Final = 1_000  # [ns]
 LIKELIHOOD = pa.binary(mugrid.BINS)
 F32 = pa.float32()
@@ -43,19 +43,17 @@ I8 = pa.int8()
 I32 = pa.int32()
 I64 = pa.int64()
 
-# the second is 13 mm
+# 2^-23 degrees of latitude are 13 mm
 _MU_STEP = 2.0**-10
 _DEGREE_STEP = 2.0**-23
 _RADIAN_STEP = 2.0**-9
 _SPEED_STEP = 2.0**-6
-_MU_RANGE: Final = (0.0, 2.0)  # beyond what a road tyre reaches on any road
+_MU_RANGE: Final = (0.0, 2.0)  # 2 is more than a road tyre reaches on any road
 _SPEED_RANGE: Final = (-100.0, 100.0)
 _MAX_I32: Final = 2**31 - 1
 
 _MU = (
-    Field(
-        "mu", F32, "-", "peak adhesion coefficient, median; NaN where not said", _MU_STEP, _MU_RANGE
-    ),
+    Field("mu", F32, "-", "peak adhesion coefficient, median; NaN if unknown", _MU_STEP, _MU_RANGE),
     Field("mu_lower", F32, "-", "5 % quantile of mu", _MU_STEP, _MU_RANGE),
     Field("mu_upper", F32, "-", "95 % quantile of mu", _MU_STEP, _MU_RANGE),
 )
@@ -73,16 +71,16 @@ _POSE = (
     Field("yaw", F32, "rad", "counter-clockwise from east", _RADIAN_STEP, (-1000.0, 1000.0)),
 )
 
-# What one vehicle learned about one cell in one visit.
+# One visit of one vehicle to one cell.
 OBSERVATION: Final = (
-    Field("enter_time", NS, "ns since 1970, UTC", "first sample in the cell"),
-    Field("leave_time", NS, "ns since 1970, UTC", "last sample in the cell"),
-    Field("cell", I64, "quadint z21", "the cell"),
+    Field("enter_time", NS, "ns since 1970, UTC", "time of the first sample in the cell"),
+    Field("leave_time", NS, "ns since 1970, UTC", "time of the last sample in the cell"),
+    Field("cell", I64, "quadint z21", "map cell, about 19 m wide at the equator"),
     Field(
         "sector",
         I8,
         "0 east, 1 north, 2 west, 3 south",
-        "heading sector",
+        "heading sector of the vehicle",
         range=(0, grid.SECTORS - 1),
     ),
     *_POSE,
@@ -93,7 +91,7 @@ OBSERVATION: Final = (
         "mu_utilised",
         F32,
         "-",
-        "largest grip used in the visit, any wheel: mu is at least this",
+        "largest grip that any wheel used in the visit; mu is at least this",
         _MU_STEP,
         _MU_RANGE,
     ),
@@ -101,20 +99,17 @@ OBSERVATION: Final = (
         "log_likelihood",
         LIKELIHOOD,
         "1/16 nat below the maximum",
-        "log p(measurements | mu) on the 32 bins of the friction grid; absent where the sender has "
-        "none",
+        "log p(measurements | mu) on the 32 bins of the friction grid; absent if not sent",
     ),
-    Field("health", I32, "flags", "schemas.signals.Health", range=(0, _MAX_I32)),
+    Field("health", I32, "flags", "bits of schemas.signals.Health", range=(0, _MAX_I32)),
     Field(
         "tyre_season",
         I8,
         "0 unknown, 1 summer, 2 winter, 3 all-season",
-        "tyres of the vehicle",
+        "season of the vehicle's tyres",
         range=(0, 3),
     ),
-    Field(
-        "air_temperature", F32, "degC", "outside; NaN where not measured", 2.0**-4, (-90.0, 80.0)
-    ),
+    Field("air_temperature", F32, "degC", "outside; NaN if not measured", 2.0**-4, (-90.0, 80.0)),
     Field(
         "abs_active", I8, "-1 unknown, 0 no, 1 yes", "anti-lock braking intervened", range=(-1, 1)
     ),
@@ -122,7 +117,7 @@ OBSERVATION: Final = (
         "used_longitudinal",
         F32,
         "-",
-        "part of mu_utilised along the vehicle, driving positive; NaN where not said",
+        "longitudinal part of mu_utilised, positive when driving; NaN if unknown",
         _MU_STEP,
         (-2.0, 2.0),
     ),
@@ -130,7 +125,7 @@ OBSERVATION: Final = (
         "used_lateral",
         F32,
         "-",
-        "part of mu_utilised across the vehicle, to the left; NaN where not said",
+        "lateral part of mu_utilised, positive to the left; NaN if unknown",
         _MU_STEP,
         (-2.0, 2.0),
     ),
@@ -143,16 +138,16 @@ OBSERVATION: Final = (
     Field(
         "wiper",
         F32,
-        "0 still … 1 wiping without a pause",
-        "front wipers, mean over the visit; NaN where not known",
+        "0 off … 1 continuous",
+        "front wipers, mean over the visit; NaN if unknown",
         2.0**-6,
         (0.0, 1.0),
     ),
 )
 
-# Where a vehicle was and how it moved.
+# Position and motion of a vehicle.
 STATE: Final = (
-    Field("time", NS, "ns since 1970, UTC", "of the sample"),
+    Field("time", NS, "ns since 1970, UTC", "time of the sample"),
     *_POSE,
     Field(
         "vx", F32, "m/s", "longitudinal speed at the centre of gravity", _SPEED_STEP, _SPEED_RANGE
@@ -161,148 +156,145 @@ STATE: Final = (
     Field("yaw_rate", F32, "rad/s", "positive to the left", 2.0**-12, (-20.0, 20.0)),
     Field("sideslip", F32, "rad", "atan2(vy, vx)", 2.0**-12, (-4.0, 4.0)),
     *_MU,
-    Field("health", I32, "flags", "schemas.signals.Health", range=(0, _MAX_I32)),
+    Field("health", I32, "flags", "bits of schemas.signals.Health", range=(0, _MAX_I32)),
 )
 
-# Who sent a row: the identity of its batch. In the archive the vehicle is a keyed hash.
+# Origin of a row: the identity of its batch. In the archive the vehicle is a keyed hash.
 IDENTITY: Final = (
-    Field("vehicle", pa.string(), "-", "enrolled name on the wire; keyed hash in the archive"),
+    Field("vehicle", pa.string(), "-", "enrolled name in a message; keyed hash in the archive"),
     Field(
         "boot",
         I64,
         "-",
-        "keyed hash of the agent's start, with the month's key; in archives of before, the start",
+        "hash of the agent's start time, with the month's key; in older archives the start time",
     ),
-    Field("region", I64, "quadint z10", "region of the batch"),
-    Field("seq", I64, "-", "dense from 1 per (boot, kind, region)"),
-    Field("row", I32, "-", "place in the batch, from 0"),
-    Field("first_held", I64, "-", "lowest seq still in the sender's spool"),
+    Field("region", I64, "quadint z10", "region to which the batch was sent"),
+    Field("seq", I64, "-", "number of the batch: 1, 2, 3, … per (boot, kind, region)"),
+    Field("row", I32, "-", "index of the row in its batch, from 0"),
+    Field("first_held", I64, "-", "lowest seq that the sender still held when it sent the batch"),
     Field("estimator", pa.string(), "-", "name of the estimator"),
 )
 
-# What the service adds when it keeps a row.
+# Columns that the service adds when it stores a row.
 BOOKKEEPING: Final = (
-    Field("received_at", NS, "ns since 1970, UTC", "clock of the service"),
+    Field("received_at", NS, "ns since 1970, UTC", "time of receipt, clock of the service"),
     Field(
         "late",
         pa.bool_(),
         "-",
-        "later than the lateness window: fused as old news where late_by says so",
+        "true if later than the lateness window; fused as an old report if late_by > 0",
     ),
-    Field("weight", F32, "-", "weight of the vehicle's vote that was used"),
+    Field("weight", F32, "-", "weight with which the fusion counted the row"),
     Field(
         "late_by",
         I64,
         "ns",
-        "how much later than leave_time a late row was fused; 0: in time, or not fused",
+        "time from leave_time until a late row was fused; 0 if in time or not fused",
     ),
-    Field("bias", F32, "-", "relative bias of the vehicle's values that was used"),
-    Field("bias_std", F32, "-", "its standard deviation"),
+    Field("bias", F32, "-", "relative bias of the vehicle that the fusion corrected"),
+    Field("bias_std", F32, "-", "standard deviation of bias"),
     Field(
         "spread",
         F32,
         "-",
-        "standard deviation of the vehicle's values over what it states that was used",
+        "factor on the standard deviation that the vehicle states, as used by the fusion",
     ),
     Field(
         "slope",
         F32,
         "-",
-        "how much too low the fleet's values are for each mu that was left unused, that was used",
+        "correction that the fusion used: error of mu per unit of grip left unused",
     ),
 )
 
-# Whether what was said of mu is a value. Without it mu is mostly the prior, and only `mu_utilised`
-# is known.
+# True if mu was measured. Otherwise mu is mostly the prior, and only `mu_utilised` is known.
 VALUE: Final = Field(
     "value",
     pa.bool_(),
     "-",
-    f"mu is a value: {EXCITED_SHARE:g} of it was used; false: only a lower bound is known",
+    f"true if mu was measured: at least {EXCITED_SHARE:g} of it was used; false: lower bound only",
 )
 
-# Road weather of a region, as it came and as the map used it.
+# Road weather of a region, as received and as used by the map.
 WEATHER: Final = (
-    Field("region", I64, "quadint z10", "the region"),
-    Field("time", NS, "ns since 1970, UTC", "from when it holds"),
-    Field("air_temperature", F32, "degC", "NaN where unknown"),
-    Field("road_temperature", F32, "degC", "of the surface; NaN where unknown"),
-    Field("precipitation", F32, "mm/h", "as water; NaN where unknown"),
+    Field("region", I64, "quadint z10", "region"),
+    Field("time", NS, "ns since 1970, UTC", "start of validity"),
+    Field("air_temperature", F32, "degC", "air temperature; NaN if unknown"),
+    Field("road_temperature", F32, "degC", "temperature of the road surface; NaN if unknown"),
+    Field("precipitation", F32, "mm/h", "precipitation as water; NaN if unknown"),
     Field(
         "prior",
         pa.list_(F32),
         "-",
-        "probabilities of the 32 bins of the friction grid; null where there is none",
+        "prior probabilities of the 32 bins of the friction grid; null if none was given",
     ),
-    Field("received_at", NS, "ns since 1970, UTC", "clock of the service"),
+    Field("received_at", NS, "ns since 1970, UTC", "time of receipt, clock of the service"),
     Field(
         "acts_from",
         NS,
         "ns since 1970, UTC",
-        "from when the map used it: nothing younger had been fused",
+        "time from which the map used it; no later observation had been fused",
     ),
 )
 
 MAP_CELL: Final = (
-    Field("cell", I64, "quadint z21", "the cell"),
+    Field("cell", I64, "quadint z21", "map cell, about 19 m wide at the equator"),
     Field("sector", I8, "0 east, 1 north, 2 west, 3 south", "heading sector"),
-    Field(
-        "mu", F32, "-", "peak adhesion coefficient, median; null where only lower bounds are known"
-    ),
-    Field("mu_lower", F32, "-", "5 % quantile"),
-    Field("mu_upper", F32, "-", "95 % quantile"),
+    Field("mu", F32, "-", "peak adhesion coefficient, median; null if only lower bounds are known"),
+    Field("mu_lower", F32, "-", "5 % quantile of mu"),
+    Field("mu_upper", F32, "-", "95 % quantile of mu"),
     Field("p_slippery", F32, "-", f"P(mu < {SLIPPERY_MU})"),
     Field(
         "basis",
         pa.string(),
         "measured | bound | borrowed",
-        "what the value rests on; bound: only lower bounds",
+        "source of the value; bound: only lower bounds; borrowed: from neighbouring cells",
     ),
-    Field("vehicles", I32, "-", "distinct vehicles"),
-    Field("observations", I64, "-", "observations"),
-    Field("first_time", NS, "ns since 1970, UTC", "first observation"),
-    Field("last_time", NS, "ns since 1970, UTC", "last observation"),
-    Field("age_s", F32, "s", "since the last observation, when the tile was made"),
-    Field("latitude", F64, "deg", "middle of the cell"),
-    Field("longitude", F64, "deg", "middle of the cell"),
-    Field("west", F64, "deg", "border of the cell"),
-    Field("south", F64, "deg", "border of the cell"),
-    Field("east", F64, "deg", "border of the cell"),
-    Field("north", F64, "deg", "border of the cell"),
+    Field("vehicles", I32, "-", "number of distinct vehicles"),
+    Field("observations", I64, "-", "number of observations"),
+    Field("first_time", NS, "ns since 1970, UTC", "time of the first observation"),
+    Field("last_time", NS, "ns since 1970, UTC", "time of the last observation"),
+    Field("age_s", F32, "s", "time from the last observation until the tile was made"),
+    Field("latitude", F64, "deg", "latitude of the cell's centre"),
+    Field("longitude", F64, "deg", "longitude of the cell's centre"),
+    Field("west", F64, "deg", "western border of the cell"),
+    Field("south", F64, "deg", "southern border of the cell"),
+    Field("east", F64, "deg", "eastern border of the cell"),
+    Field("north", F64, "deg", "northern border of the cell"),
     Field(
         "safe_deceleration",
         F32,
         "m/s^2",
-        "what the road bears with 95 % probability, g mu_lower; level road",
+        "deceleration that a level road allows with 95 % probability: g mu_lower",
     ),
 )
 
-# Parts of an hour's statistics of one cell and sector; those of the same hour are merged as each
-# column says.
+# Partial statistics of one cell, sector and hour. Rows of the same hour are merged as the meaning
+# of each column says.
 CELL_HOUR: Final = (
-    Field("cell", I64, "quadint z21", "the cell"),
+    Field("cell", I64, "quadint z21", "map cell, about 19 m wide at the equator"),
     Field("sector", I8, "0 east, 1 north, 2 west, 3 south", "heading sector"),
-    Field("hour", US, "us since 1970, UTC", "begin of the hour of leave_time"),
-    Field("observations", I64, "-", "count; add"),
-    Field("late", I64, "-", "of them not fused; add"),
+    Field("hour", US, "us since 1970, UTC", "start of the hour that contains leave_time"),
+    Field("observations", I64, "-", "number of observations; add"),
+    Field("late", I64, "-", "number of observations that were too late to be fused; add"),
+    Field("vehicles", I64, "-", "distinct vehicles of this row; cannot be added, see vehicle_bits"),
     Field(
-        "vehicles", I64, "-", "distinct vehicles of this part; they do not add, see vehicle_bits"
+        "vehicle_bits", I64, "64 bits", "vehicles, about -64 ln(share of zero bits); combine by OR"
     ),
-    Field("vehicle_bits", I64, "64 bits", "or; distinct vehicles are about -64 ln(share of zeros)"),
-    Field("mu_count", I64, "-", "observations that said mu; add"),
+    Field("mu_count", I64, "-", "number of observations with mu; add"),
     Field("mu_sum", F64, "-", "sum of mu; add"),
     Field("mu_sum_squares", F64, "-", "sum of squares of mu; add"),
-    Field("mu_min", F32, "-", "least mu; +inf where none was said; take the least"),
-    Field("mu_max", F32, "-", "largest mu; -inf where none was said; take the largest"),
-    Field("utilised_max", F32, "-", "largest grip used: mu was at least this; take the largest"),
+    Field("mu_min", F32, "-", "smallest mu, +inf if there is none; take the minimum"),
+    Field("mu_max", F32, "-", "largest mu, -inf if there is none; take the maximum"),
+    Field("utilised_max", F32, "-", "largest grip used, so mu was at least this; take the maximum"),
     Field(
         "mu_histogram",
         pa.list_(I32),
         "-",
         "counts of mu on the 32 bins of the friction grid; add per bin",
     ),
-    Field("value_count", I64, "-", "values: observations that used enough of mu to tell it; add"),
-    Field("value_sum", F64, "-", "sum of mu of the values; add"),
+    Field("value_count", I64, "-", "observations that used enough grip to measure mu; add"),
+    Field("value_sum", F64, "-", "sum of mu of these observations; add"),
     Field(
         "log_likelihood_sum",
         pa.list_(I32),
@@ -312,38 +304,41 @@ CELL_HOUR: Final = (
 )
 
 ESTIMATES: Final = (
-    Field("t", F64, "s", "of the sample"),
+    Field("t", F64, "s", "time of the sample"),
     Field("vx", F64, "m/s", "longitudinal speed at the centre of gravity"),
     Field("vy", F64, "m/s", "lateral speed at the centre of gravity"),
     Field("yaw_rate", F64, "rad/s", "positive to the left"),
     Field("sideslip", F64, "rad", "atan2(vy, vx)"),
-    Field("vx_std", F64, "m/s", "standard deviation"),
-    Field("vy_std", F64, "m/s", "standard deviation"),
-    Field("yaw_rate_std", F64, "rad/s", "standard deviation"),
-    Field("sideslip_std", F64, "rad", "standard deviation"),
-    Field("mu", F64, "-", "median"),
-    Field("mu_lower", F64, "-", "5 % quantile"),
-    Field("mu_upper", F64, "-", "95 % quantile"),
+    Field("vx_std", F64, "m/s", "standard deviation of vx"),
+    Field("vy_std", F64, "m/s", "standard deviation of vy"),
+    Field("yaw_rate_std", F64, "rad/s", "standard deviation of yaw_rate"),
+    Field("sideslip_std", F64, "rad", "standard deviation of sideslip"),
+    Field("mu", F64, "-", "peak adhesion coefficient, median"),
+    Field("mu_lower", F64, "-", "5 % quantile of mu"),
+    Field("mu_upper", F64, "-", "95 % quantile of mu"),
     *(
         Field(
-            f"{wheel}{end}", F64, "-", f"{what} of this wheel; null where the estimator has one mu"
+            f"{wheel}{end}",
+            F64,
+            "-",
+            f"{what} of mu at this wheel; null if there is one mu for all",
         )
         for wheel in per_wheel("mu")
         for end, what in (("", "median"), ("_lower", "5 % quantile"), ("_upper", "95 % quantile"))
     ),
-    Field("mu_utilised", F64, "-", "largest grip used in the last second, any wheel"),
+    Field("mu_utilised", F64, "-", "largest grip that any wheel used in the last second"),
     Field("innovation_nis", F64, "-", "normalised innovation squared over its degrees of freedom"),
-    Field("adaptation", F64, "-", "factor on the measurement noise covariance"),
-    Field("health", I32, "flags", "schemas.signals.Health"),
+    Field("adaptation", F64, "-", "factor on the measurement noise covariance, set by the filter"),
+    Field("health", I32, "flags", "bits of schemas.signals.Health"),
 )
 
 SIGNAL_LOG: Final = (
-    Field("t", F64, "s", "of the sample, increasing"),
-    *(Field(name, F64, unit, "null or NaN is a missing reading") for name, unit in UNITS.items()),
+    Field("t", F64, "s", "time of the sample, increasing"),
+    *(Field(name, F64, unit, "null or NaN: missing reading") for name, unit in UNITS.items()),
 )
-# Columns that a signal log may have beside these.
+# Columns that a signal log may have in addition.
 SIGNAL_LOG_CONTEXT: Final = tuple(
-    Field(name, F64, unit, "null or NaN is unknown; the column may be missing")
+    Field(name, F64, unit, "null or NaN: unknown; the column may be missing")
     for name, unit in CONTEXT_UNITS.items()
 )
 
@@ -367,12 +362,12 @@ def stored_columns(*fields: Field) -> tuple[Field, ...]:
 
 MAP_SCHEMA: Final = arrow_schema(*MAP_CELL)
 ESTIMATES_SCHEMA: Final = arrow_schema(*ESTIMATES)
-MAP_KEPT: Final = stored_columns(*MAP_CELL, Field("snapshot_time", NS, "", "when the map was so"))
+MAP_KEPT: Final = stored_columns(*MAP_CELL, Field("snapshot_time", NS, "", "time of the snapshot"))
 MAP_ARCHIVE: Final = arrow_schema(*MAP_KEPT)
 OBSERVATION_KEPT: Final = stored_columns(*OBSERVATION, *IDENTITY, *BOOKKEEPING, VALUE)
 OBSERVATION_ARCHIVE: Final = arrow_schema(*OBSERVATION_KEPT)
 WEATHER_ARCHIVE: Final = arrow_schema(*stored_columns(*WEATHER))
-STATE_CELL: Final = Field("cell", I64, "quadint z21", "cell of the position")
+STATE_CELL: Final = Field("cell", I64, "quadint z21", "map cell that contains the position")
 STATE_ARCHIVE: Final = arrow_schema(
     *stored_columns(*STATE, *IDENTITY, STATE_CELL, *BOOKKEEPING[:1])
 )

@@ -24,7 +24,7 @@ DESK: Final = {"width": 1280, "height": 900}
 
 
 def find_chromium() -> str | None:
-    """Where Chromium lies."""
+    """Return the path of Chromium."""
     return next((found for name in NAMES if (found := shutil.which(name))), None)
 
 
@@ -47,7 +47,7 @@ class Opened:
         return int(self.page.evaluate("document.body.dataset.drawn || 0"))
 
     def count_colours(self, panel: int = 0) -> dict[str, int]:
-        """Opaque colours of a canvas and how many of its points have them."""
+        """Return the opaque colours of a canvas with the number of pixels of each."""
         found: dict[str, int] = self.page.evaluate(_COLOURS, panel)
         return found
 

@@ -1,6 +1,4 @@
-"""A real S3 server, a process of its own on this machine, that a test can take away, freeze and
-bring back.
-"""
+"""A real S3 server in a process of its own that a test can stop, freeze and restart."""
 
 from __future__ import annotations
 
@@ -40,18 +38,18 @@ class BucketServer:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The part of a service's configuration."""
+        """Return the part of a service's configuration for this bucket."""
         return {"copy": self.url, "store": self.store}
 
     def start(self) -> None:
-        """Serve, as soon as this returns."""
+        """Start the server, and return when it serves."""
         words = ["-m", "localbucket", str(self._folder), "--port", str(self._port)]
         quiet = subprocess.DEVNULL
         self._process = subprocess.Popen([sys.executable, *words], stdout=quiet, stderr=quiet)
         until(self._is_up)
 
     def stop(self) -> None:
-        """Be gone: connections are refused."""
+        """Stop the server, so that connections are refused."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -66,7 +64,7 @@ class BucketServer:
             self._process.send_signal(signal.SIGSTOP)
 
     def bring_back(self, how: str) -> None:
-        """Go on after `take_away`."""
+        """Continue after `take_away`."""
         if how == "stopped":
             self.start()
         else:
@@ -74,7 +72,7 @@ class BucketServer:
             self._process.send_signal(signal.SIGCONT)
 
     def read_objects(self) -> dict[str, bytes]:
-        """All that is there."""
+        """Return all objects."""
         base = self._folder / BUCKET / PREFIX
         found = [
             path for path in base.rglob("*") if path.is_file() and not path.name.startswith(".")
@@ -82,7 +80,7 @@ class BucketServer:
         return {path.relative_to(base).as_posix(): path.read_bytes() for path in found}
 
     def path_of(self, name: str) -> Path:
-        """Where an object lies."""
+        """Return the path of an object's file."""
         return self._folder / BUCKET / PREFIX / name
 
     def _is_up(self) -> bool:
@@ -95,7 +93,7 @@ class BucketServer:
 
 @contextmanager
 def bucket_server(folder: Path) -> Iterator[BucketServer]:
-    """A server, for the block."""
+    """Yield a server for the block."""
     made = BucketServer(folder)
     made.start()
     try:

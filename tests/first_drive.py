@@ -31,8 +31,9 @@ def read_commands() -> list[str]:
 
 
 def map_first_drive(folder: Path) -> tuple[Cells, list[str]]:
-    """The map's cells and the keys of alerts once the minute was published under all names, by a
-    router and a service of its own."""
+    """Publish the minute under all names to a new router and service, and return the cells of the
+    map and the keys of alerts.
+    """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     with router:
         system = System(folder, endpoints[0])
@@ -43,7 +44,7 @@ def map_first_drive(folder: Path) -> tuple[Cells, list[str]]:
 
 
 def _publish_drive(system: System, log: Path) -> tuple[Cells, list[str]]:
-    """The minute imported, checked, replayed and published under each name."""
+    """Import, check and replay the minute, and publish it under each name."""
     car = ["--vehicle", str(VEHICLE)]
     out = str(log.with_suffix(".csv"))
     alerts = list[str]()

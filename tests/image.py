@@ -44,7 +44,7 @@ START_S: Final = 60.0
 
 
 def parse_steps(text: str) -> list[tuple[str, str]]:
-    """Instruction and its words, a line each, without remarks."""
+    """An instruction of the Dockerfile and its words."""
     lines = [line for line in text.splitlines() if not line.lstrip().startswith("#")]
     joined = re.sub(r"\\\n", " ", "\n".join(lines))
     parted = [line.partition(" ") for line in joined.splitlines() if line.strip()]
@@ -52,7 +52,7 @@ def parse_steps(text: str) -> list[tuple[str, str]]:
 
 
 class Image:
-    """Result of the steps, below `root`."""
+    """Result of the steps below `root`."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -68,7 +68,7 @@ class Image:
         return re.sub(r"chown (-R )?\d+:\d+", rf"chown \g<1>{os.getuid()}:{os.getgid()}", text)
 
     def run_step(self, name: str, words: str) -> None:
-        """Do one instruction."""
+        """Carry out one instruction."""
         if name == "FROM":
             self._start_from(words)
         elif name == "WORKDIR":
@@ -115,7 +115,7 @@ class Image:
 
 
 def time_start(image: Image) -> float:
-    """Seconds until a service of the image is ready at a router of it; nothing may be compiled."""
+    """Return the seconds until a service of the image is ready. It must not compile anything."""
     port = "127.0.0.1:0"
     with subprocess.Popen(
         ["python", "-m", "deploy.router", "--listen", f"tcp/{port}"],

@@ -71,7 +71,7 @@ def list_candidates(version: str) -> list[str]:
 
 
 def main() -> int:
-    """Build, install, use; exit code 1 with what went wrong."""
+    """Build the packages, install them and use them. Return 1 and print the reason if a step fails."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.packaging", description=(__doc__ or "").splitlines()[0]
     )

@@ -189,7 +189,7 @@ TABLES: Final = (
     ),
     Table(
         "worth",
-        "Worth of the fuzzy sets and of the ant colony: interval score, less is better",
+        "Benefit of the fuzzy sets and of the ant colony: interval score, less is better",
         re.compile(r"(fuzzy|ants)\.worth(\.all_rules|\.random)?(\.difference(\.se)?|\.wins)?$"),
         worth.comparison_table,
     ),

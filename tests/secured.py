@@ -1,5 +1,5 @@
-"""Two routers with mutual TLS and the generated access list, and sessions under any name: all of
-it real.
+"""Two routers with mutual TLS and the generated access list, and sessions under any name, all of
+them real.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def make_enrolment(**changed: object) -> Enrolment:
 
 
 def open_registry(folder: Path) -> Registry:
-    """The authority in a folder, at the present time."""
+    """Create an authority in a folder, valid from now on."""
     return Registry(folder, Terms(), datetime.now(UTC))
 
 
@@ -87,7 +87,7 @@ class Network:
     between: dict[str, str] = field(default_factory=dict)
 
     def open_session(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
-        """A session under a name of the folder.
+        """Open a session under a name of the folder.
 
         Raises:
             zenoh.ZError: the router does not want it.

@@ -1,5 +1,5 @@
-"""Spark on cores of this machine that tries a task again, as clusters do; work whose process
-dies the first time.
+"""Local Spark sessions that retry a task as clusters do, and tasks whose process dies at the first
+try.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ def spark_session(count: int) -> Iterator[Any]:
 def killed_at_first(
     work: Callable[[_Task], _Outcome], name_of: Callable[[_Task], str], tries: Path
 ) -> Callable[[_Task], _Outcome]:
-    """The same work, whose process is killed after the first try at each task; `tries` keeps the
-    tasks' names.
+    """Run the same work, but kill its process after the first try at each task. `tries` stores the
+    names of tasks.
     """
     tries.mkdir()
 

@@ -1,4 +1,4 @@
-"""Two services, or three, that follow each other: real processes, a real S3 server, and links
+"""Two or three services that take over from each other: real processes, a real S3 server, and links
 that can be cut.
 """
 
@@ -20,8 +20,8 @@ from tests.faults.processes import Part
 
 
 class Link:
-    """A port that leads to another one of this machine; `cut`, it takes connections and passes
-    nothing on.
+    """A port that forwards to another port of this machine. While it is cut, it accepts connections
+    and forwards nothing.
     """
 
     def __init__(self, port: int) -> None:
@@ -34,7 +34,7 @@ class Link:
         threading.Thread(target=self._accept_connections, daemon=True).start()
 
     def cut(self) -> None:
-        """Nothing passes."""
+        """Stop forwarding."""
         self._open.clear()
 
     @property
@@ -47,7 +47,7 @@ class Link:
         self._open.set()
 
     def close(self) -> None:
-        """Be gone."""
+        """Close the port."""
         for end in [self._server, *self._ends]:
             with suppress(OSError):
                 end.shutdown(socket.SHUT_RDWR)
@@ -78,7 +78,7 @@ class Link:
 
 
 class Host:
-    """A machine with a service on it, its way to the routers and its way to the bucket."""
+    """A machine with a service, its link to the routers and its link to the bucket."""
 
     def __init__(
         self,
@@ -110,7 +110,7 @@ class Host:
         return any(line.startswith(start) for line in self.part.read_lines())
 
     def close(self) -> None:
-        """End whatever is left of it."""
+        """End the service if it still runs."""
         self.to_router.close()
         self.to_bucket.close()
         self.part.send_signal(signal.SIGCONT)
@@ -142,7 +142,7 @@ def open_hosts(
 
 
 def restore_archive(folder: Path, bucket: BucketServer) -> Path:
-    """The archive that an empty disk gets from the bucket; nothing is changed there."""
+    """Return the archive that an empty disk restores from the bucket. The bucket is not changed."""
     root = folder / "archive"
     root.mkdir(parents=True)
     copy = BucketReplica(root, bucket.url, bucket.store)

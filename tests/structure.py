@@ -30,7 +30,7 @@ HEAVY: Final = ("numba", "llvmlite", "scipy", "zenoh")
 
 
 def list_sources(root: Path, *folders: str) -> list[Path]:
-    """Every Python file below the folders that a person wrote."""
+    """Return every handwritten Python file below the folders."""
     found = (path for folder in folders for path in sorted((root / folder).rglob("*.py")))
     return [path for path in found if not path.name.endswith("_pb2.py")]
 
@@ -75,7 +75,7 @@ def loose_modules(root: Path, package: str) -> list[str]:
 
 
 def too_wide(root: Path) -> list[str]:
-    """Functions with more positional parameters than a reader holds in mind."""
+    """Return functions with too many positional parameters."""
     found = []
     for path in list_sources(root, *PACKAGES):
         for node in ast.walk(parse(path)):
@@ -88,7 +88,7 @@ def too_wide(root: Path) -> list[str]:
 
 
 def ambiguous_classes(root: Path) -> dict[str, list[str]]:
-    """Names of classes, public or not, that stand for several things, with their places."""
+    """Return class names that are used for several classes, with their places."""
     places: dict[str, list[str]] = {}
     for path in list_sources(root, *PACKAGES):
         for node in ast.walk(parse(path)):
@@ -98,8 +98,8 @@ def ambiguous_classes(root: Path) -> dict[str, list[str]]:
 
 
 def light_import(root: Path) -> tuple[float, int, list[str]]:
-    """Milliseconds and modules of importing the contract, and what of the heavy libraries came
-    along.
+    """Return the time [ms] and number of modules of importing the contract, and the heavy libraries
+    among them.
     """
     words = (
         f"import sys, time; before = set(sys.modules); begun = time.perf_counter(); {LIGHT}; "

@@ -41,8 +41,8 @@ END: Final = "2026-01-28"
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An archive with values and bounds; a snapshot of its map with a bound that says mu, as
-    files before 1.2 do.
+    """Return an archive with values and bounds. The snapshot of its map contains a bound with mu,
+    as files before version 1.2 do.
     """
     root = tmp_path_factory.mktemp("bounds") / "archive"
     synthetic.write_archive(root, WORLD, 2000)
@@ -57,7 +57,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def two_cells() -> pa.Table:
-    """A cell that was measured and one that somebody rolled over."""
+    """Return a measured cell and a cell with only a bound."""
     fusion = Fusion(120.0)
     likelihoods = np.concatenate([value([0.3]), at_least([0.15])])
     fusion.update(observations(np.array([0, 1]), np.array([0, 1]), likelihoods, [CELL, CELL + 1]))
@@ -69,8 +69,8 @@ def two_cells() -> pa.Table:
 def find_painted(
     rows: list[dict[str, Any]], known: Callable[[dict[str, Any]], bool], *names: str
 ) -> list[dict[str, Any]]:
-    """Rows of which nothing is known that have a number all the same; fails where there are none
-    of either kind.
+    """Return the rows without a measurement that have a number nevertheless. Fail if there are no
+    rows of either kind.
     """
     bounds = [row for row in rows if not known(row)]
     assert bounds
@@ -101,7 +101,7 @@ def test_an_answer_of_the_service_has_no_mu_for_a_bound(form: Format) -> None:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Rows of an export as a program reads them."""
+    """Return the rows of an export as a program reads them."""
     if path.suffix == ".csv":
         return pacsv.read_csv(path).to_pylist()
     if path.suffix == ".geojson":

@@ -1,5 +1,5 @@
-"""SIGTERM and Ctrl-C: agent and service flush, settle as many reports as they can, and end,
-whatever the router does.
+"""SIGTERM and Ctrl-C: agent and service flush, settle as many reports as possible, and end, with
+and without a working router.
 """
 
 from __future__ import annotations

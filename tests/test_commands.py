@@ -1,6 +1,4 @@
-"""Both command lines as a person meets them: versions, examples, completion, Ctrl-C, minus
-signs, brakes, endings.
-"""
+"""Both command lines: versions, examples, completion, Ctrl-C, negative numbers, and exit codes."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ def system(tmp_path: Path) -> Iterator[System]:
 
 
 def slippery_cells(system: System) -> list[dict[str, object]]:
-    """Measured cells after three cars braked on ICE."""
+    """Return the measured cells after three cars braked on ICE."""
     for seed, vehicle in enumerate(VEHICLES):
         system.publish_drive(vehicle, "braking", ICE, seed)
     return [
@@ -176,7 +176,7 @@ def _most_slippery_first(cell: dict[str, object]) -> float:
 
 
 def list_archived(folder: Path) -> list[tuple[object, ...]]:
-    """Identities of all archived observations."""
+    """Return the identities of all archived observations."""
     columns = ("vehicle", "boot", "region", "seq", "row")
     tables = reading.read_tables(folder / "archive", Kind.OBSERVATION, columns)
     return [

@@ -1,5 +1,5 @@
-"""The public faces: every name is there, documented and reachable; plug-ins of another
-distribution are found.
+"""Public interfaces: every name exists, is documented and reachable; plug-ins of other
+distributions are found.
 """
 
 from __future__ import annotations

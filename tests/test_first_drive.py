@@ -1,6 +1,4 @@
-"""The tutorial's first drive has few commands, raises no alert, and is slippery nowhere on the
-map.
-"""
+"""The tutorial's first drive: few commands, no alert, and no slippery cell on the map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Colours that are told apart by every kind of sight and on grey paper, computed and not believed.
+"""Colours are distinguishable for every kind of colour vision and on grey paper, by computation.
 
 Sight is simulated as Machado, Oliveira and Fernandes (2009) do at full severity, distances are
 CIEDE2000 (Sharma, Wu and Dalal 2005).
@@ -67,7 +67,7 @@ def test_the_lines_of_the_estimators_are_told_apart(sight: str) -> None:
 
 
 def test_the_old_scale_fails() -> None:
-    """Red to green, which this replaced: dry and snow were one olive to one man in twelve."""
+    """Red to green, the former palette, made dry and snow the same olive for one man in twelve."""
     snow = to_lab("#b8831b", "deuteranopia")
     dry = to_lab("#1bb83e", "deuteranopia")
     assert colour_difference(snow, dry) < LEAST

@@ -1,4 +1,4 @@
-"""The separation of the house, read from its source: imports, sizes, entries, docstrings."""
+"""Structure of the packages, read from the source: imports, sizes, entries, docstrings."""
 
 from __future__ import annotations
 
@@ -204,13 +204,13 @@ def place_of(path: Path, line: int) -> str:
 
 
 def find_crossings(tree: ast.AST, package: str) -> list[tuple[int, str]]:
-    """Imports of project packages that `package` may not know."""
+    """Return the imports of project packages that `package` must not have."""
     forbidden = set(PACKAGES) - MAY_IMPORT[package] - {package}
     return [(line, name) for line, name in list_imports(tree) if name.split(".")[0] in forbidden]
 
 
 def find_impurities(tree: ast.AST) -> list[tuple[int, str]]:
-    """Imports and calls by which a pure module would reach the world outside."""
+    """Return the imports and calls by which a pure module would do I/O."""
     found = [(line, name) for line, name in list_imports(tree) if name.split(".")[0] in IMPURE]
     for node in ast.walk(tree):
         if (
@@ -324,7 +324,7 @@ SHARED_NUMBER = re.compile(
 
 
 def shared_numbers(text: str) -> Iterator[tuple[int, str]]:
-    """Lines of code, not of comment, on which a shared number is written again."""
+    """Return the lines of code, comments apart, that repeat a shared number."""
     for line, words in enumerate(text.splitlines(), 1):
         if found := SHARED_NUMBER.search(words.partition("#")[0]):
             yield line, found[0]

@@ -153,8 +153,9 @@ def run_page(folder: Path, endpoint: str, service: ManagedProcess, port: int) ->
 def start_fleet(
     folder: Path, vehicles: int, duration_s: float, seed: int, warned: float
 ) -> ManagedProcess:
-    """Return the process of the simulated vehicles, with one session and identity each; a share of
-    the drivers is warned."""
+    """Return the process of the simulated vehicles. Each has its own session and identity; a share
+    of the drivers is warned.
+    """
     scripts = Path(sys.executable).parent
     options = {
         "--vehicles": vehicles,

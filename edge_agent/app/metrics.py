@@ -51,7 +51,7 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         Metric(
             "late_batches",
             "counter",
-            "batches that arrived after the map had moved on",
+            "batches that arrived too late for the map",
             _by_kind_name(counts.late),
             "kind",
         ),

@@ -162,5 +162,5 @@ class ReasonReporter:
         if alike == self._told:
             return
         self._told = alike
-        text = f"not published: {'; '.join(found)}" if found else "publishing: no obstacle is left"
+        text = f"not published: {'; '.join(found)}" if found else "publishing: records are sent"
         self._say(LogLine(text, event="unpublished" if found else "publishing", reasons=found))

@@ -210,7 +210,7 @@ def _read_state(path: Path, identity: str) -> Known:
 
 
 def _write_state(path: Path, known: Known) -> None:
-    """Write the knowledge atomically."""
+    """Write the learned values to their file, atomically."""
     part = path.with_suffix(".part")
     try:
         with part.open("w", encoding="utf-8") as file:

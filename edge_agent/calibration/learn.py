@@ -102,8 +102,8 @@ ROLLING: Final = 0.008  # [1] rolling resistance over load
 BRAKED_FRONT: Final = 0.7  # [1] share of the front axle in braking
 
 DriveEstimates: TypeAlias = dict[str, float]
-"""Estimates of one drive, by quantity; QUANTITY_std is what its own regression leaves unknown of
-it.
+"""Estimates of one drive by quantity; QUANTITY_std is the standard deviation that its regression
+states.
 """
 
 

@@ -184,7 +184,7 @@ def _evaluate_worth(args: argparse.Namespace, count: int) -> int:
     measured = list(seeds)[: len(scores["fuzzy"]["all"])]
     write(args.out / "figures.json", f"edge-agent evaluate --only worth{part}", measured, figures)
     table = worth.comparison_table({figure.name: figure.value for figure in figures})
-    text = f"# Worth of the fuzzy sets and of the ant colony\n\n{table}\n\n{markdown(figures)}\n"
+    text = f"# Benefit of the fuzzy sets and of the ant colony\n\n{table}\n\n{markdown(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
@@ -255,7 +255,7 @@ def _evaluate_ahead(args: argparse.Namespace, count: int) -> int:
     write(
         args.out / "figures.json", f"edge-agent evaluate --only ahead{part}", list(seeds), figures
     )
-    text = f"# What lies ahead\n\n{markdown(figures)}\n"
+    text = f"# Road ahead\n\n{markdown(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1

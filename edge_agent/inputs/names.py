@@ -109,8 +109,8 @@ def draft_profile(signals: Mapping[str, str], name: str) -> Profile:
     ):
         channels["delta_fr"] = channels["delta_fl"]
     about = (
-        "Drafted from names: look at every signal, unit and sign, then let `edge-agent check` "
-        "do it again."
+        "Drafted from names: check every signal, unit and sign by hand, then with `edge-agent "
+        "check`."
     )
     order = {channel: channels[channel] for channel in QUANTITY if channel in channels}
     return Profile(name=re.sub(r"\W+", "-", name)[:64] or "drafted", about=about, channels=order)

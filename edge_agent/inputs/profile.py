@@ -86,13 +86,13 @@ class Channel(Part):
 
     @property
     def signals(self) -> list[str]:
-        """Whole names of the signals that are added."""
+        """Full names of the signals whose values are added."""
         names = [self.signal] if isinstance(self.signal, str) else self.signal
         return [self.full_name(name) for name in names]
 
     @property
     def gates(self) -> dict[str, list[float]]:
-        """Full names of the signals that must be valid for it."""
+        """Full names of the signals that must be valid, each with its valid values."""
         return {self.full_name(name): values for name, values in self.valid.items()}
 
     def full_name(self, name: str) -> str:

@@ -120,8 +120,8 @@ class Service:
 
     @property
     def exit_code(self) -> int:
-        """Return 0 if everything admitted is on disk and nothing failed, else 1, also if another
-        service took over.
+        """Return 0 if all admitted data are on disk and nothing failed, else 1. The result is 1 as
+        well if another service took over.
         """
         return (
             1

@@ -1,5 +1,5 @@
-"""Watching of the map: a line per changed tile, per stretch alert, and per region that loses or
-gets a service.
+"""Print changes of the map: one line per changed tile, per alert, and per region that loses or
+regains its service.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from schemas.config import ZenohSettings
 from schemas.runtime import presence, zenoh_session
 from schemas.wire.tile import decode_tile
 
-GATHER_S: Final = 0.3  # for which alerts of neighbouring cells are gathered into one
+GATHER_S: Final = 0.3  # time for which alerts of neighbouring cells are merged
 
 
 class WatchOptions(NamedTuple):
-    """Selection of what to watch.
+    """Selection of the changes to print.
 
     Attributes:
         bbox: west,south,east,north as text; None for everything.
-        only_alerts: True to omit lines of tiles.
-        as_json: True for lines in JSON.
+        only_alerts: True to omit lines for tiles.
+        as_json: True to print each line as JSON.
     """
 
     bbox: str | None = None
@@ -38,18 +38,19 @@ class WatchOptions(NamedTuple):
 
 def watch_map(
     connection: ZenohSettings,
-    wishes: WatchOptions,
+    options: WatchOptions,
     stop: threading.Event,
-    say: Callable[[str], None],
-    hear: Callable[[StretchAlert], None] = lambda _: None,
+    print_line: Callable[[str], None],
+    on_alert: Callable[[StretchAlert], None] = lambda _: None,
 ) -> None:
-    """Print a line per change until `stop` is set; wait for a router. `hear` is called with the
-    stretches too.
+    """Print one line per change until `stop` is set. Wait until a router is reachable.
+
+    `print_line` receives the lines, `on_alert` every alert that changed.
 
     Raises:
         InputError: the box is not valid.
     """
-    asked = query.parse({} if wishes.bbox is None else {"bbox": wishes.bbox})
+    asked = query.parse({} if options.bbox is None else {"bbox": options.bbox})
     box = asked.bbox
     stretches = Stretches()
     lock = threading.Lock()
@@ -64,7 +65,7 @@ def watch_map(
     def print_tile(sample: zenoh.Sample) -> None:
         tile = tile_if_near(str(sample.key_expr))
         if tile is not None:
-            say(_tile_line(tile, decode_tile(sample.payload.to_bytes()), wishes.as_json))
+            print_line(_tile_line(tile, decode_tile(sample.payload.to_bytes()), options.as_json))
 
     def apply_alert(alert: wire.Alert) -> None:
         with lock:
@@ -78,12 +79,12 @@ def watch_map(
         with lock:
             found = stretches.take_changes()
         for alert in found:
-            say(
+            print_line(
                 json.dumps({"event": "alert", **alert.to_json_values()})
-                if wishes.as_json
+                if options.as_json
                 else alert.to_line()
             )
-            hear(alert)
+            on_alert(alert)
 
     def print_services() -> None:
         nonlocal away
@@ -91,20 +92,20 @@ def watch_map(
         left = {token.region for token in services.lost} - here
         now = set(regions.unserved_expressions(asked, here)) if asked.bbox else left
         if now != away and (here or services.lost):
-            _say_regions(say, now - away, away - now, as_json=wishes.as_json)
+            _print_regions(print_line, now - away, away - now, as_json=options.as_json)
             away = now
 
     session = zenoh_session.open_session(connection, stop)
     if session is None:
         return
     with session, presence.track_tokens(session) as services:
-        if not wishes.only_alerts:
+        if not options.only_alerts:
             session.declare_subscriber(f"{keys.ROOT}/map/**", print_tile)
         session.declare_subscriber(f"{keys.ROOT}/alert/**", apply_sample)
-        for alert in standing_alerts(session):  # after the subscription: none is missed in between
+        for alert in standing_alerts(session):  # subscribe first, so that no alert is missed
             if tile_if_near(keys.alert_key(int(grid.tile_of(alert.cell)))) is not None:
                 apply_alert(alert)
-        say(json.dumps({"event": "watching"}) if wishes.as_json else "watching")
+        print_line(json.dumps({"event": "watching"}) if options.as_json else "watching")
         print_services()
         while not stop.wait(GATHER_S):
             print_changes()
@@ -122,15 +123,15 @@ def standing_alerts(session: zenoh.Session) -> list[wire.Alert]:
     return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]
 
 
-def _say_regions(
-    say: Callable[[str], None], away: set[str], back: set[str], *, as_json: bool
+def _print_regions(
+    print_line: Callable[[str], None], away: set[str], back: set[str], *, as_json: bool
 ) -> None:
     for event, found in (("away", away), ("back", back)):
         if found and as_json:
-            say(json.dumps({"event": event, "regions": sorted(found)}))
+            print_line(json.dumps({"event": event, "regions": sorted(found)}))
         elif found:
             names = ", ".join(sorted(found))
-            say(
+            print_line(
                 f"no service answers for {names}"
                 if event == "away"
                 else f"{names} has a service again"

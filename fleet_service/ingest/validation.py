@@ -200,7 +200,7 @@ def check_rows(
 
 
 ERASED: Final = Refusal(
-    "erased", BATCH, "time: its month, or its vehicle in it, was erased; delete it"
+    "erased", BATCH, "time: the data of this month or vehicle were erased; delete the batch"
 )
 TOO_LONG: Final = Refusal(
     "time", BATCH, "time: more than an hour between the batch's records; send one each second"

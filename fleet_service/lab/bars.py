@@ -49,8 +49,10 @@ BARS: Final[dict[str, MapBar]] = {
     "fusion.shared10.coverage90.n30": MapBar(0.85, "more", _SHARE),
     "fusion.moderate.coverage90.n30": MapBar(0.85, "more", _SHARE),
     "fusion.winter.coverage90.n10": MapBar(0.85, "more", _SHARE),
-    "fusion.reliability.ece": MapBar(0.045, "less", "P(slippery) given less true, worst fleet"),
-    "fusion.third_party.coverage90": MapBar(0.90, "more", "of cells, a fleet that is not ours"),
+    "fusion.reliability.ece": MapBar(
+        0.045, "less", "calibration error of P(slippery), worst fleet"
+    ),
+    "fusion.third_party.coverage90": MapBar(0.90, "more", "of cells, a fleet of another maker"),
     "fusion.third_party.false_grip": MapBar(0.03, "less", "of cells: truth below the interval"),
     "fusion.third_party.rmse": MapBar(0.05, "less", "all cells"),
     "fusion.third_party.missed_ice": MapBar(0.03, "less", "of icy cells: no alert"),
@@ -73,8 +75,10 @@ BARS: Final[dict[str, MapBar]] = {
         f"fusion.third_party.raise.never.e{e}": MapBar(0, "less", "cells without an alert")
         for e in EXCITED
     },
-    "fusion.cold.ice_passes.median": MapBar(2, "less", "passes, a service that knows nobody"),
-    "fusion.cold.ice_passes.p90": MapBar(4, "less", "passes, a service that knows nobody"),
+    "fusion.cold.ice_passes.median": MapBar(
+        2, "less", "passes, a service that knows no vehicle yet"
+    ),
+    "fusion.cold.ice_passes.p90": MapBar(4, "less", "passes, a service that knows no vehicle yet"),
     "fusion.value.known.r20": MapBar(
         0.50, "more", "of road-hours: 90 % interval below .3, 20 cars an hour"
     ),
@@ -85,9 +89,9 @@ BARS: Final[dict[str, MapBar]] = {
         0.05, "less", "of cells with grip on gentle roads: P(slippery) > .5"
     ),
     "fusion.same_manoeuvre.false_alerts": MapBar(1, "less", "of 20 fleets on a wet curve"),
-    "fusion.bounds.lower_excess": MapBar(0.05, "less", "lower end over what was used"),
+    "fusion.bounds.lower_excess": MapBar(0.05, "less", "lower end above the grip used"),
     "fusion.backlog.fused": MapBar(0.95, "more", "of an hour's rows"),
-    "fusion.gentle_after_dry.safe_excess": MapBar(0, "less", "m/s^2 over the truth's"),
+    "fusion.gentle_after_dry.safe_excess": MapBar(0, "less", "m/s^2 above the true limit"),
     "fusion.ice_onset.passes.median": MapBar(2, "less", "excited passes"),
     "fusion.ice_onset.passes.p95": MapBar(4, "less", "excited passes"),
     "fusion.ice_end.passes.median": MapBar(8, "less", "excited passes"),

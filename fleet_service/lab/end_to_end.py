@@ -77,7 +77,9 @@ def drive_command(vehicles: int, seconds: float, world: World) -> Drive:
         done = subprocess.run([sys.executable, "-m", "deploy.end_to_end", *options], check=False)
         if done.returncode:
             raise InputError(
-                "end-to-end", "the simulated vehicles failed", "see above, or --skip-end-to-end"
+                "end-to-end",
+                "the simulated vehicles failed",
+                "see the output above, or use --skip-end-to-end",
             )
 
     return run_drive

@@ -59,8 +59,8 @@ def _draw_reliability(axes: Any, values: Mapping[str, float]) -> None:  # noqa: 
     axes.plot(*_values_below(values, "fusion.clean.reliability."), marker="o", markersize=3)
     axes.set(
         title="Reliability, honest fleet",
-        xlabel="said: P(μ ≤ x)",
-        ylabel="happened: share of truths ≤ x",
+        xlabel="stated: P(μ ≤ x)",
+        ylabel="observed: share of true μ ≤ x",
     )
 
 
@@ -73,8 +73,8 @@ def _draw_rmse(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
     )
     axes.axhline(0.05, color="0.7", linewidth=1)
     axes.set(
-        title="Error against excited vehicles",
-        xlabel="excited vehicles of the cell",
+        title="Error by number of excited vehicles",
+        xlabel="vehicles that used grip in the cell",
         ylabel="RMSE of the median",
         xscale="log",
         ylim=(0, None),
@@ -83,8 +83,8 @@ def _draw_rmse(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
 
 def _draw_delay(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
     for name, label in (
-        ("ice_onset", "ice comes: P(μ < .4) > .9"),
-        ("ice_end", "ice goes: alert cleared"),
+        ("ice_onset", "ice appears: P(μ < .4) > .9"),
+        ("ice_end", "ice ends: alert cleared"),
     ):
         axes.plot(
             *_values_below(values, f"fusion.{name}.share_after."),
@@ -118,8 +118,8 @@ def _draw_misbehaving(axes: Any, values: Mapping[str, float]) -> None:  # noqa: 
             linestyle=style.dash,
         )
     axes.set(
-        title="Error against misbehaving vehicles",
-        xlabel="% that always claim .25, sure",
+        title="Error by share of misbehaving vehicles",
+        xlabel="% of vehicles that always claim μ = .25 with high confidence",
         ylabel="RMSE of the median",
         ylim=(0, None),
     )

@@ -44,8 +44,8 @@ LOG_S = 60.0
 
 
 def agent() -> list[Figure]:
-    """The edge agent's processes: start, a vehicle's share of a core, vehicles on a core, replay
-    with two jobs.
+    """Measure the edge agent's processes: start, a vehicle's share of a core, vehicles per core,
+    and replay with two jobs.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -73,7 +73,7 @@ def simulate_drive(folder: Path, name: str, seed: int, seconds: float) -> tuple[
 
 
 def measure_start(folder: Path) -> list[Figure]:
-    """Help, and a new process's first estimate, compiled code in the cache."""
+    """Measure `--help` and the first estimate of a new process whose compiled code is in the cache."""
     files = [str(path) for path in simulate_drive(folder, "short", 0, 2.0)]
 
     def run_process(*words: str) -> None:
@@ -91,7 +91,7 @@ def measure_start(folder: Path) -> list[Figure]:
 
 
 def measure_usage(folder: Path, endpoint: str, *words: str) -> tuple[float, float]:
-    """CPU [s] and resident memory [MB] of a command of the edge agent.
+    """Return processor time [s] and resident memory [MB] of a command of the edge agent.
 
     Raises:
         ArithmeticError: it left something unacknowledged, so that its figures would flatter.
@@ -135,8 +135,8 @@ def watch_memory(pid: int) -> tuple[float, resource.struct_rusage]:
 
 
 def measure_live(folder: Path, endpoint: str) -> list[Figure]:
-    """One vehicle at 100 Hz: CPU between a short and a long run, so that the start does not
-    count.
+    """Measure the processor time of one vehicle at 100 Hz. The difference of a long and a short run
+    leaves out the start.
     """
     log, vehicle = simulate_drive(folder, "live", 0, START_S + LIVE_S + 1.0)
     words = (
@@ -178,8 +178,8 @@ def measure_fleet(folder: Path, endpoint: str) -> list[Figure]:
 
 
 def measure_replay(folder: Path) -> list[Figure]:
-    """Share of the kernel's speed times two cores that a backfill of many logs reaches, Parquet
-    included.
+    """Return the throughput of a backfill of many logs, Parquet included, divided by twice that of
+    the kernel on one core.
     """
     logs = [simulate_drive(folder, f"log-{seed:02d}", seed, LOG_S) for seed in range(LOGS)]
     log = read_log(logs[0][0])

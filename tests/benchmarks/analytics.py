@@ -57,7 +57,7 @@ HALF = START_NS + DAY_S * 10**9
 
 
 def print_progress(line: str) -> None:
-    """Progress."""
+    """Print progress."""
     print(f"  {line}", flush=True)
 
 
@@ -92,7 +92,7 @@ def write_stations(folder: Path) -> Path:
 
 
 def measure_archive(root: Path, rows: int) -> list[Figure]:
-    """Rows per second of compaction, bytes of an observation."""
+    """Return rows per second of compaction, and bytes per observation."""
     print_progress(f"writing {rows:,} observations")
     synthetic.write_archive(root, SyntheticFleet(rows, DAYS))
     inbox = size_of(segments.list_segments(root, Kind.OBSERVATION))
@@ -115,12 +115,14 @@ def measure_archive(root: Path, rows: int) -> list[Figure]:
 
 
 def _ask_question(name: str, root: Path, options: Options) -> pa.Table:
-    """A question to an engine of its own."""
+    """Ask a question with a new engine."""
     return QUESTIONS[name].ask(QueryEngine("duckdb", root, PART), options)
 
 
 def measure_questions(root: Path, readings: Path) -> list[Figure]:
-    """Seconds of four questions on all rows; milliseconds of the history of one cell."""
+    """Return the seconds of four questions on all rows, and the milliseconds of the history of one
+    cell.
+    """
     found = []
     for name in TIMED:
         options = Options(stations=readings, report=lambda _: None)
@@ -147,7 +149,7 @@ def measure_questions(root: Path, readings: Path) -> list[Figure]:
 
 
 def write_small_archive(root: Path) -> dict[int, pa.Table]:
-    """A small archive with snapshots; returns them by time."""
+    """Return a small archive's snapshots by time."""
     synthetic.write_archive(root, SMALL, 4000)
     compact(root)
     rollup.complete_parts(root)
@@ -164,8 +166,8 @@ def write_small_archive(root: Path) -> dict[int, pa.Table]:
 
 
 def measure_agreement(root: Path, readings: Path) -> list[Figure]:
-    """Files that a validator refuses, readers that fail, questions that engines answer
-    differently.
+    """Count files that a validator refuses, readers that fail, and questions that two engines
+    answer differently.
     """
     invalid = sum(bool(_find_refusals(path)) for path in _geo_files(root))
     expected = sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["seq"]))
@@ -236,7 +238,7 @@ def _count_differences(root: Path, readings: Path) -> int:
 
 @contextmanager
 def open_folder() -> Iterator[Path]:
-    """An empty folder for the archives; they are gone afterwards, the figures stay."""
+    """Yield an empty folder for the archives. It is removed afterwards; the figures stay."""
     FOLDER.mkdir(exist_ok=True)
     work = FOLDER / "work"
     shutil.rmtree(work, ignore_errors=True)

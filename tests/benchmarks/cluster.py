@@ -44,7 +44,9 @@ def delays_s(folder: Path, archive: dict[str, Any]) -> list[float]:
 
 
 def cluster() -> list[Figure]:
-    """Acknowledgements with a copy of the archive in a bucket, over those without."""
+    """Compare the acknowledgement times of a service with a bucket copy with those of a service
+    without.
+    """
     alone: list[float] = []
     both: list[float] = []
     with ExitStack() as stack:

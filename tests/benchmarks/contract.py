@@ -42,7 +42,7 @@ def contract() -> list[Figure]:
 
 
 def parquet_bytes() -> list[Figure]:
-    """Bytes per observation of an archive, as its service writes it and compacted."""
+    """Return bytes per observation of an archive, as its service writes it and after compaction."""
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
         synthetic.write_archive(root, WORLD)
@@ -58,5 +58,5 @@ def parquet_bytes() -> list[Figure]:
 
 
 def size_of(paths: Iterable[Path]) -> int:
-    """Bytes of files."""
+    """Return the size of files in bytes."""
     return sum(path.stat().st_size for path in paths)

@@ -1,4 +1,4 @@
-"""Observations that look like a fleet's, for benchmarks of the wire, the fusion and the archive."""
+"""Synthetic observations for benchmarks of the wire format, the fusion and the archive."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ resident()
 def make_visits(
     rng: np.random.Generator, rows: int, cells: int, begin_s: float, seconds: float
 ) -> Observations:
-    """Visits to cells of a square, anywhere in `seconds`, in order of time."""
+    """Return visits to the cells of a square, at random places within `seconds`, in order of time."""
     side = int(np.ceil(np.sqrt(cells)))
     x, y = grid.deinterleave(grid.cell_of(57.7, 11.97))
     k = rng.integers(0, cells, rows)
@@ -72,7 +72,9 @@ def make_visits(
 
 
 def fill_fusion(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.random.Generator]:
-    """A fusion that heard so many visits of each cell, and the generator to go on with."""
+    """Return a fusion that has received this many visits per cell, and the generator for further
+    visits.
+    """
     rng = np.random.default_rng(SEED)
     fusion = Fusion(120.0)
     parts = max(cells * per_cell // 100_000, 1)
@@ -87,14 +89,14 @@ def fill_fusion(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.r
 
 
 def split_batches(o: Observations) -> Iterator[Observations]:
-    """Turns of the service."""
+    """Run turns of the service."""
     for rows in np.array_split(np.arange(len(o.time)), max(len(o.time) // BATCH, 1)):
         yield o.take(rows)
 
 
 def per_observation_s(cells: int, per_s: int = 5_000) -> float:
-    """Processor seconds per observation in a fusion of so many cells: median over ROUNDS
-    minutes.
+    """Return the processor time per observation [s] of a fusion with this many cells: median over
+    ROUNDS minutes.
     """
     fusion, rng = fill_fusion(cells, 1, 600.0)
     spent = []
@@ -110,8 +112,8 @@ def per_observation_s(cells: int, per_s: int = 5_000) -> float:
 
 
 def table_vs_dict() -> float:
-    """Time of a look-up in 10⁶ keys by numba's typed dictionary over that by the store's table,
-    in turns of BATCH.
+    """Return the time of a look-up among 10⁶ keys in numba's typed dictionary, divided by that in
+    the store's table, in turns of BATCH.
     """
     keys = np.random.default_rng(SEED).permutation(CELLS) * grid.SECTORS
     turns = np.random.default_rng(SEED + 1).choice(keys, (100, BATCH))
@@ -162,8 +164,8 @@ def resident() -> None:
 
 
 def fusion() -> list[Figure]:
-    """Observations per second of the fusion alone into 10⁶ cells, what more cells do to it, and
-    their memory.
+    """Measure observations per second of the fusion alone into 10⁶ cells, the effect of more cells,
+    and memory.
     """
     few = per_observation_s(10_000)
     many = per_observation_s(CELLS)

@@ -39,7 +39,7 @@ SECOND: Final = 10**9
 
 
 def growth() -> list[Figure]:
-    """Cost of a second against the observations in it, 10^3 to 10^5."""
+    """Measure the cost of a second of the stream for 10^3 to 10^5 observations in it."""
     cost = {rate: second_s(rate, seconds) for rate, seconds in RATES.items()}
     slope = float(np.polyfit(np.log(list(cost)), np.log(list(cost.values())), 1)[0])
     told = ", ".join(f"{1e6 * spent / rate:.1f} us at {rate}/s" for rate, spent in cost.items())
@@ -51,8 +51,8 @@ def growth() -> list[Figure]:
 
 
 def second_s(rate: int, seconds: int) -> float:
-    """Processor time [s] of a second of the stream, after a warm-up; half way an epoch ends and
-    is settled.
+    """Return the processor time [s] of a second of the stream after a warm-up. An epoch ends half
+    way.
     """
     vehicles = rate // ROWS
     spent = 0.0

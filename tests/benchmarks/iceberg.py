@@ -23,7 +23,7 @@ SEEDS: Final = (0, 10, 20, 30)
 
 
 def table_of(uri: str, kind: Kind) -> Table:
-    """The table of a kind, as a reader opens it."""
+    """Open the table of a kind as a reader does."""
     from pyiceberg.catalog import load_catalog
 
     return load_catalog("gripmap", type="sql", uri=uri).load_table(
@@ -32,8 +32,8 @@ def table_of(uri: str, kind: Kind) -> Table:
 
 
 def rows_different(root: Path, uri: str) -> int:
-    """Rows, with all their columns, that are in the compacted files or in the tables and not in
-    both as often.
+    """Count rows, with all columns, that occur in the compacted files and in the tables a different
+    number of times.
     """
     different = 0
     for kind in Kind:
@@ -55,8 +55,8 @@ def _count_rows(table: pa.Table) -> Counter[str]:
 
 
 def count_different_rows(folder: Path) -> float:
-    """Rows that differ over four rounds of compaction and registration, and after a day has gone
-    by retention.
+    """Count differing rows over four rounds of compaction and registration, and after retention has
+    removed a day.
     """
     root = folder / "archive"
     uri = f"sqlite:///{folder}/tables.db"

@@ -64,8 +64,8 @@ def ingest() -> list[Figure]:
 
 
 def measure_rates(records: int) -> tuple[tuple[float, float], float, float]:
-    """Observations per second and per CPU second; per CPU second of decoding alone, the module's
-    and ours.
+    """Return observations per second and per processor second; for decoding alone also with the
+    generated module and with our decoder. Medians after a warm-up.
 
     Medians after a warm-up.
     """
@@ -98,7 +98,7 @@ def turn_of(sent: list[Message]) -> int:
 
 
 def _decode_messages(sent: list[Message]) -> list[NDArray[Any]]:
-    """The columns of messages, by the generated module."""
+    """Return the columns of messages, decoded by the generated module."""
     read = [MESSAGE.FromString(message.payload) for message in sent]
     out: list[NDArray[Any]] = []
     for name, dtype in wire.column_types(Kind.OBSERVATION).items():
@@ -113,7 +113,8 @@ def _decode_messages(sent: list[Message]) -> list[NDArray[Any]]:
 def make_messages(
     count: int, records: int, now: int, vehicles: int = VEHICLES, begin: int = 0, east: int = 0
 ) -> list[Message]:
-    """So many messages of visits that ended `now` [ns], in one region, or one further `east`.
+    """Return messages of visits that ended `now` [ns], in one region or the next one `east`.
+    `begin` messages were made before, and sequence numbers continue.
 
     `begin` messages were made before: vehicles and their sequence numbers go on.
     """

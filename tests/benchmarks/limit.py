@@ -36,7 +36,7 @@ VECTORS = ("-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd", "-lmvec")
 
 @cache
 def compile_library(source: str, *options: str) -> ctypes.CDLL:
-    """A kernel, by gcc -O3 -march=native and `options`.
+    """Compile a kernel with gcc -O3 -march=native and `options`.
 
     Raises:
         OSError, subprocess.CalledProcessError: there is no gcc, or it refuses.
@@ -57,7 +57,7 @@ def compile_library(source: str, *options: str) -> ctypes.CDLL:
 
 
 def setting_row(memberships: Memberships) -> FloatArray:
-    """The kernels' Setting."""
+    """Structure Setting of the kernels."""
     setting = Setting()
     return np.array(
         [
@@ -95,12 +95,12 @@ def first_memory(first: FloatArray, speed: float) -> FloatArray:
 
 
 def pointer_to(array: FloatArray) -> ctypes.c_void_p:
-    """Where an array lies."""
+    """Return the address of an array's data."""
     return ctypes.c_void_p(array.ctypes.data)
 
 
 class Limit:
-    """N filters in C, one struct each, on as many threads as OpenMP has."""
+    """N filters in C, one struct each, on as many threads as OpenMP uses."""
 
     def __init__(
         self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
@@ -114,7 +114,9 @@ class Limit:
         self._memory = first_memory(first, speed)
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
-        """Means (T, N, 6) after each of the readings (T, N, 11), `gone` [s] apart."""
+        """Return the means (T, N, 6) after each of the readings (T, N, 11), which are `gone` [s]
+        apart.
+        """
         samples, vehicles, _ = readings.shape
         out = np.empty((samples, vehicles, STATES))
         self._library.drive(
@@ -131,7 +133,7 @@ class Limit:
 
 
 class VectorLimit:
-    """N filters in C, side by side in vectors, on one thread; N is a multiple of the lanes."""
+    """N filters in C, interleaved in vectors, on one thread. N must be a multiple of the lanes."""
 
     def __init__(
         self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
@@ -146,7 +148,7 @@ class VectorLimit:
         )
 
     def side_by_side(self, values: FloatArray) -> FloatArray:
-        """(..., N, numbers) as (..., N/lanes, numbers, lanes), aligned to a vector."""
+        """Convert (..., N, numbers) to (..., N/lanes, numbers, lanes), aligned to a vector."""
         *rest, vehicles, numbers = values.shape
         turned = values.reshape(*rest, vehicles // self._lanes, self._lanes, numbers).swapaxes(
             -1, -2
@@ -175,7 +177,7 @@ class VectorLimit:
 
 
 def allocate_aligned(*shape: int, to: int = 64) -> FloatArray:
-    """An empty array whose memory begins at a multiple of `to` bytes."""
+    """Return an empty array whose data is aligned to `to` bytes."""
     count = math.prod(shape)
     raw = np.empty(8 * count + to, np.uint8)
     begin = -raw.ctypes.data % to

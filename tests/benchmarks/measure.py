@@ -11,7 +11,7 @@ SEED = 0
 
 
 def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
-    """Median duration [s] after one call that warms up."""
+    """Return the median duration [s] after one call as a warm-up."""
     work()
     spent = []
     for _ in range(rounds):
@@ -24,8 +24,8 @@ def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
 def time_in_turn(
     ours: Callable[[], object], other: Callable[[], object], rounds: int = ROUNDS
 ) -> tuple[float, float]:
-    """Median durations [s] of two works in turn, after a warm-up of each, so that both see the
-    same machine.
+    """Return the median durations [s] of two functions that are called in turn, each after a
+    warm-up.
     """
     ours(), other()
     spent: tuple[list[float], list[float]] = ([], [])

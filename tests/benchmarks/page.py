@@ -120,7 +120,7 @@ map.once("idle", () => { globalThis.shown = performance.now(); });
 
 @contextmanager
 def open_window(address: str) -> Iterator[Opened]:
-    """An address in a large window, that notes when all was painted."""
+    """Open an address in a large window and record when painting was complete."""
     with browser.open_page("about:blank", unbound=True) as seen:
         size: Any = VIEWPORT
         seen.page.set_viewport_size(size)
@@ -172,9 +172,7 @@ def measure_drawing(on: Stage) -> dict[str, float]:
 
 @contextmanager
 def serve_maplibre(on: Stage) -> Iterator[str | None]:
-    """The address of MapLibre with the town as GeoJSON, from a server of this process; None
-    where npm has none.
-    """
+    """Yield the address of a MapLibre page with the town as GeoJSON; None if npm is not installed."""
     files = [npm.file_of("maplibre-gl", path) for path in npm.PACKAGES["maplibre-gl"].files]
     if not all(files):
         print("  no MapLibre: npm did not fetch it", file=sys.stderr)
@@ -202,12 +200,12 @@ def serve_maplibre(on: Stage) -> Iterator[str | None]:
 
 class _Quiet(http.server.SimpleHTTPRequestHandler):
     def log_message(self, *_: object) -> None:
-        """Say nothing."""
+        """Suppress the server's log."""
 
 
 def pushed_ms(on: Stage) -> float:
-    """95 % of the times from a put at the router to the painted cell, under CHANGED_HZ changed
-    cells a second.
+    """Return the 95 % quantile of the time from a put at the router to the painted cell, with
+    CHANGED_HZ changed cells a second.
     """
     with open_window(seen_town(on.address, on.town)) as seen:
         tiles = list(on.town.tiles)
@@ -250,15 +248,15 @@ def pushed_ms(on: Stage) -> float:
 
 
 def bytes_per_cell(on: Stage) -> float:
-    """Bytes of all blocks, uncompressed, over their cells."""
+    """Return the bytes of all blocks, uncompressed, per cell."""
     tiles = ",".join(map(str, on.town.tiles))
     with urllib.request.urlopen(f"{on.address}blocks?tiles={tiles}", timeout=30) as answer:
         return len(answer.read()) / CELLS
 
 
 async def _measure_pushes(on: Stage, count: int) -> float:
-    """95 % of the times [s] from a put to each of so many watchers; infinite where one heard
-    less than all.
+    """Return the 95 % quantile of the time [s] from a put to each watcher; infinite if a watcher
+    missed one.
     """
     host, _, port = on.address.removeprefix("http://").rstrip("/").partition(":")
     heard = [dict[int, float]() for _ in range(count)]
@@ -316,7 +314,9 @@ def count_watchers(on: Stage) -> float:
 
 
 def count_findings(on: Stage) -> float:
-    """Serious findings of axe-core in all panels; NaN where it is not there."""
+    """Return the number of serious findings of axe-core in all panels; NaN if axe-core is not
+    installed.
+    """
     with open_window(seen_town(on.address, on.town)) as seen:
         seen.page.evaluate(
             "([tile, local]) => gripmap.choose(tile, local)",
@@ -329,7 +329,9 @@ def count_findings(on: Stage) -> float:
 
 
 def colour_distance() -> float:
-    """The least between any two classes and the ground, of all kinds of sight (CIEDE2000)."""
+    """Return the smallest distance (CIEDE2000) between two classes or a class and the ground, over
+    all kinds of colour vision.
+    """
     pairs = [(a, b) for k, a in enumerate(ALL) for b in ALL[:k]]
     return min(
         colour_difference(to_lab(a, sight), to_lab(b, sight)) for sight in SIGHTS for a, b in pairs
@@ -337,7 +339,7 @@ def colour_distance() -> float:
 
 
 def measure_all() -> list[Figure]:
-    """All figures, in the order of their table."""
+    """Return all figures in the order of their table."""
     with open_stage(SEED) as on:
         found = _time_part("drawn", lambda: measure_drawing(on))
         found["push_p95_ms"] = _time_part("pushed", lambda: pushed_ms(on))

@@ -63,7 +63,7 @@ _COUNT: Final = (
 
 
 def list_records(document: bytes) -> list[ET.Element]:
-    """The records of a publication."""
+    """Return the records of a publication."""
     return list(ET.fromstring(document).iterfind(".//sit:situationRecord", _SPACES))
 
 
@@ -194,7 +194,7 @@ def measure_publication() -> dict[str, float]:
 
 
 def fetch_publication(address: str) -> bytes:
-    """The publication; an empty one while there is none."""
+    """Return the publication; an empty one if there is none yet."""
     try:
         with urllib.request.urlopen(f"{address}datex2/situation.xml", timeout=30) as answer:
             found: bytes = answer.read()
@@ -204,7 +204,7 @@ def fetch_publication(address: str) -> bytes:
 
 
 def count_features(address: str) -> int:
-    """Features that there are."""
+    """Return the number of features."""
     try:
         with urllib.request.urlopen(f"{address}collections/grip/items", timeout=30) as answer:
             return int(json.loads(answer.read())["numberReturned"])
@@ -213,7 +213,7 @@ def count_features(address: str) -> int:
 
 
 def cells_of(document: bytes) -> set[int]:
-    """Cells on which situations lie."""
+    """Return the number of cells that have a situation."""
     found = set[int]()
     for record in list_records(document):
         words = record.findtext(".//loc:posList", "", _SPACES).split()
@@ -226,7 +226,7 @@ def cells_of(document: bytes) -> set[int]:
 
 
 def measured_cells(table: pa.Table) -> set[int]:
-    """Cells of which the map has a value."""
+    """Return the number of cells for which the map has a value."""
     is_measured = np.array(table["basis"].to_pylist()) == "measured"
     return set(table["cell"].to_numpy()[is_measured].tolist())
 
@@ -256,7 +256,7 @@ def ogrinfo_opens(address: str) -> bool:
 
 
 def join_right() -> float:
-    """`roads.join_right` of this commit: measured by `make roads-bench` before, or now."""
+    """Return `roads.join_right` of this commit, from an earlier `make roads-bench` or measured now."""
     path = roads.FOLDER / "figures.json"
     rows = json.loads(path.read_text()) if path.exists() else [{}]
     if rows[0].get("commit") != figures.commit(Path(roads.__file__)):
@@ -270,7 +270,7 @@ def join_right() -> float:
 
 
 def measure_outside() -> list[Figure]:
-    """All figures of what leaves the house."""
+    """Return all figures of the interfaces for other systems."""
     invalid, unended = made_up(is_valid())
     try:
         found = measure_publication()

@@ -1,5 +1,5 @@
-"""A town of twenty thousand cells in front of the page: a router, who answers for it as a
-service does, the page.
+"""Test set-up for the page: a router, a substitute for the service with a town of twenty thousand
+cells, and the page.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ BOUND_SHARE: Final = 0.3
 
 
 class Town:
-    """Cells by tile; its changes are put as a service puts them."""
+    """Cells by tile. Changes are published as a service publishes them."""
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
@@ -50,9 +50,7 @@ class Town:
         self.marker = next(iter(self.tiles))
 
     def local_marker(self, tile: int) -> int:
-        """Place of a tile's marker, within it: the first cell, whose count of vehicles is a
-        put's number.
-        """
+        """Return the index of a tile's marker cell, whose vehicle count is the number of the put."""
         return int(self.tiles[tile]["cell"][0]) & 0x3FFF
 
     def _draw_columns(self, cells: IntArray) -> dict[str, Any]:
@@ -89,7 +87,7 @@ class Town:
         }
 
     def make_batch(self, tile: int) -> pa.RecordBatch:
-        """A tile in the schema of the map."""
+        """Return a tile in the schema of the map."""
         columns = ((self.tiles[tile][f.name], f.type) for f in tables.MAP_SCHEMA)
         arrays = [
             (c if isinstance(c, pa.Array) else pa.array(c)).cast(kind, safe=False)
@@ -108,7 +106,7 @@ class Town:
 
 
 class Stage(NamedTuple):
-    """The page's address, a session next to it, the town, the page's process."""
+    """Address of the page, a session, the town, and the process of the page."""
 
     address: str
     session: zenoh.Session
@@ -119,7 +117,7 @@ class Stage(NamedTuple):
 
 @contextmanager
 def open_stage(seed: int) -> Iterator[Stage]:
-    """Everything up; the page as its command, in a process of its own."""
+    """Yield the running set-up, with the page as its command in a process of its own."""
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     settings = ZenohSettings(connect=endpoints)
     town = Town(seed)
@@ -157,7 +155,7 @@ def tiles_of(address: str) -> int:
 
 
 def seen_town(address: str, town: Town) -> str:
-    """The address with the whole town in view, near enough for cells."""
+    """Return the address of the page with the whole town in view, zoomed in enough to show cells."""
     x, y = town.corner
     return f"{address}#x={x / 2**14:.8f}&y={y / 2**14:.8f}&zoom={ZOOM}"
 

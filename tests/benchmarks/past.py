@@ -33,8 +33,8 @@ QUERIES = 15
 
 
 def measure_past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
-    """Milliseconds of `at=` for a box of a thousand cells; largest change of a probability by a
-    restart.
+    """Return the milliseconds of a query with `at=` for a thousand cells, and the largest change of
+    a probability by a restart.
     """
     synthetic.write_archive(root, WORLD)
     compact(root)
@@ -77,7 +77,7 @@ def _find_largest_change(
 
 @contextmanager
 def _open_service(root: Path) -> Iterator[zenoh.Session]:
-    """A client of a running service on the archive."""
+    """Yield a client of a running service on the archive."""
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     settings = ZenohSettings(connect=endpoints)
     lines: list[str] = []
@@ -100,7 +100,9 @@ def _open_service(root: Path) -> Iterator[zenoh.Session]:
 
 
 def _time_answer(session: zenoh.Session, selector: str) -> tuple[float, list[pa.Table]]:
-    """Seconds of an answer, and its tiles; asks again while the past before is being put away."""
+    """Return the seconds of an answer and its tiles. Repeat the query while the previous past map
+    is still open.
+    """
     while True:
         began = time.perf_counter()
         replies = list(session.get(selector, timeout=120.0))
@@ -114,7 +116,7 @@ def _time_answer(session: zenoh.Session, selector: str) -> tuple[float, list[pa.
 
 
 def _time_queries(root: Path) -> tuple[list[float], int]:
-    """Seconds of each query, and cells of the answers."""
+    """Return the seconds of each query, and the number of cells in the answers."""
     rng = np.random.default_rng(0)
     step = 360.0 / (1 << grid.CELL_ZOOM)
     spent = []

@@ -32,7 +32,7 @@ class Problem(NamedTuple):
 
 
 class Peer(NamedTuple):
-    """A peer and how many times as fast the bank shall be."""
+    """A library's filter, and the required speed ratio of the bank to it."""
 
     drive: Callable[[Problem], object]
     bar: float

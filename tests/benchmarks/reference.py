@@ -1,6 +1,4 @@
-"""The same process and measurement as kernel.c in numpy, for the filters that people would take
-from a library.
-"""
+"""The process and measurement models of kernel.c in numpy, for filters of libraries."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def simulate_traffic(sumo: Sumo, seed: int) -> Traffic:
 
 
 def judge_join(network: RoadNetwork, traffic: Traffic, seed: int) -> dict[str, float]:
-    """Shares of fixes for which the join is right."""
+    """Return the shares of fixes for which the join is right."""
     rng = np.random.default_rng(seed)
     east = METRES_PER_DEGREE * np.cos(np.radians(traffic.latitude))
     error = rng.normal(0.0, NOISE_M, (2, len(east)))

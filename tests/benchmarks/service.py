@@ -131,7 +131,7 @@ def bare(endpoint: str, folder: str) -> None:
 
 @contextmanager
 def run_process(*words: str) -> Iterator[None]:
-    """A command that runs as long as the block."""
+    """Run a command for the duration of the block."""
     running = subprocess.Popen(
         [sys.executable, *words], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
     )
@@ -143,12 +143,12 @@ def run_process(*words: str) -> Iterator[None]:
 
 
 def fetch_reply(session: zenoh.Session, selector: str) -> bytes:
-    """The one reply to a query; empty without one."""
+    """Return the only reply to a query; empty if there is none."""
     return b"".join(reply.ok.payload.to_bytes() for reply in session.get(selector) if reply.ok)
 
 
 def poll_until(something: Callable[[], object]) -> None:
-    """Ask again until there is something."""
+    """Repeat a query until the answer is not empty."""
     deadline = time.monotonic() + 120.0
     while not something():
         if time.monotonic() > deadline:
@@ -198,8 +198,8 @@ def alert_delays_ms(session: zenoh.Session) -> list[float]:
 
 
 def ack_delays_s(session: zenoh.Session) -> list[float]:
-    """From a vehicle's publish to its acknowledgement, of batches at times that have nothing to do
-    with the service's.
+    """Return the time from a vehicle's publication to its acknowledgement, for batches sent at
+    random times.
 
     Raises:
         TimeoutError: one was not acknowledged.

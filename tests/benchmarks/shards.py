@@ -43,7 +43,7 @@ PATIENCE_S: Final = 120.0
 
 
 def shards() -> list[Figure]:
-    """A burst into one service, and into two that share its regions: engines alone, and whole
+    """Measure a burst into one service and into two that share its regions, with engines alone and
     over Zenoh.
     """
     sent = [_make_burst(k) for k in range(ROUNDS + 1)]
@@ -66,7 +66,9 @@ def shards() -> list[Figure]:
 
 
 def engines_s(bursts: Sequence[Sequence[Message]], processes: int) -> list[float]:
-    """From the word to the last acknowledgement, of every burst but the first."""
+    """Return the time from the start signal to the last acknowledgement of every burst except the
+    first.
+    """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         running = []
@@ -91,8 +93,8 @@ def engines_s(bursts: Sequence[Sequence[Message]], processes: int) -> list[float
 
 
 def _time_round(running: Sequence[subprocess.Popen[str]]) -> float:
-    """Tell all to go on, and wait until all have said that they did; the first round is their
-    start.
+    """Start a round in all processes, and wait until all have finished it. The first round is a
+    warm-up.
     """
     began = time.perf_counter()
     for process in running:
@@ -105,7 +107,7 @@ def _time_round(running: Sequence[subprocess.Popen[str]]) -> float:
 
 
 def engine(root: str) -> None:
-    """One engine, a burst at each line of standard input."""
+    """Run one engine that ingests a burst for each line of standard input."""
     bursts = [
         [Message(*fields) for fields in burst]
         for burst in pickle.loads((Path(root) / "sent").read_bytes())
@@ -122,7 +124,7 @@ def engine(root: str) -> None:
 
 
 def _make_burst(number: int) -> list[Message]:
-    """Messages of both regions in turn."""
+    """Return messages of both regions in alternation."""
     now = time.time_ns()
     west, east = (
         make_messages(BURST, ROWS, now, VEHICLES, number * BURST, side) for side in (0, 1)
@@ -131,12 +133,14 @@ def _make_burst(number: int) -> list[Message]:
 
 
 def list_regions(burst: Sequence[Message]) -> list[str]:
-    """The two region expressions of a burst."""
+    """Return the two region expressions of a burst."""
     return ["/".join(message.key.split("/")[3:6]) for message in burst[:2]]
 
 
 def services_s(bursts: Sequence[Sequence[Message]], services: int) -> list[float]:
-    """From the first put to the last acknowledgement, of every burst but the first."""
+    """Return the time from the first put to the last acknowledgement of every burst except the
+    first.
+    """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")

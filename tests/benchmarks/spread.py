@@ -55,8 +55,8 @@ def simulate_drives(folder: Path) -> list[Path]:
 
 
 def replay_difference(logs: Sequence[Path], folder: Path) -> float:
-    """Files of estimates that are not, byte for byte, those of this machine, though each task
-    was killed once.
+    """Count files of estimates that differ from those of this machine, although each task was
+    killed once.
     """
     here = folder / "here"
     there = folder / "there"
@@ -74,8 +74,8 @@ def replay_difference(logs: Sequence[Path], folder: Path) -> float:
 
 
 def rebuild_difference(folder: Path) -> float:
-    """The largest difference of a number of two rebuilt maps, one here and one on Spark with
-    each task killed once.
+    """Return the largest difference between a map rebuilt here and one rebuilt on Spark with each
+    task killed once.
     """
     archive, here, there, tries = (folder / name for name in ("archive", "here", "there", "tries"))
     fill(archive, WORLD)
@@ -98,8 +98,8 @@ def rebuild_difference(folder: Path) -> float:
 
 
 def replay_scaling(logs: Sequence[Path], folder: Path) -> float:
-    """Drives per second on two local cores over those on one: median of rounds in turn, with
-    workers that are warm.
+    """Return drives per second on two local cores divided by that on one: median of alternate
+    rounds with warm workers.
     """
     tasks = [
         Task(log, log.with_suffix(".json"), folder / f"{log.stem}-{copy}.parquet")

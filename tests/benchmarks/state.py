@@ -68,8 +68,8 @@ def state() -> list[Figure]:
 
 
 def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> tuple[float, float]:
-    """From the question to the checkpoint on disk, and the longest turn of the worker meanwhile
-    [s].
+    """Return the time from the request to the checkpoint on disk, and the worker's longest turn
+    meanwhile [s].
 
     All of `sent` is taken, half of it after the checkpoint.
     """
@@ -102,7 +102,7 @@ def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> t
 
 
 def restart_s(folder: Path, root: Path) -> float:
-    """From the start of the process until it says that it is ready."""
+    """Return the time from the start of the process until it reports that it is ready."""
     router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
     with router:
         config = folder / "service.json"

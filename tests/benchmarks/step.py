@@ -1,6 +1,4 @@
-"""A step of a six-state filter over four tyres against C, and against what people would write or
-take instead.
-"""
+"""One step of a six-state filter over four tyres, compared with C and with common libraries."""
 
 from __future__ import annotations
 
@@ -31,7 +29,7 @@ AGREE = 1e-6  # how far C and Python may be apart in v_x, v_y and yaw rate over 
 
 
 class Drive:
-    """A recorded manoeuvre, end to end over and over, as signals and as the C kernel's readings."""
+    """A recorded manoeuvre, repeated, as signals and as the C kernel's readings."""
 
     def __init__(self) -> None:
         log, self.vehicle = simulate_manoeuvre("double-lane-change", seed=SEED)
@@ -78,7 +76,7 @@ def make_limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> K
 
 
 def same_filter(drive: Drive) -> float:
-    """Speed at the first sample [m/s], after checking that C and Python do the same.
+    """Return the speed at the first sample [m/s] after a check that C and Python agree.
 
     Raises:
         ArithmeticError: they do not.
@@ -95,7 +93,7 @@ def same_filter(drive: Drive) -> float:
 
 
 def step() -> list[Figure]:
-    """One filter step: against C, against filter libraries, and the price of a call."""
+    """Compare one filter step with C and with filter libraries, and measure the cost of a call."""
     drive = Drive()
     speed = same_filter(drive)
     t, signals, readings = drive.repeat_samples(SAMPLES, 1)
@@ -127,9 +125,7 @@ def step() -> list[Figure]:
 
 
 def call_s(bank: EstimatorBank, t: FloatArray, signals: FloatArray) -> float:
-    """Seconds of a call with one sample, which is at hand; median over rounds of CALLS, of which
-    the first warms up.
-    """
+    """Return the seconds of a call with one sample: median over rounds of CALLS after a warm-up."""
     spent = []
     for begin in range(0, SAMPLES, CALLS):
         samples = [(t[k : k + 1], signals[k : k + 1]) for k in range(begin, begin + CALLS)]
@@ -141,8 +137,8 @@ def call_s(bank: EstimatorBank, t: FloatArray, signals: FloatArray) -> float:
 
 
 def bank() -> list[Figure]:
-    """Many vehicles on two threads, against C on as many, and what more of them do to the cost
-    of one.
+    """Compare many vehicles on two threads with C on as many threads, and measure the cost per
+    vehicle as their number grows.
     """
     drive = Drive()
     speed = same_filter(drive)

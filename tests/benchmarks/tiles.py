@@ -62,7 +62,7 @@ _ROWS = _ACROSS // ROW
 
 
 def make_visit(vehicle: int, turn: int) -> Batch:
-    """One vehicle's visit to the middle of one of its tiles."""
+    """Return a visit of a vehicle to the middle of one of its tiles."""
     first = grid.cell_of(LATITUDE, LONGITUDE, grid.REGION_ZOOM)
     x, y = (int(v) for v in grid.deinterleave(first))
     region, place = divmod(vehicle, _ROWS * _ACROSS)
@@ -87,7 +87,7 @@ def make_visit(vehicle: int, turn: int) -> Batch:
 
 
 class Acks:
-    """When each batch was put, and for how long it waited for its acknowledgement."""
+    """Record when each batch was put and how long it waited for its acknowledgement."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.put: dict[tuple[str, int], float] = {}
@@ -202,8 +202,8 @@ def _collect_counts(reader: subprocess.Popen[str], got: list[int]) -> None:
 
 
 def tiles() -> list[Figure]:
-    """1 500 visits/s over 8 000 tiles: acknowledgements, tiles put, and a small question behind
-    large ones.
+    """Measure acknowledgements, tiles put, and a small query behind large ones, with 1 500 visits/s
+    over 8 000 tiles.
     """
     puts: dict[str, int] = {}
 

@@ -69,13 +69,13 @@ def find_schema_errors(objects: list[Manifest]) -> list[str]:
 
 
 def of_kind(objects: list[Manifest], kind: str) -> list[Manifest]:
-    """Those of a kind."""
+    """Return the objects of a kind."""
     return [one for one in objects if one["kind"] == kind]
 
 
 @dataclass
 class Pod:
-    """One pod of a StatefulSet; `root` is where its mounts lie."""
+    """One pod of a StatefulSet; its mounts are below `root`."""
 
     name: str
     template: Manifest
@@ -87,7 +87,7 @@ class Pod:
 
     @property
     def containers(self) -> list[Manifest]:
-        """Those that go on."""
+        """Return the containers that keep running."""
         return list(self.template["spec"]["containers"])
 
     @property
@@ -120,7 +120,7 @@ def make_pods(objects: list[Manifest], root: Path) -> list[Pod]:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports that nobody has now."""
+    """Return unused ports."""
     with ExitStack() as stack:
         sockets = [
             stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)
@@ -161,7 +161,7 @@ class Cluster:
             assert fleet_service(["certs", *words]) == 0
 
     def _localize_addresses(self, name: str, text: str) -> str:
-        """A file's text with the addresses of this machine."""
+        """Return a file's text with the addresses of this machine."""
         for pod in self.pods:
             for number, port in pod.ports.items():
                 text = text.replace(f"{pod.name}.routers:{number}", f"127.0.0.1:{port}")
@@ -184,7 +184,7 @@ class Cluster:
         return text.replace('"metrics_host": "0.0.0.0"', '"metrics_host": "127.0.0.1"')
 
     def _localize_paths(self, pod: Pod, container: Manifest, text: str) -> str:
-        """A text with the paths of a container's mounts below the pod's folder."""
+        """Return a text with container mounts replaced by paths below the pod's folder."""
         for mount in sorted(
             container.get("volumeMounts", []), key=lambda one: -len(one["mountPath"])
         ):
@@ -243,8 +243,8 @@ class Cluster:
 
     @contextmanager
     def run_pods(self, bucket: BucketServer | None = None) -> Iterator[Cluster]:
-        """Every pod started; each probe answers before the block begins, and each leaves well
-        after it.
+        """Start every pod for the block. Each probe succeeds before the block begins, and each pod
+        ends cleanly after it.
         """
         kept = cache_root()
         image = self.root / "image-cache"
@@ -314,8 +314,8 @@ class Cluster:
                 return
 
     def fetch_page(self, pod: Pod, path: str) -> str:
-        """A page of a pod's metrics server; empty while a standby that takes over closes its own
-        for the service's.
+        """Return a page of a pod's metrics server; empty while a standby that takes over replaces
+        its server by that of the service.
         """
         (container,) = pod.containers
         address = f"http://127.0.0.1:{pod.port_of(container, 'metrics')}{path}"
@@ -367,7 +367,7 @@ def open_cluster(overlay: str, root: Path) -> Iterator[Cluster]:
 
 
 def main() -> int:
-    """Validate and start every overlay; 1 where a bar does not hold."""
+    """Validate and start every overlay. Return 1 if a bar does not hold."""
     wrong = list[str]()
     failed = list[str]()
     objects = 0

@@ -1,4 +1,4 @@
-"""The demo's figures are correct on small cases."""
+"""Figures of the demo on small cases."""
 
 from __future__ import annotations
 

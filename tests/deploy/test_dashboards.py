@@ -1,5 +1,5 @@
-"""The board and the rules ask for metrics that a service or an agent really shows, and the
-handbook knows each rule.
+"""The dashboard and the alert rules use only metrics that a service or an agent exports, and the
+handbook explains each rule.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ EXPRESSIONS = [rule["expr"] for rule in RULES] + [
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
-    """All metrics of a service and of an agent."""
+    """Return all metrics of a service and of an agent."""
     return reference_pages.all_metrics(tmp_path_factory.mktemp("archive"))
 
 

@@ -40,7 +40,9 @@ def test_the_examples_of_the_reference_run_in_their_order(
 
 
 def test_every_page_stands_in_the_contents_of_the_site() -> None:
-    """One that does not is a warning of Sphinx, and a warning is an error of `make docs`."""
+    """A page that is not in the table of contents is a warning of Sphinx, and `make docs` treats
+    warnings as errors.
+    """
     tables = re.findall(r"```\{toctree\}\n(.*?)```", (DOCS / "index.md").read_text(), re.DOTALL)
     entries = [
         line for table in tables for line in table.splitlines() if line and not line.startswith(":")

@@ -57,7 +57,7 @@ def test_an_estimator_of_one_s_own_says_at_least_what_was_used(capsys: Output) -
 
 @contextmanager
 def serve_ice(folder: Path) -> Iterator[str]:
-    """Endpoint of a router whose service knows of the ice that three vehicles found."""
+    """Yield the endpoint of a router whose service knows of ice that three vehicles reported."""
     session, endpoints = open_router(listen="tcp/127.0.0.1:0")
     settings = ZenohSettings(connect=endpoints)
     with session, running(settings, folder):
@@ -78,7 +78,7 @@ def test_the_map_is_asked_and_a_tile_decoded(tmp_path: Path, capsys: Output) -> 
 
 
 def test_a_car_is_warned_of_what_three_others_found(tmp_path: Path, capsys: Output) -> None:
-    """Router, service, reports, alert and a car that comes along: all of it real."""
+    """Run router, service, reports, alert and an approaching car, all of them real."""
     before = LONGITUDE - 60.0 / 111e3 / math.cos(math.radians(LATITUDE))
     with serve_ice(tmp_path) as endpoint:
         warned = be_warned.main(endpoint, LATITUDE, before)

@@ -210,7 +210,7 @@ def read_settings(running: Cluster, pod: str) -> str:
 
 
 def open_reader(running: Cluster) -> zenoh.Session:
-    """A reader's session at the routers, with its own certificate where they ask for one."""
+    """Yield a reader's session at the routers, with its own certificate if they require one."""
     name = next(pod.name for pod in running.pods if "router" not in pod.name)
     shipped = ServiceConfig.model_validate_json(read_settings(running, name)).zenoh
     config = {"connect": shipped.connect}

@@ -1,4 +1,4 @@
-"""Fixtures of the rim's tests."""
+"""Fixtures for tests with a router."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.edge_agent.service import Router, Service
 
 @pytest.fixture
 def router() -> Iterator[Router]:
-    """A router of this test."""
+    """Yield a router for this test."""
     router = Router()
     yield router
     router.stop()
@@ -19,6 +19,6 @@ def router() -> Iterator[Router]:
 
 @pytest.fixture
 def service(router: Router) -> Iterator[Service]:
-    """A service that acknowledges."""
+    """Yield a service that acknowledges."""
     with Service(router) as service:
         yield service

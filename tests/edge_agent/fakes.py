@@ -1,4 +1,4 @@
-"""Drives over the ground, made-up estimates and logs for tests of input and output; no filter runs."""
+"""Synthetic positions, estimates and logs for tests of input and output that run no filter."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ START_NS = 1_767_225_600_000_000_000  # 2026-01-01
 
 @dataclass(frozen=True)
 class MadeUp:
-    """Estimates that follow from nothing."""
+    """Arbitrary estimates that depend on no signal."""
 
     vx: FloatArray
     vy: FloatArray
@@ -48,7 +48,7 @@ class MadeUp:
     jumps: NDArray[np.bool_] | None = None
 
     def part(self, rows: slice) -> MadeUp:
-        """The same for some samples."""
+        """Return the estimates of some samples."""
         cut = {f.name: v[rows] for f in fields(self) if (v := getattr(self, f.name)) is not None}
         return replace(self, **cut)
 
@@ -56,7 +56,9 @@ class MadeUp:
 def estimates(
     samples: int, vehicles: int, seed: int = 0, mu: float | None = None, used: float = 0.1
 ) -> MadeUp:
-    """Random, or of one mu with a narrow interval; evidence everywhere."""
+    """Return random estimates, or estimates of one mu with a narrow interval; every sample has
+    evidence.
+    """
     rng = np.random.default_rng(seed)
     shape = (samples, vehicles)
     middle = rng.uniform(0.1, 1.0, shape) if mu is None else np.full(shape, mu)
@@ -111,11 +113,11 @@ class Watch:
 
     @staticmethod
     def of(vehicles: int, config: AgentConfig | None = None) -> Watch:
-        """Nothing seen yet."""
+        """Return the state before the first sample."""
         return Watch(new_tracks(vehicles), OpenVisits.before_any(vehicles), config or AgentConfig())
 
     def step(self, block: Block, output: MadeUp) -> tuple[Located, RecordBlock, RecordBlock]:
-        """One block."""
+        """Return estimates for one block."""
         self.tracks, located = locate_vehicles(self.tracks, block.t, block.signals)
         reported = cast("Estimates", output)  # which has more, of what nobody reads here
         self.open, observations, states = build_records(
@@ -125,7 +127,7 @@ class Watch:
 
 
 def part(block: Block, rows: slice) -> Block:
-    """Some samples of a block."""
+    """Return some samples of a block."""
     return Block(block.t[rows], block.time[rows], block.signals[rows])
 
 

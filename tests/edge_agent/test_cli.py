@@ -1,4 +1,4 @@
-"""The command line: files written, messages published, and one line per error."""
+"""Command line: written files, published messages, and one line per error."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ IMPATIENT = (
 def test_replay_with_a_hanging_session_keeps_its_estimates(
     drive: Path, tmp_path: Path, well: bool
 ) -> None:
-    """A frozen router takes the connection and never answers."""
+    """A frozen router accepts the connection and never answers."""
     router = Part(
         "router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], tmp_path
     )
@@ -514,7 +514,7 @@ def test_help_imports_nothing_heavy() -> None:
 
 
 def test_estimates_of_a_split_or_odd_log_stay_finite(drive: Path, tmp_path: Path) -> None:
-    """Torque, rear steering and half of the wheel speeds are gone."""
+    """Remove torque, rear steering and half of the wheel speeds."""
     log = pq.read_table(drive / "log.parquet")
     gone = [n for n in log.column_names if n.startswith(("torque", "delta_r", "true"))]
     holes = pa.array(

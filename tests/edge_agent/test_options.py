@@ -230,7 +230,7 @@ WATCHED = {"metrics_port", "metrics_host", "log"}  # shown by tests/schemas/test
 
 
 def options(command: str) -> set[str]:
-    """Names of the options that a command declares."""
+    """Return the names of the options that a command declares."""
     parser = argparse.ArgumentParser(add_help=False)
     importlib.import_module(next(c.module for c in COMMANDS if c.name == command)).add_arguments(
         parser

@@ -1,1 +1,1 @@
-"""Fault campaigns: what `make faults` runs. See `frame.py` for how one is added."""
+"""Fault campaigns of `make faults`; `frame.py` explains how to add one."""

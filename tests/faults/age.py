@@ -44,8 +44,9 @@ NEAR: Final = f"{LONGITUDE},{LATITUDE + 0.011},{LONGITUDE + 0.01},{LATITUDE + 0.
 
 
 def run(site: Site) -> list[Figure]:
-    """Twenty million observations and twice as many states, and a tenth and a third of them; in a
-    quick run, eighty thousand."""
+    """Twenty million observations and forty million states. In a quick run: eighty thousand
+    observations.
+    """
     millions = site.choose_amount(2000, 8) / 100
     shares = (0.1,) if site.quick else (0.1, 0.3)
     smaller = [_measure_smaller(site, millions * share) for share in shares]
@@ -126,8 +127,8 @@ def _ensure_archive(site: Site, root: Path, observations: int) -> Path:
 
 
 def _last_day(root: Path, to: Path, old: int) -> Path:
-    """An archive of the same files: of the last day, and, `old` times MAP_DAYS before it, of the
-    others if not 0.
+    """Yield an archive that links to the same files: those of the last day and, if `old` is not 0,
+    the others shifted into the past by `old` times MAP_DAYS.
     """
     shutil.copytree(root / "keys", to / "keys") if (root / "keys").exists() else None
     days = sorted({folder.name for folder in root.glob("observations/date=*")})
@@ -170,7 +171,7 @@ def _write_states(root: Path, rows: int) -> None:
 
 
 def _encode_past_query(root: Path) -> bytes:
-    """The question about the past, which the service would let through."""
+    """Return a query of the past that the service would accept."""
     question = PastQuery(query.parse({"bbox": NEAR}), START_NS + (DAYS - 1) * DAY_NS, 120.0, None)
     assert 0 < rows_near(root, question.at, box_of(question), LOOKED_ROWS) <= LOOKED_ROWS
     return encode_question(question)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def main() -> None:
-    """Do the work, and print its cost."""
+    """Run the chosen operation, and print its time and memory."""
     what = sys.argv[1]
     root = Path(sys.argv[2])
     began = time.perf_counter()
@@ -52,7 +52,9 @@ def _start_engine(root: Path, and_checkpoint: bool) -> dict[str, float]:
 
 
 def _most_mb() -> float:
-    """The most memory that this process had; what `getrusage` says holds its parent's too."""
+    """Return the peak memory of this process. `getrusage` is not used because its value includes
+    the parent's.
+    """
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024
 

@@ -38,7 +38,7 @@ Place = tuple[int, int]  # cell and sector
 
 
 def run(site: Site) -> list[Figure]:
-    """Eight restarts of twenty alerts; one of ten in a quick run."""
+    """Run eight restarts with twenty alerts each; in a quick run one restart with ten alerts."""
     each = site.choose_amount(20, 10)
     missing = 0
     waits = []
@@ -79,9 +79,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def _make_second_router(there: Stage) -> Part:
-    """A second router, which the first one's clients are not connected to; its port stays over
-    restarts.
-    """
+    """Yield a second router on a fixed port that clients of the first router do not know."""
     config = Path(there.folder) / "router-b.json"
     settings = zenoh.Config.from_file(str(CONFIG))
     settings.insert_json5("connect/endpoints", json.dumps([there.endpoint]))
@@ -106,7 +104,7 @@ def _record_alert(heard: dict[Place, float], sample: zenoh.Sample) -> None:
 
 
 def _make_ice_batches(turn: int, places: int) -> list[Batch]:
-    """Ice in so many places that nobody knew, by each of the witnesses."""
+    """Publish ice at this many new places, each reported by every witness."""
     latitude = LATITUDE + APART * turn
     longitudes = [LONGITUDE + APART * place for place in range(places)]
     cells = [int(grid.cell_of(latitude, longitude)) for longitude in longitudes]

@@ -1,4 +1,6 @@
-"""The attacks: each a function of the ground that says whether it got through. None may."""
+"""Attacks on a secured fleet. Each is a function that returns True if the attack succeeded; none
+may succeed.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,7 @@ def can_open(ground: Ground, name: str, router: str = ROUTERS[1], **changed: obj
 def issue_certificate(
     ground: Ground, name: str, folder: Path, *, days_ago: float = 0.0, days: float = 5.0
 ) -> dict[str, Any]:
-    """TLS entries with a certificate that the fleet's own authority issued at some time."""
+    """Issue a certificate with the authority of the fleet, and return its TLS entries."""
     authority = ca.read_pair(ground.folder / "authority" / "ca")
     assert authority is not None
     folder.mkdir(exist_ok=True)
@@ -74,7 +76,7 @@ def issue_certificate(
 
 
 def make_stranger(ground: Ground) -> Path:
-    """Folder of another authority that knows the same names."""
+    """Create another authority with the same names, and return its folder."""
     folder = ground.folder / "stranger"
     open_registry(folder).enrol(make_enrolment())
     return folder
@@ -361,7 +363,7 @@ def who_is_alive_is_told_to_a_vehicle(ground: Ground) -> bool:
 
 
 def as_router(ground: Ground, mode: str) -> bool:
-    """A vehicle that plays router or peer, so that others' traffic might pass through it."""
+    """Connect as a router or peer, so that traffic of others might pass through the vehicle."""
     given = settings(ground.network.endpoints[ROUTERS[1]], ground.folder)
     given = given.model_copy(
         update={"config": {**given.config, "mode": mode, "listen/endpoints": []}}
@@ -502,7 +504,7 @@ def administration_of_the_routers(ground: Ground) -> bool:
 
 @register_attempt
 def revoked_vehicle(ground: Ground) -> bool:
-    """After the routers were started with a list without it."""
+    """Connect after the name was removed from the list and the routers were restarted."""
     network = ground.network
     lost = {
         f"connect_{part}": str(ground.folder / f"lost.{end}")

@@ -1,4 +1,5 @@
-"""Other reader next to attackers of a page and of a service: how many of its requests are answered?
+"""Availability of page and service for another reader during attacks: share of its requests that
+are answered.
 
 Each attacker runs for itself, from an address of its own. The other reader sends requests of the
 kind that the attacker competes for, one after the other. One that is refused, or not answered
@@ -41,7 +42,7 @@ Attack = AbstractContextManager[None]
 
 
 class Target(NamedTuple):
-    """Page and endpoint under attack, and a moment of the past."""
+    """Attack the page, the query endpoint and past maps in turn."""
 
     host: str
     port: int
@@ -50,7 +51,7 @@ class Target(NamedTuple):
 
 
 def run(site: Site) -> list[Figure]:
-    """Twenty requests next to each attacker, or six."""
+    """Send twenty requests next to each attacker; in a quick run six."""
     asked = site.choose_amount(20, 6)
     served = {}
     with open_stage(site.folder, vehicle_kb_s=1e4, vehicle_burst_kb=1e5) as there:

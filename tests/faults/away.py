@@ -38,7 +38,9 @@ QUEUED: Final = 20.0  # messages of its queue for each
 
 @dataclass
 class Made:
-    """The service: an engine, batches that wait, and bytes that reached the routers."""
+    """A simulated service: a real engine, waiting batches, and the number of bytes that reached the
+    routers.
+    """
 
     cars: int
     engine: Engine
@@ -48,14 +50,16 @@ class Made:
     messages: int = 0
 
     def put(self, batch: StoredBatch) -> None:
-        """A batch on its way: into the queue, or lost."""
+        """Receive a batch: put it into the queue, or drop it if the queue is full."""
         self.sent += len(batch.payload)
         self.messages += 1
         if self.up and len(self.queue) < QUEUED * self.cars:
             self.queue.append(batch)
 
     def store_queued(self, now: float) -> list[tuple[str, bytes]]:
-        """Take as much as a step allows, and put it on disk; returns acknowledgements."""
+        """Ingest as many batches as one step allows, write them to disk, and return the
+        acknowledgements.
+        """
         if not self.up:
             return []
         taken = [
@@ -100,7 +104,7 @@ def _make_draft(car: int, now: float) -> tuple[Draft, int]:
 
 
 def run(site: Site) -> list[Figure]:
-    """An hour, or ten minutes in a quick run."""
+    """Simulate an absence of one hour; in a quick run of ten minutes."""
     with closing(Engine(ServiceConfig(), site.folder / "archive")) as engine:
         return _run_outage(site, engine)
 
@@ -172,6 +176,6 @@ def _run_outage(site: Site, engine: Engine) -> list[Figure]:
 
 
 def _list_shown_cells(engine: Engine) -> set[int]:
-    """Cells that are on the map, by a visit that counted."""
+    """Return the cells that are on the map because of a visit that was counted."""
     fusion = engine.state.fusion
     return set(fusion.cell[fusion.live.visits[: fusion.size] > 0].tolist())

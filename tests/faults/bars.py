@@ -1,4 +1,4 @@
-"""Names, units and bars of the figures that the fault campaigns owe."""
+"""Names, units and bars of the figures of the fault campaigns."""
 
 from __future__ import annotations
 
@@ -202,6 +202,6 @@ BARS: Final = {
 
 
 def make_figure(name: str, value: float) -> Figure:
-    """A figure of the table above; KeyError if it is not in it."""
+    """Return a figure of the table above; raise KeyError for an unknown name."""
     unit, bar, better = BARS[name]
     return Figure(name, value, unit, bar, better)

@@ -1,5 +1,5 @@
-"""One bit changed in a file, of every kind that service and agent keep: the change is noticed, or
-it has no effect.
+"""Single-bit errors in every kind of file of service and agent: each error is detected or has no
+effect.
 
 Each time a copy of an archive is damaged and a service begins from it. Its map and its rows are
 compared with those of the whole archive, and every difference must have been counted. The same for
@@ -44,7 +44,7 @@ BATCHES: Final = 40  # of a spool
 
 
 def run(site: Site) -> list[Figure]:
-    """Some bits of each kind of file."""
+    """Flip some bits in each kind of file."""
     logging.getLogger("fleet_service").setLevel(logging.ERROR)  # every damage says so
     logging.getLogger("edge_agent").setLevel(logging.ERROR)
     random_ = random.Random(site.seed)

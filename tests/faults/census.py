@@ -114,8 +114,8 @@ def _doubled_outside(archive: Path) -> int:
 def _count_archived(
     archive: Path, starts: set[tuple[str, int]]
 ) -> tuple[dict[Name, int], int, int]:
-    """Distinct rows of every archived batch, by starts (vehicle, boot); rows that are there
-    again; all rows.
+    """Return the distinct rows of every archived batch by start (vehicle, boot), the number of
+    repeated rows, and the number of all rows.
     """
     tables = list(reading.read_tables(archive, Kind.OBSERVATION, ROW))
     if not tables:

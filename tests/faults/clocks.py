@@ -42,7 +42,7 @@ CONFIG: Final = ServiceConfig(raw_days=31)
 
 
 class Case(NamedTuple):
-    """By how much the clock is off, and when."""
+    """Size of a clock error, and when it occurs."""
 
     jump: int
     at_start: bool
@@ -50,13 +50,13 @@ class Case(NamedTuple):
 
 @dataclass
 class Machine:
-    """Its clocks [ns]; the true time, and by how much the wall clock is off."""
+    """Simulated clocks of a machine [ns]: the true time, and the error of the wall clock."""
 
     true: int
     off: int = 0
 
     def clock(self, seen: int) -> SteadyClock:
-        """A service's clock on it."""
+        """Return a service's clock that reads these simulated clocks."""
         return SteadyClock(seen, lambda: self.true + self.off, lambda: self.true)
 
     def has_jumped(self, clock: SteadyClock) -> bool:
@@ -68,7 +68,7 @@ class Machine:
 
 @dataclass
 class Found:
-    """Failures, summed over cases."""
+    """Numbers of failures, summed over cases."""
 
     sent: int = 0
     rejected: int = 0
@@ -80,7 +80,9 @@ class Found:
 
 
 def run(site: Site) -> list[Figure]:
-    """A year ahead, a year back, thirty years back as without a battery; at run and at start."""
+    """Run all cases: a year ahead, a year back, and thirty years back as after an empty battery;
+    while running and at the start.
+    """
     cases = [
         Case(jump, at_start) for jump in (YEAR, -YEAR, -30 * YEAR) for at_start in (False, True)
     ]
@@ -163,7 +165,7 @@ def _run_case(root: Path, case: Case, found: Found, seconds: int) -> None:
 
 
 def _apply_retention(root: Path, engine: Engine, clock: SteadyClock) -> None:
-    """Retention as the service does it."""
+    """Run retention as the service does."""
     jobs = archive_jobs(engine, CONFIG, root, clock.moment)
     next(job for job in jobs if job.name == "retention").work(threading.Event())
 

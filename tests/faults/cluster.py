@@ -87,7 +87,7 @@ OWES: Final = (
 
 
 def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
-    """So many failovers, of all kinds in turn."""
+    """Run this many failovers of all kinds in turn."""
     random_ = random.Random(site.seed)
     happened: list[Failover] = []
     pauses = []
@@ -168,7 +168,7 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
 
 
 def rows_of(root: Path) -> int:
-    """Rows of an archive."""
+    """Return the rows of an archive."""
     return sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["row"]))
 
 
@@ -196,12 +196,12 @@ def _make_figures(failovers: int, happened: list[Failover], census: list[Census]
 
 
 def _make_figure(failovers: int, name: str, value: float, unit: str) -> Figure:
-    """With its bar where the whole campaign ran."""
+    """Return a figure with its bar if the whole campaign ran."""
     return make_figure(name, value) if failovers >= FULL else Figure(name, value, unit)
 
 
 def _make_median_figures(happened: list[Failover]) -> list[Figure]:
-    """Without bars: the half of it."""
+    """Return the median time per kind of failure, as figures without bars."""
     found = []
     for name, kinds in {"kill": KILLED, "freeze": FROZEN, "cut": ("bucket", "routers")}.items():
         seconds = [one.seconds for one in happened if one.way in kinds]

@@ -41,7 +41,7 @@ def run(
 
 
 def sync_and_report(copy: BucketReplica) -> int:
-    """Sync like `BucketReplica.sync`."""
+    """Print when a sync begins and ends."""
     _copying.at = False
     changed = _follow(copy)
     if _copying.at:
@@ -50,7 +50,7 @@ def sync_and_report(copy: BucketReplica) -> int:
 
 
 def put_there(copy: BucketReplica, name: str) -> bool:
-    """As `BucketReplica._upload_if_present`; the first one of a turn says that it begins."""
+    """Print when the first upload of a turn begins."""
     if getattr(_copying, "at", None) is False:
         _copying.at = True
         _print_mark(BEGINS, COPYING)

@@ -49,7 +49,7 @@ PATIENCE_S: Final = 600.0  # a takeover that takes long is a figure, no hang
 
 
 def write_town_archive(root: Path) -> str:
-    """An archive with the map of a town, as of today; returns a box of it."""
+    """Create an archive with a town's map as of today, and return the box of the town."""
     writer = Writer(root, "shard-0")
     since = time.time_ns() - START_NS - DAY_S * NS - 60 * NS
     for rows in synthetic.make_chunks(WORLD):
@@ -64,7 +64,7 @@ def write_town_archive(root: Path) -> str:
 
 
 class Journals:
-    """Batches that the loads know to be acknowledged, updated as they arrive."""
+    """Batches that were acknowledged to the loads, updated as acknowledgements arrive."""
 
     def __init__(self, paths: Iterable[Path]) -> None:
         self._paths = list(paths)
@@ -84,11 +84,11 @@ class Journals:
         return found
 
     def longest_pause(self, since: float) -> float:
-        """Longest time without an acknowledgement since then [s], as far as was read."""
+        """Return the longest time [s] without an acknowledgement since a moment."""
         return float(np.diff(sorted(at for at in self._times if at >= since)).max())
 
     def first_after(self, moment: float) -> float:
-        """Time of the first acknowledgement after a moment; waits for it."""
+        """Wait for the first acknowledgement after a moment, and return its time."""
         later: list[float] = []
 
         def has_arrived() -> bool:
@@ -102,7 +102,7 @@ class Journals:
 def start_loads(
     folder: Path, endpoint: str, processes: int, vehicles: int, rate: float
 ) -> list[Part]:
-    """Generators, started; `rate` observations per second and vehicle."""
+    """Start load generators with `rate` observations per second and vehicle."""
     made = []
     for number in range(processes):
         config = folder / f"load-{number}.json"
@@ -147,12 +147,12 @@ class Asking:
         self._thread.start()
 
     def end(self) -> None:
-        """Ask no more."""
+        """Stop the queries."""
         self._stop.set()
         self._thread.join(PATIENCE_S)
 
     def _read_cells(self) -> tuple[frozenset[tuple[int, int]], bool]:
-        """Cells and sectors of the box, and whether something is said to be missing."""
+        """Return cells and sectors of the box, and True if the answer reports a missing region."""
         try:
             answer = map_client.query_map(self._router, {"bbox": self._box})
         except InputError:
@@ -183,7 +183,7 @@ Go = Callable[[Host, random.Random, float], None]
 
 
 class Way(NamedTuple):
-    """Way in which a service with this lease time [s] fails."""
+    """A kind of failure, and the lease time [s] of the service."""
 
     go: Go
     end: Callable[[Host, random.Random], None] = lambda host, _: host.part.kill()
@@ -218,8 +218,8 @@ def _kill_during(what: str) -> Go:
 
 
 def _restore_link(host: Host, random_: random.Random) -> None:
-    """A link comes back at some time, or not before the service has seen by itself that it was
-    followed.
+    """Return when the link comes back: at a given time, or after the service has noticed its
+    successor.
     """
     if random_.random() < 0.5 or host.to_router.is_cut:
         time.sleep(random_.uniform(0.0, 3.0))
@@ -249,8 +249,8 @@ WAYS: Final = {
 
 
 class Failover(NamedTuple):
-    """Result: the failure as it happened, and the time [s] until a vehicle was acknowledged
-    again.
+    """Result of a failure: its actual kind, and the time [s] until the next acknowledgement to a
+    vehicle.
     """
 
     way: str
@@ -258,7 +258,7 @@ class Failover(NamedTuple):
 
 
 class Machines:
-    """Machines of one region: one serves, one waits, others are spare."""
+    """Machines of one region: one serves, one is the standby, the others are spare."""
 
     def __init__(
         self,
@@ -277,7 +277,7 @@ class Machines:
         self._random = random_
 
     def start_standbys(self, standbys: int) -> None:
-        """So many wait."""
+        """Start this many standbys."""
         while len(self.waiting) < standbys:
             host = self._idle.pop(0)
             host.part.start()
@@ -311,7 +311,7 @@ class Machines:
         return sum(1 for _ in self._leases.glob("*.json"))
 
     def _await_takeover(self) -> None:
-        """One that waited serves; waits for it."""
+        """Wait until one of the standbys serves, and return it."""
         until(self._find_ready, PATIENCE_S)
         taker = self._find_ready()
         assert taker is not None
@@ -324,7 +324,9 @@ class Machines:
         )
 
     def hand_over(self, router: ZenohSettings) -> Host:
-        """The service gives its region to the one that waits, and has left then; returns it."""
+        """Hand the region over to the standby, wait until the old service has ended, and return the
+        standby.
+        """
         former = self.serving
         to = self.waiting[0].root.parent.name
         with map_client.open_connected(router) as session:
@@ -361,7 +363,7 @@ class Machines:
         return find_difference(both[0].tables, both[1].tables)
 
     def stop_all(self) -> list[Host]:
-        """One after the other takes over, and stops; each machine has then seen all of it."""
+        """Let each machine take over and stop in turn, so that each one has seen all data."""
         seen = []
         everybody = len(self.waiting) + len(self._idle)
         for left in range(everybody, -1, -1):
@@ -405,7 +407,7 @@ def find_difference(one: dict[str, pa.Table], other: dict[str, pa.Table]) -> flo
 
 
 def drain_loads(parts: list[Part]) -> None:
-    """No new observations; wait until all are acknowledged, or nothing comes any more."""
+    """Stop new observations, and wait until all are acknowledged or acknowledgements stop."""
     for part in parts:
         part.send_signal(signal.SIGUSR1)
     with suppress(TimeoutError):

@@ -36,7 +36,7 @@ UNTIL_KILL_S: Final = (0.0, 0.6)  # since it began: a round takes a tenth of a s
 
 
 class Writing:
-    """A log that grows in a thread until closed; every seq up to `acknowledged` is durable."""
+    """A thread that writes to a log until it is closed. Every seq up to `acknowledged` is durable."""
 
     def __init__(self, root: Path) -> None:
         self.acknowledged = 0
@@ -53,13 +53,15 @@ class Writing:
             self.acknowledged += len(self._log.flush())
 
     def close(self) -> None:
-        """Stop writing."""
+        """Stop the writer."""
         self._stop.set()
         self._thread.join()
 
 
 class Reading:
-    """A reader in a thread until closed; counts its reads and those that were not each row once."""
+    """A thread that reads the archive until it is closed. It counts reads, and reads in which a row
+    was missing or doubled.
+    """
 
     def __init__(self, root: Path, writing: Writing) -> None:
         self.reads = self.incomplete = 0
@@ -78,7 +80,7 @@ class Reading:
             self.reads += 2
 
     def close(self) -> None:
-        """Stop reading."""
+        """Stop the reader."""
         self._stop.set()
         self._thread.join()
 
@@ -101,7 +103,7 @@ def is_complete(tables: Iterable[pa.Table], owed: int) -> bool:
 
 
 def run(site: Site) -> list[Figure]:
-    """50 kills; in a quick run, five."""
+    """Kill 50 compactions; in a quick run five."""
     root = site.folder / "archive"
     random_ = random.Random(site.seed)
     part = Part(
@@ -125,7 +127,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def main() -> None:
-    """Compact for ever."""
+    """Compact in an endless loop."""
     print("compacting", flush=True)
     while True:
         compact(Path(sys.argv[1]), ROUND_ROWS)

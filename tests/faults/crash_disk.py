@@ -26,7 +26,7 @@ FOLDER = -1  # instead of the number of a file
 
 
 class PowerLoss(BaseException):
-    """Nothing is executed after it; no handler of the code under test may catch it."""
+    """Power loss. Code under test must not catch it, and nothing is executed after it."""
 
 
 class CrashDisk:
@@ -67,13 +67,13 @@ class CrashDisk:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _number_file(self, path: Path) -> int:
-        """Number of a file that has just been made."""
+        """Return the inode number of a new file."""
         self._numbers += 1
         self._number[path.stat().st_ino] = self._numbers
         return self._numbers
 
     def _keep_content(self, path: Path) -> None:
-        """The file is about to lose its name."""
+        """Record that a file is about to lose its name."""
         if path.is_file():
             self._written[self._number[path.stat().st_ino]] = path.read_bytes()
 
@@ -85,7 +85,7 @@ class CrashDisk:
 
     @contextmanager
     def intercept_calls(self) -> Iterator[None]:
-        """All operations on the folder go through here inside the block."""
+        """Redirect all file operations on the folder to the simulated disk inside the block."""
         calls: dict[str, Callable[..., Callable[..., object]]] = {
             "fsync": self._wrap_fsync,
             "rename": self._wrap_rename,
@@ -246,7 +246,7 @@ class CrashDisk:
 
 
 def _rmtree(path: Path, ignore_errors: bool = False) -> None:
-    """As `shutil.rmtree`, by names and not by handles."""
+    """Remove a tree like `shutil.rmtree`, but by names instead of handles."""
     try:
         for inner in sorted(Path(path).iterdir()):
             if inner.is_dir():

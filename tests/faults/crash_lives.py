@@ -37,7 +37,7 @@ class Lives(ABC, Generic[BatchType]):
         self.at_stake = 0
 
     def find_violations(self) -> list[str]:
-        """Return the errors found in it."""
+        """Run the history and return the errors found in it."""
         live = self.folder / "life-0"
         live.mkdir()
         found: list[str] = []
@@ -59,11 +59,11 @@ class Lives(ABC, Generic[BatchType]):
 
     @abstractmethod
     def _run_life(self, root: Path, last: bool) -> None:
-        """One life, on the disk."""
+        """Run one life on the disk."""
 
     @abstractmethod
     def _find_problems(self, root: Path, last: bool) -> list[str]:
         """Read the archive as the next life finds it."""
 
     def _pass_time(self) -> None:
-        """Between two lives."""
+        """Run the checks between two lives."""

@@ -49,14 +49,14 @@ CELLS: Final = grid.cell_of(np.array([57.7, 57.7]), np.array([11.97, 15.97]))
 
 
 class Batch(NamedTuple):
-    """One batch of the history."""
+    """Return one batch of the history."""
 
     kind: Kind
     seq: int
 
 
 def rows_of(batches: list[Batch]) -> Rows:
-    """Rows of batches of one kind as the log takes them."""
+    """Return rows of batches of one kind in the form that the log takes."""
     kind = batches[0].kind
     n = ROWS * len(batches)
     rows: Rows = {
@@ -166,12 +166,14 @@ class History(Lives[Batch]):
 
 
 def run_log_history(number: int) -> list[str]:
-    """Violations of one history of the log."""
+    """Return the violations of one history of the log."""
     return _run_log(number)[0]
 
 
 def _run_log(number: int) -> tuple[list[str], int]:
-    """As `run_log_history`, and how many batches were acknowledged before a power loss."""
+    """Return the violations of one history of the log, and the number of batches acknowledged
+    before a power loss.
+    """
     folder = Path(tempfile.mkdtemp(prefix="crash-", dir=_find_memory_folder()))
     one = History(number, folder)
     try:
@@ -181,24 +183,26 @@ def _run_log(number: int) -> tuple[list[str], int]:
 
 
 def _run_outbox(number: int) -> tuple[list[str], int]:
-    """The same of the outbox, where nothing is acknowledged."""
+    """Return the same for the outbox, where nothing is acknowledged."""
     return spool_history(number), 0
 
 
 def _run_service(number: int) -> tuple[list[str], int]:
-    """The same of a whole service."""
+    """Return the same for a whole service."""
     with tempfile.TemporaryDirectory(prefix="crash-", dir=_find_memory_folder()) as folder:
         one = ServiceHistory(number, Path(folder))
         return one.find_violations(), one.at_stake
 
 
 def _find_memory_folder() -> str | None:
-    """A folder in memory, where there is one: the disk that forgets is ours, not the machine's."""
+    """Return a folder in memory if there is one. The simulated disk decides about durability, so
+    the real one need not be used.
+    """
     return "/dev/shm" if Path("/dev/shm").is_dir() else None
 
 
 def run(site: Site) -> list[Figure]:
-    """5 000 histories of the log, 500 of the outbox and 600 of a service; in a quick run, 120 of
+    """Run 5 000 histories of the log, 500 of the outbox and 600 of a service; in a quick run 120 of
     all.
     """
     logs = site.choose_amount(5000, 100)

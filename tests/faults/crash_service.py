@@ -72,7 +72,7 @@ class Sent(NamedTuple):
 
     @property
     def month(self) -> str:
-        """That it belongs to."""
+        """Return the month to which the batch belongs."""
         return f"{datetime.fromtimestamp(self.rows[0] // SECOND, UTC):%Y-%m}"
 
 
@@ -120,7 +120,7 @@ class ServiceHistory(Lives[Sent]):
         self._now += self.random.randint(0, AWAY_DAYS * 86_400) * SECOND
 
     def _forget_month(self, root: Path) -> None:
-        """Nobody serves: a vehicle's month, or the whole month, is forgotten."""
+        """Erase a vehicle's month, or a whole month, while no service runs."""
         one = self.random.choice(self.sent)
         whole = self.random.random() < 0.3
         key = root / "keys" / f"{one.month}.key"
@@ -174,7 +174,9 @@ class ServiceHistory(Lives[Sent]):
             self.done[job] += 1
 
     def _write_checkpoint(self, engine: Engine, root: Path) -> None:
-        """Wanted by upkeep, taken by the worker after a segment."""
+        """Take a checkpoint: requested by the background job, written by the worker after a
+        segment.
+        """
         stop = threading.Event()
         with ThreadPoolExecutor(1) as upkeep:
             coming = upkeep.submit(engine.checkpoint, stop)
@@ -266,8 +268,8 @@ class ServiceHistory(Lives[Sent]):
         return found
 
     def _find_lost(self, rows: Counter[int], last: bool) -> list[str]:
-        """Acknowledged, and neither there nor given up; in the last life everything that may
-        come was sent again.
+        """Return acknowledged rows that are missing without a reason. In the last life every
+        vehicle has sent its batches again.
         """
         owed = [
             one for one in self.sent if one in self.acknowledged or (last and self._may_come(one))
@@ -296,7 +298,9 @@ class ServiceHistory(Lives[Sent]):
         return found + ["the key of a month came back" for key in keys if key in self.destroyed]
 
     def _find_state_errors(self, root: Path, rows: Counter[int]) -> list[str]:
-        """The map and the batches that are known, from a checkpoint and from the log alone."""
+        """Compare the map and the known batches restored from a checkpoint with those restored from
+        the log alone.
+        """
         if not (root / "inbox").is_dir():
             return []
         same, bare = (root.with_name(f"{root.name}-{name}") for name in ("same", "bare"))
@@ -332,7 +336,7 @@ class ServiceHistory(Lives[Sent]):
 
 
 def _compute_boot(vehicle: str) -> int:
-    """As `examples.batch` has it."""
+    """Return a batch like `examples.batch`."""
     return 1 + sum(vehicle.encode())
 
 

@@ -36,7 +36,7 @@ class Files(NamedTuple):
 
 
 def spool_history(number: int) -> list[str]:
-    """Violations of one history."""
+    """Return the violations of one history."""
     random_ = random.Random(number)
     folder = Path(tempfile.mkdtemp(prefix="spool-"))
     try:

@@ -51,7 +51,7 @@ STUCK_S: Final = 60.0
 
 @contextmanager
 def small_disk(folder: Path) -> Iterator[bool]:
-    """Mount a small file system at a folder; whether that is allowed."""
+    """Mount a small file system at a folder. Return False if this process may not mount."""
     folder.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", f"size={SIZE_MB}m", "tmpfs", str(folder)]
     try:
@@ -67,7 +67,7 @@ def small_disk(folder: Path) -> Iterator[bool]:
 
 @contextmanager
 def fill_disk(folder: Path, mounted: bool) -> Iterator[None]:
-    """No room while the block runs."""
+    """Fill the disk for the duration of the block."""
     if mounted:
         ballast = folder / "ballast"
         with suppress(OSError), ballast.open("wb", buffering=0) as file:
@@ -85,7 +85,7 @@ def fill_disk(folder: Path, mounted: bool) -> Iterator[None]:
 
 @contextmanager
 def _refuse_writes(*names: str) -> Iterator[None]:
-    """These calls of the system fail as on a full disk."""
+    """Let system calls that write fail as on a full disk."""
 
     def refuse(*_: object, **__: object) -> object:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -101,7 +101,7 @@ def _refuse_writes(*names: str) -> Iterator[None]:
 
 
 def run(site: Site) -> list[Figure]:
-    """Full several times, at other moments of the jobs."""
+    """Fill the disk several times, at different moments of the jobs."""
     false = 0
     stuck = 0
     refused = 0
@@ -150,7 +150,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def _drive(engine: Engine, since: int, steps: int) -> int:
-    """Some seconds of load; returns the batches that were acknowledged."""
+    """Run some seconds of load, and return the acknowledged batches."""
     got = 0
     for seq in range(since + 1, since + steps + 1):
         now = time.time_ns()
@@ -199,7 +199,7 @@ def _count_rows(root: Path) -> int:
 
 
 def _room_made(engine: Engine, folder: Path) -> int:
-    """Days that retention removes from a disk that is full."""
+    """Return the days that retention removes from a full disk."""
     root = folder / "archive"
     begin_with_old_rows(root)
     with patch.multiple(disk_reserve, SIZE=RESERVE_MB << 20, _LEAST_FREE=2 * RESERVE_MB << 20):

@@ -52,20 +52,22 @@ def list_places() -> list[tuple[int, float, float]]:
 
 
 def make_visit(name: str, seq: int, now: int) -> Batch:
-    """One visit of a vehicle; it goes round the road."""
+    """Return a visit of a vehicle that drives round the road."""
     cell, latitude, longitude = list_places()[(seq + hash_of(name)) % CELLS]
     mu = FLOODED_MU if name == FLOODER else 0.75 + 0.01 * (hash_of(name) % 10)
     return batch(name, seq, now, [mu], cell=[cell], latitude=[latitude], longitude=[longitude])
 
 
 def hash_of(name: str) -> int:
-    """A number of a name, the same in every run."""
+    """Return a number for a name, the same in every run."""
     return sum(name.encode())
 
 
 @dataclass
 class Honest:
-    """An honest vehicle: it sends, repeats unsettled batches, and records how long each took."""
+    """An honest vehicle. It sends, repeats batches that are not settled, and records how long each
+    took.
+    """
 
     session: zenoh.Session
     name: str
@@ -93,7 +95,7 @@ class Honest:
         )
 
     def drive(self) -> None:
-        """Send the next one."""
+        """Send the next batch."""
         seq = len(self.sent) + 1
         one = make_visit(self.name, seq, time.time_ns())
         self._last[seq] = time.monotonic()
@@ -113,7 +115,7 @@ class Honest:
 
 
 def run(site: Site) -> list[Figure]:
-    """Half a minute of flood, or three seconds."""
+    """Flood for half a minute; in a quick run for three seconds."""
     seconds = site.choose_amount(30, 3)
     fleet = make_enrolment(vehicles=[*HONEST, FLOODER])
     with open_network(site.folder / "certificates", fleet=fleet) as running:
@@ -155,7 +157,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def _start_service(folder: Path, running: Network) -> subprocess.Popen[bytes]:
-    """The service as a process; returns when it listens."""
+    """Start the service as a process, and return when it listens."""
     config = ServiceConfig(
         zenoh=settings(running.endpoints[ROUTERS[0]], running.folder), name=SERVICE
     )
@@ -225,8 +227,8 @@ def _read_map(running: Network) -> pa.Table:
 def _simulate_unflooded(
     folder: Path, honest: Sequence[Honest], seconds: float, now: int
 ) -> pa.Table:
-    """The map of the same honest visits, and of the flooder at one visit a second, round the
-    road once at least.
+    """Return the map of the same honest visits with a flooder that sends one visit a second and has
+    gone round the road at least once.
     """
     sent = [one for vehicle in honest for one, _ in vehicle.sent.values()]
     began = min(int(one.columns["leave_time"][0]) for one in sent)
@@ -246,8 +248,8 @@ def _simulate_unflooded(
 
 
 def _find_difference(found: pa.Table, expected: pa.Table, honest: Sequence[Honest]) -> float:
-    """The largest difference of an end of mu over the cells of the honest vehicles; NaN if one
-    is missing.
+    """Return the largest difference of a bound of mu over the cells of the honest vehicles; NaN if
+    a cell is missing.
     """
     driven = {int(sent.columns["cell"][0]) for one in honest for sent, _ in one.sent.values()}
     ends = [

@@ -25,7 +25,7 @@ ROWS = (1, 1, 1, 50)  # the smallest messages cost most for their size, the larg
 
 
 def main() -> None:
-    """Send until the time is over."""
+    """Send messages until the time is over."""
     told = json.loads(sys.stdin.readline())
     name = told["name"]
     cells = told["cells"]

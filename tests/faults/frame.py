@@ -50,7 +50,7 @@ class Site:
     say: Callable[[str], None]
 
     def choose_amount(self, full: int, quick: int) -> int:
-        """One of two numbers, by how long it may take."""
+        """Return one of two values, depending on whether the run is quick."""
         return quick if self.quick else full
 
 

@@ -77,7 +77,7 @@ NEEDED: Final = {"latitude", "longitude"}
 
 
 def run(site: Site) -> list[Figure]:
-    """A million of them, or some thousands."""
+    """Run a million malformed messages; in a quick run some thousands."""
     count = site.choose_amount(1_000_000, 10_000)
     began = time.time_ns()
     crashes = 0
@@ -137,7 +137,7 @@ def _make_honest(seq: int, now: int) -> Iterator[Message]:
 
 
 def _run_turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
-    """One turn of the service's worker; 1 if anything but a refusal came of it."""
+    """Run one turn of the service's worker. Return 1 if anything other than a refusal resulted."""
     try:
         engine.intake.ingest(messages, now)
         for _, ack in engine.settlement.flush():
@@ -172,7 +172,7 @@ def _ask_query(
 
 
 def _decode_damaged_tiles(site: Site, engine: Engine, now: int) -> tuple[int, int]:
-    """Damaged tiles as a client reads them: how many, and how many crashes."""
+    """Decode damaged tiles as a client does. Return the number of tiles and of crashes."""
     r = np.random.default_rng(site.seed)
     crashes = 0
     count = site.choose_amount(50_000, 1_000)
@@ -196,7 +196,9 @@ def _decode_damaged_tiles(site: Site, engine: Engine, now: int) -> tuple[int, in
 
 
 def _count_archived(root: Path, began: int, now: int) -> tuple[int, int, int]:
-    """Rows, impossible rows, and rows of the honest vehicles, in everything that was written."""
+    """Return the numbers of rows, of impossible rows, and of rows of the honest vehicles in all
+    files.
+    """
     rows = impossible = found = 0
     honest = _list_pseudonyms(root, began) | _list_pseudonyms(root, now)
     for file in sorted(root.rglob("*.parquet")):

@@ -22,7 +22,7 @@ LONGEST_S: Final = 7200.0
 
 
 def run(site: Site) -> list[Figure]:
-    """Ten million executions, or some thousands."""
+    """Run ten million inputs; in a quick run some thousands."""
     fuzzers = {
         name: Fuzzer(parser, seeds_of(name), site.seed, make_keeper(site.folder / name))
         for name, parser in PARSERS.items()

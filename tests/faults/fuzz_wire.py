@@ -46,7 +46,7 @@ ASKED: Final = (
 
 
 def run(site: Site) -> list[Figure]:
-    """Two hundred thousand of them, or four thousand in a quick run."""
+    """Send two hundred thousand malformed messages; in a quick run four thousand."""
     r = random.Random(site.seed)
     sent = 0
     answers = 0
@@ -91,7 +91,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def _make_message(r: random.Random, mutants: Mutants) -> tuple[str, bytes, str]:
-    """Key, payload and encoding of the next."""
+    """Return key, payload and encoding of the next message."""
     message = mutants.make_message()
     what = r.random()
     if what < 0.02:
@@ -149,7 +149,7 @@ def _ask_query(session: zenoh.Session, r: random.Random, mutants: Mutants) -> in
 
 
 def _read_metrics(there: Stage) -> dict[str, float]:
-    """The service's metrics."""
+    """Return the service's metrics."""
     address = there.service.line_with("ready: ").split()[-1]
     with urllib.request.urlopen(f"{address}/metrics", timeout=30.0) as page:
         lines = [line for line in page.read().decode().splitlines() if not line.startswith("#")]

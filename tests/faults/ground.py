@@ -1,5 +1,5 @@
-"""The stage of the attacks: two routers with TLS and access list, a running service, honest
-parties, listeners.
+"""Set-up of the attacks: two routers with TLS and access list, a running service, honest parties,
+and listeners.
 
 No step waits by sleeping. Samples of one priority keep their order on each way. So a marker that is
 put after an attack, and received, shows that nothing of the attack is still under way. Messages
@@ -33,7 +33,7 @@ MARKER = f"{keys.ROOT}/map/0000/000/000/0000"
 
 @dataclass
 class Listener:
-    """A session and all that it hears on some key expressions."""
+    """A session that records all messages on some key expressions."""
 
     session: zenoh.Session
     expressions: tuple[str, ...]
@@ -72,12 +72,12 @@ class Ground:
         self._marks = self._seq = 0
 
     def open_session(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
-        """A session that is closed at the end."""
+        """Yield a session that is closed at the end."""
         return self._stack.enter_context(self.network.open_session(name, router, **changed))
 
     @property
     def admitted_count(self) -> int:
-        """Observations that the service took in."""
+        """Return the number of observations that the service accepted."""
         return self.service.engine.counts[wire.Kind.OBSERVATION]
 
     def drive(self, session: zenoh.Session | None = None, name: str = HONEST) -> None:
@@ -134,7 +134,7 @@ class Ground:
 
 @contextmanager
 def open_ground(network: Network) -> Iterator[Ground]:
-    """A service behind the network, and the honest parties, connected and heard."""
+    """Yield a service behind the network and the honest parties, connected and acknowledged."""
     config = ServiceConfig(
         zenoh=settings(network.endpoints[ROUTERS[0]], network.folder),
         name=SERVICE,

@@ -40,8 +40,8 @@ WARM_S: Final = 60  # until pools and windows are what they are
 
 
 def _make_growth_figure(grown: float, seconds: int, *, quick: bool) -> Figure:
-    """By the hour; of a quick run as it is: ten megabytes come and go, which is no rate of three
-    minutes.
+    """Return memory growth per hour. A quick run returns the plain difference, because three
+    minutes give no rate.
     """
     if quick:
         return replace(make_figure("faults.insider.mb_per_hour", grown), unit="MB in all")
@@ -49,7 +49,7 @@ def _make_growth_figure(grown: float, seconds: int, *, quick: bool) -> Figure:
 
 
 def run(site: Site) -> list[Figure]:
-    """An hour, or four minutes in a quick run."""
+    """Run an hour; in a quick run four minutes."""
     seconds = site.choose_amount(3600, 240)
     counts = Counter[str]()
     random_ = np.random.default_rng(site.seed)
@@ -146,7 +146,7 @@ def _make_ice(seq: int, now: int, rows: int) -> Batch:
 
 
 def _make_visit(name: str, seq: int, now: int, second: int) -> Batch:
-    """An honest visit; they go round a road of twenty cells at 12 m/s."""
+    """Return an honest visit on a road of twenty cells driven at 12 m/s."""
     longitude = LONGITUDE + 2e-4 * ((second + sum(name.encode())) % 20)
     one = batch(name, seq, now, [0.8])
     cell = grid.cell_of(LATITUDE, longitude)
@@ -156,7 +156,7 @@ def _make_visit(name: str, seq: int, now: int, second: int) -> Batch:
 
 
 def _make_scattered(seq: int, now: int, random_: np.random.Generator, degrees: float) -> Batch:
-    """Visits of fifty cells anywhere near a place; a batch has the region of its first."""
+    """Return a batch of visits to fifty cells near a place. Its region is that of the first visit."""
     spread = random_.uniform(-degrees, degrees, (2, 50))
     latitude = np.clip(LATITUDE + spread[0], -80.0, 80.0)
     longitude = LONGITUDE + spread[1]
@@ -176,7 +176,7 @@ def _make_message(one: Batch) -> Message:
 
 
 def _make_text_message(one: Batch) -> Message:
-    """A batch as a person would write it."""
+    """Return a batch as handwritten JSON."""
     text = {
         "vehicle": one.vehicle,
         "boot": str(one.boot),

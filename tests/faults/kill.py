@@ -71,8 +71,8 @@ class Load(NamedTuple):
 
 
 def run(site: Site) -> list[Figure]:
-    """200 kills in ten rounds; in a quick run, five in one with six agents, and bars that it can
-    reach.
+    """Kill 200 times in ten rounds; in a quick run five times in one round, with six agents and
+    weaker bars.
     """
     random_ = random.Random(site.seed)
     kills = 0
@@ -121,13 +121,13 @@ def run(site: Site) -> list[Figure]:
 
 
 def _make_figure(site: Site, name: str, value: float, quick: float) -> Figure:
-    """A figure with its bar, or with the one of a quick run, which is smaller."""
+    """Return a figure with its bar; the bar of a quick run is weaker."""
     found = make_figure(name, value)
     return replace(found, bar=quick) if site.quick else found
 
 
 def begin_with_old_rows(archive: Path) -> None:
-    """An archive of old rows, which no service reads again: it has a day of today, too."""
+    """Create an archive with old rows that no service reads back, and a day of recent rows."""
     synthetic.write_archive(archive, OLD, OLD.rows // 4)
     compact(archive)
     (archive / layout.TABLES[Kind.OBSERVATION] / f"date={datetime.now(UTC).date()}").mkdir(
@@ -136,7 +136,7 @@ def begin_with_old_rows(archive: Path) -> None:
 
 
 def old_days(archive: Path) -> list[Path]:
-    """Days that retention removes."""
+    """Return the days that retention removes."""
     return due_folders(archive, LEAST_DAYS, datetime.now(UTC).date())
 
 
@@ -147,9 +147,10 @@ def _find_finished_jobs(archive: Path) -> frozenset[str]:
 
 
 def map_difference(archive: Path) -> float:
-    """The map that a service begins with, from its checkpoint, against that of the log alone: the
-    largest difference of mu, of its bounds and of P(slippery); infinite if a cell or a visit is
-    missing."""
+    """Compare the map that a service restores from its checkpoint with that of the log alone.
+    Return the largest difference of mu, its bounds and P(slippery); infinite if a cell or a visit
+    is missing.
+    """
     maps = []
     for _ in range(2):
         with closing(Engine(ServiceConfig(), archive)) as engine:
@@ -215,7 +216,9 @@ def _run_round(
 
 
 def _choose_victims(there: Stage, random_: random.Random) -> list[Part]:
-    """One or several at once; router and service as often as all the agents together."""
+    """Return the processes to kill: one or several; router and service together as often as all
+    agents together.
+    """
     chosen = [part for part in (there.router, there.service) if random_.random() < 0.45]
     return chosen + random_.sample(
         there.loads, random_.choice((0, 1, 3)) if chosen else random_.choice((1, 2, 5))

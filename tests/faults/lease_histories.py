@@ -77,7 +77,7 @@ def judge_history(events: list[Event]) -> Verdict:
 
 
 class _EndError(BaseException):
-    """The process or the history is over."""
+    """Raised in a thread when its process or the history has ended."""
 
 
 class _Process:

@@ -37,7 +37,7 @@ PLACE = (57.70, 11.97)
 
 @dataclass(frozen=True)
 class Plan:
-    """Work of one generator; `rate` is observations per second and vehicle."""
+    """Settings of one load generator; `rate` is observations per second and vehicle."""
 
     endpoint: str
     names: list[str]
@@ -62,7 +62,7 @@ def print_events(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
 
 
 class WatchedOutbox(Outbox):
-    """The agent's outbox, with a journal."""
+    """Outbox of an agent that also writes a journal."""
 
     def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
         held = super().store(drafts, now)
@@ -80,7 +80,7 @@ class WatchedOutbox(Outbox):
 def make_visits(
     rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: int
 ) -> RecordBlock:
-    """One made-up visit per element of `vehicle` (n,), all just left; now [ns]."""
+    """Return one synthetic visit per element of `vehicle` (n,), all ending now [ns]."""
     n = len(vehicle)
     columns: Columns = {}
     for name, dtype in column_types(Kind.OBSERVATION).items():
@@ -103,8 +103,8 @@ def make_visits(
 
 
 def offer_blocks(plan: Plan, publisher: Publisher, quiet: threading.Event) -> tuple[int, float]:
-    """Offer a block each BLOCK_S until `quiet`; returns the blocks that were late by one, and
-    the longest lag [s].
+    """Offer a block every BLOCK_S until `quiet`. Return the number of blocks that were late by a
+    whole block, and the longest lag [s].
     """
     rng = np.random.default_rng(plan.seed)
     per_block = plan.rate * BLOCK_S * len(plan.names)

@@ -11,7 +11,9 @@ from tests.faults.protocol_model import BROKEN, Rules, explore_states
 
 
 def run(site: Site) -> list[Figure]:
-    """All states with equal and unlike lease times; the broken protocols must be found out."""
+    """Check all states with equal and different lease times, and that the checker finds each broken
+    protocol.
+    """
     checked = [
         explore_states(Rules(), most_turn=site.choose_amount(2, 1)),
         explore_states(Rules(lease=(6, 2)), most_turn=site.choose_amount(2, 1)),

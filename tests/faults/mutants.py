@@ -89,8 +89,8 @@ _ENCODINGS: Final = (
 
 
 class Mutants:
-    """A source of malformed messages of the vehicles `rogue-NN`, as at the time `now` [ns],
-    which may be set.
+    """Source of malformed messages of the vehicles `rogue-NN` as of the time `now` [ns], which a
+    test may set.
     """
 
     def __init__(self, seed: int, now: int) -> None:
@@ -99,7 +99,7 @@ class Mutants:
         self._seq = 0
 
     def make_message(self) -> Message:
-        """The next one."""
+        """Return the next message."""
         r = self._random
         kind = r.choice(list(Kind))
         name = f"rogue-{r.randrange(50):02}"
@@ -141,7 +141,7 @@ class Mutants:
         return message
 
     def make_query(self) -> dict[str, str]:
-        """Parameters of a malformed query."""
+        """Return the parameters of a malformed query."""
         r = self._random
         asked = dict(r.sample(list(_QUERY.items()), r.randrange(1, 4)))
         for _ in range(r.choice((1, 1, 2, 4))):
@@ -174,7 +174,7 @@ def _make_states() -> Any:  # noqa: ANN401
 
 
 def _shift_columns(place: int, rows: int) -> dict[str, Any]:
-    """Columns of a batch some cells to the east."""
+    """Return the columns of a batch moved east by some cells."""
     longitude = LONGITUDE + 2e-4 * place
     return {
         "longitude": [longitude] * rows,
@@ -204,7 +204,7 @@ _QUERY: Final = {
 
 
 def changed_bytes(r: Random, data: bytes) -> bytes:
-    """Bytes with a few of them changed, left out, repeated or put in."""
+    """Return bytes of which a few were changed, removed, repeated or inserted."""
     out = bytearray(data)
     for _ in range(r.choice((1, 1, 1, 2, 4, 16))):
         at = r.randrange(len(out)) if out else 0

@@ -1,5 +1,6 @@
-"""Outages: the router gone for a minute, router and service frozen, disks full; and leaving.
-Nothing is lost, nobody waits."""
+"""Outages: router gone for a minute, router and service frozen, full disks, and shutdown. No
+acknowledged report is lost.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +21,9 @@ DRAIN_S: Final = 60.0
 
 
 def router_down(site: Site) -> list[Figure]:
-    """The router killed, gone for a minute, back: everything of that minute is settled soon."""
+    """Kill the router for a minute. Every report of that minute must be settled soon after its
+    return.
+    """
     down_s = site.choose_amount(60, 4)
     with open_stage(site.folder) as there:
         _load_agents(there, site.choose_amount(5, 2))
@@ -45,9 +48,7 @@ def router_down(site: Site) -> list[Figure]:
 
 
 def freeze_parts(site: Site) -> list[Figure]:
-    """Router, then service, stopped and continued: agents keep their pace meanwhile, and lose
-    nothing.
-    """
+    """Freeze the router, then the service. Agents must keep pace meanwhile and lose nothing."""
     frozen_s = site.choose_amount(20, 3)
     spans = []
     with open_stage(site.folder) as there:
@@ -106,8 +107,8 @@ def stop_parts(site: Site) -> list[Figure]:
 
 
 def disk_full(site: Site) -> list[Figure]:
-    """No file of the service may grow, then none of the agents: nothing false is acknowledged,
-    and all of it later.
+    """Prevent the files of the service, then those of the agents, from growing. Nothing may be
+    acknowledged falsely, and everything must be acknowledged later.
     """
     full_s = site.choose_amount(10, 2)
     false_acks = recovered = waiting = 0

@@ -41,7 +41,9 @@ METRES_PER_DEGREE: Final = 111_195.0
 
 
 def run(site: Site) -> list[Figure]:
-    """A thousand teleports and three ways of two cars, or a few hundred."""
+    """Send a thousand teleports and three drives of two cars; in a quick run a few hundred
+    teleports.
+    """
     teleports = site.choose_amount(1_000, 140)
     accepted, honest_lost = _drive_teleports(site, teleports)
     alerts = {way: _two_cars(site, way) for way in ("leaps", "backlog", "live")}

@@ -51,15 +51,15 @@ ICE: Final = 0.12
 
 
 class Trip(NamedTuple):
-    """Cells and sectors of a trip that the agent publishes, one visit a second."""
+    """Return cells and sectors of a trip that the agent publishes, one visit a second."""
 
     cell: IntArray
     sector: IntArray
 
 
 class Pursuit(NamedTuple):
-    """Result of a reader's pursuit: probabilities of a right place per put, of one drawn at random,
-    and of the right street.
+    """Result of an attempt to follow a car: probabilities of a right place per put, of a random
+    place, and of the right street.
     """
 
     hits: list[float]

@@ -56,7 +56,7 @@ class Part:
 
     @property
     def is_alive(self) -> bool:
-        """Return True if it runs."""
+        """Return True if the process runs."""
         return self._process is not None and self._process.poll() is None
 
     def read_lines(self) -> list[str]:
@@ -64,7 +64,7 @@ class Part:
         return self.log.read_bytes()[self._since :].decode(errors="replace").splitlines()
 
     def line_with(self, start: str) -> str:
-        """The first line that begins with `start`; waits for it."""
+        """Wait for the first line of output that begins with `start`, and return it."""
 
         def find_lines() -> list[str]:
             there = [line for line in self.read_lines() if line.startswith(start)]
@@ -82,7 +82,7 @@ class Part:
             os.kill(self.pid, number)
 
     def kill(self) -> None:
-        """kill -9, and wait until it is gone."""
+        """Kill the process with SIGKILL, and wait until it has ended."""
         self.send_signal(signal.SIGKILL)
         if self._process is not None:
             self.wait(STOP_S)
@@ -98,14 +98,12 @@ class Part:
         return code
 
     def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
-        """SIGTERM, or another signal; returns the exit code."""
+        """Send SIGTERM or another signal, and return the exit code."""
         self.send_signal(number)
         return self.wait(STOP_S)
 
     def limit_files(self, size: int) -> None:
-        """No file of the process may grow beyond `size` bytes, as on a full disk; -1 gives the
-        room back.
-        """
+        """Limit the files of the process to `size` bytes, as on a full disk; -1 removes the limit."""
         _, hard = resource.prlimit(self.pid, resource.RLIMIT_FSIZE)
         resource.prlimit(self.pid, resource.RLIMIT_FSIZE, (hard if size < 0 else size, hard))
 
@@ -133,8 +131,8 @@ class Stage:
         return [sys.executable, "-m", "deploy.router", "--listen", endpoint]
 
     def make_load(self, names: Sequence[str], rate: float, **more: object) -> Part:
-        """A generator of observations for these vehicles, `rate` per second each; not yet
-        started.
+        """Return a generator, not yet started, that sends `rate` observations per second for each
+        vehicle.
         """
         name = f"load-{len(self.loads):02}"
         config = self.folder / f"{name}.json"
@@ -157,7 +155,7 @@ class Stage:
 
     @property
     def parts(self) -> list[Part]:
-        """Everything that can be killed."""
+        """Return every process that can be killed."""
         return [self.router, self.service, *self.loads]
 
     @property
@@ -193,7 +191,7 @@ class Stage:
 
 @contextmanager
 def open_stage(folder: Path, **service: object) -> Iterator[Stage]:
-    """A stage whose service is ready; every process of it is gone after the block."""
+    """Yield a stage whose service is ready. Every process is ended after the block."""
     there = Stage(folder, **service)
     try:
         there.service.line_with("ready: ")

@@ -34,7 +34,7 @@ HEAVY: Final = 2
 
 
 def run(site: Site) -> list[Figure]:
-    """Twenty thousand cells, half a minute; five thousand and four seconds in a quick run."""
+    """Run twenty thousand cells for half a minute; in a quick run five thousand for four seconds."""
     seconds = site.choose_amount(30, 4)
     with open_stage(site.folder, vehicle_kb_s=1e4, vehicle_burst_kb=1e5) as there:
         session = open_session(ZenohSettings(connect=[there.endpoint]))
@@ -64,7 +64,9 @@ def run(site: Site) -> list[Figure]:
 
 
 def _fill_map(session: zenoh.Session, there: Stage, vehicles: int) -> int:
-    """Every vehicle a lane of 250 cells, each second one further on; until all of it is settled."""
+    """Fill the map: each vehicle visits 250 cells, one per second. Return when all reports are
+    settled.
+    """
     acked: set[str] = set()
     acks = session.declare_subscriber(
         f"{keys.ROOT}/ack/*", lambda sample: acked.add(str(sample.key_expr))

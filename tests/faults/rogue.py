@@ -21,7 +21,7 @@ from schemas.runtime.zenoh_session import configuration
 
 
 def main() -> None:
-    """Do as told."""
+    """Carry out the instructions of the campaign."""
     told = json.loads(sys.stdin.readline())
     heard: list[str] = []
     session = zenoh.open(

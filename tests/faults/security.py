@@ -13,7 +13,7 @@ from tests.secured import open_network
 
 
 def run(site: Site) -> list[Figure]:
-    """Every attack on one ground; the last revokes the attacker."""
+    """Run every attack on one set-up. The last attack revokes the attacker."""
     breaches = []
     with open_network(site.folder / "certificates") as running, open_ground(running) as found:
         for name, attempt in ATTEMPTS.items():

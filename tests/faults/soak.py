@@ -1,5 +1,5 @@
-"""`python -m tests.faults.soak [--minutes 30] [--out DIR]`: a steady load for half an hour; does
-anything grow?
+"""`python -m tests.faults.soak [--minutes 30] [--out DIR]`: steady load for half an hour, and a
+check that no resource grows.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ OWES: Final = (
 
 
 def memory_mb(part: Part) -> float:
-    """Resident memory of a process."""
+    """Return the resident memory of a process."""
     lines = Path(f"/proc/{part.pid}/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) / 1024
 
@@ -62,7 +62,7 @@ def fit_slope(times: FloatArray, megabytes: FloatArray) -> float:
 
 
 def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
-    """The steepest slope of memory, and the largest growth of handles, of any process."""
+    """Return the steepest slope of memory and the largest growth of handles of any process."""
     times: list[float] = []
     seen: dict[str, list[tuple[float, int]]] = {}
     with open_stage(site.folder, compact_s=300.0) as there:
@@ -107,7 +107,7 @@ def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
 
 
 def main() -> int:
-    """Run; 0 if every bar holds."""
+    """Run the campaign. Return 0 if every bar holds."""
     parser = argparse.ArgumentParser(
         prog="tests.faults.soak", description="A steady load; does anything grow?"
     )

@@ -62,7 +62,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def _write_archive(root: Path) -> tuple[list[Batch], Path]:
-    """Batches in the order of their segments, and the newest segment."""
+    """Return the batches in the order of their segments, and the newest segment."""
     now = time.time_ns() - SECOND
     batches = [batch("sim-001", seq, now, [0.8, 0.7]) for seq in range(1, SEGMENTS * BATCHES + 1)]
     with closing(Engine(ServiceConfig(), root)) as engine:
@@ -101,8 +101,8 @@ def _list_expected(batches: Sequence[Batch]) -> set[tuple[int, int, float]]:
 
 
 def _count_lost(root: Path, batches: Sequence[Batch]) -> int:
-    """Rows of older segments that are missing, and of the newest that count as held and are not,
-    or are wrong.
+    """Count rows of older segments that are missing, and rows of the newest segment that are
+    counted as held but are missing or wrong.
     """
     held = {(seq, row, round(mu, 3)) for seq, row, mu in _read_rows(root)}
     streams = SequenceTrackers()
@@ -123,9 +123,7 @@ def _count_lost(root: Path, batches: Sequence[Batch]) -> int:
 
 
 def _after_all_is_sent_again(root: Path, batches: Sequence[Batch]) -> int:
-    """Rows that are missing or doubled once a service has been sent everything again, and
-    acknowledged it.
-    """
+    """Count rows that are missing or doubled after every batch was sent again and acknowledged."""
     with closing(Engine(ServiceConfig(), root)) as engine:
         engine.intake.ingest(_make_messages(batches), time.time_ns())
         ((_, ack),) = engine.settlement.flush()

@@ -79,7 +79,7 @@ BREAKS: Final[dict[str, Callable[[socket.socket], None]]] = {
 
 
 class Receiver:
-    """Server on loopback that is broken in one way for its first connections."""
+    """An HTTP server on loopback that fails in one way for its first connections."""
 
     def __init__(self, kind: str) -> None:
         self.heard: set[str] = set()
@@ -91,7 +91,7 @@ class Receiver:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop accepting."""
+        """Stop the server."""
         self._server.shutdown(socket.SHUT_RDWR)
         self._server.close()
         self._thread.join()
@@ -172,7 +172,7 @@ def run_kind(folder: Path, kind: str) -> tuple[int, int]:
 
 
 def run(site: Site) -> list[Figure]:
-    """All kinds at once; seconds."""
+    """Run all kinds at once, for some seconds."""
     with ThreadPoolExecutor(len(BREAKS)) as pool:
         found = dict(
             zip(BREAKS, pool.map(lambda kind: run_kind(site.folder, kind), BREAKS), strict=True)

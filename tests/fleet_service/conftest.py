@@ -59,7 +59,7 @@ def session(router: ZenohSettings) -> Iterator[zenoh.Session]:
 
 @contextmanager
 def running(router: ZenohSettings, root: Path, **changed: object) -> Iterator[Running]:
-    """A service on an archive; ends with the block."""
+    """Yield a service on an archive; it is stopped after the block."""
     config = ServiceConfig(zenoh=router, put_s=PUT_S, segment_s=0.1, **changed)  # type: ignore[arg-type]
     lines: list[str] = []
     service = Service(config, root, lines.append)

@@ -28,12 +28,12 @@ Numbers: TypeAlias = Sequence[float] | NDArray[np.floating[Any]] | NDArray[np.in
 
 
 def value(mu: Numbers, std: float = STD) -> FloatArray:
-    """Log-likelihoods of visits that saw μ, (n, 32)."""
+    """Return log-likelihoods of visits that measured μ, (n, 32)."""
     return np.asarray(-0.5 * np.square((mugrid.CENTRES - np.asarray(mu, float)[:, None]) / std))
 
 
 def at_least(used: Numbers) -> FloatArray:
-    """Log-likelihoods of visits that only used so much, (n, 32)."""
+    """Return log-likelihoods of visits that only used this much grip, (n, 32)."""
     return np.where(np.asarray(used, float)[:, None] > mugrid.CENTRES, -8.0, 0.0)
 
 
@@ -44,7 +44,7 @@ def observations(
     cell: int | Numbers = CELL,
     second: int = -1,
 ) -> Observations:
-    """Visits at START + seconds; place in the stream follows the order."""
+    """Return visits at START + seconds, numbered in their order."""
     n = len(seconds)
     whole = np.zeros(n, np.int64)
     time = START + (np.asarray(seconds, float) * SECOND).astype(np.int64)
@@ -69,7 +69,7 @@ def observations(
 
 
 def posterior_evidence(mu: float, lower: float, upper: float, used: float) -> FloatArray:
-    """Log-likelihood (32,) of a sender without one."""
+    """Return the log-likelihood (32,) for a sender that sends none."""
     names = ("mu", "mu_lower", "mu_upper", "mu_utilised")
     columns: dict[str, NDArray[Any]] = dict(
         zip(names, (np.array([v]) for v in (mu, lower, upper, used)), strict=True)
@@ -90,12 +90,12 @@ def belief(fusion: Fusion, cell: int = CELL, sector: int = 0, now: int | None = 
 
 
 def interval(p: FloatArray) -> tuple[float, float]:
-    """5 % and 95 % quantile."""
+    """Return the 5 % and 95 % quantiles."""
     return float(mugrid.quantiles(p, 0.05)), float(mugrid.quantiles(p, 0.95))
 
 
 def slippery(p: FloatArray) -> float:
-    """P(μ < 0.4)."""
+    """Return P(μ < 0.4)."""
     return float(p @ SLIPPERY_SHARE)
 
 

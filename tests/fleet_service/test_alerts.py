@@ -1,6 +1,4 @@
-"""Alerts that somebody can be sent to: stretches with length, direction, id and life cycle; a
-webhook that arrives.
-"""
+"""Alerts as stretches with length, direction, id and life cycle, and delivery by webhook."""
 
 from __future__ import annotations
 
@@ -115,7 +113,7 @@ def test_a_stretch_keeps_its_id_while_it_grows_joins_falls_apart_and_ends() -> N
 
 @contextmanager
 def receiver(refuse: int = 0) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """A real HTTP server that takes webhooks, after refusing so many."""
+    """A real HTTP server that accepts webhooks after a number of refusals."""
     heard: list[dict[str, Any]] = []
     left = [refuse]
 
@@ -131,7 +129,7 @@ def receiver(refuse: int = 0) -> Iterator[tuple[str, list[dict[str, Any]]]]:
             self.end_headers()
 
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002
-            """Silent."""
+            """Suppress the log."""
 
     server = HTTPServer(("127.0.0.1", 0), Handler)
     thread = threading.Thread(target=server.serve_forever, daemon=True)

@@ -1,4 +1,4 @@
-"""The commands as a person types them."""
+"""The commands of `fleet-service`, run as processes."""
 
 from __future__ import annotations
 

@@ -227,7 +227,7 @@ class Done(NamedTuple):
 
 
 def place(folder: Path) -> dict[str, str]:
-    """Two archives that are not the same, and files that are given to commands."""
+    """Create two different archives, and files that commands take."""
     names = {name: folder / name for name in ("a", "b", "out", "fleet", "fleet2", "warm", "cold")}
     for name in ("a", "b"):
         shutil.copytree(DATA / "v1.0" / "archive", names[name])
@@ -288,7 +288,9 @@ def test_every_option_of_every_command_is_in_a_table() -> None:
 
 @pytest.mark.parametrize("command", SHOWN_BELOW)
 def test_the_tests_that_show_an_option_give_it_to_the_command(command: str) -> None:
-    """That is read, not run: in their modules, or below the tables of this one."""
+    """Read the tests instead of running them: each option must occur in its test module or below
+    the tables of this module.
+    """
     own = Path(__file__)
     texts = [(own.parent / f"{name}.py").read_text() for name in GIVEN_IN[command]]
     text = "".join([*texts, own.read_text().partition("class Done")[2]])

@@ -1,4 +1,4 @@
-"""A map that is empty, and a map that nobody serves; answers as files."""
+"""Queries of an empty map and of a map without a service; answers as files."""
 
 from __future__ import annotations
 

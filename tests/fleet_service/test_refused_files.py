@@ -1,4 +1,4 @@
-"""Commands refuse files that do not exist, whatever else they are told."""
+"""Commands refuse files that do not exist, with any other options."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def of_service(look: Callable[[Service], object]) -> Show:
 
 
 def let_in(made: Service) -> list[bool]:
-    """Which of thirty messages of 40 kB of two vehicles are looked at."""
+    """Return which of thirty messages of 40 kB from two vehicles are decoded."""
     return [
         made.inbox._limits.allows(key(name), 40_000)
         for name in ("car-1", "car-2")

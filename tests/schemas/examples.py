@@ -26,7 +26,7 @@ LATER = (
 
 
 def batch(kind: Kind, rows: int = 3) -> Batch:
-    """A batch whose every column has values of its own."""
+    """Return a batch in which every column has distinct values."""
     rng = np.random.default_rng(7)
     columns: dict[str, NDArray[Any]] = {}
     for name, dtype in wire.column_types(kind).items():
@@ -47,7 +47,7 @@ def batch(kind: Kind, rows: int = 3) -> Batch:
 
 
 def batch_of_version_1(kind: Kind) -> Batch:
-    """The batch as it was before there were other columns."""
+    """Return the batch without the columns that later versions added."""
     whole = batch(kind)
     return replace(
         whole, columns={name: c for name, c in whole.columns.items() if name not in LATER}
@@ -55,7 +55,7 @@ def batch_of_version_1(kind: Kind) -> Batch:
 
 
 def make_acknowledgement() -> tuple[str, list[StreamAck]]:
-    """An acknowledgement of two streams."""
+    """Return an acknowledgement of two streams."""
     return "volvo-240", [
         StreamAck(2**62 + 5, Kind.OBSERVATION, 396_303, durable=((1, 12), (14, 14))),
         StreamAck(
@@ -65,7 +65,7 @@ def make_acknowledgement() -> tuple[str, list[StreamAck]]:
 
 
 def make_alert() -> Alert:
-    """An alert whose floats are exact in 32 bits."""
+    """Return an alert whose floats are exact in 32 bits."""
     return Alert(
         1_664_484_383_910,
         2,

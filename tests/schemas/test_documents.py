@@ -103,7 +103,7 @@ IN_README = (
 
 
 def to_plain_letters(text: str) -> str:
-    """A text in the letters of the .proto."""
+    """Return a text in the letters of the .proto file."""
     letters = {"·`mu`": " mu", "`": "", "≥": ">=", "μ": "mu", " degrees of": "° of"}
     for letter, replacement in letters.items():
         text = text.replace(letter, replacement)
@@ -179,7 +179,9 @@ def test_the_module_of_the_messages_is_the_one_that_the_proto_gives(tmp_path: Pa
 
 
 def read_descriptor(module: str) -> str:
-    """The messages in a generated module, without what depends on the generator's version."""
+    """Return the messages of a generated module without parts that depend on the generator's
+    version.
+    """
     found = re.search(r"AddSerializedFile\((.*)\)", module)
     assert found
     return found[1]

@@ -1,4 +1,4 @@
-"""The speed from which one stops within what one sees."""
+"""Largest speed from which a vehicle can stop within the known distance."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""A third party takes part with the contract alone: no compiler, no science library, nothing of
-agent or service.
+"""A third party can take part with the contract alone: without compiler, science library, agent or
+service.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Understeer that the axles of a vehicle file ask for."""
+"""Understeer that follows from the axles of a vehicle file."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ FORBIDDEN: Final = ("numba", "llvmlite", "scipy", "edge_agent", "fleet_service",
 
 
 class Blocker(MetaPathFinder):
-    """Refuses to find the forbidden packages, as if they were not installed."""
+    """Import hook that hides the forbidden packages, as if they were not installed."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: object = None
@@ -58,7 +58,7 @@ PROTOBUF_SENDER = "anna"
 
 
 def protobuf_batch(now: int) -> bytes:
-    """Visits of one cell with likelihoods, as `schemas.wire` packs them."""
+    """Return visits of one cell with likelihoods, packed by `schemas.wire`."""
     leave = now - SECOND * np.arange(VISITS)[::-1]
     log_likelihood = -0.5 * np.square((mugrid.CENTRES - ICE) / STD)
     columns: dict[str, Any] = {
@@ -81,9 +81,7 @@ def protobuf_batch(now: int) -> bytes:
 
 
 def json_batch(now: int) -> bytes:
-    """The same visits as a person would write them: cell, sector and region follow from the
-    pose.
-    """
+    """Return the same visits as handwritten JSON; cell, sector and region follow from the pose."""
     times = [str(now - SECOND * k) for k in reversed(range(VISITS))]
     numbers = {
         "latitude": LATITUDE,
@@ -101,7 +99,7 @@ def json_batch(now: int) -> bytes:
 
 
 def open_session(endpoint: str) -> zenoh.Session:
-    """A client of one router, by Zenoh's own configuration."""
+    """Open a client session to one router with Zenoh's own configuration."""
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))
@@ -140,7 +138,7 @@ class Heard:
 
 
 def query_replies(session: zenoh.Session, selector: str) -> list[tuple[str, bytes]]:
-    """Encoding and payload of every reply; an error reply comes back as its text."""
+    """Return encoding and payload of every reply; for an error reply its text."""
     return [
         (str(reply.ok.encoding), reply.ok.payload.to_bytes())
         if reply.ok is not None
@@ -150,7 +148,7 @@ def query_replies(session: zenoh.Session, selector: str) -> list[tuple[str, byte
 
 
 def find_blocked() -> list[str]:
-    """Which of the forbidden packages can indeed not be loaded."""
+    """Return the forbidden packages that cannot be imported."""
     out = []
     for name in FORBIDDEN:
         try:

@@ -54,7 +54,7 @@ DAY: Final = ("--from", "2026-01-27", "--to", "2026-01-28")
 
 
 class House:
-    """A folder with an archive, and the figures with their notes."""
+    """Folder with an archive, and the figures with their notes."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -84,7 +84,7 @@ def readme_commands_failed(house: House) -> float:
 
 
 def pages_with_errors(house: House) -> float:
-    """Pages that complain, ask for something, or draw nothing, in Chromium."""
+    """Count pages that report an error, request an external file, or stay empty in Chromium."""
     pages = []
     for words in PAGES:
         out = house.folder / f"{words.replace(' ', '')}.html"
@@ -130,8 +130,8 @@ def live_page(house: House) -> tuple[str, list[str], list[str]] | None:
 
 
 def service_ready_s(house: House) -> float:
-    """From the command to `ready:` of a service on an empty archive, kernels as `make setup`
-    left them.
+    """Return the time from the command to `ready:` of a service on an empty archive, with the
+    kernels of `make setup`.
     """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     (house.folder / "ready.json").write_text(json.dumps({"zenoh": {"connect": endpoints}}))
@@ -154,7 +154,7 @@ def service_ready_s(house: House) -> float:
 
 
 def bound_painted(house: House) -> float:
-    """Outputs in which a bound has a number to colour by."""
+    """Count outputs in which a cell with only a bound has a number that could be coloured."""
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "tests/test_bounds_unpainted.py"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     counts = {
@@ -170,7 +170,9 @@ def bound_painted(house: House) -> float:
 
 
 def colour_distance(house: House) -> float:
-    """Least CIEDE2000 between surfaces, and between lines, for four kinds of sight."""
+    """Return the smallest CIEDE2000 distance between surfaces, and between lines, for four kinds of
+    colour vision.
+    """
     surfaces = [shade(mu, *GRIP_RANGE) for mu in SURFACES.values()]
     lines = [style.colour for style in (*ESTIMATORS.values(), TRUTH)]
     least = {
@@ -186,28 +188,28 @@ def colour_distance(house: House) -> float:
 
 
 def wrong_logs_unnoticed(house: House) -> float:
-    """Planted mistakes of a recording that `replay` does not mention."""
+    """Count planted mistakes in a recording that `replay` does not mention."""
     found = find_unnoticed(house.folder, WRONG, SEED)
     house.print_measured("wrong logs", f"{len(WRONG)} planted, unnoticed: {found}")
     return float(len(found))
 
 
 def count_tracebacks(house: House) -> float:
-    """Mistakes at the command line that are answered with a traceback or with success."""
+    """Count mistakes at the command line that end in a traceback or in success."""
     count, bad = mistakes.find_tracebacks(house.folder, house.archive)
     house.print_measured("mistakes", f"{count} made, bad: {bad}")
     return float(len(bad)) if count >= 60 else float("nan")
 
 
 def silent_seconds(house: House) -> float:
-    """Longest silence on a terminal."""
+    """Return the longest time without output on a terminal."""
     found = waiting.silent_seconds(house.folder, house.archive)
     house.print_measured("silence", found)
     return max(found.values())
 
 
 def install_to_first_map_s(house: House) -> float:
-    """From an empty environment and a wheel to a map in a browser."""
+    """Measure the way from an empty environment and a wheel to a map in a browser."""
     built = house.folder / "dist"
     build = [sys.executable, "-m", "build", "--wheel", "--outdir", str(built), str(ROOT)]
     subprocess.run(build, check=True, capture_output=True)
@@ -266,7 +268,7 @@ def first_drive_commands(_: House) -> float:
 
 
 def first_drive_alerts(house: House) -> float:
-    """That a real minute on a dry motorway raises under three names."""
+    """Count alerts that a real minute on a dry motorway raises when published under three names."""
     folder = house.folder / "minute"
     folder.mkdir()
     cells, alerts = map_first_drive(folder)

@@ -1,5 +1,5 @@
-"""Mistakes at the command line: each is one line with exit code 2 or argparse's own, and never a
-traceback.
+"""Mistakes at the command line: each ends with one line and exit code 2, or with an error of
+argparse, and never with a traceback.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ FLEET: Final = (
 
 
 def prepare_files(folder: Path) -> None:
-    """Files that the mistakes are made with."""
+    """Create the files that the mistakes need."""
     (folder / "text.csv").write_text("a;b\n1,5;x\n")
     (folder / "bad.json").write_text(json.dumps({"mass": "heavy", "surprise": 1}))
     words = ["simulate", "slalom", "--duration", "1", "--out", str(folder / "log.parquet")]

@@ -112,7 +112,7 @@ def run_all(folder: Path) -> list[str]:
 
 
 def _run_to_end(line: list[str], folder: Path, log: Path, environment: dict[str, str]) -> int | str:
-    """The exit code of a command, or that it did not end."""
+    """Return the exit code of a command, or report that it did not end."""
     with log.open("wb") as out:
         try:
             done = subprocess.run(

@@ -44,8 +44,8 @@ LASTING: Final = (
 
 
 def longest_silence(command: list[str], cache: Path, ready: bytes | None = None) -> float:
-    """The longest time between two signs of life of a command on a terminal, its begin and its end
-    counted [s].
+    """Return the longest time [s] between two outputs of a command on a terminal, start and end
+    included. A command that prints `ready` is interrupted there.
 
     One that is `ready` with a word is interrupted there, and its end does not count.
     """
@@ -87,7 +87,7 @@ def longest_silence(command: list[str], cache: Path, ready: bytes | None = None)
 
 
 def silent_seconds(folder: Path, archive: Path) -> dict[str, float]:
-    """The longest silence of each command, with an empty cache of kernels."""
+    """Return the longest silence of each command with an empty cache of kernels."""
     found = {}
     for command in COMMANDS:
         words = [word.format(d=folder, a=archive) for word in command]

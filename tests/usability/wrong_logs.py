@@ -1,4 +1,4 @@
-"""Recordings with a planted mistake, estimated as a new user does: is the mistake mentioned?"""
+"""Recordings with a planted mistake, estimated as a new user does. Each mistake must be mentioned."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ WRONG: Final = (  # those that gave sure ice, or the wrong place, in silence onc
 
 
 def find_unnoticed(folder: Path, names: Sequence[str], seed: int) -> list[str]:
-    """Names of mistakes of which `edge-agent replay` says nothing; the sound drive must be
-    passed in silence.
+    """Return the mistakes that `edge-agent replay` does not mention. It must not complain about the
+    correct drive.
     """
     drive = drives(1, seed, rough=False)[0]
     out = [] if not _has_warned(folder, drive) else ["the sound drive is suspected"]

@@ -91,7 +91,7 @@ def diagnose(
         signals[:, [S.AX, S.AY]] = signals[:, [S.AY, S.AX]]
         drive = prepare_drive(t, signals, vehicle, ground)
     if has_exchanged_position(t, signals, drive):
-        words = "the fixes go as fast as the wheels only when latitude and longitude are exchanged"
+        words = "the fixes match the wheels' speed only if latitude and longitude are exchanged"
         diagnosis.findings.append(Finding("latitude", "exchanged with longitude", words))
         signals[:, [S.LATITUDE, S.LONGITUDE]] = signals[:, [S.LONGITUDE, S.LATITUDE]]
         drive = prepare_drive(t, signals, vehicle, ground)
@@ -219,9 +219,9 @@ WORDS: Final = {
     "ay": "a_y is {gain:.3g} of v·r",
     "r": "a_y is {lateral:.3g} of v·r, the wheels' yaw rate {axle:.3g} of it",
     "delta": "steering is {gain:.3g} of L·r/v",
-    "v": "the wheels go {wheels:.3g} times the speed that everything else tells",
+    "v": "the wheel speed is {wheels:.3g} times the speed from the other signals",
     "sides": "left and right wheels differ by {gain:.3g} of track·r",
-    "place": "the course turns by {gain:.3g} of r",
+    "place": "the turn rate of the course is {gain:.3g} of r",
 }
 ASKED: Final = {
     "ax": "longitudinal",
@@ -389,7 +389,7 @@ def _compare_axles(drive: EvenDrive) -> list[Finding]:
     count = max(len(x) / RATE_HZ, 1.0)
     error = spread / max(float(x.std()) * np.sqrt(count), 1e-12)
     if abs(solution[0] + 1.0) < 0.4 and error < 0.45:
-        words = "in turns the rear wheels go the longer way: front and rear exchanged?"
+        words = "the rear wheels travel farther in turns: front and rear exchanged?"
         return [Finding("omega", "front and rear exchanged", words)]
     return []
 
@@ -441,7 +441,7 @@ def _find_offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
     ):
         listed.append(("delta", steering.offset, steering.offset_error, LARGEST_STEER, "rad"))
     return [
-        Finding(channel, "offset", f"{value:+.3g} {unit} when it should be none", offset=-value)
+        Finding(channel, "offset", f"{value:+.3g} {unit}; expected about 0", offset=-value)
         for channel, value, error, largest, unit in listed
         if np.isfinite(value) and abs(value) > largest + SURE * error
     ]

@@ -113,7 +113,7 @@ def approach_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -
 def drive_town(
     seed: int, seconds: float, vehicles: int, counts: Approaches, *, routed: bool
 ) -> None:
-    """Drive one town and add what happened to the counts."""
+    """Drive one town and add its outcomes to the counts."""
     fleet = SimulatedFleet(f"hills-{seed}", vehicles, seed, RATE_HZ, rough=0.5)
     known = map_of_places(places_of(fleet.scenario, AFTER_S), START_NS)
     tracks = [_Track() for _ in range(vehicles)]

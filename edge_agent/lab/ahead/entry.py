@@ -110,7 +110,7 @@ def record_beliefs(
         published += [row.tobytes() for row in seen.columns["log_likelihood"]]
         beliefs = pipeline.beliefs()
         if beliefs is None:
-            raise RuntimeError("the default estimator tells no belief")
+            raise RuntimeError("the default estimator reports no belief")
         if prior is not None:
             now = START_NS
             map_beliefs = {

@@ -81,7 +81,7 @@ def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str],
     results.noise, plotted = experiments(seeds)
     for key, (batch, reported) in plotted.items():
         results.drives[key, "paper-aco-fckf"] = PlottedDrive(batch, reported)
-    log_line("paper 004, its two noise experiments")
+    log_line("both noise experiments of paper 004")
     for name, scenario in (PAPERS | OTHERS | VEHICLES).items():
         if quick and name not in QUICK_SCENARIOS:
             continue
@@ -108,13 +108,13 @@ def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str],
         f"rough cars in {1 if quick else real_world.TOWNS} hilly towns, and standing on slopes"
     )
     results.worth = worth.campaign(seeds, quick=quick)
-    log_line("what fuzzy inference and the ant colony bring")
+    log_line("gain from fuzzy inference and from the ant colony")
     if not quick:
         results.oracle = {
             "002.sine.rmse_vx": oracle.speed(seeds),
             "003.accel.mu_error": oracle.friction(seeds)[0],
         }
-        log_line("what an oracle makes of two of the papers' manoeuvres")
+        log_line("an oracle on two manoeuvres of the papers")
         results.foreign = _foreign_tyres(seeds, log_line)
     return results
 
@@ -152,5 +152,5 @@ def _foreign_tyres(seeds: Sequence[int], log_line: Callable[[str], None]) -> dic
             batch = realistic(foreign(scenario, kind), seeds[place :: len(kinds)] or seeds[:1])
             reported = estimates(bank_of(DEFAULT, batch.vehicles), batch)
             found[kind].extend(measures(batch, reported)["coverage90"])
-    log_line("all scenarios on foreign tyres")
+    log_line("all scenarios on tyres that the filter does not model")
     return {kind: np.array(values) for kind, values in found.items()}

@@ -101,8 +101,8 @@ def judge_towns(
     *,
     oracle: bool = True,
 ) -> DetectionResults:
-    """Drive and judge towns; `oracle`: ask the oracle about short towns; `log_line` gets a line
-    per town.
+    """Drive and judge towns. With `oracle`, also run the oracle in short towns. `log_line` receives
+    one line per town.
     """
     results = DetectionResults()
     for town in chosen:
@@ -144,7 +144,7 @@ def town_named(text: str) -> DetectionTown:
     )
     if len(given) > len(usual) or not sound:
         raise InputError(
-            "town", f"{text!r} is no town", "give SEED, SEED:plain:900 or SEED:plain:900:winter"
+            "town", f"{text!r} is not a town", "give SEED, SEED:plain:900 or SEED:plain:900:winter"
         )
     return DetectionTown(int(seed), kind, float(seconds), winter=season == "winter")
 

@@ -73,66 +73,69 @@ def fault_on(kind: str, *channels: str, size: float = 0.0) -> tuple[Fault, ...]:
 
 
 CASES: Final = {
-    "none": Case((), Health.OK, "the drives as they are, for comparison"),
+    "none": Case((), Health.OK, "the same drives without a fault, for comparison"),
     "inertial-dropout": Case(
         fault_on("dropout", "ax", "ay", "yaw_rate"),
         Health.NO_INERTIAL,
-        "motion is carried by the wheels with wider spread; nothing is concluded on friction",
+        "motion is estimated from the wheels, with a larger variance; friction is not updated",
     ),
     "steering-dropout": Case(
         fault_on("dropout", "delta"),
         Health.NO_STEERING,
-        "the last angle is held; axles say nothing of friction",
+        "the last angle is kept; the axles give no evidence of friction",
     ),
     "wheel-speed-stuck": Case(
         fault_on("stuck", "omega_fl"),
         Health.OK,
-        "not told; a wheel that seems to slide is outvoted",
+        "not reported; the other wheels outvote a wheel that seems to slide",
     ),
     "spikes-beyond-belief": Case(
         fault_on("spike", "omega_fl", size=900.0) + fault_on("spike", "ay", size=60.0),
         Health.OUTLIER,
-        "refused reading by reading",
+        "each reading is refused",
     ),
     "believable-spikes": Case(
         fault_on("spike", "omega_fl", size=8.0) + fault_on("spike", "ax", size=5.0),
         Health.OK,
-        "not told by all; an acceleration that jumps is refused once, a wheel that does is trusted "
-        "less",
+        "not reported by all estimators; a jump of an acceleration is refused once, a wheel that "
+        "jumps is trusted less",
     ),
     "bias-step": Case(
         (Fault("bias", "ay", BEGINS, size=0.3),),
         Health.OK,
-        "not told; the offset is a state and is learned in seconds",
+        "not reported; the offset is a state of the filter and is learned in seconds",
     ),
     "wrong-steering-zero": Case(
         (Fault("bias", "delta_fl", size=0.003), Fault("bias", "delta_fr", size=0.003)),
         Health.OK,
-        "3 degrees at the steering wheel: not told; the offset of the steering is a state",
+        "3 degrees at the steering wheel: not reported; the steering offset is a state of the filter",
     ),
     "one-wheel-speed-lost": Case(
         (Fault("dropout", "omega_rl", BEGINS),),
         Health.NO_WHEEL_SPEED,
-        "the others do; the interval is a little wider",
+        "the other wheels suffice; the interval is a little wider",
     ),
     "no-torque-at-all": Case(
         (Fault("missing", "torque"),),
         Health.NO_TORQUE,
-        "force from the accelerometer, shared out by guess",
+        "total force from the accelerometer, divided between the wheels by assumption",
     ),
     "position-gone": Case(
         tuple(Fault("dropout", channel, BEGINS) for channel in ("latitude", "longitude", "yaw")),
         Health.NO_POSITION,
-        "estimates as before; no visit, so no observation",
+        "estimates do not change; without a position there are no visits and no observations",
     ),
     "time-gap": Case(
         (),
         Health.TIME_GAP,
-        "motion begins anew, friction fades over the metres missed",
+        "the motion filter restarts; the belief of friction widens with the distance driven in the gap",
         kept_samples,
     ),
     "sample-out-of-order": Case(
-        (), Health.TIME_GAP, "left out, the estimate before is repeated", late_samples
+        (),
+        Health.TIME_GAP,
+        "the sample is skipped and the previous estimate is repeated",
+        late_samples,
     ),
 }
 

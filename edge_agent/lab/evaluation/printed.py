@@ -58,7 +58,7 @@ PRINTED: Final = (
     *(
         Printed(
             "004",
-            f"{noise} noise, before the ants, MAE {name}",
+            f"{noise} noise, before tuning, MAE {name}",
             value,
             f"noise.004.{noise}.paper-fckf.mae_{key}",
             "",
@@ -141,24 +141,29 @@ def names() -> list[str]:
 
 
 WHY_NOT: Final = """\
-"Ours" of 000 to 003 is measured on the simulator's own plant: drag, lagging loads, and tyres whose slip stiffness does
-not depend on μ. `edge-agent evaluate --paper NUMBER` sets up the papers' conditions, and there every printed error is
-reached. What the difference is made of:
+"Ours" of 000 to 003 is measured on the simulator's own plant: drag, lagging loads, and tyres whose
+slip stiffness does not depend on μ. `edge-agent evaluate --paper NUMBER` sets up the papers'
+conditions, and there every printed error is reached. Reasons for the difference:
 
-- **004.** The printed μ errors need Dugoff tyres in the plant. "Ours" here has a Magic Formula that is as steep in the
-  middle. With P₀ = .2·I and Q = .1·I as printed, read as .1·T² per step, v_x, v_y and yaw rate reach the printed MAE.
-  The paper begins at the truth, so its μ is no evidence that friction is found.
-- **004, before the ants.** Where R is right and the start known, untuned sets are as good as tuned ones. With the
-  printed P₀ and Q untuned sets are worse than leaving R alone, and the colony on likelihood gets part of that back. The
-  printed objective (33) makes the filter worse.
-- **003.** Needs slip stiffness proportional to μ, the wheels' torque balances as measurements, given motion and no
-  noise. On real tyres constant speed straight on shows no friction at all: its rows show the prior's error. The UKF
-  column of the paper is an artefact of single precision with α = .001.
-- **000.** With stiffness proportional to μ the printed Q = I, R = 10⁴·I and μ₀ = 1 give "about 3 s". On a tyre whose
-  stiffness does not depend on μ they say nothing of friction: at 30 km/h half of the grip is used.
-- **001.** v_y is almost nothing with the rear wheels steered by (53): "always zero" has an error of .0059. β is printed
-  in degrees, and is in radians if it is that of the v_y next to it.
-- **001, 002.** Friction is set by hand and not estimated: both report the prior. 002's tables 6 and 7 (road test)
-  repeat tables 2 and 3 (simulation) digit for digit. R is set by hand per manoeuvre in 001; here once. With drag 002's
-  WCKF-B is worse than WCKF-A in v_x.
+- **004.** The printed μ errors need Dugoff tyres in the plant. The plant of "ours" has a Magic
+  Formula that is equally steep in the middle. With P₀ = .2·I and Q = .1·I as printed, read as .1·T²
+  per step, v_x, v_y and yaw rate reach the printed MAE. The paper's filter starts at the true μ, so
+  its small error is no evidence that it finds friction.
+- **004, before tuning.** Where R is correct and the start is known, untuned fuzzy sets are as good
+  as tuned ones. With the printed P₀ and Q untuned sets are worse than a constant R, and the colony
+  that maximises likelihood recovers part of this loss. The printed objective (33) makes the filter
+  worse.
+- **003.** Needs slip stiffness proportional to μ, the wheels' torque balances as measurements,
+  given motion and no noise. On real tyres, driving straight on at constant speed gives no
+  information about friction: these rows show the error of the prior. The UKF column of the paper is
+  an artefact of single precision with α = .001.
+- **000.** With stiffness proportional to μ the printed Q = I, R = 10⁴·I and μ₀ = 1 give "about 3
+  s". On a tyre whose stiffness does not depend on μ they give no information about friction: at 30
+  km/h only half of the grip is used.
+- **001.** v_y is almost nothing with the rear wheels steered by (53): the estimate "always zero"
+  has an error of .0059. β is printed in degrees, but agrees with the v_y printed next to it only in
+  radians.
+- **001, 002.** Friction is set by hand and not estimated: both report the prior. 002's tables 6 and
+  7 (road test) repeat tables 2 and 3 (simulation) digit for digit. Paper 001 sets R by hand for
+  each manoeuvre; here it is set once. With drag 002's WCKF-B is worse than WCKF-A in v_x.
 """

@@ -101,7 +101,7 @@ def judge_folder(
     if not paths:
         raise InputError(
             "logs",
-            f"{folder} has no LOG.parquet with LOG.json",
+            f"{folder} has no LOG.parquet with a LOG.json next to it",
             "put each log next to its vehicle file",
         )
     found = []

@@ -15,62 +15,78 @@ from schemas.runtime.figures import Figure, markdown
 PAPERS_HEAD: Final = """\
 ## The papers' figures
 
-Printed; ours, the paper's estimator with sensors without error: 004 with the paper's noise on a matched plant, the
-others on the simulator's own plant; the same and the default with ordinary sensors, a vehicle known to a few per cent
-and μ unknown at the start (mean ± sd over seeds). `edge-agent evaluate --paper` has the papers' own conditions."""
+Columns. Printed: the number in the paper. Ours: the paper's estimator with error-free sensors; 004
+with the paper's noise on a matched plant, the others on the simulator's own plant. Realistic: the
+same estimator with ordinary sensors, vehicle parameters known to a few per cent, and μ unknown at
+the start. Default, realistic: the default estimator on the same drives. Values are mean ± standard
+deviation over seeds. `edge-agent evaluate --paper` has the papers' own conditions."""
 VEHICLES_HEAD: Final = """\
 ## The default on other vehicles
 
-A front-driven hatchback, a van on soft tyres, a loaded car: anti-lock stops, split friction, jumps, J-turn, ice."""
+A front-wheel-drive hatchback, a van on soft tyres and a loaded car. Manoeuvres: stops with
+anti-lock braking, split friction, jumps of friction, J-turn, ice."""
 FAULTS_HEAD: Final = """\
 ## Sensor faults
 
-From 2 s on, mostly to 5 s, in a slalom on snow, a double lane change on dry road and a braking from dry to wet. "Told":
-health says so in every drive, of every estimator. "Finite": no number of any estimator is NaN or out of order.
-Coverage, width and errors of the default from 2 s on; coverage of the papers' estimators that estimate friction."""
+Each fault lasts from 2 s on, mostly to 5 s. Drives: a slalom on snow, a double lane change on dry
+road, and braking from dry to wet. "Reported": every estimator sets the health flag of the fault in
+every drive. "Finite": no number of any estimator is NaN or infinite. Coverage, width and errors are
+those of the default from 2 s on. The last column is the coverage of the papers' estimators that
+estimate friction."""
 CONSISTENCY_HEAD: Final = """\
 ## Consistency and reliability
 
-NEES of (v_x, v_y) and NIS per component, mean over all scenarios, and the share of instants at which the mean over the
-drives lies within the 95 % bounds of a right filter. R holds model error, which lasts: NIS is lower by design, and
-errors that last leave the bounds of NEES for seconds. Then: share of true frictions below each stated quantile; the
-frictions are those of the scenarios, and not drawn from anybody's prior."""
+First table: NEES of (v_x, v_y) and NIS per component, mean over all scenarios, and the share of
+instants at which the mean over the drives lies within the 95 % bounds of a consistent filter. R
+includes slowly varying model error. Therefore NIS is below 1 by design, and NEES can leave its
+bounds for seconds. Second table: share of true frictions below each stated quantile. The frictions
+are those of the scenarios and not drawn from the prior of any estimator."""
 ALL_HEAD: Final = """\
 ## Every estimator in every scenario
 
-Ordinary sensors. NEES of (v_x, v_y) and NIS per row: 1 is expected; where R holds model error as well, NIS is lower."""
+Ordinary sensors. The expected NEES of (v_x, v_y) and NIS are 1; where R includes model error, NIS
+is lower."""
 WORLD_HEAD: Final = """\
-## The world as it is
+## Realistic cars in hilly towns
 
-Rough cars in hilly towns that nobody tuned on (`real_world.py`), half of them without torque, every estimator. Every
-second town is a winter town. Missed ice: the upper end is not below .4 on ice where grip is used. False grip: the lower
-end lies .05 or more above the friction of ice.
-False ice: the whole interval below .4 on a road above .6; strict: the share of the samples on wet and dry road (from
-.45); settled: of those whose car left snow and ice 3 s ago or never met any. Below: the upper end lies under the grip
-in use, which is wrong for certain. Width where excited, over the prior's. Coverage of v_x and v_y: of what the stated
-standard deviation makes of 90 %. Lost: v_x off by more than 1 m/s. Standing: the largest speed given to a car that
-stands on 5 %.
+Every estimator in cars with realistic sensor errors, in hilly towns that were not used for tuning
+(`real_world.py`). Half of the cars send no torque. Every second town is a winter town. Columns:
+
+- *Missed ice*: on ice where grip is used, the upper end of the interval is not below .4.
+- *False grip*: the lower end lies at least .05 above the friction of ice.
+- *False ice*: the whole interval lies below .4 on a road above .6. *Of all*: share of the samples
+  on wet and dry road (from .45). *Settled*: share of the samples whose car left snow and ice at
+  least 3 s ago or never met any.
+- *Below*: the upper end lies below the grip in use, which is certainly wrong.
+- *Width, excited*: width of the interval where grip is used, divided by the prior's.
+- *Coverage of v_x and v_y*: of the 90 % interval that follows from the stated standard deviation.
+- *Lost*: the error of v_x is more than 1 m/s. *Standing*: the largest estimated speed of a car that
+  stands on a 5 % slope.
+
 The baseline is the mean of the wheels' speeds for v_x and the prior for friction."""
 OWN_HEAD: Final = """\
 ## Paper 004's bars on plants that are not its filter's model
 
-The bars above hold on the plant that is matched to the filter: tyres, drag and loads as its model has them. The paper
-used CarSim, which is not matched. The same experiments on the simulator's own sedan and van (rounder tyres, drag,
-lagging loads):"""
+The bars above are for a plant that equals the filter's model in tyres, drag and loads. The paper
+used CarSim, which does not. This table has the same experiments on the simulator's own sedan and
+van (rounder tyres, drag, lagging loads):"""
 ORACLE_HEAD: Final = """\
-## What anybody could do
+## Limit of the sensors
 
-Two bars of the papers that are hard, and an oracle on the same sensors (`oracle.py`): a Bayesian who knows the friction
-and the motion, and knows everything but what vehicle file and data sheet leave open."""
+Two difficult bars of the papers, compared with an oracle on the same sensors (`oracle.py`). The
+oracle is a Bayesian estimator that knows friction, motion and everything else that vehicle file and
+data sheet specify."""
 DETECTION_HEAD: Final = """\
 # Detection
 
-Towns drawn by seeds that nobody tuned on, rough cars and plain cars apart; short: 120 s, long: 900 s, because faults
-that silence a car only show there. Half of the towns are winter towns (`scenarios.winter`, all cars with winter
-equipment); their figure stands in brackets. Definitions: `edge_agent/lab/evaluation/detection.py`. ± is the standard
-error over towns. `flag`: ordinary ABS and ESC logic on the same signals (`slip_flag.py`); `oracle`: an observer who
-knows motion and forces (`slide_oracle.py`); `roc`: the estimator's belief at other thresholds. Cars under which ice
-appeared while they stood are counted as `stood` and nowhere else."""
+Towns are drawn by seeds that were not used for tuning. Cars with realistic sensor errors ("rough")
+and cars with ordinary sensors ("plain") are reported separately. Short drives last 120 s; long
+drives last 900 s, because faults that silence a car appear only there. Half of the towns are winter
+towns (`scenarios.winter`; all cars have winter equipment); their figure is in brackets. Definitions
+are in `edge_agent/lab/evaluation/detection.py`. ± is the standard error over towns. `flag`:
+ordinary ABS and ESC logic on the same signals (`slip_flag.py`). `oracle`: an observer that knows
+motion and forces (`slide_oracle.py`). `roc`: the estimator's belief at other thresholds. If ice
+appears under a car that stands, it is counted as `stood` and nowhere else."""
 FRICTION: Final = (
     "paper-aco-fckf",
     "federated-ckf",
@@ -243,7 +259,14 @@ def faults(values: dict[str, float]) -> str:
                 ),
             ]
         )
-    head = ("fault", "expected", "told", "finite", *shown, "coverage of 004, 000, 003")
+    head = (
+        "fault",
+        "expected behaviour",
+        "reported",
+        "finite",
+        *shown,
+        "coverage of 004, 000, 003",
+    )
     return grid(head, rows)
 
 

@@ -1,4 +1,4 @@
-"""Worth of the fuzzy sets and of the ant colony: interval scores on rough drives that were not used
+"""Benefit of the fuzzy sets and of the ant colony: interval scores on rough drives that were not used
 for tuning.
 
 Legend, all scores less is better

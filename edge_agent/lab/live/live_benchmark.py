@@ -47,7 +47,7 @@ class Peer:
         for line in _read_lines(self.process.stdout):
             if line == word:
                 return
-        raise RuntimeError(f"the peer ended before it was {word}")
+        raise RuntimeError(f"the peer ended before it printed {word!r}")
 
     def send_go(self) -> None:
         """Send the peer the signal to begin or to end."""
@@ -223,9 +223,9 @@ def count_crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
         agent.terminate()
         output, _ = agent.communicate(timeout=PATIENCE_S)
         if missed or agent.returncode or not output.strip().endswith("}"):
-            unseen = f"did not see {', '.join(missed)}" if missed else "saw all"
+            unseen = f"did not notice {', '.join(missed)}" if missed else "noticed every change"
             bad.append(
-                f"{kind}: the agent {unseen}, ended with {agent.returncode} and said "
+                f"{kind}: the agent {unseen}, exited with code {agent.returncode}, and printed "
                 f"{output[-200:]!r}"
             )
     return bad, losses

@@ -36,7 +36,7 @@ def checked_seed(seed: int) -> int:
         InputError: it is negative.
     """
     if seed < 0:
-        raise InputError("seed", f"{seed} is negative", "give a whole number from 0 on")
+        raise InputError("seed", f"{seed} is negative", "give a whole number of at least 0")
     return seed
 
 

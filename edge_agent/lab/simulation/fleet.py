@@ -228,7 +228,9 @@ class SimulatedFleet:
         then that of this block.
         """
         if steps < 1:
-            raise InputError("steps", f"{steps} samples cannot be had", "give a positive number")
+            raise InputError(
+                "steps", f"{steps} samples cannot be simulated", "give a positive number"
+            )
         network = self.scenario.network
         origin = self.scenario.origin
         lanes = (network.points, network.first, network.size, network.spacing, network.ways)

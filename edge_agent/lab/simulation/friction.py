@@ -53,7 +53,9 @@ class Patch:
             )
         if not (self.length > 0.0 and self.width > 0.0 and self.start < self.end):
             raise InputError(
-                "patch", f"{self.name} covers nothing", "give positive sizes, and start before end"
+                "patch",
+                f"{self.name} covers no area or no time",
+                "give positive sizes, and start before end",
             )
 
 

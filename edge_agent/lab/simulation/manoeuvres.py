@@ -55,8 +55,8 @@ class TimedFriction(NamedTuple):
 
 
 Friction = float | Callable[[float, float], float] | TimedFriction
-"""Friction everywhere, or a function of (x along the track, y to the left) [m], asked for each
-wheel, or of time.
+"""Friction everywhere, or a function of (x along the track, y to the left) [m], evaluated at each
+wheel, or a function of time.
 """
 
 
@@ -267,13 +267,13 @@ def kmh(speed: float) -> float:
 
 MANOEUVRES: Final = {
     "double-lane-change": Manoeuvre(
-        double_lane_change, kmh(80), 10.0, 0.85, "double lane change, ISO 3888-1 in kind"
+        double_lane_change, kmh(80), 10.0, 0.85, "double lane change, similar to ISO 3888-1"
     ),
     "slalom": Manoeuvre(slalom, kmh(30), 15.0, 0.30, "slalom around cones 18 m apart"),
     "sine": Manoeuvre(sine, kmh(70), 12.0, 0.50, "sine steering of half a hertz"),
     "acceleration": Manoeuvre(acceleration, kmh(20), 8.0, 0.85, "full throttle in a straight line"),
     "braking": Manoeuvre(
-        braking, kmh(80), 8.0, 0.85, "stop with anti-lock control, ISO 21994 in kind"
+        braking, kmh(80), 8.0, 0.85, "stop with anti-lock control, similar to ISO 21994"
     ),
     "jump-braking": Manoeuvre(
         braking, kmh(80), 8.0, jump(0.85, 0.30, 45.0), "the same stop from dry onto snow"
@@ -283,14 +283,22 @@ MANOEUVRES: Final = {
     ),
     "gentle-braking": Manoeuvre(gentle_braking, kmh(60), 10.0, 0.85, "braking with 2 m/s^2"),
     "constant-radius": Manoeuvre(
-        constant_radius, kmh(40), 30.0, 0.35, "circle of 40 m radius, ISO 4138 in kind"
+        constant_radius, kmh(40), 30.0, 0.35, "circle of 40 m radius, similar to ISO 4138"
     ),
     "straight": Manoeuvre(
-        straight, kmh(60), 20.0, 0.85, "straight on at constant speed: unexcited"
+        straight,
+        kmh(60),
+        20.0,
+        0.85,
+        "straight on at constant speed: no information about friction",
     ),
-    "j-turn": Manoeuvre(j_turn, kmh(70), 8.0, 0.85, "step of the steering, ISO 7401 in kind"),
+    "j-turn": Manoeuvre(j_turn, kmh(70), 8.0, 0.85, "step of the steering, similar to ISO 7401"),
     "two-lane-changes": Manoeuvre(
-        two_lane_changes, kmh(30), 25.0, jump(0.5, 0.3, 110.0), "wet, then snow: paper 000"
+        two_lane_changes,
+        kmh(30),
+        25.0,
+        jump(0.5, 0.3, 110.0),
+        "wet, then snow: manoeuvre of paper 000",
     ),
     "accelerating-sine": Manoeuvre(
         accelerating_sine, 20.0, 13.0, 0.70, "sine, then faster: paper 002"
@@ -309,10 +317,10 @@ MANOEUVRES: Final = {
         moderate_braking, kmh(80), 6.0, jump(0.85, 0.30, 60.0), "0.28 g from dry onto snow"
     ),
     "standing": Manoeuvre(
-        standing, 0.0, 60.0, 0.85, "at rest, the foot on the brake: level or on a slope"
+        standing, 0.0, 60.0, 0.85, "standing with the brake applied: level or on a slope"
     ),
     "stop-and-go": Manoeuvre(
-        stop_and_go, kmh(40), 56.0, 0.85, "traffic lights: stop, stand, start again"
+        stop_and_go, kmh(40), 56.0, 0.85, "traffic lights: stop, wait, start again"
     ),
     "pulses": Manoeuvre(pulses, kmh(50), 30.0, 0.60, "throttle and brakes in turn while weaving"),
 }

@@ -125,7 +125,7 @@ def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, 
         if not 1 <= len(ways[k]) <= MOST_WAYS:
             raise InputError(
                 "roads",
-                f"lane {k} has {len(ways[k])} ways to go on",
+                f"lane {k} has {len(ways[k])} successors",
                 f"join 2 to {MOST_WAYS + 1} roads",
             )
     return network_of(lanes, ways, count)

@@ -130,7 +130,7 @@ def demo() -> Scenario:
             Patch("wet north-west", -110.0, 90.0, 220.0, 160.0, WET, looks=WET),
             Patch("snow south-west", -110.0, -80.0, 220.0, 180.0, SNOW, looks=SNOW),
             Patch(
-                "slush west of the southern street",
+                "slush in the west of the southern street",
                 -4.0,
                 -75.0,
                 70.0,
@@ -169,7 +169,7 @@ def hills() -> Scenario:
     return replace(
         demo(),
         name="hills",
-        about="the demo's town on slopes to 8 %, with crossfall",
+        about="the town of the demo on slopes of up to 8 %, with crossfall",
         relief=relief,
     )
 
@@ -235,7 +235,7 @@ def drawn_town(seed: int) -> Scenario:
     return replace(
         usual,
         name=f"{DRAWN}{seed}",
-        about="a town on drawn hills",
+        about="a town on randomly drawn hills",
         background=now[DRY],
         patches=patches,
         relief=relief,
@@ -260,7 +260,7 @@ def winter(seed: int) -> Scenario:
             kind, network.lane(lane), lane, [uniform(key, 100 + 4 * lane + k) for k in range(3)]
         )
     temperature = -6.0 + 7.0 * uniform(key, 99)
-    about = "a winter town on drawn hills"
+    about = "a winter town on randomly drawn hills"
     return replace(
         town,
         name=f"{WINTER}{seed}",

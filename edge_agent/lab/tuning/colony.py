@@ -51,7 +51,7 @@ class Habits:
         for name in ("evaporation", "elite", "memory", "retrace"):
             value = getattr(self, name)
             if not 0.0 < value < 1.0:
-                raise InputError(name, f"{value} is no share", "use a number between 0 and 1")
+                raise InputError(name, f"{value} is not a share", "use a number between 0 and 1")
         for name in ("alpha", "theta"):
             if getattr(self, name) < 0.0:
                 raise InputError(

@@ -178,7 +178,7 @@ def term_of(name: str) -> int | None:
 
 
 def age_key(name: str) -> tuple[int, int, str]:
-    """Return a sort key of segments, and of files with their rows, from old to new: epoch,
+    """Return a sort key that orders segments, or files with their rows, from old to new: epoch,
     number, shard.
     """
     shard, epoch, number = Path(name).stem.rsplit("-", 2)

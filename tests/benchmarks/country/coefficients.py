@@ -31,7 +31,7 @@ TURN: Final = 512
 
 
 class Coefficients(NamedTuple):
-    """Bytes of a service's memory."""
+    """Memory of a service, in bytes."""
 
     vehicle_bytes: float
     cell_bytes: float
@@ -41,7 +41,7 @@ class Coefficients(NamedTuple):
 
 
 def measure_coefficients() -> Coefficients:
-    """Measured now."""
+    """Return the memory at present."""
     few, vehicles, cells = (_measure_growth(kind) for kind in ("few", "vehicles", "cells"))
     return Coefficients(
         (vehicles[0] - few[0]) / (MANY - FEW), (cells[0] - few[0]) / (cells[1] - few[1]), few[2]
@@ -49,8 +49,8 @@ def measure_coefficients() -> Coefficients:
 
 
 def _measure_growth(kind: str) -> tuple[float, float, float]:
-    """Bytes that the stream added, cells at the end, and bytes of the table of pairs for each of
-    them, by a process.
+    """Return the bytes that a stream added, the number of cells at the end, and the bytes of the
+    table of pairs, measured in a new process.
     """
     command = [sys.executable, "-m", "tests.benchmarks.country.coefficients", kind]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)

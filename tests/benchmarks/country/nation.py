@@ -55,20 +55,20 @@ class Look(NamedTuple):
 
 
 def spent_s(part: Part) -> float:
-    """Processor time of a process and of those that it began and that have ended."""
+    """Return the processor time of a process and of its child processes that have ended."""
     fields = Path(f"/proc/{part.pid}/stat").read_text().rpartition(")")[2].split()
     return sum(int(field) for field in fields[11:15]) / _TICKS
 
 
 class Service(NamedTuple):
-    """A service of the country, and where its metrics are."""
+    """A service of the country, and the address of its metrics."""
 
     part: Part
     archive: Path
     metrics: str
 
     def read_metrics(self) -> dict[str, float]:
-        """Its metrics now, by name and labels."""
+        """Return the service's current metrics by name and labels."""
         with urllib.request.urlopen(f"{self.metrics}/metrics", timeout=30.0) as page:
             lines = page.read().decode().splitlines()
         return {
@@ -78,7 +78,9 @@ class Service(NamedTuple):
         }
 
     def count_archived(self) -> int:
-        """Rows of observations in its archive, by the files' own words."""
+        """Return the number of observation rows in the service's archive, from the footers of its
+        files.
+        """
         files = [
             *self.archive.glob("inbox/**/*.parquet"),
             *self.archive.glob("observations/**/*.parquet"),
@@ -87,7 +89,7 @@ class Service(NamedTuple):
 
 
 def start_service(folder: Path, endpoint: str, name: str, region: str) -> Service:
-    """A service that is ready."""
+    """Yield a service that is ready."""
     config = ServiceConfig(
         name=name,
         regions=[region],
@@ -175,7 +177,7 @@ def simulate_nation(
 
 
 def _watch_parts(parts: Sequence[Part], services: Sequence[Service], sender: Part) -> list[Look]:
-    """Look every EVERY_S until the sender, the last of the parts, has ended."""
+    """Sample every EVERY_S seconds until the sender, which ends last, has ended."""
     looks: list[Look] = []
     began = time.monotonic() - SAYS_S
     least = [float("inf")] * (len(parts) - 1)

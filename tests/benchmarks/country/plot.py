@@ -1,4 +1,4 @@
-"""The country's course: memory and cells of each service, and how long batches waited."""
+"""Plot of the country run: memory and cells of each service, and waiting time of batches."""
 
 from __future__ import annotations
 

@@ -95,18 +95,18 @@ class Country:
                 self.begin[same] = np.arange(len(same)) * len(self.drives[one]) // len(same)
 
     def _locate_region(self, zone: int, k: int) -> tuple[int, int]:
-        """Column and row of the k-th region of a zone, among all regions of the world."""
+        """Return column and row of region k of a zone in the grid of all regions."""
         zone_x, zone_y = (int(side[0]) for side in self._home)
         return (zone_x + zone - 1) * _REGIONS + k % _REGIONS, zone_y * _REGIONS + 2 + k // _REGIONS
 
     def list_expressions(self) -> list[str]:
-        """The regions of each service, as key expressions of zones."""
+        """Return the regions of each service as key expressions of zones."""
         first = [sum(ZONES[:zone]) for zone in range(len(ZONES))]
         parts = [keys.chunks(int(self.region_id(k)), grid.REGION_ZOOM).split("/") for k in first]
         return ["/".join((*part[:2], "*")) for part in parts]
 
     def region_id(self, k: int) -> int:
-        """The quadint of region k of the country."""
+        """Return the quadint of region k of the country."""
         x, y = self.regions[k]
         return int(grid.interleave(np.array([x]), np.array([y]))[0])
 
@@ -142,8 +142,8 @@ def _compute_shares(count: int) -> FloatArray:
 
 
 def _cut_chunks(columns: dict[str, Any], who: int, corner: IntArray) -> list[Chunk]:
-    """The visits of one vehicle in the order of time, ROWS at a time; the last few, if there are
-    less, are left out.
+    """Yield the visits of one vehicle in order of time, ROWS at a time. Fewer visits at the end are
+    left out.
     """
     mine = np.flatnonzero(columns["vehicle"] == who)
     mine = mine[np.argsort(columns["leave_time"][mine], kind="stable")]

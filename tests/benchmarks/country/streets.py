@@ -50,7 +50,7 @@ class Streets(Scenario):
 
     @property
     def network(self) -> Network:
-        """The lanes."""
+        """Return the lanes."""
         assert self.lanes is not None
         return self.lanes
 
@@ -72,7 +72,7 @@ def simulate_drives(sumo: Sumo, vehicles: int, seconds: int, seed: int) -> list[
 
 
 def _make_drive(rows: pd.DataFrame) -> Drive | None:
-    """The path of one vehicle; None of one that leapt, or went nowhere."""
+    """Return the path of one vehicle, or None if it jumped or did not move."""
     x, y = HELSINKI.from_latlon(rows.vehicle_y.to_numpy(), rows.vehicle_x.to_numpy())
     step = np.hypot(np.diff(x), np.diff(y))
     moves = np.r_[True, step > 0.05]
@@ -98,9 +98,7 @@ def _make_drive(rows: pd.DataFrame) -> Drive | None:
 
 
 def make_streets(found: list[Drive], seed: int) -> Streets:
-    """The streets of these drives on drawn hills, wet and snowy in parts, with ice here and
-    there on a way.
-    """
+    """Return the streets of these drives on random hills, with wet and snowy parts and some ice."""
     allowed = [np.maximum(one.speed, SLOWEST) ** 2 / USUAL_Q for one in found]
     lanes = network_of(
         [one.line for one in found], [[k] for k in range(len(found))], len(found), allowed

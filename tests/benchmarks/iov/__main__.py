@@ -154,7 +154,7 @@ PARTS: Final = {
 
 
 def main() -> int:
-    """Measure; 0 if every bar holds."""
+    """Measure all figures. Return 0 if every bar holds."""
     parser = argparse.ArgumentParser(prog="tests.benchmarks.iov", description=__doc__)
     parser.add_argument("--only", nargs="+", choices=PARTS, help="these parts alone")
     parser.add_argument(

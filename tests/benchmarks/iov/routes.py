@@ -34,7 +34,7 @@ NO_PATH: Final = 442  # error code of an answer without a route
 
 @dataclass(frozen=True)
 class StreetTown:
-    """Crossings (n, 2) [deg] and streets as pairs of crossings."""
+    """Return crossings (n, 2) [deg] and streets as pairs of crossings."""
 
     crossings: FloatArray
     streets: list[tuple[int, int]]
@@ -113,7 +113,7 @@ def unpack_wheel(name: str, version: str, target: Path) -> None:
 
 
 class Valhalla:
-    """Valhalla's own programs, from the wheel."""
+    """Return the folder of Valhalla's own programs from the wheel."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -1,5 +1,5 @@
-"""The fuzzy adaptation grows R when innovations are too large, within bounds, by tables that
-refuse nonsense.
+"""Fuzzy adaptation: R grows within bounds when innovations are too large; invalid tables are
+refused.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""The rules: memberships rise between foot and peak, and each rule does what its line in the
-table says.
+"""Fuzzy rules: memberships rise between foot and peak, and each rule has the effect that its table
+states.
 """
 
 import math

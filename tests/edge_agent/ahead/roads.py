@@ -21,13 +21,15 @@ HOME = Pose(57.7, 11.97, 0.3, 14.0, NOW)
 def line(
     length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Latitude and longitude [deg] of a straight road from the car, a point a metre."""
+    """Return latitude and longitude [deg] of a straight road that starts at the car, one point per
+    metre.
+    """
     s = np.arange(start, length)
     return path.to_degrees(s * math.cos(yaw), s * math.sin(yaw), HOME)
 
 
 def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) -> IntArray:
-    """The places of that road in its order, each once."""
+    """Return the cells of that road in order, each once."""
     key = grid.cell_of(*line(length, yaw, start)) * grid.SECTORS + int(grid.sector_of(yaw))
     return key[np.sort(np.unique(key, return_index=True)[1])]
 
@@ -35,7 +37,7 @@ def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) ->
 def cells(
     key: IntArray, mu: float, *, width: float = 0.1, basis: int = local_map.MEASURED, at: int = NOW
 ) -> ReceivedCells:
-    """HeardCells of one friction."""
+    """Return HeardCells with one friction."""
     said = np.full(len(key), mu)
     slippery = np.full(len(key), 1.0 if mu + width < 0.4 else 0.0 if mu - width > 0.4 else 0.5)
     belief = local_map.belief_of(said - width, said, said + width, slippery)
@@ -50,7 +52,7 @@ def cells(
 
 
 def make_local_map(parts: list[ReceivedCells]) -> LocalMap:
-    """A cache that has heard of these cells."""
+    """Return a map cache that contains these cells."""
     cache = LocalMap()
     for part in parts:
         for tile in np.unique(grid.tile_of(part.key // grid.SECTORS)).tolist():
@@ -60,7 +62,7 @@ def make_local_map(parts: list[ReceivedCells]) -> LocalMap:
 
 
 def alert(key: int, *, raised: bool = True, time: int = NOW) -> Alert:
-    """An alert of ice at a place."""
+    """Return an ice alert at a place."""
     cell, sector = divmod(int(key), grid.SECTORS)
     latitude, longitude = grid.centre(cell)
     return Alert(

@@ -1,5 +1,5 @@
-"""The horizon: metres to cells, unknown that stays unknown, fading, the cache, and the safe
-speed.
+"""Horizon: conversion of metres to cells, unknown cells that stay unknown, fading, the cache, and
+the safe speed.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def test_a_route_goes_on_where_the_car_is_and_is_none_for_who_left_it() -> None:
 def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
     ahead: float, turned: float, spacing: float
 ) -> None:
-    """A right angle to the left, 120 m on."""
+    """Return a road with a right angle to the left after 120 m."""
     way = np.arange(0.0, 120.0 + spacing / 2, spacing)
     x = np.concatenate([way, np.full(len(way) - 1, 120.0)])
     y = np.concatenate([np.zeros(len(way)), way[1:]])
@@ -83,8 +83,8 @@ def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
 
 @pytest.mark.parametrize("turned", [0.0, 90.0, 180.0])
 def test_a_route_that_begins_here_is_not_left_by_how_the_car_stands(turned: float) -> None:
-    """A navigation system leaves out the part already driven, so the next corner may be the
-    beginning.
+    """A navigation system leaves out the part already driven, so the route may begin at the next
+    corner.
     """
     path = GivenRoute(*line()).ahead(HOME._replace(yaw=HOME.yaw + math.radians(turned)), 300.0)
     assert path is not None

@@ -1,5 +1,5 @@
-"""Listening cars over real sessions: warned by alerts and by the map, through a lost router, by
-nobody's lies.
+"""Listening cars over real sessions: warnings by alerts and by the map, after a lost router, and
+none from forged messages.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Driving:
         self.lookout.start()
 
     def report_pose(self, *, later_s: float = 0.0) -> None:
-        """Say where it is."""
+        """Update the position."""
         latitude, longitude = line(self.metre + 2.0, start=self.metre)
         now = time.time_ns() + round(later_s * NS)
         self.lookout.see([Pose(float(latitude[0]), float(longitude[0]), HOME.yaw, 14.0, now)])
@@ -91,7 +91,7 @@ def driving(router: Router) -> Iterator[Driving]:
 
 @pytest.fixture
 def town(router: Router) -> Iterator[MadeUpService]:
-    """A service's side without any ice yet."""
+    """The service's end of the connection, without ice at first."""
     with MadeUpService(router.settings, time.time_ns()) as town:
         yield town
 
@@ -345,9 +345,7 @@ def test_bytes_that_are_no_tile_are_refused(payload: bytes) -> None:
 
 
 class Liar(MadeUpService):
-    """Answers for the map with one thing after the other that cannot be, and with a tile of no
-    cells.
-    """
+    """Answer map queries with invalid tiles in turn, and with an empty tile."""
 
     said = 0
 

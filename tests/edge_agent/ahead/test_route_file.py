@@ -1,4 +1,4 @@
-"""Routes as people have them, and files that are none."""
+"""Route files of common programs, and files that are not routes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Warnings: once, in time to stop at the lower end of grip, updated, ended; none without reason."""
+"""Warnings: given once and early enough to stop at the lower end of grip, updated, ended, and never
+without reason.
+"""
 
 from __future__ import annotations
 
@@ -113,7 +115,7 @@ def test_one_vehicle_alone_warns_nobody() -> None:
 
 
 def test_alert_over_a_mere_bound_is_exported_with_its_own_grip() -> None:
-    """Ice fades on the map before its alert ends: the former value is only a bound then."""
+    """Ice fades on the map before its alert ends; the former value is then only a bound."""
     cache = make_local_map([cells(icy(), 0.1, basis=BOUND)])
     for key in icy():
         cache.store_alert(alert(key, time=NOW - NS), NOW)

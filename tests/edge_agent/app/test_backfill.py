@@ -1,4 +1,6 @@
-"""Many recorded drives: each to its own file, several at a time, a bad one among good ones."""
+"""Many recorded drives: each is written to its own file, several run at a time, and a bad drive
+does not stop the others.
+"""
 
 from __future__ import annotations
 
@@ -53,8 +55,8 @@ def test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes(
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_so_many_drives_are_under_way_at_once(drives: Path, tmp_path: Path, jobs: int) -> None:
-    """Their vehicle files are pipes: a drive waits there until something is written, or the
-    writer leaves.
+    """Use pipes as vehicle files: a drive waits at its pipe until something is written or the
+    writer closes it.
     """
     tasks = [
         task._replace(vehicle=tmp_path / task.vehicle.name)

@@ -1,5 +1,5 @@
-"""The pipeline and the live loop: visits closed at the end, real time kept or its loss counted,
-stopped when told.
+"""Pipeline and live loop: visits are closed at the end, lag behind real time is counted, and the
+loop stops on request.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ RATE = 50.0
 
 
 class Basket:
-    """A receiver of everything that the loop offers."""
+    """A receiver that stores everything that the loop offers."""
 
     is_broken = False
 
@@ -124,8 +124,8 @@ def run(
 def test_a_simulated_source_hands_its_context_to_the_observations(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """Hand-made: the first car brakes with ABS now and then, the second one's lamp always burns,
-    the third has none.
+    """Return signals of three cars: the first brakes with ABS now and then, the ABS flag of the
+    second is always on, the third has none.
     """
     fleet, parts = fleet_blocks(300)
     for place, block in enumerate(parts):

@@ -1,4 +1,4 @@
-"""Estimates as MCAP: the reader of the format's owners finds every sample and value."""
+"""Estimates as MCAP: the reference reader of the format finds every sample and value."""
 
 from __future__ import annotations
 

@@ -108,5 +108,5 @@ def test_a_reason_is_printed_again_only_when_it_changes() -> None:
     assert told_within(block(), lambda _: next(changing), 20.0) == [
         "not published: a",
         "not published: b",
-        "publishing: no obstacle is left",
+        "publishing: records are sent",
     ]

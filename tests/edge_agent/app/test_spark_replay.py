@@ -1,5 +1,5 @@
-"""`make spark-test`: drives that are estimated on Spark give the bytes that this machine gives,
-whatever dies.
+"""`make spark-test`: drives estimated on Spark give the same bytes as on this machine, also if
+tasks or workers die.
 """
 
 from __future__ import annotations

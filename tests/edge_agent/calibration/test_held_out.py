@@ -28,7 +28,9 @@ def drive() -> Recorded:
 
 
 def offset_judge(vehicle: Vehicle, drive: Drive) -> Prediction:
-    """Likelihood that only the offset of a_x changes; radii make every drive worse."""
+    """Return a likelihood that only the offset of a_x improves and that radii make worse on every
+    drive.
+    """
     known = vehicle.calibration
     if known is None:
         return Prediction(0.0, 0.0)

@@ -100,8 +100,8 @@ def test_what_is_hardly_known_is_drawn_to_what_cars_usually_have(smooth: Recorde
 
 
 def test_the_driven_axle_is_not_taken_for_a_smaller_one() -> None:
-    """On the same drives a file that does not say which axle drives is wrong about radii, and
-    knows it.
+    """On the same drives, a file without the driven axle gives wrong radii and a larger stated
+    uncertainty.
     """
     drive = drives(3, 32, rough=False, seconds=300)[2]  # a van: its rear wheels drive
     assert drive.vehicle.drive_split_front == 0.0

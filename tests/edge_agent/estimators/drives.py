@@ -19,8 +19,8 @@ OMEGA = slice(S.OMEGA, S.OMEGA + 4)
 def drive(
     name: str, mu: float | None, seed: int = 1, seconds: float | None = None
 ) -> tuple[FloatArray, FloatArray, Vehicle]:
-    """t (T,) [s], signals (T, 18), nominal vehicle of a manoeuvre with ordinary sensors; its own
-    friction if None.
+    """Return t (T,) [s], signals (T, 18) and nominal vehicle of a manoeuvre with ordinary sensors.
+    `mu` None means the manoeuvre's own friction.
     """
     log, vehicle = simulate_manoeuvre(name, mu=mu, seed=seed, duration_s=seconds, sensors="mems")
     return (
@@ -31,7 +31,7 @@ def drive(
 
 
 def join_drives(*parts: tuple[FloatArray, FloatArray, Vehicle]) -> tuple[FloatArray, FloatArray]:
-    """Drives one after the other, 10 ms apart."""
+    """Join drives into one, with 10 ms between them."""
     clock = []
     rows = []
     end = 0.0

@@ -37,7 +37,7 @@ SHORT: dict[str, float | None] = {
 
 
 class Move(NamedTuple):
-    """Effect of changing a constant on a figure of a drive."""
+    """Change of a figure of a drive when a constant is changed."""
 
     figure: str
     drive: str
@@ -226,8 +226,8 @@ def make_drive(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
 
 
 def made_up(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
-    """Drives that no plant makes: a stop on slipping wheels, a car that stands, side force that
-    nothing turns.
+    """Return synthetic drives that the plant cannot make: a stop on slipping wheels, a standing
+    car, and side force without yaw.
     """
     t = np.arange(0.0, 4.0 if name == "stopping" else 20.0, 0.01)
     signals = np.zeros((len(t), len(CHANNELS)))
@@ -246,7 +246,7 @@ def made_up(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
 
 @cache
 def figures(place: str, name: str | None, times: float) -> dict[str, float]:
-    """Figures of a drive, with constant `name` that many times as large."""
+    """Return the figures of a drive with the constant `name` multiplied by a factor."""
     t, signals, vehicle = make_drive(place)
     constants = Constants()
     if name is not None:
@@ -279,7 +279,7 @@ def summarize_reports(estimates: Estimates) -> dict[str, float]:
 
 
 def inside(filters: np.ndarray) -> dict[str, float]:
-    """Figures of the filter of one drive, looked into again and again."""
+    """Return figures of the filter during one drive."""
     weight = filters["weight"]
     split = filters["split"]
     chain = weight[:, :NODES]
@@ -322,7 +322,7 @@ def mean_of_known(values: FloatArray, where: FloatArray) -> float:
 
 
 def geometric(values: FloatArray) -> float:
-    """Geometric mean of probabilities, 0 of none."""
+    """Return the geometric mean of probabilities; 0 if there are none."""
     return float(np.exp(np.log(np.maximum(values, 1e-12)).mean())) if values.size else 0.0
 
 

@@ -1,4 +1,4 @@
-"""Element lists of the papers: each departure has a reason, and each home exists."""
+"""Lists of the papers' elements: each deviation has a reason, and each place in the code exists."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Samples made fit for the papers' filters: the grip used in the last second, and the steering's
-cosines.
+"""Preparation of samples for the papers' filters: grip used in the last second, and cosines of the
+steering angles.
 """
 
 from __future__ import annotations

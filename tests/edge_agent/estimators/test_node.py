@@ -1,4 +1,4 @@
-"""The pieces of a node against textbooks: its update row by row, its tyre curve."""
+"""Parts of a friction node compared with textbooks: sequential update and tyre curve."""
 
 from __future__ import annotations
 

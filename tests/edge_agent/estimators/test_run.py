@@ -1,6 +1,4 @@
-"""The one way of the papers' filters through their samples: it is compiled once for all
-processes.
-"""
+"""The shared loop of the papers' filters: it is compiled once for all processes."""
 
 from __future__ import annotations
 

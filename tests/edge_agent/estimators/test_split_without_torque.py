@@ -1,5 +1,5 @@
-"""Roads with unlike sides in a car that records no wheel torque: the yaw balance tells which
-side is slippery.
+"""Roads with different sides in a car without wheel torque: the yaw balance shows which side is
+slippery.
 """
 
 from __future__ import annotations

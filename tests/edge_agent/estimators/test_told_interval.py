@@ -1,4 +1,4 @@
-"""The interval that is told of a friction: its levels, and what patches of ice do to it."""
+"""Reported interval of friction: its levels, and the effect of ice patches on it."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def _tell(
 def find_told_interval(
     weight: FloatArray, patch: float = 0.0, likeness: float = 0.0
 ) -> tuple[float, float, float]:
-    """Lower end, median, upper end of a belief, with this share of patches of ice, of a car so
-    like its file.
+    """Return lower end, median and upper end of a belief, for a share of ice patches and a degree
+    of agreement with the vehicle file.
     """
     contexts = records(MixtureContext, 1)
     put_record(contexts["design"][0], DESIGN)
@@ -60,7 +60,7 @@ def find_told_interval(
 
 
 def about(mu: float, width: float) -> FloatArray:
-    """A belief about this friction."""
+    """Return a belief around this friction."""
     weight = DESIGN.prior * np.exp(-0.5 * ((DESIGN.mu - mu) / width) ** 2)
     return np.asarray(weight / weight.sum())
 

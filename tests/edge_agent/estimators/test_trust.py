@@ -1,5 +1,5 @@
-"""Strain tells a car that is as its file says from one that is not; contradiction is of the
-axles, and not of ice.
+"""Model strain separates cars that match their file from others; contradiction is found per axle,
+and ice does not cause it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Grip in use as it is reported, and torque that is known on one axle only."""
+"""Reported grip in use, and torque that is known on one axle only."""
 
 from __future__ import annotations
 

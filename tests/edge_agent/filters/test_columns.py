@@ -1,4 +1,4 @@
-"""The cubature filter in columns is the one in rows: same points, same prediction."""
+"""The cubature filter with columns equals the one with rows: same points, same prediction."""
 
 from __future__ import annotations
 

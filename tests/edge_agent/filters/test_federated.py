@@ -1,4 +1,6 @@
-"""Sharing, fusing, downdating, and points by singular values: identities and linear oracles."""
+"""Federated filters: information sharing, fusion, downdates, and points by singular values, tested
+by identities and linear oracles.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ def covariance(n: int, seed: int) -> FloatArray:
 
 
 def root_of(cov: FloatArray) -> FloatArray:
-    """Its lower triangular factor."""
+    """Return the lower triangular factor."""
     return np.asarray(np.linalg.cholesky(cov), np.float64)
 
 
@@ -30,7 +32,7 @@ System = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 def textbook(
     mean: FloatArray, cov: FloatArray, system: System, z: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """One turn of the Kalman filter with whole covariances."""
+    """Run one step of the Kalman filter with full covariances."""
     f, q, h, noise = system
     mean = f @ mean
     cov = f @ cov @ f.T + q

@@ -187,9 +187,7 @@ def test_square_root_filter_is_textbook_for_a_nonlinear_measurement() -> None:
 def _textbook(
     rule: SigmaRule, mean: FloatArray, cov: FloatArray, q: FloatArray, r: FloatArray, z: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """One turn of the cubature filter with whole covariances, for the pendulum of the test
-    below.
-    """
+    """Run one step of the cubature filter with full covariances, for the pendulum below."""
     points = swing(mean + rule.xi @ np.linalg.cholesky(cov).T)
     mean = points.mean(axis=0)
     cov = (points - mean).T @ (points - mean) / len(points) + q

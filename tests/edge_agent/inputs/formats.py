@@ -1,4 +1,4 @@
-"""The real minute, and its frames."""
+"""The recorded minute of tests/data, and its CAN frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ VEHICLE = DATA / "rav4.json"
 
 
 def frames(most: int | None = None) -> list[can.Message]:
-    """The first frames of the real minute, at whole microseconds, as most loggers stamp them."""
+    """Return the first frames of the recorded minute with times in whole microseconds, as most
+    loggers store them.
+    """
     with can.BLFReader(BLF) as reader:
         found = [message for _, message in zip(range(most or 10**9), reader, strict=False)]
     for message in found:

@@ -1,5 +1,5 @@
-"""A small compressed recording that holds a large one ends with a line, not with the machine's
-memory.
+"""A small compressed recording that expands to a very large one is refused with an error and does
+not exhaust memory.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def text(words: str) -> bytes:
 
 
 def write_mcap_bomb(path: Path) -> Path:
-    """A bag of one message and a compressed chunk with LARGE zeros behind it."""
+    """Return a bag with one message and a compressed chunk that holds LARGE zeros."""
     lz4 = pytest.importorskip("lz4.frame")
     second = 10**9
     schema = struct.pack("<H", 1) + text("std_msgs/msg/Float64") + text("ros2msg")

@@ -1,4 +1,4 @@
-"""Front and rear wheels told apart by the bumps of the road."""
+"""Detection of exchanged front and rear wheels from bumps of the road."""
 
 from __future__ import annotations
 

@@ -223,8 +223,8 @@ def test_a_table_fills_the_context_and_keeps_its_rows(tmp_path: Path) -> None:
 
 
 def live_blocks(values: dict[str, float], every: int, blocks: int, profile: Profile) -> FloatArray:
-    """Context (T, 5) of live rows of a source that speaks at 50 Hz, and tells `values` each
-    `every` messages.
+    """Return context (T, 5) of live rows of a 50 Hz source that sends `values` in every `every`-th
+    message.
     """
     clock = Steered()
     feed = Scripted("bus", clock)

@@ -1,4 +1,4 @@
-"""Decoding against cantools, frame by frame, and databases that are not quite as they should be."""
+"""CAN decoding compared with cantools frame by frame, and databases with small errors."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The signal doctor: planted mistakes are named, sound drives and the real minute pass,
-corrections correct.
+"""Signal doctor: it names planted mistakes, accepts correct drives and the recorded minute, and
+proposes right corrections.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def test_a_mistake_is_named_on_ice_too(winter: Recorded, name: str) -> None:
 
 @pytest.mark.timeout(600)  # the kernels of the default estimator may have to be compiled
 def test_the_first_drive(tmp_path: Path, router: Router, service: Service, capsys: Output) -> None:
-    """The README's five lines on the real minute."""
+    """Run the five lines of the README on the recorded minute."""
     log, page, out = (
         str(tmp_path / name) for name in ("drive.parquet", "check.html", "estimates.parquet")
     )

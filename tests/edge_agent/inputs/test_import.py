@@ -1,5 +1,5 @@
-"""`edge-agent import`: one drive in every format is one log, clocks are merged, and foreign
-fingers break nothing.
+"""`edge-agent import`: a drive in any format becomes the same log, clocks are merged, and damaged
+files cause no crash.
 """
 
 from __future__ import annotations
@@ -355,7 +355,7 @@ def test_a_validity_bit_and_a_sign_bit_are_heeded(tmp_path: Path) -> None:
 
 
 def broken(data: bytes, kind: str, rng: np.random.Generator) -> bytes:
-    """A file as a hostile or a dying recorder leaves it."""
+    """Return a file damaged by a hostile or failing recorder."""
     if kind == "cut":
         return data[: int(rng.integers(len(data)))]
     if kind == "full":

@@ -1,5 +1,5 @@
-"""Live rows: one clock for all sources, linear between readings, late fixes moved, lost sources
-opened again.
+"""Live rows: one clock for all sources, interpolated readings, late fixes moved to their time, and
+lost sources opened again.
 """
 
 from __future__ import annotations
@@ -229,7 +229,7 @@ def test_rows_wait_for_a_slow_source_and_count_late_readings(
 
 
 class Hanging(Scripted):
-    """A source whose driver comes back only when it likes to."""
+    """A source whose driver becomes available when the test decides."""
 
     def __init__(self, name: str, clock: Steered) -> None:
         super().__init__(name, clock)

@@ -1,4 +1,4 @@
-"""The campaign of the road ahead measures correctly, on a small scale."""
+"""The campaign of the road ahead on a small scale."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Visits: one cell and sector after the other, not shaken by jitter, nowhere without a fix."""
+"""Visits: one cell and sector after the other, robust to jitter, none without a fix."""
 
 from __future__ import annotations
 

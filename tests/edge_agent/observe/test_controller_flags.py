@@ -1,4 +1,4 @@
-"""Flags that cannot be true carry no weight; those that can are passed on as they are."""
+"""Implausible controller flags have no weight; others are passed on unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The observer: one observation per visit, states in their slots, whatever the blocks."""
+"""Observation builder: one observation per visit and states in their time slots, for any division
+into blocks.
+"""
 
 from __future__ import annotations
 
@@ -156,8 +158,8 @@ def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
 
 
 def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
-    """At 14 m/s a cell takes less than the window: braking on the dry road before is not told of
-    the ice.
+    """At 14 m/s a cell is crossed in less than the window, so braking on dry road before must not
+    count for the ice.
     """
     samples = 30
     east = np.arange(samples)[:, None] * 1.4
@@ -178,8 +180,8 @@ def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
 
 
 def observe_grip(observed: np.ndarray, east: np.ndarray) -> list[float]:
-    """Grip told of the visits of a car that goes east along `east` (T, 1) [m] at 100 Hz and
-    feels `observed` (T,) g.
+    """Return the grip reported for the visits of a car that drives east along `east` (T, 1) [m] at
+    100 Hz and measures `observed` (T,) g.
     """
     flat = np.zeros_like(east)
     block = ground(east, flat, flat, rate_hz=100.0, fix_every=10)
@@ -195,8 +197,8 @@ def observe_grip(observed: np.ndarray, east: np.ndarray) -> list[float]:
 
 
 def test_grip_felt_at_the_border_of_a_cell_may_be_of_its_neighbour() -> None:
-    """Braking at the border, as far as a fix may be wrong, is told of neither cell; further
-    inside of its own.
+    """Braking within the error of a fix from the border counts for neither cell; braking further
+    inside counts for its own.
     """
     east = np.arange(450)[:, None] * 0.1
     flat = np.zeros_like(east)

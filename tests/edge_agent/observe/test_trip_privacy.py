@@ -1,5 +1,5 @@
-"""Trip ends: nothing is published about the places where a trip began and ended, and everything in
-between.
+"""Trip privacy: nothing is published near the start and the end of a trip, and everything in
+between is.
 """
 
 from __future__ import annotations

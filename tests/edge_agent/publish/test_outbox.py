@@ -1,5 +1,5 @@
-"""The outbox: named densely, on disk first, settled by ranges, resent with patience, bounded,
-one agent only.
+"""Outbox: consecutive numbers, disk first, settlement by ranges, retries with back-off, a limit,
+and one agent only.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def draft(
     records: int = 1,
     size: int = 0,
 ) -> Draft:
-    """A batch whose payload spells its seq and first_held."""
+    """Return a batch whose payload contains its seq and first_held."""
     return Draft(
         vehicle,
         kind,
@@ -101,7 +101,7 @@ def test_an_acknowledgement_of_what_is_not_held_changes_nothing(path: Path) -> N
 
 
 def test_stored_batches_survive_a_kill_and_are_due_under_their_name(path: Path) -> None:
-    """A child process stores, says so, and is killed without closing anything."""
+    """Store batches in a child process that reports this and is then killed."""
     script = f"""
 import os, pathlib, signal
 from edge_agent.publish.batching import Draft
@@ -277,7 +277,7 @@ def test_what_was_given_up_does_not_come_back_after_a_restart(path: Path) -> Non
 
 
 def test_a_settled_batch_that_a_crash_brings_back_is_offered_again(path: Path) -> None:
-    """Nothing is lost by it: the service knows the batch and acknowledges it again."""
+    """Nothing is lost: the service knows the batch and acknowledges it again."""
     script = f"""
 import os, pathlib, signal
 from edge_agent.publish.batching import Draft

@@ -1,5 +1,5 @@
-"""The publisher on real sessions: everything arrives under its own name, once it can, and is
-settled by answers.
+"""Publisher on real sessions: every record arrives once under its vehicle's name and is settled by
+an answer.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def drive(seed: int = 0, samples: int = 200) -> tuple[RecordBlock, RecordBlock]:
 
 
 def rows(batches: list[Batch], kind: Kind) -> int:
-    """Records received, each identity once."""
+    """Return the received records, each identity once."""
     return sum(
         {(b.vehicle, b.boot, b.region, b.seq): b.rows for b in batches if b.kind is kind}.values()
     )
@@ -242,7 +242,7 @@ def test_a_service_that_tells_its_time_shows_that_the_clock_is_off(
 def test_a_full_disk_is_waited_for(
     router: Router, service: Service, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """SQLite may not grow its file beyond the pages that it has, then it may."""
+    """Prevent SQLite from growing its file, then allow it."""
     config = settings(router, tmp_path)
     outbox = Outbox(config.spool)
     database = outbox._database

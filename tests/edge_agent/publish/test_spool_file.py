@@ -1,4 +1,6 @@
-"""A damaged spool is set aside and counted, its readable rows are saved, and the car goes on."""
+"""A damaged spool is set aside and counted, its readable rows are recovered, and the agent
+continues.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The friction here as VSS signals: percent, clipped, absent where unknown; over a real session
-and by the command.
+"""Friction at the vehicle as VSS signals: percent, limited to the range, absent if unknown; over a
+session and by the command.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""An archive whose roads cross the border of two zones, with a third zone far away; for
-rebuilding by zone.
+"""An archive whose roads cross the border of two zones, with a third zone far away; for tests of a
+rebuild by zone.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def fill(root: Path, world: SyntheticFleet) -> None:
 
 
 def rebuilt_map(out: Path) -> pa.Table:
-    """All zones of a rebuilt map, in the order of a map."""
+    """Return all zones of a rebuilt map in the order of a map."""
     parts = [
         pq.read_table(path, partitioning=None)
         for path in sorted((out / "map").glob("*/*/*.parquet"))
@@ -72,7 +72,7 @@ def difference(ours: pa.Table, theirs: pa.Table) -> float:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder."""
+    """Return every file below a folder."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in folder.rglob("*")

@@ -1,4 +1,4 @@
-"""A small synthetic archive, and its rows as pandas has them: the oracle of the questions."""
+"""A small synthetic archive, and its rows in pandas as the oracle of the questions."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ HOUR_NS = 3600 * 10**9
 
 
 def find_visited(fusion: Fusion) -> IntArray:
-    """Slots that somebody visited."""
+    """Return the slots that a vehicle visited."""
     return np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)
 
 
 @pytest.fixture(scope="session")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Compacted, with a snapshot of the map every twelve hours."""
+    """Return the archive, compacted, with a snapshot of the map every twelve hours."""
     root = tmp_path_factory.mktemp("analytics") / "archive"
     synthetic.write_archive(root, WORLD, 4000)
     compact(root)
@@ -57,7 +57,9 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def rows(archive: Path) -> pd.DataFrame:
-    """All rows; `time` in whole seconds, `value`: whether mu was told, as the contract says it."""
+    """Return all rows, with `time` in whole seconds and `value` True if mu was measured as the
+    contract defines it.
+    """
     frame = (
         pa.concat_tables(reading.read_tables(archive, Kind.OBSERVATION))
         .drop_columns(["log_likelihood"])

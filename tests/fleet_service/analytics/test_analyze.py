@@ -58,7 +58,7 @@ MAP = {
 
 
 def list_explained(question: str) -> set[str]:
-    """Columns of an answer that the handbook's page has a meaning for."""
+    """Return the columns of an answer that the documentation explains."""
     page = (ROOT / "deploy" / "docs" / "reference" / "questions.md").read_text(encoding="utf-8")
     rows = [line.split("|") for line in page.splitlines() if line.startswith(f"| `{question}` |")]
     assert all(row[4].strip() for row in rows)

@@ -1,5 +1,5 @@
-"""Rates of change: the fit finds those of a known process, its interval holds, pairs are counted
-right.
+"""Rates of change: the fit finds the rates of a known process, its interval is calibrated, and
+pairs are counted correctly.
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ NAMES = ("pairs", "unlike", "slippery", "seconds")
 
 @pytest.mark.campaign
 def test_the_interval_holds_as_often_as_it_says_when_days_differ() -> None:
-    """Days of very unlike rates, mean RATE: the pairs of a day are no independent witnesses."""
+    """Return days with very different rates of mean RATE: pairs of the same day are not
+    independent.
+    """
     held = 0
     trials = 20
     for trial in range(trials):
@@ -95,8 +97,8 @@ def test_pairs_are_values_in_a_row_by_different_vehicles(asked: Ask, rows: pd.Da
 
 
 def test_roads_change_faster_where_ice_comes_and_goes(asked: Ask, stations: Path) -> None:
-    """The synthetic roads freeze at four and thaw at eight: below freezing, not in the
-    afternoon.
+    """The synthetic roads freeze at four and thaw at eight; the rate is found below freezing and
+    not in the afternoon.
     """
     for options in ({}, {"stations": stations}):
         found = asked("change-rates", **options).to_pandas().set_index(["by", "class"])

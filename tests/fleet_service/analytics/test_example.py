@@ -1,4 +1,4 @@
-"""The example as its page says."""
+"""The example on the documentation page runs as described."""
 
 from __future__ import annotations
 

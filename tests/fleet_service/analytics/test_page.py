@@ -1,6 +1,4 @@
-"""The pages as a person meets them: opened in a real browser, pointed at, touched and walked by
-keyboard.
-"""
+"""HTML maps of answers in a real browser, used by mouse, touch and keyboard."""
 
 from __future__ import annotations
 

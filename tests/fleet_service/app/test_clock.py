@@ -1,4 +1,4 @@
-"""Jumps of the system's clock: honest vehicles are not refused for them, before and after a
+"""Jumps of the system clock: honest vehicles are not refused because of them, before and after a
 restart.
 """
 
@@ -27,7 +27,7 @@ YEAR = 365 * 86_400 * SECOND
 
 @dataclass
 class System:
-    """The clocks of a machine."""
+    """Simulated clocks of a machine."""
 
     wall: int
     steady: int = 0

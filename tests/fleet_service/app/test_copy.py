@@ -1,5 +1,5 @@
-"""Acknowledged means two places: a disk that is lost, a bucket that is away, and a service
-killed between the two.
+"""An acknowledged report is in two places: tests with a lost disk, an absent bucket, and a service
+killed between the two writes.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def take(engine: Engine, sent: list[Batch]) -> None:
 
 
 def read_image(engine: Engine) -> dict[str, pa.Table]:
-    """All that a service would keep of itself: map, trust, batches, alerts."""
+    """Return the whole state that a service restores: map, trust, batches and alerts."""
     return dict(engine._image().tables)
 
 

@@ -1,5 +1,5 @@
-"""A vehicle is erased while a service runs, and drives on: nothing of it is left, nothing of others
-is lost.
+"""A vehicle is erased while the service runs and the vehicle drives on: no data of it remains, and
+no data of others is lost.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def pseudonyms_of(root: Path) -> list[str]:
 
 
 def count_shown(session: zenoh.Session) -> dict[int, int]:
-    """Observations by cell."""
+    """Return observations by cell."""
     found: dict[int, int] = {}
     for reply in session.get(keys.map_key(TILE)):
         if reply.ok is not None:

@@ -1,6 +1,4 @@
-"""The past is rebuilt in a process of its own, from as many rows as are asked for, or not at
-all.
-"""
+"""Past maps are rebuilt in a subprocess from a limited number of rows, or refused."""
 
 from __future__ import annotations
 
@@ -136,7 +134,7 @@ def test_the_answer_of_the_other_process_is_that_of_this_one(
 
 @pytest.fixture
 def begun(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
-    """The processes that were begun."""
+    """Return the processes that were started."""
     found: list[subprocess.Popen[bytes]] = []
 
     real = subprocess.Popen

@@ -79,7 +79,7 @@ def test_killed_service_keeps_acknowledged_reports_and_doubles_none(
 
 
 def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
-    """Boot as it is archived, seq and row of everything acknowledged."""
+    """Return boot (as archived), seq and row of every acknowledged row."""
     pseudonyms = Pseudonyms(folder / "archive" / "keys")
     now = time.time_ns()
     boots = {
@@ -94,7 +94,7 @@ def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
 
 
 def list_archived(folder: Path) -> list[tuple[int, int, int]]:
-    """Boot, seq and row of everything in the segments."""
+    """Return boot, seq and row of every row in the segments."""
     table = pa.concat_tables(
         reading.read_tables(folder / "archive", Kind.OBSERVATION, ["boot", "seq", "row"])
     )

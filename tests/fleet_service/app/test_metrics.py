@@ -1,4 +1,4 @@
-"""A running service as its operator sees it: refusals by reason, the queue, what waits, health."""
+"""Metrics of a running service: refusals by reason, the queue, waiting batches, and health."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ VEHICLES = ("sim-001", "sim-002", "sim-003")
 
 
 class Fleet:
-    """Publishes batches and hears acknowledgements, tiles and alerts."""
+    """A client that publishes batches and stores acknowledgements, tiles and alerts."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
@@ -94,7 +94,7 @@ class Fleet:
         send(self.session, sent)
 
     def list_unsettled(self, sent: list[Batch]) -> list[Batch]:
-        """Those that were not acknowledged yet."""
+        """Return the batches that are not acknowledged yet."""
         return [one for one in sent if one.seq not in self.durable[one.vehicle]]
 
     def settle(self, *sent: Batch) -> None:
@@ -125,7 +125,7 @@ def ask(
 
 
 def alive(session: zenoh.Session) -> list[str]:
-    """Tokens of the services."""
+    """Return the presence tokens of the services."""
     return [
         str(reply.ok.key_expr)
         for reply in session.liveliness().get(f"{keys.ROOT}/shard/*")
@@ -225,8 +225,8 @@ def test_what_is_not_ours_is_counted_and_the_service_goes_on(
 
 
 def seconds() -> Iterator[int]:
-    """Moments a second apart, as vehicles that follow each other come by; the last is not yet in
-    the future.
+    """Return times one second apart, as of vehicles that follow each other; the last is not in the
+    future.
     """
     return iter(range(now() - 30 * SECOND, now(), SECOND))
 

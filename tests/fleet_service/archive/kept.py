@@ -59,7 +59,7 @@ COLUMNS: Final = (
 
 
 def now_of(turn: int) -> int:
-    """When a round is received."""
+    """Return the time at which a round is received."""
     return MIDNIGHT + (turn - ROUNDS // 2) * ROUND_NS
 
 
@@ -105,7 +105,7 @@ def make_state(turn: int, vehicle: int) -> Batch:
 
 
 def messages(turn: int) -> Iterator[Message]:
-    """All that a round brings."""
+    """Return all messages of a round."""
     for vehicle in range(VEHICLES):
         for one, key in (
             (make_observations(turn, vehicle), keys.observation_key),
@@ -117,7 +117,7 @@ def messages(turn: int) -> Iterator[Message]:
 
 
 def take_checkpoint(engine: Engine) -> Any:  # noqa: ANN401 tables and a time
-    """A checkpoint as the service takes it: asked by one thread, taken by the worker."""
+    """Take a checkpoint as the service does: one thread requests it, the worker writes it."""
     found: list[object] = []
     stop = threading.Event()
     thread = threading.Thread(target=lambda: found.append(engine.checkpoint(stop)))
@@ -179,7 +179,7 @@ def make(root: Path) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Make one in a folder."""
+    """Create a reference archive in a folder."""
     folder = Path(sys.argv[1])
     found = make(folder / "archive")
     (folder / "lock").unlink(missing_ok=True)

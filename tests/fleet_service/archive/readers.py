@@ -1,5 +1,6 @@
-"""The tools that people read an archive with, each as a function: rows, mean of mu, rows with a
-likelihood, zones.
+"""Common tools that read an archive, each as a function that returns rows, mean of mu, rows with a
+likelihood, and zones. A tool that is not installed is left out. Spark has a test of its own,
+because it takes long.
 
 A reader that is not installed is left out. Spark has a test of its own, for it takes a Java and
 twenty seconds.

@@ -44,7 +44,7 @@ def read_settled(acks: list[tuple[str, bytes]]) -> dict[str, list[tuple[int, int
 
 @pytest.fixture
 def engine(tmp_path: Path) -> Iterator[Engine]:
-    """On an empty archive."""
+    """Open a log on an empty archive."""
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         yield engine
 

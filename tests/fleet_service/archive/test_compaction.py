@@ -1,4 +1,4 @@
-"""Compaction loses and doubles nothing, at whatever point it dies and with any reader."""
+"""Compaction loses and doubles no row, wherever it is interrupted and whichever reader is used."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ ROWS = 50
 
 
 class DiedError(BaseException):
-    """The process is gone: nothing catches this."""
+    """Death of the process; no handler catches it."""
 
 
 def public(root: Path, kind: Kind) -> list[tuple[int, int]]:
-    """(boot, seq) of what another tool sees in the compacted files."""
+    """Return (boot, seq) of the rows that another tool finds in the compacted files."""
     paths = list((root / layout.TABLES[kind]).rglob("*.parquet"))
     found = [pq.read_table(path, columns=["boot", "seq"], partitioning=None) for path in paths]
     return sorted((row["boot"], row["seq"]) for table in found for row in table.to_pylist())

@@ -1,4 +1,4 @@
-"""The log: nothing is settled before it is durable, and a failed write loses nothing."""
+"""Segment log: nothing is settled before it is durable, and a failed write loses no row."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def log(tmp_path: Path) -> Iterator[SegmentLog[str]]:
 
 
 def add(log: SegmentLog[str], name: str, seed: int, kind: Kind = Kind.OBSERVATION) -> None:
-    """Three rows of a batch."""
+    """Return three rows of a batch."""
     log.add(kind, rows_of(kind, 3, seed), [name])
 
 
@@ -87,7 +87,7 @@ def test_segment_order_does_not_depend_on_the_number_of_digits() -> None:
 
 
 def test_a_power_loss_after_the_first_key_was_given_never_takes_it_back(tmp_path: Path) -> None:
-    """A batch that is acknowledged under a forgotten key would come in again under another."""
+    """If a batch is acknowledged under an erased key, it is admitted again under the next key."""
     for seed in range(20):
         live = tmp_path / f"live-{seed}"
         after = tmp_path / f"after-{seed}"

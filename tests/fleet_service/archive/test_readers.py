@@ -1,4 +1,4 @@
-"""The archive as it stands, opened with other people's tools."""
+"""The archive, unchanged, opened with common tools."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.fleet_service.archive.rows import fill
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Seen]:
-    """A compacted archive, and what every tool must see."""
+    """Return a compacted archive, and the expected result of every tool."""
     root = tmp_path_factory.mktemp("archive")
     fill(root, 3, 100)
     compact(root)
@@ -43,4 +43,4 @@ def test_the_page_in_an_archive_names_every_column_with_its_unit(
     page = (archive[0] / "README.md").read_text()
     assert page == readme.page_text()
     assert "| `speed` | float | m/s | mean speed over the visit; multiples of 0.015625 |" in page
-    assert "| `vehicle_bits` | int64 | 64 bits | or; distinct vehicles" in page
+    assert "| `vehicle_bits` | int64 | 64 bits | vehicles, about -64 ln(" in page

@@ -154,7 +154,7 @@ def test_a_destroyed_key_makes_the_way_back_to_a_name_unknown(tmp_path: Path) ->
 
 NOON = int(datetime(2026, 1, 31, 12, tzinfo=UTC).timestamp()) * SECOND
 DAY = 86_400 * SECOND
-ERASED = "time: its month, or its vehicle in it, was erased; delete it"
+ERASED = "time: the data of this month or vehicle were erased; delete the batch"
 
 
 def acknowledge_batch(engine: Engine, sent: Batch, now: int) -> list[str]:
@@ -175,7 +175,7 @@ def rows_kept(root: Path) -> int:
 
 
 def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: Path) -> None:
-    """Nobody can tell any more that a batch was there before; a spool may hold it, for its
+    """The record of an old batch is gone, but a spool may still hold the batch if its
     acknowledgement was lost.
     """
     old = batch("car-001", 1, NOON, [0.8])

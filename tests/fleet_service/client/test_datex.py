@@ -1,4 +1,6 @@
-"""Slippery stretches as DATEX II: valid, versioned, ended; a stretch without news has not ended."""
+"""Slippery stretches as DATEX II: valid, versioned and ended. A stretch without new reports has not
+ended.
+"""
 
 from __future__ import annotations
 

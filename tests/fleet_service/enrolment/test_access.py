@@ -228,7 +228,7 @@ def test_a_certificate_that_is_not_there_is_said_by_name(tmp_path: Path) -> None
 
 
 def test_a_declared_publisher_of_a_vehicle_is_told_that_somebody_listens(running: Network) -> None:
-    """Else it would send nothing, silently."""
+    """Without this rule the vehicle would send nothing, without any error."""
     received: list[bytes] = []
     with (
         running.open_session(SERVICE) as service,

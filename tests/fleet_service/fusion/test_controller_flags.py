@@ -1,5 +1,5 @@
-"""Slip controllers as witnesses: they support an alert, never a belief, and only with a good
-record of their own.
+"""Slip controllers as witnesses: they support an alert but change no belief, and only if their
+record is good.
 """
 
 from __future__ import annotations

@@ -31,13 +31,13 @@ UNTESTED = at_least([0.3] * 4)  # four gentle drivers
 
 
 def east(steps: int, north: int = 0) -> int:
-    """The cell so far east of CELL."""
+    """Return the cell this many steps east of CELL."""
     return int(grid.interleave(np.array([X + steps]), np.array([Y - north]))[0])
 
 
 def road(found: dict[int, FloatArray], sector: int = 0) -> Fusion:
-    """A fusion after the visits (n, 32) to cells so many steps east of CELL, each by vehicles of
-    its own.
+    """Return a fusion after visits (n, 32) to cells this many steps east of CELL, each by new
+    vehicles.
     """
     fusion = Fusion(120.0)
     for steps, said in found.items():

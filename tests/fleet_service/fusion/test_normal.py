@@ -1,4 +1,4 @@
-"""The normal distribution against a library's, far into both ends."""
+"""The normal distribution compared with a library's, far into both tails."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def drive(seed: int, n: int, duration_s: float) -> Observations:
 
 
 def delay_arrivals(o: Observations, most_s: float, seed: int) -> IntArray:
-    """An order of arrival in which each visit comes up to `most_s` late."""
+    """Return an order of arrival in which each visit is at most `most_s` late."""
     return np.argsort(
         o.time + (np.random.default_rng(seed).random(len(o.time)) * most_s * 1e9).astype(np.int64)
     )
@@ -53,7 +53,7 @@ def fold_in(
 
 
 def difference(a: Fusion, b: Fusion) -> float:
-    """Largest difference of any probability of any cell."""
+    """Return the largest difference of a probability over all cells."""
     assert a.size == b.size
     there = b.slots_of(a.cell[: a.size], a.sector[: a.size])
     now = int(max(a.live.time.max(), b.live.time.max()))

@@ -1,5 +1,5 @@
-"""Errors that vehicles of one place have in common: more vehicles do not average them out, other
-manoeuvres do.
+"""Common errors of vehicles in one place: more vehicles do not average them out, other manoeuvres
+do.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Silence: visits without a value end the knowledge of ice, and never show grip."""
+"""Visits without a value: they end the knowledge of ice and never show grip."""
 
 from __future__ import annotations
 

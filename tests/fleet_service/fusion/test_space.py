@@ -1,4 +1,4 @@
-"""A visit whose place is uncertain: it is shared among cells, and never doubled."""
+"""A visit with an uncertain position is shared among cells and never counted twice."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def spread(std: float, yaw: float = 0.0, cell: int = CELL) -> tuple[IntArray, Fl
 
 
 def information(p: FloatArray) -> float:
-    """Nats that a belief has gained over the prior."""
+    """Return the information that a belief has gained over the prior [nat]."""
     return float(np.sum(p * np.log(np.maximum(p, 1e-300) * mugrid.BINS)))
 
 
 def read_beliefs(fusion: Fusion) -> FloatArray:
-    """Beliefs of all cells by their own reports, (cells, 32)."""
+    """Return the beliefs of all cells from their own reports only, (cells, 32)."""
     kept = fusion.live.belief[: fusion.size].astype(float)
     return np.asarray(kept / kept.sum(axis=1, keepdims=True))
 

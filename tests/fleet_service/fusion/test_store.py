@@ -63,8 +63,8 @@ def test_reporters_and_sources_of_hours_ago_are_dropped_and_reused() -> None:
 
 
 def test_old_cells_back_at_the_prior_are_dropped_without_other_effect() -> None:
-    """A fusion that dropped them gives the same results for later observations as one that has them
-    all.
+    """A fusion that dropped unused slots gives the same results for later observations as one that
+    kept them.
     """
     fusion = Fusion(LATENESS_S)
     whole = Fusion(LATENESS_S)

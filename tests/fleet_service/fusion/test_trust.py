@@ -1,4 +1,4 @@
-"""Trust: which vehicles are trusted, and that a group that only agrees with itself gains nothing."""
+"""Trust of vehicles: a group that agrees only with itself gains none."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ LIARS = np.arange(100, 108)
 
 
 def drive_liars(private: int = 0, *, enrolled: bool = False) -> Fusion:
-    """Twenty honest vehicles and eight that agree on .25, in four cells; the eight also in
-    `private` others.
+    """Return a fusion with twenty honest vehicles and eight that claim .25 in four cells; the eight
+    also visit `private` other cells.
     """
     rng = np.random.default_rng(4)
     fusion = Fusion(120.0, enrolled=enrolled)

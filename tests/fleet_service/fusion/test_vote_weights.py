@@ -1,4 +1,6 @@
-"""Vehicles' weights, and how far their values fall with the grip they leave unused, are learned."""
+"""The fusion learns the weights of vehicles, and how much their values fall with the grip left
+unused.
+"""
 
 from __future__ import annotations
 
@@ -59,8 +61,8 @@ def test_shape_of_nobody_is_the_prior() -> None:
 
 @pytest.mark.parametrize("gain_std", [0.05, 0.1])
 def test_gain_error_common_to_value_and_use_is_no_shape(gain_std: float) -> None:
-    """Between vehicles such errors look like a slope of cov(value, use)/var(use) ≥ .3; within
-    one they cancel.
+    """Between vehicles such errors look like a slope cov(value, use)/var(use) ≥ .3; within one
+    vehicle they cancel.
     """
     assert learned_slope(make_acquainted(0.0, gain_std, gain_in_use=True)) < 0.12
 
@@ -93,8 +95,8 @@ def test_shape_is_the_slope_and_a_doubt() -> None:
 
 
 def test_doubt_of_an_alarm_ends_once_the_shape_is_known() -> None:
-    """A service that knows nobody doubts a gentle value more before an alarm; one that knows its
-    fleet hardly.
+    """A service that knows no vehicle doubts a gentle value before an alert more than one that
+    knows its fleet.
     """
     unknown = shared.UNKNOWN_SHAPE
     assert unknown.alarm == pytest.approx(0.5, abs=0.01)

@@ -1,4 +1,4 @@
-"""Road time: what weather does to forgetting, and that it does not matter when it is told."""
+"""Effect of weather on forgetting; the order in which reports of weather arrive does not matter."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STEADY = (15.0, np.nan, 0.0)
 
 
 def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGION) -> w.Reports:
-    """Hours after START, and air, road and precipitation."""
+    """Return hourly reports after START with air temperature, road temperature and precipitation."""
     air, road, water = np.array([row[1] for row in rows]).T
     time = np.array([START + int(row[0] * HOUR) for row in rows])
     return w.Reports(

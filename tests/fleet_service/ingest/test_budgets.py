@@ -1,4 +1,4 @@
-"""One valid car is one witness, and cannot fill a service, whatever a valid car may send."""
+"""One valid car counts as one witness and cannot fill a service, whatever it sends."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_batches_with_unhashed_starts_are_recognised_again(
 
 
 def test_a_car_with_one_foot_in_last_month_raises_no_alert_alone(engine: Engine) -> None:
-    """A batch's pseudonym is of its first record's month, and the first may be long ago."""
+    """The pseudonym of a batch belongs to the month of its first record, which may be long ago."""
     now = time.time_ns()
     for seq in range(1, 40):
         old = now - 29 * 86_400 * SECOND

@@ -36,7 +36,7 @@ def test_ranges_hold_exactly_their_numbers(numbers: set[int]) -> None:
 
 
 class Desk:
-    """An intake on its own."""
+    """Return an intake without a service."""
 
     def __init__(self, folder: Path) -> None:
         self.counts: Counter[str] = Counter()
@@ -77,7 +77,7 @@ FAR = int(grid.cell_of(LATITUDE, 12.02))
 
 
 def one(column: str, values: list[float]) -> dict[str, Any]:
-    """A column to be changed."""
+    """A change of one column."""
     return {column: values}
 
 
@@ -219,7 +219,7 @@ def test_no_text_stops_the_intake(desk: Desk, payload: bytes) -> None:
 
 
 def test_unusable_records_are_rejected_if_the_head_can_be_read(desk: Desk) -> None:
-    """Else it would come again for ever, and stop its stream after 65 536 others."""
+    """Otherwise the batch would be sent again for ever and stop its stream after 65 536 others."""
     pb = wire.parse(wire.encode(batch("sim-001", 7, NOW, [0.8, 0.8])), "", ObservationBatch, "")
     del pb.mu[1:]
     assert desk.take(message(batch("sim-001", 7, NOW, [0.8]), pb.SerializeToString())) == 0

@@ -1,4 +1,4 @@
-"""Weather in: from a file and over Zenoh, refused with a reason, archived, and the same after a
+"""Weather input from a file and over Zenoh: refused with a reason, archived, and the same after a
 restart.
 """
 

@@ -1,6 +1,4 @@
-"""A dry road does not stay dry: the longer ago, and the nearer to freezing, the less is vouched
-for.
-"""
+"""Fading of a dry road: the lower end falls with time, and faster near freezing."""
 
 from __future__ import annotations
 

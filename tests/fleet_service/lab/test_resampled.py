@@ -1,4 +1,6 @@
-"""Errors resampled from drives: of the same vehicle, on a similar road, scaled to the town's."""
+"""Errors resampled from drives: of the same vehicle, on a similar road, scaled to the friction of
+the town.
+"""
 
 from __future__ import annotations
 

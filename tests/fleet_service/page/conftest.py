@@ -22,7 +22,7 @@ from tests.waiting import until
 
 @dataclass
 class RunningPage:
-    """A page that listens, with its folder and address."""
+    """A running page with its folder and address."""
 
     address: str
     service: Running | None
@@ -48,7 +48,7 @@ def page_of(connection: ZenohSettings, **changed: object) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def bare(router: ZenohSettings) -> Iterator[str]:
-    """The address of a page that no service speaks to."""
+    """Yield the address of a page without a service."""
     with page_of(router) as address:
         yield address
 

@@ -14,7 +14,7 @@ MISSING: Final = "no axe-core in .page/tools: make browser-test fetches it with 
 
 
 def findings(seen: Opened, tabs: tuple[str, ...] = TABS) -> list[str] | None:
-    """Serious findings, one a line; None where axe-core is not there."""
+    """Return serious findings, one per line; None if axe-core is not installed."""
     source = file_of("axe-core", "axe.min.js")
     if source is None:
         return None

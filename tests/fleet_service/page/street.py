@@ -1,6 +1,4 @@
-"""A crossing of two streets that six cars drove: dry, snow, ice, and a part that was only
-passed.
-"""
+"""A crossing of two streets driven by six cars: dry, snow, ice, and a part where nobody used grip."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""One client cannot take the past, the streams or the connections of a page from the others."""
+"""One client cannot use up past maps, event streams or connections of a page so that others are
+shut out.
+"""
 
 from __future__ import annotations
 
@@ -64,14 +66,14 @@ def test_full_page_takes_a_stream_from_the_client_with_most() -> None:
 
 
 class Transport:
-    """Connection that records its end."""
+    """Connection that records that it was closed."""
 
     def __init__(self, host: str) -> None:
         self._host = host
         self.is_aborted = False
 
     def abort(self) -> None:
-        """End it."""
+        """Close the connection."""
         self.is_aborted = True
 
     def get_extra_info(self, name: str) -> Any:  # noqa: ANN401 as asyncio has it

@@ -1,6 +1,4 @@
-"""Tiles below the cells from a file of the operator's own: accepted files, refused files, and the
-picture.
-"""
+"""Base map from a file of the operator: accepted files, refused files, and the rendered picture."""
 
 from __future__ import annotations
 
@@ -110,8 +108,8 @@ def test_tiles_of_a_file_are_served_and_one_that_is_not_there_is_no_error(
 def test_a_person_sees_the_file_below_the_map_without_any_network(
     router: ZenohSettings, tmp_path: Path
 ) -> None:
-    """Further in than the file goes its deepest tiles are drawn larger; far out none is asked
-    for.
+    """When zoomed in beyond the file's deepest level its tiles are enlarged; when zoomed out far no
+    tile is requested.
     """
     with (
         page_of(router, base_map=base_map(str(town(tmp_path / "town.mbtiles")))) as address,

@@ -1,4 +1,6 @@
-"""Colours of the live page: told apart by every kind of sight, and never a promise."""
+"""Colours of the live page: distinguishable for every kind of colour vision, and none that promises
+grip.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ DARK = (*DARK_FOUR, *DARK_TWO, DARK_LITTLE, DARK_GROUND)
 
 
 def in_danger(four: tuple[str, ...], two: tuple[str, ...]) -> tuple[str, ...]:
-    """Ice, snow, rather slippery, wet, rather not, good grip."""
+    """Return the colours of ice, snow, rather slippery, wet, rather not slippery, and good grip."""
     return (four[0], four[1], two[0], four[2], two[1], four[3])
 
 
@@ -48,8 +50,8 @@ def test_any_two_classes_and_the_ground_are_told_apart(
 
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_lightness_is_the_order_of_danger(sight: str) -> None:
-    """On light ground the most dangerous is the darkest, on dark ground the lightest; grey paper
-    shows the same.
+    """The most dangerous class is the darkest on light ground and the lightest on dark ground; the
+    order holds on grey paper.
     """
     for ladder, sign in ((in_danger(FOUR, TWO), 1.0), (in_danger(DARK_FOUR, DARK_TWO), -1.0)):
         light = [sign * float(to_lab(colour, sight)[0]) for colour in ladder]

@@ -1,4 +1,6 @@
-"""The publication that others pull from the page: as the alerts are, gone on with, valid."""
+"""DATEX II publication served by the page: equal to the alerts, continued after a restart, and
+valid.
+"""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ READERS = {
 
 
 def opened_by(reader: str, address: str, folder: Path) -> Any:  # noqa: ANN401 geopandas is untyped
-    """The features as a reader of others has them."""
+    """Return the features as a third-party reader gets them."""
     out = folder / f"{reader}.parquet"
     script = f"{READERS[reader].format(address=address)}; found.to_parquet({str(out)!r})"
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
@@ -39,7 +39,7 @@ def opened_by(reader: str, address: str, folder: Path) -> Any:  # noqa: ANN401 g
 
 
 def fetch_document(page: RunningPage, path: str) -> dict[str, Any]:
-    """A document, which must be there."""
+    """Return a document that must exist."""
     status, headers, body = ask(page.address, path)
     assert status == 200, body
     assert "json" in headers["content-type"]
@@ -48,14 +48,14 @@ def fetch_document(page: RunningPage, path: str) -> dict[str, Any]:
 
 
 def drive_parts(page: RunningPage, drive: Drive, *parts: str) -> None:
-    """Parts are driven, and the page knows of it."""
+    """Drive parts of the street, and wait until the page shows them."""
     before = count(page)
     drive(*parts)
     until(lambda: count(page) >= before + street.count_known(*parts))
 
 
 def count(page: RunningPage) -> int:
-    """Features that there are; 0 before the page knows of a service."""
+    """Return the number of features; 0 before the page knows of a service."""
     status, _, body = ask(page.address, ITEMS)
     assert status in (200, 503), body
     return int(json.loads(body)["numberReturned"]) if status == 200 else 0

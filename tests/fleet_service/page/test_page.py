@@ -29,7 +29,7 @@ ICE, SNOW, WET, DRY, RATHER, RATHER_NOT, LITTLE, HOLLOW = range(8)
 
 
 def look(seen: Opened, name: str) -> None:
-    """Keep a picture, for people."""
+    """Store a screenshot for inspection by people."""
     PICTURES.mkdir(exist_ok=True)
     seen.page.screenshot(path=PICTURES / f"{name}.png")
 
@@ -59,7 +59,7 @@ def kinds(seen: Opened) -> list[int]:
 
 
 def near(seen: Opened, cell: int, zoom: float = 18.0) -> None:
-    """Look at a cell, near enough for headings."""
+    """Zoom in on a cell until headings are shown."""
     latitude, longitude = (float(v) for v in grid.centre(cell))
     seen.page.evaluate(
         "([x, y, z]) => { gripmap.goTo(x, y); gripmap.view.go(gripmap.view.x, gripmap.view.y, z) }",

@@ -1,5 +1,5 @@
-"""Other uses of the page: a night played, a sound, on paper, on a wall, a dropped route, read
-aloud.
+"""Other uses of the page: replay of a night, sound, print, wall display, a dropped route, and
+screen reader.
 """
 
 from __future__ import annotations

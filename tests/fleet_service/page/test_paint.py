@@ -1,5 +1,5 @@
-"""Painted points: the unknown share, seams, guesses, a route, the world before any service
-answered.
+"""Painting: cells with an unknown part, seams, borrowed values, a route, and the map before a
+service answers.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Records agree with the map and are never drier; ancestors have the worst value of their cells."""
+"""Map records equal the map and never show more grip; a parent tile has the worst value of its
+cells.
+"""
 
 from __future__ import annotations
 

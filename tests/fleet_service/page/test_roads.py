@@ -1,4 +1,6 @@
-"""Roads of the page: lines of a file, lines learned from cells, recent moments, areas with data."""
+"""Roads of the page: lines from a file, lines learned from cells, recent times, and areas with
+data.
+"""
 
 from __future__ import annotations
 

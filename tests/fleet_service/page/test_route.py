@@ -1,4 +1,6 @@
-"""Grip along a route: an unknown part stays unknown, and speed follows from the lower end."""
+"""Grip along a route: an unknown part stays unknown, and the speed follows from the lower end of
+the interval.
+"""
 
 from __future__ import annotations
 

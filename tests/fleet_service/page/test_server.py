@@ -44,7 +44,7 @@ WORLD: Final = View((-180.0, -90.0, 180.0, 90.0), 21)
 
 
 def ask(address: str, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    """Status, headers and body of a question."""
+    """Return status, headers and body of an answer."""
     connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
@@ -61,7 +61,7 @@ def ask(address: str, path: str, **headers: str) -> tuple[int, dict[str, str], b
 
 @contextmanager
 def listening(address: str, path: str = "/events") -> Iterator[Iterator[tuple[str, Any]]]:
-    """Events as they come."""
+    """Yield events as they arrive."""
     connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
     connection.request("GET", path)
     answer = connection.getresponse()
@@ -204,7 +204,7 @@ def test_as_many_watch_as_may_and_the_next_is_told_to_come_again(router: ZenohSe
 
 
 def ask_briefly(address: str) -> int:
-    """Status of a stream that is left at once."""
+    """Return the status of an event stream that is closed at once."""
     connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
     connection.request("GET", "/events")
     answer = connection.getresponse()

@@ -1,5 +1,5 @@
-"""The page's own files, as text: words in one table, modules that are short, sent as one, from
-nowhere else.
+"""Static files of the page: all texts in one table, short modules, one bundle, and no external
+file.
 """
 
 from __future__ import annotations

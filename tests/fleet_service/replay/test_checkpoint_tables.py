@@ -1,4 +1,4 @@
-"""A checkpoint goes on exactly where the fusion was."""
+"""A fusion restored from a checkpoint continues exactly as the original."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.fleet_service.fusion.test_weather import RAIN, reports
 
 
 def store_tables(tables: dict[str, pa.Table]) -> dict[str, pa.Table]:
-    """Written as Parquet and read again."""
+    """Write a fusion as Parquet and read it again."""
     out = {}
     for name, table in tables.items():
         buffer = io.BytesIO()

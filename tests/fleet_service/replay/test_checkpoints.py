@@ -1,6 +1,4 @@
-"""Checkpoints: a restart from one is a restart from the whole log, and costs only what came
-since.
-"""
+"""Checkpoints: a restart from one equals a restart from the whole log and reads only later rows."""
 
 from __future__ import annotations
 
@@ -120,7 +118,9 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(
 
 
 def read_state(engine: Engine) -> dict[str, NDArray[Any]]:
-    """All that a map is read from, by cell and sector, and the time at which a restart reads it."""
+    """Return everything from which a map is made, by cell and sector, and the time at which a
+    restart reads it.
+    """
     fusion = engine.state.fusion
     rows = engine.state.fusion.store.state.live
     order = np.lexsort((fusion.sector, fusion.cell))
@@ -159,7 +159,7 @@ def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
 
 
 def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) -> None:
-    """Whatever comes late, in disorder, and last before the checkpoint."""
+    """The checkpoint is taken after late and unordered reports."""
     rng = np.random.default_rng(3)
     now = time.time_ns()
     sent = []
@@ -258,7 +258,9 @@ def _set() -> threading.Event:
 
 
 def test_rows_after_the_checkpoint_are_replayed_whatever_the_clock(tmp_path: Path) -> None:
-    """The checkpoint's run was an hour ahead; then the clock is put right, and ice is found."""
+    """The clock was an hour ahead when the checkpoint was taken; it is then corrected, and ice is
+    reported.
+    """
     ahead = time.time_ns() + 3600 * SECOND
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.intake.ingest([icy(9, 1, 0.15)], ahead)

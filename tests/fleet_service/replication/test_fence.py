@@ -1,4 +1,4 @@
-"""Late uploads of a service that lost its lease replace nothing of its successor."""
+"""Fencing: late uploads of a service that lost its lease replace no object of its successor."""
 
 from __future__ import annotations
 

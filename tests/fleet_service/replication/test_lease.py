@@ -1,5 +1,5 @@
-"""A service that is gone, frozen or cut off is followed by another, which has every acknowledged
-row once.
+"""Lease: a service that ended, froze or was cut off is followed by another, which has every
+acknowledged row once.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def test_of_two_standbys_one_takes_over_and_the_other_waits_for_it(
 
 
 class Machine:
-    """A folder whose service is no process, so that it can be stopped between any two steps."""
+    """A folder with a service in threads that a test can stop between any two steps."""
 
     def __init__(
         self,
@@ -175,7 +175,7 @@ class Machine:
         return self.holding.copy
 
     def freeze(self) -> None:
-        """No renewal any more."""
+        """Stop renewals."""
         assert self.holding.lease is not None
         self.holding.lease._stop.set()
 

@@ -1,5 +1,5 @@
-"""The lease object states the lease time; other versions are read; damage is waited for and
-never ends a service.
+"""The lease object: it states the lease time, other versions are read, and a damaged object delays
+but never ends a service.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def test_holder_repairs_a_damaged_lease_and_keeps_it() -> None:
 
 
 def test_failed_renewal_uses_its_turn_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The write may take effect late, and the next renewal must differ from it."""
+    """The write may take effect late, so the next renewal must differ from it."""
     bucket = MemoryBucket()
     holder = lease_on(bucket, "one", 0.5)
     assert holder._create_next(None, lambda: 0, threading.Event())

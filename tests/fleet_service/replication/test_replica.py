@@ -1,6 +1,4 @@
-"""The bucket replica: settled rows are there, deletions follow, and an empty disk is restored from
-it.
-"""
+"""Bucket replica: it contains settled rows, follows deletions, and restores an empty disk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When an alert begins and ends."""
+"""Begin and end of alerts."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ COLUMN, ROW = (int(part[0]) for part in grid.deinterleave(np.array([CELL])))
 
 
 def icy(vehicles: list[int]) -> tuple[Fusion, Alerts, list[bool]]:
-    """A cell that these vehicles called icy, one after the other; and whether each of them
-    raised an alert.
+    """Let vehicles report ice in a cell one after the other. Return the cell, and for each vehicle
+    whether it raised an alert.
     """
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)

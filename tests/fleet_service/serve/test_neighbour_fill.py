@@ -1,4 +1,6 @@
-"""Borrowed cells: less with the distance, never surer than their sources, and marked."""
+"""Cells with borrowed values: the influence falls with distance, the values are never more certain
+than their sources, and they are marked.
+"""
 
 from __future__ import annotations
 

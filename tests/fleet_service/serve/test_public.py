@@ -45,7 +45,7 @@ MORE = tuple(
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """An engine that shows cells of so many vehicles."""
+    """Return an engine that shows only cells with at least this many vehicles."""
     opened: list[Engine] = []
 
     def begin(public: int) -> Engine:
@@ -147,9 +147,7 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
 
 
 def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Start) -> None:
-    """The vehicles that make a cell public are those of the last hours, in answers, routes,
-    snapshots and tiles.
-    """
+    """Only vehicles of the last hours make a cell public, in answers, routes, snapshots and tiles."""
     engine = start(3)
     day = (time.time_ns() // (2 * PART_NS) - 2) * 2 * PART_NS + 8 * 3600 * SECOND
     names = [f"sim-{k:03}" for k in range(6)]
@@ -291,7 +289,7 @@ def test_cells_unvisited_for_a_week_are_dropped_live_and_by_restart(start: Start
 
 
 def hear_ice(engine: Engine, now: int) -> list[wire.Alert]:
-    """Four vehicles find ice in a cell of their own, which raises an alert."""
+    """Let four vehicles find ice in separate cells, which raises an alert."""
     where: dict[str, Any] = {
         "latitude": [LATITUDE + 0.002] * 3,
         "cell": [grid.cell_of(LATITUDE + 0.002, LONGITUDE)] * 3,

@@ -1,4 +1,4 @@
-"""An answer that fails says so: without a word its asker would take it for a map without data."""
+"""Failed answers carry an error, because a client would take silence for a map without data."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FAILURES = (
 
 
 def texts(session: zenoh.Session, selector: str) -> list[str]:
-    """All replies, errors too, in the order of the alphabet: Zenoh has none."""
+    """Return all replies and errors, sorted, because Zenoh gives them no order."""
     return sorted(
         part.payload.to_string()
         for reply in session.get(selector)
@@ -143,7 +143,7 @@ COSTS = {2: MOST, 3: 2 * LIGHT, 4: LIGHT}  # by what is asked for; a question of
 
 
 class Half:
-    """Answers of two tiles; those that cost most wait for `go` after the first."""
+    """Return answers of two tiles; the most expensive ones wait for `go` after the first tile."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.counts = Counter[str]()
@@ -172,7 +172,7 @@ class Half:
 
 @pytest.fixture
 def half(session: zenoh.Session) -> Iterator[Half]:
-    """Such a queryable, heard."""
+    """Yield such a queryable."""
     made = Half(session)
     declared = session.declare_queryable(made.key, made.queryable, complete=True)
     querier = session.declare_querier(made.key)

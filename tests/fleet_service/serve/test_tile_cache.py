@@ -1,5 +1,5 @@
-"""A cached tile is served again for at most a second, and never without acknowledged or alerted
-reports.
+"""A cached tile is served for at most a second, and never after an acknowledged report or an alert
+changed it.
 """
 
 from __future__ import annotations

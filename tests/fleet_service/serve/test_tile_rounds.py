@@ -1,6 +1,4 @@
-"""Rounds of tiles: on a grid, each tile in turn, and never more of a turn of the worker than its
-share.
-"""
+"""Rounds of tiles: regular, each tile in turn, and never more than a fixed share of a worker turn."""
 
 from __future__ import annotations
 

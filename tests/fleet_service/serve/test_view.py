@@ -1,4 +1,4 @@
-"""Basis of a cell: a belief that calls the road slippery is never a mere bound."""
+"""Basis of a cell: a cell that is probably slippery is never shown as a bound."""
 
 from __future__ import annotations
 

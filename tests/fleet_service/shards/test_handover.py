@@ -1,4 +1,4 @@
-"""A region goes from one service to another, live: map, alerts, trust and batches go along."""
+"""Live hand-over of a region between services: map, alerts, trust and batches move along."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""A region is served or it is not, and everyone knows: three services side by side, one of which
-goes.
+"""Presence of regions: every client knows which regions are served. Three services run, and one of
+them stops.
 """
 
 from __future__ import annotations
@@ -63,7 +63,9 @@ def nobody(session: zenoh.Session) -> None:
 
 
 def visits(vehicle: str) -> list[Batch]:
-    """A batch for each place of the street, of a car for each: one could not be in all at once."""
+    """Return a batch for each place of the street, each by another car, because one car cannot be
+    at all places at once.
+    """
     now = time.time_ns() - 2 * SECOND
     out = list[Batch]()
     for number, longitude in enumerate(LONGITUDES):
@@ -249,7 +251,7 @@ def test_who_comes_while_it_is_asked_may_not_have_been_asked(
 def test_who_is_found_after_it_was_asked_is_asked_again(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its queryables are there, and the token that tells its regions is on the way."""
+    """The queryables of the service exist, but its presence token has not arrived yet."""
     monkeypatch.setattr("fleet_service.app.service.serving_regions", lambda *_: nullcontext())
     with running(router, tmp_path / "one", name="first", regions=NAMES[1:2]) as service:
         drive_one(session, service)

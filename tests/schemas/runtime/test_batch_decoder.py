@@ -29,7 +29,7 @@ _FLOAT = st.floats(width=32)
 
 @st.composite
 def draw_message(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401 protobuf messages are untyped
-    """A message with records, some of its columns, and anything in them."""
+    """Return a random message: records with some of the columns and arbitrary values."""
     rows = draw(st.integers(1, 4))
     message = MESSAGES[kind](
         vehicle=draw(st.sampled_from(["sim-001", "", "a" * 200])),

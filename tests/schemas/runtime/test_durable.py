@@ -1,5 +1,5 @@
-"""A file is there whole or as it was; permissions from its first byte on; folders that power
-loss does not forget.
+"""Durable writes: a file is complete or unchanged, has its permissions from the first byte on, and
+survives power loss.
 """
 
 from __future__ import annotations

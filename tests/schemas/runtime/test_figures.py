@@ -1,4 +1,4 @@
-"""A figure holds or it does not, and the file says which."""
+"""A figure holds its bar or not, and the file records which."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Install hints name where this distribution came from, because no index has it."""
+"""Install hints name the source of this distribution, because it is not in a package index."""
 
 from __future__ import annotations
 

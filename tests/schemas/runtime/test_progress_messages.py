@@ -16,7 +16,7 @@ class Terminal(io.StringIO):
     """A terminal that collects its output."""
 
     def isatty(self) -> bool:
-        """It is one."""
+        """Return True, as a terminal does."""
         return True
 
 

@@ -27,7 +27,7 @@ class Outer(NamedTuple):
 
 
 class Row:
-    """The same for a kernel, which changes it."""
+    """Change a record in a compiled kernel."""
 
     begun: bool
     seen: int

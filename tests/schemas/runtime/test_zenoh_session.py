@@ -1,4 +1,4 @@
-"""A session that waits for its router says why, in words of a user's world."""
+"""A session that waits for its router prints the reason in plain words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tiles are read as if a stranger had sent them."""
+"""The tile decoder treats its input as untrusted."""
 
 from __future__ import annotations
 

@@ -24,14 +24,15 @@ PAPERS: Final[dict[str, tuple[str, tuple[Element, ...]]]] = {
 INTRODUCTION: Final = """\
 # Elements of the papers
 
-Every equation, table and figure of the five papers, and how the code stands to it.
+Every equation, table and figure of the five papers, and whether the code follows it.
 
 - *As printed*: no change.
-- *Option*: as printed if it is asked for, because the default needs something else.
+- *Option*: as printed if an option is set; the default needs something else.
 - *Corrected*: changed, with the reason.
-- *Left out*: not there, with the reason.
+- *Left out*: not in the code, with the reason.
 
-The lists are in the modules of the estimators. Homes are below `edge_agent`, mostly `edge_agent/estimators`.
+The lists are in the modules of the estimators. Paths in the column "where" are relative to `edge_agent`, mostly below
+`edge_agent/estimators`.
 """
 
 

@@ -120,7 +120,10 @@ def _set_plot(tuned: Memberships) -> PaperPlot:
             )
             panels.append(PlotPanel(title, label, "membership [1]", curves))
     return PaperPlot(
-        "memberships", "Figures 2, 3, 6, 7: sets before and after, as shipped", tuple(panels), 2
+        "memberships",
+        "Figures 2, 3, 6, 7: fuzzy sets before and after tuning, as shipped",
+        tuple(panels),
+        2,
     )
 
 

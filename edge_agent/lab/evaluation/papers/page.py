@@ -22,10 +22,11 @@ img { max-width: 100%; } figure { margin: 1em 0; } .sum { font-size: 1.1em; }
 """
 
 LEGEND: Final = (
-    "Printed: the number in the paper. Matched: the paper's filter on a plant that is the filter's "
-    "model. Own plant: the same filter on the simulator's plant. Realistic sensors: the paper's "
-    "estimator for a car, with ordinary sensors and a vehicle known to a few per cent. Default "
-    "estimator: the one that agents run, on the same drives."
+    "Printed: the number in the paper. Matched: the paper's filter on a simulated car that equals "
+    "the filter's model. Own plant: the same filter on the simulator's standard car. Realistic "
+    "sensors: the paper's estimator as a car would run it, with ordinary sensors and vehicle "
+    "parameters known to a few per cent. Default estimator: the estimator that agents run, on the "
+    "same drives."
 )
 
 
@@ -51,7 +52,7 @@ def limit_text(row: PaperRow) -> str:
 def summary(done: Reproduction) -> str:
     """Return one sentence about the bars."""
     barred = [row for row in done.rows if row.limit is not None]
-    text = f"{len(barred) - len(done.missed_rows)} of {len(barred)} matched numbers hold their bar."
+    text = f"{len(barred) - len(done.missed_rows)} of {len(barred)} matched numbers meet their bar."
     return text if not done.missed_rows else f"{text} Missed: {', '.join(done.missed_rows)}."
 
 

@@ -188,12 +188,13 @@ NOTES: Final = (
         "change begins."
     ),
     (
-        "With stiffness that does not depend on μ the same numbers say nothing: at 30 km/h "
-        "about half of the grip is used, and an honest interval stays wide."
+        "With stiffness that does not depend on μ the same numbers give no information about μ: "
+        "at 30 km/h about half of the grip is used, and a calibrated interval stays wide."
     ),
     (
-        "The printed filter has its motion given. Jointly with the printed motion filter (P ="
-        " Q = 100·I) the speed is lost, so the joint row uses the project's motion filter."
+        "The printed friction filter is given the true motion. Together with the printed motion "
+        "filter (P = Q = 100·I) the speed diverges, so the joint row uses the project's motion "
+        "filter."
     ),
     ("The paper prints no error. Its rows without a printed number are shown for comparison."),
 )

@@ -87,7 +87,7 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
         PaperTable(
             "Table 3: double lane change, comparator FKF", _table_rows("FKF", matched, own, {}, {})
         ),
-        PaperTable("What v_y is worth", _lateral_rows(matched)),
+        PaperTable("Comparison of v_y with the estimate 0", _lateral_rows(matched)),
         PaperTable("Options of the filter", _option_rows()),
         PaperTable("The five drives, improved filter and FKF", _all_drives(drives)),
     ]
@@ -98,23 +98,22 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
 
 NOTES: Final = (
     (
-        "With the rear wheels steered as (53) says, v_y is almost nothing: 'always zero' has "
-        "an error of .0059, below that of the paper's FKF (.0274) and twice that of its "
-        "improved filter. The rows on a car whose rear wheels do not steer are those that say"
-        " something of v_y."
+        "With the rear wheels steered as (53) says, v_y is almost nothing: 'always zero' has an "
+        "error of .0059, below that of the paper's FKF (.0274) and twice that of its improved "
+        "filter. Only the rows on a car whose rear wheels do not steer test v_y."
     ),
     (
-        "The paper's gap between FKF and improved filter in v_x is one of drag: on the "
-        "simulator's own plant, which drags, FKF is wrong by .0060 and the improved filter by"
-        " .0012 (printed .0050 and .0009). On the matched plant R is right, and both are "
+        "The paper's gap between FKF and improved filter in v_x comes from drag: on the "
+        "simulator's own plant, which has drag, FKF is wrong by .0060 and the improved filter by "
+        ".0012 (printed .0050 and .0009). On the matched plant R is correct, and both filters are "
         "equally good."
     ),
     "The gap in v_y and β is not reproduced.",
     (
-        "Friction is set by hand in the paper and here. On realistic drives it is set to .85, "
-        "which is the truth there."
+        "Friction is set by hand in the paper and here. On realistic drives it is set to .85, the "
+        "true value there."
     ),
-    "β is printed in degrees; that of the printed v_y is in radians.",
+    "β is printed in degrees; the β that follows from the printed v_y is in radians.",
 )
 
 

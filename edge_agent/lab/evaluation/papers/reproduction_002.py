@@ -160,7 +160,7 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
     dragged = run_drive(MATCHED["002.sine.drag"], IN_WHEEL_TYRE)
     done.tables.append(
         PaperTable(
-            "The same sine with drag in the plant, which no filter knows", _with_drag(dragged)
+            "The same sine with drag in the plant, which no filter models", _with_drag(dragged)
         )
     )
     vx = real["sine"][1]["rmse_vx"]
@@ -172,17 +172,17 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
 
 NOTES: Final = (
     (
-        "With drag, which neither filter knows, WCKF-B is many times worse than WCKF-A in "
-        "v_x: the opposite of the paper's claim. B believes its forces; A follows the "
+        "With drag, which neither filter models, WCKF-B is many times worse than WCKF-A in v_x: "
+        "the opposite of the paper's claim. B relies on its modelled forces; A follows the "
         "accelerometer."
     ),
     (
-        "The unit of F_x in tables 3 and 5 is not given. Ours is in newtons, so it has no "
-        "bar; PRE is a share, and the printed numbers read as per cent are met where they are"
-        " met as shares."
+        "The unit of F_x in tables 3 and 5 is not given. Ours is in newtons, so it has no bar; "
+        "PRE is a share. A printed number that is reached as a share is also reached if it is "
+        "read as per cent."
     ),
     (
-        "Wheel torque stands for motor current, because cars send no current. K_a, K_t and J "
+        "Wheel torque replaces motor current, because cars do not send the current. K_a, K_t and J "
         "of table 1 are not of one machine; J is used as printed, which leaves the wheels "
         "slow."
     ),
@@ -190,7 +190,8 @@ NOTES: Final = (
         "With ordinary sensors the default estimator's error of v_x in the sine is the error of "
         "the wheel radius in the vehicle file, which no sensor of the car shows: over 20 drives "
         "the two are correlated by .99, and the radius alone costs .035 m/s. An oracle that knows "
-        "all but radius, stiffness, roll and offsets is wrong by .033 m/s (`lab.evaluation.oracle`)."
+        "everything except radius, stiffness, roll and offsets has an error of .033 m/s "
+        "(`lab.evaluation.oracle`)."
     ),
     (
         "Friction is set by hand in the paper and here. Tables 6 and 7 (road test) repeat "

@@ -131,7 +131,7 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
         ),
         PaperTable("Comparator UKF: double and single precision", _comparator_rows(cases)),
         PaperTable(
-            "What the conditions are worth: the same filter without one of them", _ablation_rows()
+            "Effect of the conditions: the same filter without one of them", _ablation_rows()
         ),
         PaperTable(
             "Constant speed straight on, split friction: errors of sensors", _sensor_errors()
@@ -163,33 +163,35 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
 NOTES: Final = (
     (
         "The printed errors need three things: slip stiffness that is proportional to μ, the "
-        "wheels' torque balances as measurements, and no noise. With the printed signals "
-        "alone (a_x, a_y, r) the straight drives are reached, the turn and the jump are not: "
-        "two of four frictions are visible."
+        "wheels' torque balances as measurements, and no noise. With the printed signals alone "
+        "(a_x, a_y, r) the printed errors are reached on straight drives but not in the turn and "
+        "the jump, because these signals show only two of the four frictions."
     ),
     (
-        "On a real tyre slip stiffness does not depend on μ. Then constant speed straight on "
-        "shows no friction at all, and the default estimator reports its prior there."
+        "On a real tyre slip stiffness does not depend on μ. Then driving straight on at constant "
+        "speed gives no information about friction, and the default estimator reports its prior "
+        "there."
     ),
     (
-        "UKF and SR-UKF are one filter algebraically, and in double precision they agree. In "
-        "single precision with α = .001 the covariance form loses its Cholesky factor. The "
-        "printed gap of 6 to 33 between them is that."
+        "UKF and SR-UKF are algebraically the same filter, and in double precision they agree. In "
+        "single precision with α = .001 the covariance form loses its Cholesky factor. This "
+        "explains the printed factor of 6 to 33 between them."
     ),
     (
         "The figures of sensors without error hold for a wheel radius that is known exactly. "
         "At constant speed an error of 1e-4 of the radius, or .003 rad/s of noise on the "
-        "wheel speeds, is enough to lose the result: see the last table."
+        "wheel speeds, is enough to spoil the result: see the last table."
     ),
     (
         "At a constant .6 g the default estimator finds a lower limit of μ and no more: slip and "
-        "force are then one point of the tyre's curve, which a stiffer or sharper tyre with "
-        "another μ has as well. Its interval holds the truth. Its middle is too high, because in "
-        "its own, rounder tyre a friction near .85 would let the wheels slide."
+        "force are then a single point of the tyre's curve, and a stiffer or sharper tyre with "
+        "another μ passes through the same point. The interval contains the truth. Its middle is "
+        "too high, because in the estimator's own, rounder tyre model a friction near .85 would "
+        "let the wheels slide."
     ),
     (
-        "Q, R and P₀ are lost in the text; those used are of the size that the text "
-        "describes. The vehicle's table is lost too: it is that of paper 004. Throttle .3 is "
+        "Q, R and P₀ are missing in the text; the values used have the size that the text "
+        "describes. The vehicle's table is missing too: that of paper 004 is used. Throttle .3 is "
         "taken as 3 m/s²."
     ),
 )

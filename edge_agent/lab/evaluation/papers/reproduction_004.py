@@ -45,7 +45,7 @@ PRINTED: Final = {
 }
 PEAKS: Final = {"vx": 0.0493, "vy": 0.0622, "yaw_rate": 0.0341, "mu": 0.0068}  # IV.B, as shares
 SHOWN: Final = {("constant", "mae", "mu"): ".0095 (printed .095)"}
-STILL: Final = Memberships(outputs=(0.0,) * SETS)  # R as it is
+STILL: Final = Memberships(outputs=(0.0,) * SETS)  # R constant
 TUNING_SEEDS: Final = (31, 32, 33)
 ANTS: Final = 10
 ITERATIONS: Final = 12
@@ -118,7 +118,7 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
             )
             done.tables.append(PaperTable(f"Table {number}: {noise} noise, {name}", rows))
     done.tables.append(
-        PaperTable("The same with the printed P₀, Q = .1·T², R and μ₀", _as_printed(printed))
+        PaperTable("The same drives with the printed P₀, Q = .1·T², R and μ₀", _as_printed(printed))
     )
     done.tables.append(
         PaperTable("Errors of the peaks in the text, as shares", _peak_rows(both["constant"]))
@@ -137,23 +137,23 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
 
 NOTES: Final = (
     (
-        "The printed errors of μ need Dugoff tyres in the plant: nothing else differs from "
-        "the simulator's matched plant, on which they were missed by a factor of three."
+        "The printed errors of μ need Dugoff tyres in the plant. On the simulator's matched "
+        "plant, which differs in nothing else, the errors are three times the printed ones."
     ),
     (
-        "The paper begins at the truth, so a small error of μ is not evidence that friction "
-        "is found: the realistic columns begin without knowing it."
+        "The paper's filter starts at the true μ, so a small error of μ is no evidence that it "
+        "finds friction. In the realistic columns the filter starts without knowing μ."
     ),
     (
-        "P₀ = .2·I and Q = .1·I as printed give the printed MAE of v_x, v_y and yaw rate if Q"
-        " is read per second squared. RMSE of the yaw rate and μ are then larger than "
-        "printed: the first samples pay for P₀."
+        "P₀ = .2·I and Q = .1·I as printed give the printed MAE of v_x, v_y and yaw rate if Q is "
+        "read per second squared. RMSE of the yaw rate and μ are then larger than printed, "
+        "because the large P₀ makes the first estimates noisy."
     ),
     (
-        "With R right and the start known, untuned sets are as good as tuned ones. With the "
-        "printed P₀ and Q untuned sets are worse than leaving R alone, and the colony on "
-        "likelihood gets part of that back. The paper's objective (33) rewards a variance "
-        "that fits its window, not a better estimate: see the last table."
+        "If R is correct and the start is known, untuned fuzzy sets are as good as tuned ones. "
+        "With the printed P₀ and Q untuned sets are worse than a constant R, and the colony that "
+        "maximises likelihood recovers part of this loss. The paper's objective (33) rewards a "
+        "variance that fits its window, not a better estimate: see the last table."
     ),
     "Variable noise is on a_y alone, as the paper says; a_x and yaw rate keep .05.",
 )
@@ -252,11 +252,11 @@ def _tuning_rows(seeds: Sequence[int]) -> tuple[PaperTuning, tuple[PaperRow, ...
         for objective in ("likelihood", "mismatch", "error")
     }
     filters: dict[str, tuple[Memberships | LowerVertices, Setting]] = {
-        "R as it is": (STILL, setting),
+        "R constant": (STILL, setting),
         "untuned": (LowerVertices(), setting),
-        "colony on the likelihood": (found["likelihood"].sets, setting),
-        "colony on (33)": (found["mismatch"].sets, setting),
-        "colony on the error": (found["error"].sets, setting),
+        "colony, objective likelihood": (found["likelihood"].sets, setting),
+        "colony, objective (33)": (found["mismatch"].sets, setting),
+        "colony, objective error": (found["error"].sets, setting),
     }
     rows = []
     short = ("still", "untuned", "likelihood", "objective_33", "error")

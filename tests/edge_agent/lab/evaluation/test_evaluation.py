@@ -78,7 +78,7 @@ ASKED = {
 
 
 def fake(mu: float, lower: float, upper: float, like: DriveSet) -> Estimates:
-    """Estimates that tell the same friction all the time, and the true motion."""
+    """Return estimates with constant friction and the true motion."""
     output = np.zeros((*like.t.shape, ONE_FRICTION))
     truth = like.truth
     output[..., Column.VX], output[..., Column.VY], output[..., Column.YAW_RATE] = (
@@ -191,7 +191,7 @@ def test_the_report_is_made_from_the_figures_and_hides_nothing() -> None:
     assert "DOES NOT HOLD" in text
     assert "0 of 1 bars hold" in text
     assert "0.3 ± 0.1" in text
-    assert "What the difference is made of" in text
+    assert "Reasons for the difference" in text
 
 
 @pytest.mark.parametrize(

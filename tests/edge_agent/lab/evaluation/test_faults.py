@@ -1,5 +1,5 @@
-"""The table of sensor faults: no estimate is lost, health says what happened, the default's
-interval stays honest.
+"""Sensor faults: no estimate is lost, health reports the fault, and the default's interval stays
+calibrated.
 """
 
 from __future__ import annotations

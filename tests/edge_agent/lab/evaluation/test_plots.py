@@ -1,4 +1,4 @@
-"""Plots state their content, and an estimator has one colour in all of them."""
+"""Plots have captions, and an estimator has the same colour in all of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recorded drives in a folder are judged by the truth that is known of them."""
+"""Recorded drives in a folder are judged against the known part of their truth."""
 
 from __future__ import annotations
 

@@ -20,12 +20,12 @@ from schemas.thresholds import GRAVITY, SURFACES
 
 @pytest.fixture(scope="module")
 def driven() -> tuple[DriveSet, FloatArray]:
-    """Six rough cars for forty seconds in a town of the figures."""
+    """Return six cars with realistic errors that drive for forty seconds in a town of the figures."""
     return real_world.town(FIGURES, 6, 40.0)
 
 
 def saying(batch: DriveSet, lower: float, upper: float) -> Estimates:
-    """Estimates that know the motion and always say the same of friction."""
+    """Return estimates with the true motion and constant friction."""
     output = np.zeros((*batch.t.shape, ONE_FRICTION))
     for column, name in ((Column.VX, "vx"), (Column.VY, "vy"), (Column.YAW_RATE, "yaw_rate")):
         output[..., column] = batch.truth[f"true_{name}"]
@@ -143,8 +143,8 @@ def test_cars_stand_on_the_slope_they_were_put_on() -> None:
 
 
 def test_the_oracle_knows_what_is_told_and_misses_what_is_unknown() -> None:
-    """The file's radius is most of what he misses of the speed; friction he finds to a few
-    hundredths.
+    """Most of the oracle's error of speed comes from the wheel radius in the file; its error of
+    friction is a few hundredths.
     """
     seeds = range(FIGURES, FIGURES + 4)
     speeds = oracle.speed(seeds)

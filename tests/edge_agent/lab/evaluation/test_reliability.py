@@ -1,6 +1,4 @@
-"""Reliability and consistency are correct on answers whose error is known, and on the banks
-themselves.
-"""
+"""Reliability and consistency figures on estimates with a known error, and on the estimators."""
 
 from __future__ import annotations
 
@@ -84,9 +82,7 @@ def test_watching_a_drive_changes_nothing_that_is_said_of_it(
 def test_posterior_of_the_default_has_its_reported_quantiles(
     turning: DriveSet,
 ) -> None:
-    """The ends are told at the levels at which they hold, and patches of ice lower the lower
-    one.
-    """
+    """Interval ends are reported at calibrated levels, and ice patches lower the lower end."""
     reported, _ = estimate_with_ranks(bank_of("aco-fckf", turning.vehicles), turning)
     for least, most, output in (
         (0.0, LOWER_END, reported.mu_lower),

@@ -1,5 +1,5 @@
-"""Fleets: the same whatever their number and their blocks; on the road for ever; excited where
-it matters.
+"""Simulated fleets: results do not depend on the number of vehicles or on blocks, cars stay on the
+road, and grip is used where intended.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def test_a_block_needs_at_least_one_sample() -> None:
 
 
 def test_warned_driver_slows_down_only_for_the_stretch() -> None:
-    """The same driver, warned and not, from the same start."""
+    """Simulate the same driver from the same start with and without a warning."""
     speeds = []
     for warned in (False, True):
         fleet = SimulatedFleet("demo", 1, 3, 50.0)

@@ -1,4 +1,6 @@
-"""The plant against mechanics: Newton, friction circle, energy, circles, signs; then its limits."""
+"""The plant compared with mechanics: Newton's laws, friction circle, energy, circles and signs;
+then its limits.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ ROUNDING = 1e-9
 def some_instant(
     rng: np.random.Generator, mu: float = 0.6
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """State, parameters, inputs and filled wheels of a vehicle in the middle of something rough."""
+    """Return state, parameters, inputs and wheels of a vehicle in a violent manoeuvre."""
     p = PRESETS["sedan"].row()
     x = np.zeros(STATES)
     u = np.zeros((len(Control), 4))
@@ -63,7 +65,7 @@ def rolling(
 def run(
     x: FloatArray, p: FloatArray, u: FloatArray, seconds: float, dt: float = 1e-3
 ) -> FloatArray:
-    """Wheels at the end of so many seconds with the inputs held."""
+    """Return the wheels after this many seconds with constant inputs."""
     w = np.zeros((len(Wheel), 4))
     advance(x, p, u, w, dt, round(seconds / dt))
     return w
@@ -143,7 +145,7 @@ def test_steering_left_turns_left_and_loads_the_right_wheels() -> None:
 
 @pytest.mark.parametrize("share", [-0.4, 0.3])
 def test_rear_wheels_that_steer_keep_the_circle_and_swing_the_tail(share: float) -> None:
-    """At walking pace the yaw rate follows from the wheels' directions, for every share of rear
+    """At walking pace the directions of the wheels determine the yaw rate, for every share of rear
     steering.
     """
     circles = []
@@ -227,8 +229,8 @@ def test_a_stopped_vehicle_stays_where_it_is() -> None:
 
 
 def test_a_wheel_has_the_inertia_that_it_has() -> None:
-    """J ω̇ = T − R F_x, which is how an estimator gets the force: the integrator must not add to
-    J, even when slow.
+    """An estimator computes the force from J ω̇ = T − R F_x, so the integrator must not add to J,
+    even at low speed.
     """
     vehicle = replace(PRESETS["sedan"], drag=0.0, rolling=0.0)
     for speed in (4.0, 20.0):

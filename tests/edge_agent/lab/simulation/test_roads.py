@@ -163,8 +163,8 @@ def test_patches_that_cover_nothing_or_have_no_friction_are_refused() -> None:
 
 
 def test_vehicles_start_on_given_lanes_at_the_speed_of_traffic() -> None:
-    """Two straight lanes side by side: 13 m/s are allowed on the one, 6 m/s on the other, to a
-    driver of 5 m/s².
+    """Return two parallel straight lanes: one allows 13 m/s, the other 6 m/s, to a driver with 5
+    m/s².
     """
     x = np.arange(0.0, 400.0)
     lanes = [np.column_stack([x, np.full(400, y)]) for y in (0.0, 50.0)]

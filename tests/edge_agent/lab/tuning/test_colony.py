@@ -26,16 +26,16 @@ CHOICES = [np.linspace(0.0, 1.0, POSITIONS)] * VERTICES
 
 
 def bowl(seed: int) -> Objective:
-    """Separable: a parabola per vertex, its top at a position drawn from the seed; the maximum
-    is 0.
+    """Separable objective: one parabola per vertex with its maximum at a random position; the
+    maximum is 0.
     """
     top = np.random.default_rng(seed).integers(POSITIONS, size=VERTICES) / (POSITIONS - 1)
     return lambda vector: -float(np.sum((vector - top) ** 2))
 
 
 def decoy(seed: int) -> Objective:
-    """Deceptive: at every vertex the slope leads away from the one best position; the maximum is
-    VERTICES.
+    """Deceptive objective: at every vertex the slope leads away from the best position; the maximum
+    is VERTICES.
     """
     top = np.random.default_rng(seed).integers(POSITIONS, size=VERTICES) / (POSITIONS - 1)
 
@@ -60,7 +60,7 @@ def run(search: object, objective: Objective, seed: int, **options: object) -> R
 def test_colony_beats_random_search_in_at_least_21_of_24_trials(
     family: Callable[[int], Objective],
 ) -> None:
-    """By chance alone, 21 wins of 24 happen once in 7 000 times."""
+    """With equal searches, 21 wins of 24 have a probability of 1 in 7 000."""
     wins = 0
     for trial in range(TRIALS):
         ours = run(colony, family(trial), 1000 + trial)

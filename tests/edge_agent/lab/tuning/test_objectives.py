@@ -1,5 +1,5 @@
-"""The objective: proper, finite, on drives that the judge does not share; and the command from
-end to end.
+"""The objective is a proper score and finite, its drives differ from those of the judge, and the
+command works from end to end.
 """
 
 import argparse
@@ -105,8 +105,8 @@ def test_interval_score_is_least_at_the_true_quantiles() -> None:
 
 
 def test_inflated_noise_does_not_win_the_innovation_likelihood(drives: TuningSet) -> None:
-    """R times 4.5 makes the innovations less likely than R as it is, however seldom it is
-    surprised.
+    """Innovations are less likely with 4.5 R than with R, although fewer of them exceed their
+    bound.
     """
     usual, inflated = (
         scores_of(Memberships(ln_scales=(s, s)), drives, ESTIMATOR) for s in (0.0, 1.5)
@@ -246,7 +246,9 @@ def test_another_drive_of_the_set_gives_another_worth(drives: TuningSet) -> None
 
 
 def test_drives_of_one_s_own_are_searched_on(tmp_path: Path) -> None:
-    """Without a truth, the next measurement judges, on the last third of the recordings."""
+    """Without a truth, the prediction of the next measurement is the score, on the last third of
+    the recordings.
+    """
     logs = []
     found = []
     for name, seed in (("one", "1"), ("two", "2")):

@@ -1,5 +1,5 @@
-"""`contract`: shortest and longest possible time below the contracted grip; a place that was not
-measured never counts as kept.
+"""`contract`: shortest and longest possible time below the contracted grip. A place without
+measurements never counts as compliant.
 """
 
 from __future__ import annotations
@@ -189,8 +189,8 @@ def test_options_that_say_nothing_are_refused(
 
 
 def test_a_breach_lies_within_the_measurements() -> None:
-    """Half an hour of reports that begins in the middle of a slot: no breach is older or longer
-    than the reports.
+    """Half an hour of reports that begins in the middle of a slot: no breach begins earlier or
+    lasts longer than the reports.
     """
     begin = 100 * SLOT_S + 1300
     span = (begin, begin + 1897)

@@ -1,5 +1,5 @@
-"""Cells and sectors on links: the nearest of those that go the same way; both where one ends and
-the next begins.
+"""Join of cells and sectors to links: the nearest link of the same direction; both links where one
+ends and the next begins.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ EAST = METRES_PER_DEGREE * np.cos(np.radians(LATITUDE))
 
 
 def place(x: float, y: float) -> tuple[float, float]:
-    """Latitude and longitude of metres east and north."""
+    """Return latitude and longitude of a point given in metres east and north."""
     return LATITUDE + y / METRES_PER_DEGREE, LONGITUDE + x / EAST
 
 

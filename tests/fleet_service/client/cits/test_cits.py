@@ -50,7 +50,7 @@ PLACE = (57.7, 11.97)
 
 
 def random_denm(draw: np.random.Generator) -> Denm:
-    """A DENM with everything that ours can have."""
+    """Return a DENM with every field that the gateway can set."""
     position = (float(draw.uniform(-80, 80)), float(draw.uniform(-179, 179)))
     near = [
         (position[0] + float(draw.normal(0, 1e-3)), position[1] + float(draw.normal(0, 1e-3)))
