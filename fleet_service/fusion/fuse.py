@@ -269,15 +269,10 @@ class Fusion:
         A source is a vehicle, still trusted, that reported GRIP or ICE there after `since` [ns]. At
         most SOURCES are remembered; 0 stands for none.
         """
-        _, when = self._sources(slots, side, since)
+        _, when = self.find_sources(slots, side, since)
         return -np.sort(-when, axis=1)
 
-    def witnesses(self, slot: int, side: int, since: int) -> list[int]:
-        """Return the numbers of the corroborating sources of one slot; see `sources`."""
-        who, when = self._sources(np.array([slot]), side, since)
-        return [int(self.store.names["key"][index]) for index in who[0][when[0] > 0].tolist()]
-
-    def _sources(
+    def find_sources(
         self, slots: IntArray, side: int, since: IntArray | int
     ) -> tuple[IntArray, IntArray]:
         """Return index and time [ns] of each remembered source, (k, SOURCES); time 0 if it does

@@ -151,6 +151,31 @@ def road_beliefs(
     return out
 
 
+@compiled
+def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
+    """Return each slot (k,) and the slots before and behind it that may belong to the same slippery
+    stretch, (k, 1 + 2·NEIGHBOURS); NONE for the others.
+
+    A stretch ends at a cell whose own reports make slippery road unlikely.
+    """
+    out = np.full((len(slots), 1 + 2 * c.NEIGHBOURS), NONE)
+    for k in range(len(slots)):
+        out[k, 0] = slots[k]
+        key = live.cells[slots[k]].key
+        sector = key % grid.SECTORS
+        for side in range(2):
+            there = key // grid.SECTORS
+            for step in range(c.NEIGHBOURS):
+                there = next_cell(there, (sector + 2 * side) % grid.SECTORS)
+                row = find_row(table, live.cells, there * grid.SECTORS + sector)
+                if row == NONE or live.cells[row].vehicles == 0:
+                    continue
+                if _stored_slippery(live, row) < _ASKED:
+                    break
+                out[k, 1 + side * c.NEIGHBOURS + step] = row
+    return out
+
+
 @refcount_free_inlined
 def _slippery_probability(road: Bins) -> float:
     whole = 0.0

@@ -182,13 +182,39 @@ def test_bounds_clear_an_alert_when_only_a_dry_road_gives_so_much_grip() -> None
         assert bool(alerts.slots) is stands
 
 
-@pytest.mark.parametrize(("wait", "needed"), [(400.0, 5), (700.0, 4)])
-def test_ice_takes_four_vehicles_to_clear_and_five_where_it_is_fresh(
-    wait: float, needed: int
-) -> None:
-    fusion, under = report_in_turn(0.2, range(20), 0.85, range(5, 11), wait)
+@pytest.mark.parametrize(("icy", "needed"), [(2, 4), (20, 5)])
+def test_an_alert_ends_with_two_more_sources_of_grip_than_of_ice(icy: int, needed: int) -> None:
+    fusion, under = report_in_turn(0.2, range(icy), 0.85, range(5, 11), 700.0)
     assert slippery(belief(fusion)) < 0.05
     assert under == [True] * (needed - 1) + [False] * (7 - needed)
+
+
+@pytest.mark.parametrize(
+    ("beside", "grip_used", "alerted"),
+    [(0.2, False, [True, True]), (0.85, False, [False, False]), (0.2, True, [False, False])],
+)
+def test_one_source_of_ice_in_each_of_two_cells_of_a_stretch_is_enough(
+    beside: float, grip_used: bool, alerted: list[bool]
+) -> None:
+    fusion = Fusion(120.0)
+    alerts = Alerts(fusion)
+    cells = grid.interleave(COLUMN + np.array([0, 2]), np.full(2, ROW))
+    if grip_used:
+        for cell in cells.tolist():
+            fusion.update(observations([0.0], [9], at_least(np.array([0.8])), cell))
+    for vehicle, cell, mu in ((1, int(cells[0]), 0.2), (2, int(cells[1]), beside)):
+        updated = fusion.update(observations([10.0 * vehicle], [vehicle], value([mu]), cell))
+        alerts.update(updated.slots)
+    slots = fusion.slots_of(cells, np.zeros(2, np.int64))
+    assert [slot in alerts.slots for slot in slots.tolist()] == alerted
+
+
+def test_one_vehicle_along_a_stretch_raises_no_alert() -> None:
+    fusion = Fusion(120.0)
+    alerts = Alerts(fusion)
+    for step, cell in enumerate(grid.interleave(COLUMN + np.arange(4), np.full(4, ROW)).tolist()):
+        alerts.update(fusion.update(observations([float(step)], [1], value([0.2]), cell)).slots)
+    assert not alerts.slots
 
 
 def test_a_vehicle_without_trust_no_longer_corroborates() -> None:

@@ -1,0 +1,43 @@
+"""Sources of ice on the slippery stretch around a cell: the reports that confirm an alert. Pure."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fleet_service.fusion.fuse import Fusion
+from fleet_service.fusion.neighbours import stretches
+from fleet_service.fusion.store.records import ICE, NONE, SOURCES
+from schemas.numeric import IntArray
+
+
+def stretch_slots(fusion: Fusion, slots: IntArray) -> IntArray:
+    """Return the slots of the slippery stretch around each slot (k,), the slot itself first; NONE
+    for places without one.
+    """
+    return stretches(fusion.store.state.live, fusion.store.table, slots)
+
+
+def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the sources of ice on the stretches around slots (k,), newest first: index of the
+    vehicle and time [ns] of its newest report after `since` (k,); time 0 where there is none.
+    """
+    along = stretch_slots(fusion, slots)
+    places = along.shape[1] * SOURCES
+    who, when = fusion.find_sources(
+        np.maximum(along, 0).ravel(), ICE, np.repeat(since, along.shape[1])
+    )
+    when = np.where(along.reshape(-1, 1) == NONE, 0, when).reshape(-1, places)
+    who, when = _newest_first(who.reshape(-1, places), when)
+    again = np.tril(who[:, :, None] == who[:, None, :], -1).any(axis=2)
+    return _newest_first(who, np.where(again, 0, when))
+
+
+def witnesses_of(fusion: Fusion, slot: int, since: int) -> list[int]:
+    """Return the numbers of the sources of ice on the stretch around a slot after `since` [ns]."""
+    who, when = stretch_sources(fusion, np.array([slot]), np.array([since]))
+    return [int(fusion.store.names["key"][index]) for index in who[0][when[0] > 0].tolist()]
+
+
+def _newest_first(who: IntArray, when: IntArray) -> tuple[IntArray, IntArray]:
+    newest = np.argsort(-when, axis=1, kind="stable")
+    return np.take_along_axis(who, newest, axis=1), np.take_along_axis(when, newest, axis=1)
