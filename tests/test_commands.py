@@ -307,3 +307,19 @@ def test_every_module_of_a_command_says_what_it_is() -> None:
     for line in LINES.values():
         for command in line.COMMANDS:
             assert importlib.import_module(command.module).__doc__.startswith("`")  # type: ignore[union-attr]
+
+
+def test_missing_package_is_one_line_with_its_extra(capsys: pytest.CaptureFixture[str]) -> None:
+    def import_missing() -> int:
+        raise ModuleNotFoundError("No module named 'scipy.stats'", name="scipy.stats")
+
+    assert commandline.run_guarded(import_missing) == commandline.BAD_INPUT
+    said = capsys.readouterr().err
+    assert said.startswith("error: packages: scipy is not installed; pip install ")
+    assert "analytics" in said
+
+    def import_unknown() -> int:
+        raise ModuleNotFoundError("No module named 'typo'", name="typo")
+
+    with pytest.raises(ModuleNotFoundError):
+        commandline.run_guarded(import_unknown)

@@ -56,7 +56,7 @@ class Listener:
             cells = pa.concat_tables(self.tiles.values()) if self.tiles else None
             alerts = list(self.alerts)
         if cells is None:
-            return "no cell yet"
+            return "no report yet: the vehicles start, and compile their kernels the first time"
         basis = cells["basis"].to_pylist()
         several = int((cells["vehicles"].to_numpy() >= 2).sum())
         standing = {(alert.cell, alert.sector): alert.raised for _, alert in alerts}

@@ -10,11 +10,12 @@ import subprocess
 import sys
 import time
 import webbrowser
+from importlib.util import find_spec
 from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from deploy.demo import compare, page, picture, processes, screenshot
+from deploy.demo import compare, page, processes, screenshot
 from deploy.demo.listener import Listener
 from edge_agent.lab.simulation.scenarios import scenario_named
 from fleet_service.archive.maintenance.compaction import compact
@@ -75,13 +76,16 @@ def report_figures(
     """
     found = [*measured, *grip.figures()]
     figures.write(folder / "figures.json", "demo", [seed], found)
-    picture.draw_maps(comparison, folder / "map.png", grip)
+    image = ""
+    if find_spec("matplotlib") is not None:  # a picture beside the page, where it can be drawn
+        from deploy.demo import picture
+
+        picture.draw_maps(comparison, folder / "map.png", grip)
+        image = f"picture {folder}/map.png, "
     page.write_page(comparison, found, folder / "map.html")
     table = figures.markdown(found)
-    print(
-        f"\n{grip.line()}\n\n{table}\n\npicture {folder}/map.png, page {folder}/map.html, ", end=""
-    )
-    print(f"figures {folder}/figures.json", flush=True)
+    print(f"\n{grip.line()}\n\n{table}\n", flush=True)
+    print(f"{image}page {folder}/map.html, figures {folder}/figures.json", flush=True)
     return found
 
 

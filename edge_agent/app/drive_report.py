@@ -229,7 +229,9 @@ def figure_of(drive: RecordedDrive) -> Any:  # noqa: ANN401 a figure of matplotl
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise InputError("out", "matplotlib is not installed", install_command("demo")) from error
+        raise InputError(
+            "out", "matplotlib is not installed", install_command("analytics")
+        ) from error
     drawn = Figure(figsize=(11, 10), layout="constrained")
     grid = drawn.add_gridspec(len(PANELS), 3)
     first = None

@@ -112,7 +112,9 @@ def plot(
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise InputError("plot", "matplotlib is not installed", install_command("demo")) from error
+        raise InputError(
+            "plot", "matplotlib is not installed", install_command("analytics")
+        ) from error
     figure = Figure(figsize=(8, 6), layout="constrained")
     speed, friction = figure.subplots(2, 1, sharex=True)
     if truth is not None:

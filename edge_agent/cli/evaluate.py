@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
         and importlib.util.find_spec("matplotlib") is None
     ):
         raise InputError(
-            "plots", "matplotlib is not installed", "install gripmap[demo], or give --no-plots"
+            "plots", "matplotlib is not installed", "install gripmap[analytics], or give --no-plots"
         )
     try:
         args.out.mkdir(parents=True, exist_ok=True)

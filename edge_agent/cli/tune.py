@@ -228,7 +228,7 @@ def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
     from edge_agent.lab.tuning import study_report
 
     if importlib.util.find_spec("matplotlib") is None:
-        raise InputError("study", "its plot needs matplotlib", "install gripmap[demo]")
+        raise InputError("study", "its plot needs matplotlib", "install gripmap[analytics]")
     try:
         args.study.mkdir(parents=True, exist_ok=True)
     except OSError as error:

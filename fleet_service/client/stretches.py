@@ -14,12 +14,9 @@ from datetime import UTC, datetime
 from typing import Any, Final, Literal
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components, minimum_spanning_tree, shortest_path
-from scipy.spatial import cKDTree
 
 from schemas import grid
-from schemas.numeric import IntArray
+from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import METRES_PER_DEGREE, NS
 from schemas.wire import Alert
 
@@ -201,16 +198,38 @@ class Stretches:
 
 def link_cells(cell: IntArray) -> IntArray:
     """Return the stretch number of each cell, (n,): cells at most LINK_CELLS apart belong
-    together.
+    together. Stretches are numbered in the order of their first cells.
     """
-    if not len(cell):
-        return np.zeros(0, np.int64)
-    places = np.stack(grid.deinterleave(cell), axis=1).astype(np.float64)
-    pairs = cKDTree(places).query_pairs(LINK_CELLS, p=np.inf, output_type="ndarray")
-    near = coo_array(
-        (np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(cell), len(cell))
-    )
-    return np.asarray(connected_components(near, directed=False)[1], np.int64)
+    distinct, first, of_cell = np.unique(cell, return_index=True, return_inverse=True)
+    one, other = _find_neighbours(distinct)
+    label = first.copy()  # of a cell: the first one of its stretch, as far as is known
+    while len(one):
+        lower = np.minimum(label[one], label[other])
+        joined = label.copy()
+        np.minimum.at(joined, one, lower)
+        np.minimum.at(joined, other, lower)
+        joined = joined[of_cell[joined]]  # what a cell's first one has learned
+        if (joined == label).all():
+            break
+        label = joined
+    return np.unique(label[of_cell], return_inverse=True)[1]
+
+
+def _find_neighbours(cell: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the positions of each pair of distinct cells at most LINK_CELLS apart."""
+    column, row = (part.astype(np.int64) for part in grid.deinterleave(cell))
+    key = column << 32 | row
+    order = np.argsort(key)
+    ones = [np.zeros(0, np.int64)]
+    others = [np.zeros(0, np.int64)]
+    steps = range(-LINK_CELLS, LINK_CELLS + 1)
+    for across, along in ((x, y) for x in steps for y in steps if (x, y) > (0, 0)):
+        wanted = (column + across) << 32 | (row + along)
+        place = np.minimum(np.searchsorted(key, wanted, sorter=order), len(key) - 1)
+        found = key[order[place]] == wanted if len(key) else np.zeros(0, bool)
+        ones.append(np.flatnonzero(found))
+        others.append(order[place[found]])
+    return np.concatenate(ones), np.concatenate(others)
 
 
 def _cells_of(group: list[Alert]) -> set[int]:
@@ -226,19 +245,56 @@ def _centre_line(cell: IntArray) -> tuple[tuple[float, float], ...]:
     neighbour.
     """
     places = np.stack(grid.deinterleave(cell), axis=1).astype(np.float64)
-    pairs = cKDTree(places).query_pairs(LINK_CELLS, p=np.inf, output_type="ndarray")
-    apart = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
-    tree = minimum_spanning_tree(
-        coo_array((apart, (pairs[:, 0], pairs[:, 1])), shape=(len(cell), len(cell)))
-    )
-    far = shortest_path(tree, directed=False, indices=0)
-    end = int(np.argmax(far))
-    length, before = shortest_path(tree, directed=False, indices=end, return_predecessors=True)
+    tree = _span_tree(places)
+    end = int(np.argmax(_walk_tree(tree, 0)[0]))
+    length, before = _walk_tree(tree, end)
     way = [int(np.argmax(length))]
     while way[-1] != end:
-        way.append(int(before[way[-1]]))
+        way.append(before[way[-1]])
     latitude, longitude = grid.centre(cell[way])
     return tuple(zip(latitude.tolist(), longitude.tolist(), strict=True))
+
+
+def _span_tree(places: FloatArray) -> list[list[tuple[int, float]]]:
+    """Return the neighbours of each place (n, 2), with distances, in a minimum spanning tree
+    (Prim); places more than LINK_CELLS apart are no neighbours.
+    """
+    tree: list[list[tuple[int, float]]] = [[] for _ in places]
+    nearest = np.full(len(places), np.inf)
+    parent = np.zeros(len(places), np.int64)
+    is_waiting = np.ones(len(places), bool)
+    nearest[0] = 0.0
+    for _ in places:
+        k = int(np.argmin(np.where(is_waiting, nearest, np.inf)))
+        is_waiting[k] = False
+        if 0.0 < nearest[k] < np.inf:
+            tree[k].append((int(parent[k]), float(nearest[k])))
+            tree[int(parent[k])].append((k, float(nearest[k])))
+        apart = places - places[k]
+        distance = np.hypot(apart[:, 0], apart[:, 1])
+        distance[np.abs(apart).max(axis=1) > LINK_CELLS] = np.inf
+        closer = is_waiting & (distance < nearest)
+        nearest[closer] = distance[closer]
+        parent[closer] = k
+    return tree
+
+
+def _walk_tree(tree: list[list[tuple[int, float]]], start: int) -> tuple[FloatArray, list[int]]:
+    """Return the distance of each place from `start` along the tree, -1 where it is not joined, and
+    the place before it.
+    """
+    length = np.full(len(tree), -1.0)
+    before = [start] * len(tree)
+    length[start] = 0.0
+    waiting = [start]
+    while waiting:
+        k = waiting.pop()
+        for other, distance in tree[k]:
+            if length[other] < 0.0:
+                length[other] = length[k] + distance
+                before[other] = k
+                waiting.append(other)
+    return length, before
 
 
 def _measure_shape(

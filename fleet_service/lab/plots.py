@@ -27,7 +27,9 @@ def draw_plots(
     try:
         from matplotlib.figure import Figure as Canvas
     except ImportError as error:
-        raise InputError("plots", "matplotlib is not installed", install_command("demo")) from error
+        raise InputError(
+            "plots", "matplotlib is not installed", install_command("analytics")
+        ) from error
     values = {figure.name: figure.value for figure in found}
     paths = []
     for name, plot in (

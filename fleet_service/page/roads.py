@@ -8,7 +8,6 @@ follow the centres of neighbouring cells of one heading, smoothed. Pure but for 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -19,7 +18,7 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.numeric import FloatArray, IntArray
 
-# cells to the next one of a learned line: what nobody reported in between is bridged
+# cells to the next one of a learned line, and between two of one lane: no report in between
 AHEAD: Final = 3
 SMOOTHED: Final = 5  # cells, centred: two lanes and a receiver's error make the raw line zigzag
 LEAST_CELLS: Final = 3  # of a learned line; fewer have no direction
@@ -117,36 +116,55 @@ def learned_lines(cell: IntArray, sector: IntArray) -> list[Line]:
     return found[:MOST_LINES]
 
 
-def _chain_cells(cells: list[tuple[int, int]], heading: int) -> Iterable[list[tuple[int, int]]]:
-    """Yield chains of cells in the order of travel: each cell goes on to the nearest one ahead
-    that has no other.
+def _merge_side_by_side(cells: list[tuple[int, int]], heading: int) -> dict[int, list[float]]:
+    """Return the positions across the heading by the column along it.
+
+    The receiver's error spreads one lane over neighbouring cells. Cells of one column that are at
+    most AHEAD apart become one position, their mean.
     """
-    here = set(cells)
     dx, dy = _STEP[heading]
-    offsets = sorted(
-        (
-            (along, side)
-            for along in range(AHEAD + 1)
-            for side in range(-AHEAD, AHEAD + 1)
-            if (along, side) != (0, 0)
-        ),
-        key=lambda one: (math.hypot(*one), abs(one[1])),
-    )
-    offsets = [(along, side) for along, side in offsets if along >= abs(side)]
-    following: dict[tuple[int, int], tuple[int, int]] = {}
-    before: dict[tuple[int, int], tuple[int, int]] = {}
-    for x, y in sorted(here, key=lambda one: one[0] * dx + one[1] * dy):
-        for along, side in offsets:
-            ahead = (x + along * dx + side * dy, y + along * dy + side * dx)
-            if ahead in here and ahead not in before:
-                following[x, y], before[ahead] = ahead, (x, y)
-                break
-    for start in sorted(here - set(before)):
+    columns: dict[int, list[int]] = {}
+    for x, y in cells:
+        columns.setdefault(x * dx + y * dy, []).append(x * dy + y * dx)
+    found: dict[int, list[float]] = {}
+    for along, sides in columns.items():
+        sides.sort()
+        first = 0
+        for k in range(1, len(sides) + 1):
+            if k == len(sides) or sides[k] - sides[k - 1] > AHEAD:
+                found.setdefault(along, []).append(sum(sides[first:k]) / (k - first))
+                first = k
+    return found
+
+
+def _chain_cells(cells: list[tuple[int, int]], heading: int) -> Iterable[list[tuple[float, float]]]:
+    """Yield chains of positions in the order of travel: each goes on to the next one ahead that
+    has no other.
+    """
+    dx, dy = _STEP[heading]
+    here = _merge_side_by_side(cells, heading)
+    following: dict[tuple[int, float], tuple[int, float]] = {}
+    before: set[tuple[int, float]] = set()
+    nodes = [(along, side) for along in sorted(here) for side in here[along]]
+    for along, side in nodes:
+        ahead = [
+            ((step, abs(other - side)), (along + step, other))
+            for step in range(1, AHEAD + 1)
+            for other in here.get(along + step, ())
+            if abs(other - side) <= step + 1 and (along + step, other) not in before
+        ]
+        if ahead:
+            nearest = min(ahead)[1]
+            following[along, side] = nearest
+            before.add(nearest)
+    for start in nodes:
+        if start in before:
+            continue
         chain = [start]
         while chain[-1] in following:
             chain.append(following[chain[-1]])
         if len(chain) >= LEAST_CELLS:
-            yield chain
+            yield [(along * dx + side * dy, along * dy + side * dx) for along, side in chain]
 
 
 def _smooth_chain(chain: FloatArray) -> list[list[float]]:

@@ -16,11 +16,13 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, NoReturn
 
 from schemas.errors import InputError, UnreachableError
+from schemas.runtime.installing import install_command
 
 FAILED: Final = 1
 BAD_INPUT: Final = 2
 INTERRUPTED: Final = 130  # 128 + SIGINT, as shells have it
 SHELLS: Final = ("bash", "zsh", "tcsh")
+EXTRA_OF: Final = {"scipy": "analytics", "matplotlib": "analytics"}  # that installs a package
 _NEGATIVE: Final = re.compile(r"^-[\d.]")
 
 
@@ -133,6 +135,13 @@ def run_guarded(run: Callable[[], int]) -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return FAILED if isinstance(error, UnreachableError) else BAD_INPUT
+    except ModuleNotFoundError as error:
+        name = (error.name or "").partition(".")[0]
+        if name not in EXTRA_OF:
+            raise
+        fix = install_command(EXTRA_OF[name])
+        print(f"error: packages: {name} is not installed; {fix}", file=sys.stderr)
+        return BAD_INPUT
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED

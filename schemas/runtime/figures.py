@@ -7,6 +7,7 @@ import math
 import platform
 import subprocess
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -48,9 +49,18 @@ def header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:
         "commit": commit(Path(__file__)),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
-        "versions": {name: metadata.version(name) for name in PACKAGES},
+        "versions": _find_versions(),
         "seeds": list(seeds),
     }
+
+
+def _find_versions() -> dict[str, str]:
+    """Return the versions of PACKAGES that are installed."""
+    found = {}
+    for name in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
 
 
 def commit(source: Path) -> str:

@@ -20,8 +20,7 @@ function item(app, alert, number) {
   return make("li", { "data-alert": alert.id, class: alert.mu < .2 ? "ice" : "snow" },
     make("span", { class: "number", "aria-hidden": "true" }, String(number)),
     make("div", {}, make("strong", {}, alertWords(alert, app.roadAt(alert.longitude, alert.latitude))), make("span", {}, say("alerts.line", values)), make("span", { class: "note" }, say("alerts.grip", values)),
-      make("span", { class: "note place" }, coordinates(alert.longitude, alert.latitude)),
-      make("button", { type: "button", onclick: () => app.jump(alert) }, say("alerts.jump"))));
+      make("div", { class: "line" }, make("button", { type: "button", onclick: () => app.jump(alert) }, say("alerts.jump")), make("span", { class: "note place" }, coordinates(alert.longitude, alert.latitude)))));
 }
 
 // Those of `after` that were not there before.

@@ -6,13 +6,14 @@ import { Cells } from "./cells.js";
 import { addControls } from "./controls.js";
 import { kindOf, setColours } from "./colours.js";
 import { byId, make } from "./elements.js";
-import { CELLS, CELL_LEVEL, cellAt, cellOf, latitudeOf, localOfCell, longitudeOf, middleOf, tileOfCell, worldX, worldY } from "./grid.js";
+import { CELLS, CELL_LEVEL, cellAt, cellOf, latitudeOf, localOfCell, longitudeOf, metresPerWorld, middleOf, tileOfCell, worldX, worldY } from "./grid.js";
 import { healthPanel } from "./health.js";
 import { legend } from "./legend.js";
 import { Live } from "./live.js";
 import { overviewPanel } from "./overview.js";
 import { paint, scaleBar } from "./paint.js";
 import { placePanel } from "./place.js";
+import { sidewaysOf } from "./ribbons.js";
 import { Roads } from "./roads.js";
 import { ask, open, routePanel } from "./route.js";
 import { fromHash, sharePanel, toHash } from "./share.js";
@@ -24,7 +25,7 @@ import { View } from "./view.js";
 import { alertWords, bySeverity } from "./words.js";
 
 const TABS = ["now", "legend", "cell", "alerts", "route", "health", "share"];
-const LOOK_MS = 120, CLOCK_MS = 500, HEALTH_MS = 3000, LIST_MS = 15000, ROADS_MS = 1500;
+const LOOK_MS = 120, CLOCK_MS = 500, HEALTH_MS = 3000, LIST_MS = 15000, ROADS_MS = 1500, SAID_MS = 10000, NEAR_PX = 12;
 const FAR = 1e-3;  // of the world: some 40 km
 const WORLD = [-180, -85, 180, 85];
 
@@ -61,21 +62,20 @@ class App {
     document.addEventListener("drop", e => { e.preventDefault(); const file = e.dataTransfer.files[0]; if (file) { this.open("route"); open(this, file); } });
     byId("map").addEventListener("keydown", e => { if (e.key === "a" && this.alerts.length) this.jump(this.alerts[0]); });
     setInterval(() => this.tick(), CLOCK_MS);
-    setInterval(() => this.tab === "health" && this.panel(), HEALTH_MS);
+    setInterval(() => ["health", "now"].includes(this.tab) && !document.activeElement?.closest("#panel > *") && this.panel(), HEALTH_MS);
     setInterval(() => { this.now.list().catch(() => {}); this.timeline.load(); this.loadAreas(); this.loadRoads(); this.tab === "alerts" && this.panel(); }, LIST_MS);
     const state = fromHash(location.hash), beside = Promise.all([this.timeline.load(), this.loadAreas(), this.loadRoads(), this.settings.overlay ? this.loadTruth() : null]);
     if (state.at !== undefined || state.compare !== undefined) await beside;
     this.started = true;
-    if (state.x) await this.restore(state);
-    else {
-      await this.begin();
-    }
+    await (state.x ? this.restore(state) : this.begin());
     this.open(this.tab);
     this.tick();
     await this.look();
     await beside;
     document.body.dataset.ready = "1";
+    this.drawNow();
     if (this.missed) this.reload();
+    this.panel();
   }
 
   async restore(state) {
@@ -120,9 +120,7 @@ class App {
 
   showPlace(x, y) {
     this.view.go(x, y, Math.max(this.view.zoom, 18));
-    const { tile, local } = cellAt(x, y);
-    this.choose(tile, local);
-    this.open("cell");
+    this.chooseAt(x, y);
   }
 
   // The area with most alerts where several lie far apart, else the whole map.
@@ -148,6 +146,7 @@ class App {
   }
 
   resize() {
+    if (matchMedia("print").matches) return;  // paper takes the picture of the screen
     const ratio = devicePixelRatio || 1;
     for (const id of ["beside", "divider"]) byId(id).hidden = !this.comparing;
     this.slide(this.swipe);
@@ -161,6 +160,7 @@ class App {
     if (!changed) return;
     this.view.width = byId("map").clientWidth;
     this.view.height = byId("map").clientHeight;
+    this.view.covered = byId("foot").offsetHeight;
     this.moved();
   }
 
@@ -178,7 +178,7 @@ class App {
     const level = this.view.level, box = this.view.box, stores = this.comparing ? [this.cells, this.pinned] : [this.cells];
     try { await Promise.all(stores.map(store => store.show(box, level))); } catch { this.note(say("error.asked")); }
     this.asked = true;
-    if (this.chosen && this.chosen.level !== level) this.choose(this.chosen.tile, this.chosen.local);
+    if (this.chosen && this.chosen.level !== level) this.choose(this.chosen.tile, this.chosen.local, this.chosen.sector);
     this.remember();
     this.draw();
   }
@@ -243,7 +243,7 @@ class App {
     place.dataset.state = words === say("live") ? "live" : "late";
   }
 
-  note(words) { byId("said").textContent = words; }
+  note(words) { byId("said").textContent = words; clearTimeout(this.saying); if (words) this.saying = setTimeout(() => this.note(""), SAID_MS); }
 
   // Not before the first cells were asked for: an empty picture is painted as slowly as a full one.
   draw() {
@@ -256,7 +256,8 @@ class App {
       base: this.base, roads: this.show.roads && !this.show.borrowed ? this.roads : null, away: this.past ? [] : this.away, alerts: this.past ? [] : this.alerts, route: this.route, bounds: this.show.bounds,
       oldest: this.show.recent ? (this.cells.at ?? this.live.now()) - this.show.recent : 0, truth: this.show.overlay ? this.truth : null, chosen: this.chosen,
     };
-    const drawn = paint(byId("map").getContext("2d"), this.view, this.cells, extra);
+    const { drawn, asRoads } = paint(byId("map").getContext("2d"), this.view, this.cells, extra);
+    this.asRoads = asRoads;
     if (this.comparing) this.drawBeside(extra);
     scaleBar(byId("scale"), this.view, say);
     Object.assign(document.body.dataset, { drawn: drawn.reduce((a, b) => a + b), kinds: drawn.join(","), level: this.view.level });
@@ -271,15 +272,19 @@ class App {
   click(px, py) {
     const at = this.view.place(px, py);
     if (this.tab === "route") { this.setRoute([...this.route, this.degreesOf(at.x, at.y)]); return; }
-    const { tile, local } = cellAt(at.x, at.y);
-    this.choose(tile, local);
+    this.chooseAt(at.x, at.y);
+  }
+
+  chooseAt(x, y) {
+    const { tile, local, sector = null } = this.asRoads ? this.roads.meantAt(this.cells, x, y, sidewaysOf(this.view), NEAR_PX * metresPerWorld(y) / this.view.scale) : cellAt(x, y);
+    this.choose(tile, local, sector);
     this.open("cell");
   }
 
-  choose(tile, local) {
+  choose(tile, local, sector = null) {
     const level = this.cells.tiles.get(tile)?.block.level ?? CELL_LEVEL, side = 2 ** (CELL_LEVEL - level) / CELLS;
     const { x, y } = middleOf(cellOf(tile, local));
-    this.chosen = { tile, local, x, y, side, level, records: this.cells.at_place(tile, local) };
+    this.chosen = { tile, local, sector, x, y, side, level, records: this.cells.at_place(tile, local) };
     this.chosen.x = Math.floor(x / side) * side;
     this.chosen.y = Math.floor(y / side) * side;
     Object.assign(this.chosen, { middleX: x, middleY: y });
@@ -301,7 +306,8 @@ class App {
       now: () => overviewPanel(this), legend: () => legend(this), cell: () => placePanel(this, this.chosen), alerts: () => alertsPanel(this), route: () => routePanel(this),
       health: () => healthPanel(this), share: () => sharePanel(this),
     })[name]();
-    if (name === this.tab) byId("panel").replaceChildren(...made);
+    const held = byId("panel"), same = held.childNodes.length === made.length && made.every((one, k) => one.isEqualNode(held.childNodes[k]));
+    if (name === this.tab && !same) held.replaceChildren(...made);
   }
 
   set(name, value) {
@@ -345,7 +351,7 @@ class App {
     }
     if (this.past !== before) return;  // another was chosen meanwhile
     this.past = past;
-    if (this.chosen) this.choose(this.chosen.tile, this.chosen.local);
+    if (this.chosen) this.choose(this.chosen.tile, this.chosen.local, this.chosen.sector);
     this.tick();
     this.remember();
     this.drawNow();

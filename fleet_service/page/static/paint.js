@@ -4,7 +4,7 @@ import { BORROWED } from "./blocks.js";
 import { HOLLOW, alertColour, fills, groundColour, inks, themeName } from "./colours.js";
 import { CELLS, CELL_LEVEL, TILES, metresPerWorld, worldX, worldY } from "./grid.js";
 import { Pixels } from "./pixels.js";
-import { ribbons, ribbonWidth, streets } from "./ribbons.js";
+import { ribbons, ribbonWidth, streets, track } from "./ribbons.js";
 import { write } from "./vector.js";
 
 const NEAR_PX = 14, MOST_RECORDS = 9000, LEAST_RIBBON_ZOOM = 14.7, pixels = new Pixels();
@@ -20,13 +20,13 @@ function hatching(pen) {
   return hatches[themeName()] = pen.createPattern(tile, "repeat");
 }
 
-// Returns how many places were drawn, by kind.
+// Returns how many places were drawn, by kind, and whether roads were drawn as ribbons.
 export function paint(pen, view, cells, extra) {
   const drawn = new Array(8).fill(0), box = view.box, near = view.scale / CELLS >= NEAR_PX, passes = passing(extra);
   const seen = [...cells.tiles.values()].filter(({ west, north }) =>
     west <= box.east && north <= box.south && west + 1 / TILES >= box.west && north + 1 / TILES >= box.north);
   const records = seen.reduce((sum, tile) => sum + tile.block.count, 0), roads = extra.roads;
-  const asRoads = roads && view.zoom >= LEAST_RIBBON_ZOOM && records <= MOST_RECORDS && seen.every(tile => tile.block.level === CELL_LEVEL);
+  const asRoads = Boolean(roads) && view.zoom >= LEAST_RIBBON_ZOOM && records <= MOST_RECORDS && seen.every(tile => tile.block.level === CELL_LEVEL);
   const named = roads && !roads.learned, below = extra.base || named || asRoads || extra.away.length || extra.route.length;
   if (below) {
     pen.fillStyle = groundColour();
@@ -37,7 +37,7 @@ export function paint(pen, view, cells, extra) {
     for (const region of extra.away) regionAway(pen, view, region.box);
   }
   if (asRoads) {
-    for (const alert of extra.alerts) halo(pen, view, alert);
+    for (const alert of extra.alerts) halo(pen, view, tracesOf(view, alert, roads));
     const left = roads.lay(seen, passes, drawn, box);
     ribbons(pen, view, roads);
     for (const [tile, rows] of left) dots(pen, view, tile.parts, rows);
@@ -47,15 +47,15 @@ export function paint(pen, view, cells, extra) {
     for (const tile of seen) if (!parted(tile)) pixels.squares(view, tile.squares, passes, drawn);
     pixels.show(pen);
     for (const tile of seen) if (parted(tile)) headings(pen, view, tile.parts, passes, drawn);
-    for (const alert of extra.alerts) halo(pen, view, alert);
+    for (const alert of extra.alerts) halo(pen, view, tracesOf(view, alert, null));
   }
   if (extra.truth) truthDots(pen, view, extra.truth);
   if (extra.base?.label) extra.base.label(pen, view);
   else if (named) names(pen, view, roads);
-  extra.alerts.forEach((alert, k) => badge(pen, view, alert, k + 1));
+  extra.alerts.forEach((alert, k) => badge(pen, view, tracesOf(view, alert, asRoads ? roads : null), k + 1));
   if (extra.route.length) stops(pen, view, extra.route);
   if (extra.chosen) mark(pen, view, extra.chosen);
-  return drawn;
+  return { drawn, asRoads };
 }
 
 // What a person asked to see, or null: all. What is known to be slippery is no mere bound, whatever its basis.
@@ -118,12 +118,23 @@ function regionAway(pen, view, [west, south, east, north]) {
   pen.strokeRect(left, top, right - left, bottom - top);
 }
 
-// A stretch under alert: a broad outline around its road, and its number in the list beside it.
-function halo(pen, view, alert) {
-  const width = Math.max(22, 3.6 * ribbonWidth(view)), path = new Path2D();
-  const points = alert.points?.length ? alert.points.map(([latitude, longitude]) => [view.left(worldX(longitude)), view.top(worldY(latitude))]) : [middle(view, alert)];
-  points.forEach(([x, y], k) => k ? path.lineTo(x, y) : path.moveTo(x, y));
-  if (points.length === 1) path.lineTo(points[0][0] + .01, points[0][1]);
+// Where an alert is drawn: along the ribbons of its lanes, else from cell to cell.
+function tracesOf(view, alert, roads) {
+  const found = roads ? roads.under(alert).map(({ lane, first, end }) => {
+    const [left, top] = track(view, roads, lane);
+    return Array.from({ length: end - first + 1 }, (_, k) => [left(first + k), top(first + k)]);
+  }) : [];
+  if (found.length) return found.sort((a, b) => b.length - a.length);
+  return [alert.points?.length ? alert.points.map(([latitude, longitude]) => [view.left(worldX(longitude)), view.top(worldY(latitude))]) : [middle(view, alert)]];
+}
+
+// A stretch under alert: a broad outline around its ribbons, and its number in the list beside it.
+function halo(pen, view, traces) {
+  const width = Math.max(18, 2.6 * ribbonWidth(view)), path = new Path2D();
+  for (const points of traces) {
+    points.forEach(([x, y], k) => k ? path.lineTo(x, y) : path.moveTo(x, y));
+    if (points.length === 1) path.lineTo(points[0][0] + .01, points[0][1]);
+  }
   pen.lineJoin = pen.lineCap = "round";
   for (const [wide, ink] of [[width + 6, alertColour()], [width, groundColour()]]) { pen.lineWidth = wide; pen.strokeStyle = ink; pen.stroke(path); }
   pen.globalAlpha = .16;
@@ -135,8 +146,8 @@ function halo(pen, view, alert) {
 
 const middle = (view, { bbox: [west, south, east, north] }) => [view.left(worldX((west + east) / 2)), view.top((worldY(south) + worldY(north)) / 2)];
 
-function badge(pen, view, alert, number) {
-  const [x, y] = middle(view, alert), up = Math.max(22, 3.6 * ribbonWidth(view)) * .5 + 16;
+function badge(pen, view, [points], number) {
+  const [x, y] = points[points.length >> 1], up = Math.max(18, 2.6 * ribbonWidth(view)) * .5 + 16;
   pen.beginPath();
   pen.moveTo(x, y - up + 18);
   pen.arc(x, y - up, 12, .8, Math.PI - .8, true);

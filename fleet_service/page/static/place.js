@@ -35,7 +35,7 @@ export function placePanel(app, chosen) {
   const head = placeHead(app, chosen);
   if (!chosen.records.length) return [...head, make("p", { class: "nobody" }, say("cell.nobody"))];
   const kind = record => kindOf(record.basis, record.mu, record.lower, record.upper, record.slippery);
-  const ordered = [...chosen.records].sort((a, b) => rankOf(kind(a)) - rankOf(kind(b)));
+  const ordered = [...chosen.records].sort((a, b) => (b.sector === chosen.sector) - (a.sector === chosen.sector) || rankOf(kind(a)) - rankOf(kind(b)));
   return [...head, ...ordered.map(record => one(app, chosen, numbers(record, app.settings), kind(record)))];
 }
 

@@ -4,10 +4,18 @@ import { DANGER, HOLLOW, LITTLE, fills, groundColour, inks } from "./colours.js"
 import { metresPerWorld } from "./grid.js";
 import { isNone } from "./roads.js";
 
-const LANE_M = 3.4, SHARE = [1, 1, 1, 1, .7, .7, .34, .34], ARROW_PX = 110, ARROWS_PX = 9;
+const LANE_M = 3.4, SHARE = [1, 1, 1, 1, .7, .7, .34, .34], ARROW_PX = 110, ARROWS_PX = 9, SIDEWAYS = .56;
 
 export function ribbonWidth(view) {
   return Math.max(4.5, Math.min(26, LANE_M * view.scale / metresPerWorld(view.y)));
+}
+
+// A lane is drawn beside the middle of its road where both directions share it: that far [m], and its points on the screen.
+export const sidewaysOf = view => SIDEWAYS * ribbonWidth(view) * metresPerWorld(view.y) / view.scale;
+
+export function track(view, roads, lane) {
+  const off = lane.both || roads.learned ? SIDEWAYS * ribbonWidth(view) : 0;
+  return [i => view.left(lane.x[i]) + lane.nx[i] * off, i => view.top(lane.y[i]) + lane.ny[i] * off];
 }
 
 const inView = (lane, box, pad) => lane.west - pad <= box.east && lane.east + pad >= box.west && lane.north - pad <= box.south && lane.south + pad >= box.north;
@@ -31,8 +39,7 @@ export function ribbons(pen, view, roads) {
   const arrows = [];
   for (const lane of roads.lanes) {
     if (!lane.any || !inView(lane, box, pad)) continue;
-    const off = lane.both || roads.learned ? wide * .56 : 0;
-    const left = i => view.left(lane.x[i]) + lane.nx[i] * off, top = i => view.top(lane.y[i]) + lane.ny[i] * off;
+    const [left, top] = track(view, roads, lane);
     for (let i = 0; i < lane.count; i++) {
       const kind = lane.kind[i];
       if (isNone(kind)) continue;

@@ -1,9 +1,9 @@
 // Roads as ribbons: lines cut into pieces, each direction with the most dangerous of the records that lie on it.
-import { CELLS, columnOf, metresPerWorld, rowOf, worldX, worldY } from "./grid.js";
-import { rankOf } from "./colours.js";
+import { CELLS, HEADINGS, cellAt, columnOf, metresPerWorld, rowOf, worldX, worldY } from "./grid.js";
+import { kindOf, rankOf } from "./colours.js";
 
-const PIECE_M = 8, REACH_M = 24, LEAST_COS = .3, NONE = 255, BRIDGED = 2;
-const WAYS = [[1, 0], [0, -1], [-1, 0], [0, 1]];  // of the headings, x to the east and y to the south
+const PIECE_M = 8, REACH_M = 24, LEAST_COS = .3, NONE = 255, BRIDGED = 2, LINKED = 5;
+export const WAYS = [[1, 0], [0, -1], [-1, 0], [0, 1]];  // of the headings, x to the east and y to the south
 const keyOf = (column, row) => row * CELLS + column;
 
 // A line in equal pieces: points and unit normals to its right, in parts of the world.
@@ -23,7 +23,7 @@ function cut(points) {
 
 // One direction of a line.
 function laneOf({ x, y, count, length }, name, backward) {
-  const lane = { name, count, length, x: new Float64Array(count + 1), y: new Float64Array(count + 1), nx: new Float64Array(count + 1), ny: new Float64Array(count + 1), kind: new Uint8Array(count).fill(NONE), records: new Array(count).fill(null) };
+  const lane = { name, count, length, x: new Float64Array(count + 1), y: new Float64Array(count + 1), nx: new Float64Array(count + 1), ny: new Float64Array(count + 1), kind: new Uint8Array(count).fill(NONE), records: new Array(count).fill(null), any: false };
   for (let i = 0; i <= count; i++) { const from = backward ? count - i : i; lane.x[i] = x[from]; lane.y[i] = y[from]; }
   for (let i = 0; i <= count; i++) {
     const a = Math.max(0, i - 1), b = Math.min(count, i + 1), dx = lane.x[b] - lane.x[a], dy = lane.y[b] - lane.y[a], size = Math.hypot(dx, dy) || 1;
@@ -72,7 +72,7 @@ export class Roads {
 
   // Lay the records of tiles upon the lanes; what lies on no road comes back, tile by tile, as row numbers.
   lay(tiles, passes, drawn, box) {
-    for (const lane of this.lanes) { lane.kind.fill(NONE); lane.any = false; }
+    for (const lane of this.lanes) { lane.kind.fill(NONE); lane.records.fill(null); lane.any = false; }
     const left = [];
     for (const tile of tiles) {
       const { rows, x, y, kind, side } = tile.parts, column = columnOf(tile.block.tile) * 128, row = rowOf(tile.block.tile) * 128, rest = [];
@@ -83,12 +83,54 @@ export class Roads {
         if (!at) { rest.push(k); continue; }
         const lane = this.lanes[at[0]], held = lane.kind[at[1]];
         lane.any = true;
-        if (held === NONE || rankOf(kind[k]) < rankOf(held)) lane.kind[at[1]] = kind[k];
+        if (held === NONE || rankOf(kind[k]) < rankOf(held)) { lane.kind[at[1]] = kind[k]; lane.records[at[1]] = { tile, k }; }
       }
       if (rest.length) left.push([tile, rest]);
     }
     for (const lane of this.lanes) if (lane.any) bridge(lane);
     return left;
+  }
+
+  // The pieces of the lanes that an alert lies on: { lane, first, end } from neighbour to neighbour.
+  under(alert) {
+    const pieces = new Map(), found = [];
+    for (const [latitude, longitude] of alert.points ?? []) for (const heading of alert.headings) {
+      const at = this.pieceOf(Math.floor(worldX(longitude) * CELLS), Math.floor(worldY(latitude) * CELLS), HEADINGS.indexOf(heading));
+      if (at) pieces.set(at[0], [...pieces.get(at[0]) ?? [], at[1]]);
+    }
+    for (const [number, own] of pieces) {
+      const sorted = own.sort((a, b) => a - b);
+      let first = sorted[0];
+      sorted.forEach((i, k) => {
+        if (k + 1 < sorted.length && sorted[k + 1] - i <= LINKED) return;
+        found.push({ lane: this.lanes[number], first, end: i + 1 });
+        first = sorted[k + 1];
+      });
+    }
+    return found;
+  }
+
+  // The record that is drawn nearest to a place of the map, within some metres; null where no ribbon is near.
+  drawnAt(x, y, offset, within) {
+    const metre = 1 / metresPerWorld(y);
+    let best = null, kind = NONE, least = within * metre;
+    for (const lane of this.lanes) {
+      if (!lane.any) continue;
+      const off = lane.both || this.learned ? offset * metre : 0;
+      for (let i = 0; i < lane.count; i++) {
+        if (lane.kind[i] === NONE) continue;
+        const far = distance(x - lane.nx[i] * off, y - lane.ny[i] * off, lane, i);
+        if (far < least) { least = far; kind = lane.kind[i]; best = [0, -1, 1, -2, 2].map(step => lane.records[i + step]).find(Boolean) ?? best; }
+      }
+    }
+    return best && { tile: best.tile.block.tile, local: best.tile.parts.rows.place[best.k] >> 2, sector: best.tile.parts.rows.place[best.k] & 3, kind };
+  }
+
+  // The cell and heading that a click means: those under it if their record is drawn like the ribbon there, else those of the ribbon.
+  meantAt(cells, x, y, offset, within) {
+    const under = cellAt(x, y), ribbon = this.drawnAt(x, y, offset, within), here = ribbon ? cells.at_place(under.tile, under.local) : [];
+    const same = here.some(one => one.sector === ribbon.sector && kindOf(one.basis, one.mu, one.lower, one.upper, one.slippery) === ribbon.kind);
+    return ribbon && !same ? ribbon : { ...under, sector: ribbon?.sector };
   }
 
   // The road nearest to a point, within a distance: its name and direction of travel there.
@@ -108,6 +150,13 @@ export class Roads {
     const own = this.lanes.filter(lane => lane.name === name);
     return { west: Math.min(...own.map(l => l.west)), east: Math.max(...own.map(l => l.east)), north: Math.min(...own.map(l => l.north)), south: Math.max(...own.map(l => l.south)) };
   }
+}
+
+// From a point to a piece of a lane.
+function distance(x, y, lane, i) {
+  const ax = lane.x[i], ay = lane.y[i], dx = lane.x[i + 1] - ax, dy = lane.y[i + 1] - ay, along = ((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy || 1);
+  const share = Math.min(1, Math.max(0, along));
+  return Math.hypot(ax + share * dx - x, ay + share * dy - y);
 }
 
 // A gap of a piece or two between two pieces with records is the width of a cell, not an unknown road.

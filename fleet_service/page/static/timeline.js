@@ -47,7 +47,7 @@ export class Timeline {
     const any = this.moments.length > 0;
     this.none.hidden = any;
     this.none.textContent = say(this.app.settings.archive ? "time.none.archive" : "time.none");
-    for (const one of [this.play, this.slider, this.compare]) one.disabled = !any;
+    for (const one of [this.play, this.slider, this.compare]) Object.assign(one, { disabled: !any, hidden: !any });
     this.compare.textContent = say(this.app.comparing ? "time.compare.stop" : "time.compare");
     this.compare.setAttribute("aria-pressed", String(this.app.comparing));
   }

@@ -1,11 +1,11 @@
 // The window on the world: where it is, how large, and how mouse, fingers and keys move it.
 import { CELL_LEVEL, TILE_LEVEL, latitudeOf, longitudeOf } from "./grid.js";
 
-const LEAST_ZOOM = 2, MOST_ZOOM = 21, TILE_PX = 256, TURN = 1.25, STEP_PX = 60;
+const LEAST_ZOOM = 2, MOST_ZOOM = 21, TILE_PX = 256, TURN = 1.25, STEP_PX = 60, CONTROLS_PX = 56;
 
 export class View {
   constructor(canvas) {
-    Object.assign(this, { canvas, x: .5, y: .35, zoom: 3, gone: false, width: 1, height: 1, moved: () => {}, clicked: () => {} });
+    Object.assign(this, { canvas, x: .5, y: .35, zoom: 3, gone: false, width: 1, height: 1, covered: 0, moved: () => {}, clicked: () => {} });
     this.fingers = new Map();
     this.listen();
   }
@@ -33,9 +33,11 @@ export class View {
     this.moved();
   }
 
+  // Into the part of the window that no key, time bar or button covers.
   fit({ west, east, north, south }) {
-    const zoom = Math.log2(.85 * Math.min(this.width / Math.max(east - west, 1e-6), this.height / Math.max(south - north, 1e-6)) / TILE_PX);
-    this.go((west + east) / 2, (north + south) / 2, Math.min(zoom, 18));
+    const high = Math.max(this.height - this.covered, this.height / 2), wide = this.width - CONTROLS_PX, fits = Math.min(wide / Math.max(east - west, 1e-6), high / Math.max(south - north, 1e-6));
+    const zoom = Math.min(Math.log2(.85 * fits / TILE_PX), 18);
+    this.go((west + east) / 2 + CONTROLS_PX / 2 / (TILE_PX * 2 ** zoom), (north + south) / 2 + (this.height - high) / 2 / (TILE_PX * 2 ** zoom), zoom);
   }
 
   turn(by, px = this.width / 2, py = this.height / 2) {

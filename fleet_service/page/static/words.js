@@ -1,4 +1,5 @@
 // Plain words for places and alerts, with the names of roads where they are known.
+import { latitudeOf, longitudeOf } from "./grid.js";
 import { say } from "./texts.js";
 
 const BOUNDS = { east: "eastbound", north: "northbound", west: "westbound", south: "southbound" };
@@ -13,6 +14,10 @@ const surfaceRank = mu => mu < .2 ? 0 : 1;
 export function alertWords(alert, road) {
   const what = say(alert.mu < .2 ? "alert.ice" : "alert.slippery"), ways = alert.headings.length >= 4 ? say("alert.all_ways") : alert.headings.map(one => say(`alert.${BOUNDS[one]}`)).join(` ${say("and")} `);
   return say(road ? "alert.on_road" : "alert.on_no_road", { what, road, ways, place: coordinates(alert.longitude, alert.latitude) });
+}
+
+export function stretchWords({ name, heading, x, y }) {
+  return say(name ? "alert.on_road" : "alert.on_no_road", { what: say("alert.slippery"), road: name, ways: say(`alert.${BOUNDS[heading]}`), place: coordinates(longitudeOf(x), latitudeOf(y)) });
 }
 
 // Percent of certainty, never rounded up to all of it.

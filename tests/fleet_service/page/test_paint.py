@@ -136,6 +136,9 @@ def test_before_any_service_spoke_the_world_is_hatched_and_not_empty(bare: str) 
         waits(seen, "gripmap.live.state && !gripmap.frame")
         waits(seen, f"({_ALL})() > 10000")
         assert seen.page.locator("#live").inner_text() == "○ no update yet"
+        seen.page.evaluate("gripmap.panel()")
+        assert "No service answers, so nothing is known" in seen.page.locator("#panel").inner_text()
+        assert not seen.page.locator("#play").is_visible(), "there is no past to play"
 
 
 def test_what_one_direction_found_is_not_said_of_the_other(page: RunningPage, drive: Drive) -> None:

@@ -101,3 +101,12 @@ def test_nothing_is_kept_twice_while_nothing_changes() -> None:
     assert recent.times() == [0]
     assert recent.at(0) == {7: tile}
     assert recent.at(5) is None
+
+
+def test_cells_side_by_side_are_one_learned_line() -> None:
+    """The receiver's error spreads one lane over two or three rows of cells."""
+    scattered = cells(
+        *((k, (0, 2, 0, 1)[k % 4]) for k in range(24)), *((k, 2) for k in range(3, 9))
+    )
+    (line,) = learned_lines(scattered, np.full(len(scattered), EAST))
+    assert len(line.points) == 24

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from schemas.runtime import figures as figures_module
 from schemas.runtime.figures import Figure, commit, markdown, write
 
 
@@ -76,3 +77,12 @@ def test_a_value_of_numpy_is_written_like_any_other(tmp_path: Path) -> None:
         True,
         False,
     ]
+
+
+def test_figures_are_written_without_an_optional_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(figures_module, "PACKAGES", ("numpy", "not-installed-anywhere"))
+    write(tmp_path / "figures.json", "demo", [1], [])
+    versions = json.loads((tmp_path / "figures.json").read_text())[0]["versions"]
+    assert list(versions) == ["numpy"]
