@@ -44,6 +44,8 @@ def _read_source(path: Path, profile: Profile | None, database: Database | None)
     suffix = path.suffix.lower()
     if not path.exists():
         raise InputError("source", f"{path} does not exist", "give the path of a recording")
+    if not path.is_file() and not path.is_dir():  # reading a pipe may never end
+        raise InputError("source", f"{path} is not a file", "write the recording to a file first")
     if rosbag.is_bag(path):
         with rosbag.open_bag(path) as reader:
             if rosbag.has_frames(reader):

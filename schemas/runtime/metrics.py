@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Thread
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from socket import SHUT_RD, socket
+from threading import Thread, Timer
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 from urllib.parse import urlsplit
 
 from schemas.errors import InputError
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from prometheus_client.registry import CollectorRegistry
 
 PREFIX: Final = "gripmap_"
-READ_S: Final = 5.0  # a silent client is cut off
+READ_S: Final = 5.0  # a client whose request is not complete is cut off
 
 
 class Metric(NamedTuple):
@@ -69,7 +70,7 @@ def serve_metrics(
         {"exposition": staticmethod(_exposition(read)), "troubles": staticmethod(troubles)},
     )
     try:
-        server = ThreadingHTTPServer((host, port), handler)
+        server = _MetricsServer((host, port), handler)
     except OSError as error:
         raise InputError(
             "metrics_port", f"cannot listen on {host}:{port} ({error.strerror})", "give another"
@@ -108,6 +109,22 @@ def _exposition(read: Read) -> Callable[[], tuple[str, bytes]]:
     registry: CollectorRegistry = CollectorRegistry()
     registry.register(Values())
     return lambda: (CONTENT_TYPE_LATEST, generate_latest(registry))
+
+
+class _MetricsServer(ThreadingHTTPServer):
+    def finish_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 the type of its base
+        deadline = Timer(READ_S, _stop_reading, (request,))
+        deadline.daemon = True
+        deadline.start()
+        try:
+            super().finish_request(request, client_address)
+        finally:
+            deadline.cancel()
+
+
+def _stop_reading(connection: socket) -> None:
+    with suppress(OSError):  # it has just ended
+        connection.shutdown(SHUT_RD)
 
 
 class _Handler(BaseHTTPRequestHandler):

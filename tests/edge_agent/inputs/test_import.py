@@ -5,6 +5,7 @@ files cause no crash.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
@@ -403,6 +404,12 @@ def test_a_hostile_file_is_one_clear_error_or_the_readings_that_are_left(
         except InputError:
             refused += 1
     assert refused > 0 or kind in ("nmea", "asc", "log", "trc", "csv"), "text is read line by line"
+
+
+def test_pipe_that_nobody_writes_to_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.csv")
+    with pytest.raises(InputError, match="is not a file"):
+        read_source(tmp_path / "a.csv", None, None)
 
 
 def test_blocks_of_a_measurement_in_a_circle_are_refused(tmp_path: Path) -> None:

@@ -9,11 +9,13 @@ import socket
 import urllib.error
 import urllib.request
 from collections.abc import Sequence
+from urllib.parse import urlsplit
 
 import pytest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
 from schemas.errors import InputError
+from schemas.runtime import metrics
 from schemas.runtime.metrics import Metric, gauge, serve_metrics
 from schemas.runtime.process import LogLine, line_logger, log_as
 
@@ -119,3 +121,22 @@ def test_warnings_of_the_program_take_the_same_form() -> None:
         "edge_agent.publish.publisher",
         "batch 7 was rejected",
     )
+
+
+def test_request_that_arrives_drop_by_drop_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics, "READ_S", 0.2)
+    with serve_metrics("127.0.0.1", 0, read_metrics, list) as address:
+        place = urlsplit(str(address))
+        with socket.create_connection((str(place.hostname), int(place.port or 0))) as one:
+            one.settimeout(0.05)
+            assert any(has_ended(one) for _ in range(200))
+
+
+def has_ended(connection: socket.socket) -> bool:
+    try:
+        connection.send(b"G")
+        return connection.recv(1) == b""
+    except TimeoutError:
+        return False
+    except OSError:
+        return True
