@@ -133,10 +133,12 @@ def test_request_that_arrives_drop_by_drop_is_cut_off(monkeypatch: pytest.Monkey
 
 
 def has_ended(connection: socket.socket) -> bool:
+    """Send a byte; return True if the server has ended the request, with or without an answer."""
     try:
         connection.send(b"G")
-        return connection.recv(1) == b""
+        connection.recv(1)
     except TimeoutError:
         return False
     except OSError:
         return True
+    return True
