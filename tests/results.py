@@ -246,6 +246,8 @@ def _read_rows(name: str) -> list[Row]:
 def keep_figures(name: str, source: Path) -> str:
     """Keep the figures of a campaign's last complete run; figures that it did not measure stay.
 
+    Each fault campaign is complete in itself, so `--only NAME` is accepted for them.
+
     Args:
         name: key in CAMPAIGNS.
         source: the `figures.json` that the campaign wrote.
@@ -257,7 +259,10 @@ def keep_figures(name: str, source: Path) -> str:
     if not source.exists():
         return f"{name}: unchanged; run `{campaign.command}` first"
     header, *rows = json.loads(source.read_text(encoding="utf-8"))
-    if header["campaign"] != campaign.title:
+    title = header["campaign"]
+    if name == "faults":
+        title = title.partition(" --only ")[0]
+    if title != campaign.title:
         return f"{name}: unchanged; {source} is a run of {header['campaign']!r}"
     before = read_kept(name)
     runs = _read_runs(name)
