@@ -323,3 +323,24 @@ def test_missing_package_is_one_line_with_its_extra(capsys: pytest.CaptureFixtur
 
     with pytest.raises(ModuleNotFoundError):
         commandline.run_guarded(import_unknown)
+
+
+@pytest.mark.parametrize(
+    "modules",
+    [
+        "deploy.demo.story, deploy.demo.processes, fleet_service.page.server",
+        "edge_agent.cli.run, edge_agent.cli.fleet, edge_agent.cli.replay, edge_agent.cli.check",
+        "fleet_service.cli.run, fleet_service.cli.watch, fleet_service.cli.query",
+    ],
+)
+def test_demo_and_plain_commands_load_without_optional_packages(modules: str) -> None:
+    """The extras demo and page bring neither SciPy nor matplotlib."""
+    hidden = "import sys; sys.modules.update(dict.fromkeys(('scipy', 'matplotlib', 'ibis')))"
+    command = [sys.executable, "-c", f"{hidden}; import {modules}"]
+    subprocess.run(command, check=True, capture_output=True)
+
+
+def test_no_command_reports_the_threads_of_a_library() -> None:
+    asked = "import logging, edge_agent.cli as c; c.main(['simulate', '--list']); "
+    asked += "assert not logging.getLogger('numexpr').isEnabledFor(logging.INFO)"
+    subprocess.run([sys.executable, "-c", asked], check=True, capture_output=True)

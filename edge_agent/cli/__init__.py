@@ -116,6 +116,8 @@ def _run_command(
     logging.basicConfig(
         level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )
+    # pandas, which many libraries load, imports it, and it reports its threads at INFO
+    logging.getLogger("numexpr").setLevel(logging.WARNING)
     from edge_agent.cli.common import left_behind
     from schemas.runtime.process import limit_memory
 

@@ -5,7 +5,6 @@ needs.
 from __future__ import annotations
 
 import importlib
-import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -74,9 +73,6 @@ def import_optional(name: str, extra: str = "inputs") -> Any:  # noqa: ANN401 mo
     Raises:
         InputError: it is not installed.
     """
-    logging.getLogger("numexpr").setLevel(
-        logging.WARNING
-    )  # which tells at INFO how many threads it has
     try:
         return importlib.import_module(name)
     except ImportError as error:

@@ -10,7 +10,6 @@ Time may stand still (the estimator reports this in `health`) but not go back.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,9 +27,6 @@ from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, CONTEXT, S, per_wheel
 from schemas.thresholds import NS
 
-logging.getLogger("numexpr").setLevel(
-    logging.WARNING
-)  # it reports its threads at INFO when pandas loads it
 GROUND: Final = "gnss_speed"  # beside the channels; only the signal doctor reads it
 NEEDED: Final = ("ax", "ay", "yaw_rate", *per_wheel("omega"))
 FRONT_STEERING: Final = per_wheel("delta")[:2]

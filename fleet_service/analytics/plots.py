@@ -192,7 +192,7 @@ def _before_after(figure: Figure, table: pa.Table) -> None:
         right,
         0,
         np.array([after[name] for name in ("lower", "difference", "upper")]),
-        "difference, 95 % interval",
+        "difference, 90 % interval",
     )
     right.axhline(0.0, color=_MARK, linewidth=1, label="no change")
     right.set_xticks([0], ["after - before"])
@@ -303,11 +303,22 @@ def _first_two(figure: Figure, table: pa.Table) -> None:
     axes.set(xlabel=numbers[0], ylabel=numbers[-1])
 
 
+def _draw_trend(figure: Figure, table: pa.Table) -> None:
+    months = [f"{month:%Y-%m}" for month in table["month"].to_pylist()]
+    axes = figure.subplots()
+    axes.plot(months, _float_column(table, "mu_p50"), "o-", color=_DARK, label="median of μ")
+    share = _float_column(table, "share_slippery")
+    axes.plot(months, share, "s--", color=_MARK, label="share of slippery values")
+    axes.set(ylabel=MU, ylim=(0.0, 1.2))
+    axes.legend(fontsize=8)
+
+
 _DRAWN: Final[dict[str, Callable[[Figure, pa.Table], None]]] = {
     "grip": _draw_grip,
     "worst": _draw_worst,
     "spells": _draw_spells,
     "before-after": _before_after,
+    "trend": _draw_trend,
     "vehicles": _draw_vehicles,
     "calibration": _draw_calibration,
     "weather": _draw_weather,

@@ -96,9 +96,8 @@ COMMANDS: Final = (
     Command(
         "analyze",
         "fleet_service.cli.analyze",
-        "analyse the archive: grip, worst, spells, before-after, vehicles, calibration, weather, "
-        "change-rates, "
-        "contract, replay",
+        "analyse the archive: grip, worst, spells, before-after, trend, vehicles, calibration, "
+        "weather, change-rates, contract, replay",
         "fleet-service analyze worst --archive archive --from 2026-01-01 --out worst.html",
     ),
     Command(

@@ -10,7 +10,13 @@ from typing import Final
 
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import Question, known_questions, question_of
-from fleet_service.cli.common import add_part, compact_first, duration_s, time_span
+from fleet_service.cli.common import (
+    add_part,
+    compact_first,
+    describe_covered_box,
+    duration_s,
+    time_span,
+)
 from schemas import mugrid
 from schemas.config import moment
 from schemas.errors import InputError
@@ -23,7 +29,7 @@ FOR: Final = {
     "stations": ("weather", "change-rates"),
     "step": ("replay",),
     "min_vehicles": ("worst", "spells", "contract"),
-    "roads": ("contract",),
+    "roads": ("contract", "grip", "worst", "spells", "replay"),
     "level": ("contract",),
     "within": ("contract",),
 }
@@ -65,7 +71,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     vehicles = f"worst, spells, contract: default {USUAL_VEHICLES}"
     parser.add_argument("--min-vehicles", metavar="K", type=int, help=vehicles)
     parser.add_argument(
-        "--roads", metavar="FILE", type=Path, help="contract: file written by `fleet-service roads`"
+        "--roads",
+        metavar="FILE",
+        type=Path,
+        help="file written by `fleet-service roads`: links of contract; others add a column `road`",
     )
     parser.add_argument(
         "--level", metavar="MU", type=float, help="contract: agreed friction, e.g. .35"
@@ -117,6 +126,12 @@ def run(arguments: argparse.Namespace) -> int:
         "observations"
     )
     found = question.ask(engine, options)
+    if bbox is not None and not found.num_rows:
+        _report_covered_box(arguments, bbox)
+    if arguments.roads is not None and question.name != "contract":
+        from fleet_service.analytics.roads.join import add_road_names
+
+        found = add_road_names(found, arguments.roads)
     print(
         output.format_json_lines(found, question)
         if arguments.json
@@ -126,6 +141,27 @@ def run(arguments: argparse.Namespace) -> int:
         output.write(found, question, arguments.out)
         _print_progress(f"written: {arguments.out}")
     return 0
+
+
+def _report_covered_box(arguments: argparse.Namespace, bbox: tuple[float, ...]) -> None:
+    """Report the box of all observations if a queried box is empty: latitude and longitude may be
+    swapped.
+    """
+    from fleet_service.analytics import engines
+    from fleet_service.archive.export.extract import Extract
+
+    part = Extract(*time_span(arguments), None)
+    engine = engines.QueryEngine(arguments.engine, arguments.archive, part, progress=False)
+    t = engine.observations()
+    whole = t.aggregate(
+        west=t.longitude.min(),
+        south=t.latitude.min(),
+        east=t.longitude.max(),
+        north=t.latitude.max(),
+    )
+    (box,) = engine.answer(whole).to_pylist()
+    if box["west"] is not None:
+        _print_progress(describe_covered_box("archive", tuple(box.values()), bbox))
 
 
 def _within_seconds(text: str | None) -> float | None:

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -208,3 +208,15 @@ def compact_first(root: Path) -> None:
         progress_messages.report(f"compacted first: {done.rows:,} rows of {done.segments} segments")
     except (OSError, InputError) as error:
         print(f"warning: {waiting} segments of the log are not included: {error}", file=sys.stderr)
+
+
+def describe_covered_box(what: str, box: Sequence[float], asked: Sequence[float]) -> str:
+    """Return a line that names the box of all data, for a queried box without any; both are west,
+    south, east, north [deg].
+    """
+    sides = ",".join(f"{side:.3f}" for side in box)
+    words = f"no cell lies in this box; the {what} covers --bbox {sides}"
+    west, south, east, north = asked
+    if box[0] < north and box[2] > south and box[1] < east and box[3] > west:
+        words += ": longitude comes before latitude"
+    return words

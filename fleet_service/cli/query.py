@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from fleet_service.cli.common import add_connection
+from fleet_service.cli.common import add_connection, describe_covered_box
 from schemas.errors import InputError
 from schemas.runtime import commandline
 
@@ -110,13 +110,8 @@ def _say_what_is_covered(arguments: argparse.Namespace) -> None:
         float(east_end.max()),
         float(north_end.max()),
     ]
-    words = "no cell lies in this box; the map covers --bbox " + ",".join(
-        f"{side:.3f}" for side in box
-    )
-    west, south, east, north = (float(side) for side in arguments.bbox.split(","))
-    if box[0] < north and box[2] > south and box[1] < east and box[3] > west:
-        words += ": longitude comes before latitude"
-    print(words, file=sys.stderr)
+    asked = [float(side) for side in arguments.bbox.split(",")]
+    print(describe_covered_box("map", box, asked), file=sys.stderr)
 
 
 def _output_format(out: Path | None, given: str | None) -> str | None:

@@ -24,8 +24,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
-from scipy.special import log_ndtr
 
+from fleet_service.fusion.normal import log_distribution
 from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import EXCITED_SHARE
@@ -161,7 +161,7 @@ def draw_reports(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
     std = np.hypot(NOISE_ABSOLUTE, relative * seen)
     reading = seen + std * p.e
     used = np.clip(p.share * p.mu + USED_STD * rng.normal(size=len(p.mu)), 0.02, 1.3)
-    bound = log_ndtr((mugrid.CENTRES - used[:, None]) / BOUND_STD)
+    bound = log_distribution((mugrid.CENTRES - used[:, None]) / BOUND_STD)
     above = np.clip((mugrid.CENTRES - used[:, None]) / (mugrid.UPPER - mugrid.LOWER), 0.0, 1.0)
     sloping = bound + errors.slope[who, None] * above
     peaked = reading_likelihood(reading, model.stated * relative, model.stated * NOISE_ABSOLUTE)

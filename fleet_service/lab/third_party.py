@@ -26,9 +26,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
-from scipy.special import log_ndtr
 
 from fleet_service.fusion import Fusion, Observations, observations_of
+from fleet_service.fusion.normal import log_distribution
 from fleet_service.fusion.store.records import MANOEUVRES
 from fleet_service.lab import agent
 from fleet_service.lab.agent import SimulatedReports
@@ -85,7 +85,7 @@ def make_reports(
     seen = mu * (1.0 + gain[vehicle])
     reading = seen * (1.0 + NOISE * rng.normal(size=n))
     used = share * seen
-    bound = log_ndtr((mugrid.CENTRES - used[:, None]) / agent.BOUND_STD)
+    bound = log_distribution((mugrid.CENTRES - used[:, None]) / agent.BOUND_STD)
     value = agent.reading_likelihood(np.maximum(reading, mugrid.LOWER), np.full(n, NOISE), 0.0)
     std = np.where(excited, NOISE * reading, np.nan)
     return SimulatedReports(

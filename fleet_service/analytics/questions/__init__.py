@@ -60,6 +60,7 @@ QUESTIONS: Final = {
             "duration_s",
         ),
         Question("before-after", "change of grip by a treatment, with interval", "-period", None),
+        Question("trend", "grip month by month, compared in the same cells", "month", None),
         Question("vehicles", "bias and sensor health per vehicle", "-z", None),
         Question("calibration", "how often the published interval held", "age_h", None),
         Question(

@@ -12,6 +12,8 @@ Legend
 
 from __future__ import annotations
 
+from typing import Any
+
 import ibis
 import numpy as np
 import pyarrow as pa
@@ -56,6 +58,22 @@ def expression(t: Table, at_s: int) -> Table:
     return total.cross_join(spread)
 
 
+def find_difference(row: dict[str, Any]) -> dict[str, float]:
+    """Return `difference` with its 90 % interval `lower` to `upper`, and `cells`, from the row of
+    `expression`; empty if fewer than two vehicles measured in both periods.
+    """
+    if not row["cells"] or row["vehicles"] < 2:
+        return {}
+    difference = (row["later"] - row["before"]) / row["w"]
+    std = float(np.sqrt(row["squares"] * row["vehicles"] / (row["vehicles"] - 1))) / row["w"]
+    return {
+        "difference": difference,
+        "lower": difference - Z_95 * std,
+        "upper": difference + Z_95 * std,
+        "cells": row["cells"],
+    }
+
+
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Return two rows, before and after: mu, its difference with interval, and the cells, vehicles
     and values used.
@@ -68,19 +86,18 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
             "at", "the time of the treatment is missing", "give it, e.g. --at 2026-01-31T07:00:00Z"
         )
     (row,) = engine.answer(expression(engine.observations(), options.at // NS)).to_pylist()
-    if not row["cells"] or row["vehicles"] < 2:
+    change = find_difference(row)
+    if not change:
         raise InputError(
             "at", "in no cell did two vehicles measure in both periods", "choose longer periods"
         )
-    difference = (row["later"] - row["before"]) / row["w"]
-    std = float(np.sqrt(row["squares"] * row["vehicles"] / (row["vehicles"] - 1))) / row["w"]
     return pa.table(
         {
             "period": ["before", "after"],
             "mu": [row["before"] / row["w"], row["later"] / row["w"]],
-            "difference": [0.0, difference],
-            "lower": [0.0, difference - Z_95 * std],
-            "upper": [0.0, difference + Z_95 * std],
+            "difference": [0.0, change["difference"]],
+            "lower": [0.0, change["lower"]],
+            "upper": [0.0, change["upper"]],
             "cells": [row["cells"]] * 2,
             "vehicles": [row["vehicles"]] * 2,
             "values": [row["values"]] * 2,

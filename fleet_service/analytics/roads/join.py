@@ -221,3 +221,18 @@ def _to_mercator(latitude: FloatArray, longitude: FloatArray) -> FloatArray:
 
 def _angle_between(yaw: FloatArray, axis: float) -> FloatArray:
     return np.asarray(np.abs((yaw - axis + np.pi) % (2.0 * np.pi) - np.pi))
+
+
+def add_road_names(found: pa.Table, roads: Path) -> pa.Table:
+    """Return an answer with the names of its cells' roads as column `road`; null where no named
+    road is near.
+    """
+    network = read_roads(roads).sort_by("distance_m")
+    nearest: dict[Any, str] = {}
+    columns = (network[name].to_pylist() for name in ("cell", "sector", "name"))
+    for cell, sector, name in zip(*columns, strict=True):
+        if name:
+            nearest.setdefault((cell, sector), name)
+    places = zip(found["cell"].to_pylist(), found["sector"].to_pylist(), strict=True)
+    names = pa.array([nearest.get(place) for place in places], pa.string())
+    return found.append_column("road", names)

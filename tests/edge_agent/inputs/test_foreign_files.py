@@ -148,4 +148,3 @@ def test_libraries_do_not_report_what_nobody_asked(tmp_path: Path) -> None:
         DATABASE,
     )
     assert not logging.getLogger("can").isEnabledFor(logging.INFO)
-    assert not logging.getLogger("numexpr").isEnabledFor(logging.INFO)

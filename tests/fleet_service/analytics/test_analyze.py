@@ -5,14 +5,19 @@ from __future__ import annotations
 import json
 import re
 import struct
+from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import geopandas
 import geoparquet_validator
+import ibis
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import QUESTIONS
 from fleet_service.archive.export import extract
 from fleet_service.archive.format import geo
@@ -63,6 +68,63 @@ def list_explained(question: str) -> set[str]:
     rows = [line.split("|") for line in page.splitlines() if line.startswith(f"| `{question}` |")]
     assert all(row[4].strip() for row in rows)
     return {name for row in rows for name in re.findall(r"`(\w+)`", row[2])}
+
+
+def test_empty_box_names_the_box_of_the_archive(
+    archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert analyze(archive, "grip", "--bbox", "0,0,1,1") == 0
+    said = capsys.readouterr().err
+    covered = re.search(r"no cell lies in this box; the archive covers --bbox ([\d.,-]+)\n", said)
+    assert covered is not None
+    west, south, east, north = covered[1].split(",")
+    assert analyze(archive, "grip", "--bbox", f"{south},{west},{north},{east}") == 0
+    assert "longitude comes before latitude" in capsys.readouterr().err
+
+
+def test_roads_name_the_roads_of_an_answer(
+    archive: Path, links: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert analyze(archive, "worst", "--roads", str(links), "--json") == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert rows
+    named = [row["road"] for row in rows if row["road"]]
+    assert named
+    assert set(named) <= set(pq.read_table(links)["name"].to_pylist())
+
+
+def test_trend_compares_months_in_the_same_cells() -> None:
+    """One cell becomes 0.2 more slippery; another cell, seen in one month only, does not count."""
+    rows = [
+        ("2026-01-10", 1, "a", 0.8),
+        ("2026-01-11", 1, "b", 0.9),
+        ("2026-02-10", 1, "a", 0.6),
+        ("2026-02-11", 1, "b", 0.7),
+        ("2026-02-11", 2, "b", 0.2),
+    ]
+    days = [datetime.fromisoformat(f"{day}T12:00:00+00:00") for day, *_ in rows]
+    mu = [row[3] for row in rows]
+    table = ibis.memtable(
+        pa.table(
+            {
+                "day": pa.array([day.date() for day in days]),
+                "time": [int(day.timestamp()) for day in days],
+                "cell": [row[1] for row in rows],
+                "sector": [0] * len(rows),
+                "vehicle": [row[2] for row in rows],
+                "mu": mu,
+                "mu_utilised": mu,
+            }
+        )
+    )
+    engine: Any = SimpleNamespace(
+        observations=lambda: table, answer=lambda expression: expression.to_pyarrow()
+    )
+    january, february = QUESTIONS["trend"].ask(engine, Options()).to_pylist()
+    assert (january["values"], january["difference"]) == (2, None)
+    assert february["share_slippery"] == pytest.approx(1 / 3)
+    assert february["difference"] == pytest.approx(-0.2)
+    assert february["cells"] == 1
 
 
 def test_an_answer_with_a_place_becomes_geoparquet_geojson_and_a_map(

@@ -1,0 +1,67 @@
+"""`trend`: grip month by month, and its change from the month before in the same cells.
+
+Months have different cells, so their percentiles cannot be compared directly. The difference uses
+cells with values of both months only, with the interval of `before-after`.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, date, datetime
+from typing import Any, Final
+
+import ibis
+import pyarrow as pa
+
+from fleet_service.analytics.engines import QueryEngine, Table, has_value
+from fleet_service.analytics.options import Options
+from fleet_service.analytics.questions import before_after
+from schemas.thresholds import SLIPPERY_MU
+
+TYPES: Final[dict[str, pa.DataType]] = {
+    "month": pa.date32(),
+    "values": pa.int64(),
+    "vehicles": pa.int64(),
+    "mu_p50": pa.float64(),
+    "share_slippery": pa.float64(),
+    "difference": pa.float64(),
+    "lower": pa.float64(),
+    "upper": pa.float64(),
+    "cells": pa.int64(),
+}
+
+
+def expression(t: Table) -> Table:
+    """Return one row per month with values."""
+    t = t.filter(has_value(t)).select(
+        "cell", "sector", "vehicle", month=t.day.truncate("M"), y=t.mu.cast("float64")
+    )
+    return t.group_by("month").aggregate(
+        values=t.count(),
+        vehicles=t.vehicle.nunique(),
+        mu_p50=t.y.quantile(0.5),
+        share_slippery=ibis.ifelse(t.y < SLIPPERY_MU, 1.0, 0.0).mean(),
+    )
+
+
+def ask(engine: QueryEngine, options: Options) -> pa.Table:  # noqa: ARG001 as all questions have it
+    """Return one row per month; the difference is null where no cell has values of two vehicles in
+    both months.
+    """
+    t = engine.observations()
+    months = sorted(engine.answer(expression(t)).to_pylist(), key=lambda row: row["month"])
+    empty = dict.fromkeys(("difference", "lower", "upper", "cells"))
+    found: list[dict[str, Any]] = [{**row, **empty} for row in months]
+    for row, earlier in zip(found[1:], found, strict=False):
+        month = t.day.truncate("M")
+        both = t.filter((month == _as_date(row["month"])) | (month == _as_date(earlier["month"])))
+        begin = datetime.combine(_as_date(row["month"]), datetime.min.time(), UTC)
+        compared = before_after.expression(both, int(begin.timestamp()))
+        row.update(before_after.find_difference(engine.answer(compared).to_pylist()[0]))
+    return pa.Table.from_pylist(
+        [{**row, "month": _as_date(row["month"])} for row in found], schema=pa.schema(TYPES)
+    )
+
+
+def _as_date(month: date) -> date:
+    """Return a month's first day; one engine gives a date, the other a time."""
+    return month.date() if isinstance(month, datetime) else month
