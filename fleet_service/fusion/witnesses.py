@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from fleet_service.fusion.fuse import Fusion
 from fleet_service.fusion.neighbours import stretches
 from fleet_service.fusion.store.records import ICE, NONE, SOURCES
-from schemas.numeric import IntArray
+from schemas.numeric import BoolArray, IntArray
 
 
 def stretch_slots(fusion: Fusion, slots: IntArray) -> IntArray:
@@ -17,24 +19,39 @@ def stretch_slots(fusion: Fusion, slots: IntArray) -> IntArray:
     return stretches(fusion.store.state.live, fusion.store.table, slots)
 
 
-def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the sources of ice on the stretches around slots (k,), newest first: index of the
-    vehicle and time [ns] of its newest report after `since` (k,); time 0 where there is none.
+class StretchSources(NamedTuple):
+    """Sources of ice on the stretches around k slots, the newest first.
+
+    Attributes:
+        who: index of the vehicle, (k, n).
+        when: time of its newest report [ns], (k, n); 0 where there is none.
+        around: True for slots with sources both before and behind them, (k,).
+    """
+
+    who: IntArray
+    when: IntArray
+    around: BoolArray
+
+
+def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> StretchSources:
+    """Return the sources of ice on the stretches around slots (k,) after `since` (k,) [ns]; a
+    vehicle counts once.
     """
     along = stretch_slots(fusion, slots)
-    places = along.shape[1] * SOURCES
-    who, when = fusion.find_sources(
-        np.maximum(along, 0).ravel(), ICE, np.repeat(since, along.shape[1])
-    )
-    when = np.where(along.reshape(-1, 1) == NONE, 0, when).reshape(-1, places)
-    who, when = _newest_first(who.reshape(-1, places), when)
+    places = along.shape[1]
+    who, when = fusion.find_sources(np.maximum(along, 0).ravel(), ICE, np.repeat(since, places))
+    when = np.where(along.reshape(-1, 1) == NONE, 0, when).reshape(-1, places, SOURCES)
+    found = when.max(axis=2) > 0
+    middle = 1 + places // 2
+    around = found[:, 1:middle].any(axis=1) & found[:, middle:].any(axis=1)
+    who, when = _newest_first(who.reshape(-1, places * SOURCES), when.reshape(-1, places * SOURCES))
     again = np.tril(who[:, :, None] == who[:, None, :], -1).any(axis=2)
-    return _newest_first(who, np.where(again, 0, when))
+    return StretchSources(*_newest_first(who, np.where(again, 0, when)), around)
 
 
 def witnesses_of(fusion: Fusion, slot: int, since: int) -> list[int]:
     """Return the numbers of the sources of ice on the stretch around a slot after `since` [ns]."""
-    who, when = stretch_sources(fusion, np.array([slot]), np.array([since]))
+    who, when, _ = stretch_sources(fusion, np.array([slot]), np.array([since]))
     return [int(fusion.store.names["key"][index]) for index in who[0][when[0] > 0].tolist()]
 
 

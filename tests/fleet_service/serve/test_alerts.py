@@ -209,6 +209,21 @@ def test_one_source_of_ice_in_each_of_two_cells_of_a_stretch_is_enough(
     assert [slot in alerts.slots for slot in slots.tolist()] == alerted
 
 
+def test_a_cell_between_two_sources_needs_none_of_its_own() -> None:
+    fusion = Fusion(120.0)
+    alerts = Alerts(fusion)
+    cells = grid.interleave(COLUMN + np.arange(4), np.full(4, ROW))
+    bounds = at_least(np.array([0.1]))
+    for step in (1, 3):
+        fusion.update(observations([float(step)], [9], bounds, int(cells[step])))
+    for vehicle, step in ((1, 0), (2, 2)):
+        seconds = [10.0 * vehicle]
+        updated = fusion.update(observations(seconds, [vehicle], value([0.2]), int(cells[step])))
+        alerts.update(updated.slots)
+    slots = fusion.slots_of(cells, np.zeros(4, np.int64))
+    assert [slot in alerts.slots for slot in slots.tolist()] == [True, True, True, False]
+
+
 def test_one_vehicle_along_a_stretch_raises_no_alert() -> None:
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)
