@@ -28,7 +28,7 @@ MIDDLING: Final = 0.6  # ... two
 EDGES: Final = (0.2, SLIPPERY_MU, 0.6)  # ice | snow | wet | dry (Pacejka 2012, ch. 1)
 KNOWN_SLIPPERY: Final = 0.5  # of P(mu < SLIPPERY_MU), above which a place is never drawn as unknown
 ALERT: Final = "#c4003a"
-DARK_ALERT: Final = "#ff5c7a"
+DARK_ALERT: Final = "#ff6b86"
 
 
 def colour_of(mu: float, lower: float, upper: float, p_slippery: float = 0.0) -> str:

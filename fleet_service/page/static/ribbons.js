@@ -5,6 +5,8 @@ import { metresPerWorld } from "./grid.js";
 import { isNone } from "./roads.js";
 
 const LANE_M = 3.4, SHARE = [1, 1, 1, 1, .7, .7, .34, .34], ARROW_PX = 110, ARROWS_PX = 9, SIDEWAYS = .56;
+// Kinds that are too near the ground in lightness without an edge (WCAG 1.4.11 asks for 3 : 1).
+const EDGED = [2, 3, 5, 6];
 
 export function ribbonWidth(view) {
   return Math.max(4.5, Math.min(26, LANE_M * view.scale / metresPerWorld(view.y)));
@@ -57,9 +59,10 @@ export function ribbons(pen, view, roads) {
   const line = (kind, width, colour) => { pen.lineWidth = width; pen.strokeStyle = colour; pen.stroke(paths[kind]); };
   line(HOLLOW, Math.max(3, wide * SHARE[HOLLOW]), ink.bound);
   line(HOLLOW, Math.max(1.2, wide * SHARE[HOLLOW] - 2.2), ground);
-  line(LITTLE, Math.max(2.5, wide * SHARE[LITTLE]), colours[LITTLE]);
+  line(LITTLE, Math.max(3, wide * SHARE[LITTLE]), ink.bound);
+  line(LITTLE, Math.max(1.2, wide * SHARE[LITTLE] - 2.2), colours[LITTLE]);
   pen.lineCap = "round";
-  for (const kind of [...DANGER].reverse()) if (kind < LITTLE) line(kind, wide * SHARE[kind] + 2, ink.casing);
+  for (const kind of [...DANGER].reverse()) if (kind < LITTLE) line(kind, wide * SHARE[kind] + 2, EDGED.includes(kind) ? ink.bound : ink.casing);
   for (const kind of [...DANGER].reverse()) if (kind < LITTLE) line(kind, wide * SHARE[kind], colours[kind]);
   pen.lineCap = "butt";
   for (const [x, y, ax, ay, kind] of arrows) arrow(pen, x, y, ax, ay, wide * .26, contrastOf(colours[kind]));
