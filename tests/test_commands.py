@@ -6,10 +6,12 @@ import importlib
 import json
 import os
 import pty
+import re
 import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,9 +21,11 @@ import pytest
 
 import edge_agent.cli
 import fleet_service.cli
+from deploy.demo.processes import DemoError, ManagedProcess
 from schemas.errors import InputError
 from schemas.runtime import commandline
 from tests.fleet_service.archive.kept import DATA
+from tests.structure import ROOT
 
 LINES: Final[dict[str, Any]] = {"edge-agent": edge_agent.cli, "fleet-service": fleet_service.cli}
 EXAMPLES: Final = [(name, c.name, c.example) for name, line in LINES.items() for c in line.COMMANDS]
@@ -338,6 +342,17 @@ def test_demo_and_plain_commands_load_without_optional_packages(modules: str) ->
     hidden = "import sys; sys.modules.update(dict.fromkeys(('scipy', 'matplotlib', 'ibis')))"
     command = [sys.executable, "-c", f"{hidden}; import {modules}"]
     subprocess.run(command, check=True, capture_output=True)
+
+
+def test_demo_extra_brings_what_its_processes_need(tmp_path: Path) -> None:
+    """The demo's service shows metrics; a part that cannot start gives its reason."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    names = {re.split(r"[<>=]", one)[0] for one in extras["optional-dependencies"]["demo"]}
+    assert {"prometheus-client", "starlette", "uvicorn"} <= names
+    failing = [sys.executable, "-c", "print('error: metrics_port: is missing')"]
+    part = ManagedProcess("service", failing, tmp_path)
+    with pytest.raises(DemoError, match="ends with: error: metrics_port: is missing"):
+        part.line_with("ready")
 
 
 def test_no_command_reports_the_threads_of_a_library() -> None:

@@ -68,6 +68,4 @@ def run(args: argparse.Namespace) -> int:
     try:
         return story.run(args)
     except processes.DemoError as error:
-        raise InputError(
-            "demo", str(error), "read that log; its last line gives the reason"
-        ) from error
+        raise InputError("demo", str(error), "correct the reason, or read the whole log") from error

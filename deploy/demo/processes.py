@@ -54,7 +54,8 @@ class ManagedProcess:
             if self.process.poll() is not None:
                 break
             time.sleep(0.05)
-        raise DemoError(f"{self.name} did not print {start!r}; see {self.log}")
+        last = next(reversed(self.lines()), "no output")
+        raise DemoError(f"{self.name} did not print {start!r}; {self.log} ends with: {last}")
 
     def wait(self, every_s: float, tick: Callable[[], None]) -> int:
         """Wait for the end, calling `tick` now and then; return the exit code."""

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import unquote, urlsplit
 
 from schemas.errors import InputError
 from schemas.runtime.installing import install_command
@@ -21,9 +22,8 @@ from schemas.runtime.installing import install_command
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
 
-SCHEMES: Final = re.compile(
-    r"(s3|gs|az|abfss?)://[^/]+"
-)  # a folder or memory would not be a second place
+# a folder of this machine is no second place: it is for trials
+SCHEMES: Final = re.compile(r"(s3|gs|az|abfss?)://[^/]+|file:///.")
 CONNECT_S: Final = 2.0
 _ENDPOINTS: Final = ("AWS_ENDPOINT_URL", "AWS_ENDPOINT")
 _TOOK: Final = re.compile(r" in [\d.]+[^\s\d.]*s\b")
@@ -38,7 +38,7 @@ class ObjectBucket:
     """Objects below a URL.
 
     Args:
-        url: for example s3://bucket/folder.
+        url: for example s3://bucket/folder; file:///folder is for trials on one machine.
         options: of obstore, in addition to the environment: endpoint, region, access_key_id …
         timeout_s: of one request in total.
         retries: of a failed request.
@@ -54,12 +54,12 @@ class ObjectBucket:
             raise InputError(
                 "archive.copy",
                 f"{url} is not the URL of a bucket",
-                "give a URL such as s3://bucket/folder",
+                "give a URL such as s3://bucket/folder, or file:///folder to try it",
             )
         try:
             import obstore
             from obstore.exceptions import AlreadyExistsError, BaseError, NotFoundError
-            from obstore.store import from_url
+            from obstore.store import LocalStore, from_url
         except ImportError as error:
             fix = install_command("objects")
             raise InputError(
@@ -83,8 +83,10 @@ class ObjectBucket:
         retry: Any = {"max_retries": retries, "retry_timeout": timedelta(seconds=timeout_s)}
         given: Any = dict(options)
         try:
-            self._store: ObjectStore = from_url(
-                url, config=given, client_options=client, retry_config=retry
+            self._store: ObjectStore = (
+                LocalStore(unquote(urlsplit(url).path), mkdir=True)
+                if url.startswith("file://")
+                else from_url(url, config=given, client_options=client, retry_config=retry)
             )
         except (BaseError, ValueError, TypeError) as error:
             fix = "see `store` in the settings; credentials may come from the environment"

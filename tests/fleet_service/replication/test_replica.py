@@ -221,12 +221,29 @@ def test_a_bucket_that_is_away_at_the_start_is_told_and_nothing_hangs(
     assert SECRET not in str(told.value)
 
 
+def test_folder_of_this_machine_serves_as_a_bucket_for_trials(tmp_path: Path) -> None:
+    pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
+    copy = ObjectBucket((tmp_path / "a bucket" / "north").as_uri(), {}, 5.0)
+    assert copy.get("lease/1") is None
+    assert copy.create("lease/1", b"mine")
+    assert copy.create("lease/1", b"mine"), "the same content again"
+    assert not copy.create("lease/1", b"another service's")
+    copy.put("log/2", b"first")
+    copy.put("log/2", b"second")
+    assert sorted(copy.list_names("lease") + copy.list_names("log")) == ["lease/1", "log/2"]
+    assert b"".join(copy.read_parts("log/2")) == b"second"
+    copy.delete("log/2")
+    copy.delete("log/2")
+    assert copy.list_sizes() == {"lease/1": 4}
+    assert (tmp_path / "a bucket" / "north" / "lease" / "1").read_bytes() == b"mine"
+
+
 def test_settings_that_cannot_be_used_say_which_and_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
     for url, store, field in [
-        ("file:///elsewhere", {}, "archive.copy"),
+        ("ftp://elsewhere/folder", {}, "archive.copy"),
         ("s3://", {}, "archive.copy"),
         ("s3://bucket", {"endpiont": SECRET}, "archive.store"),
     ]:
