@@ -208,12 +208,62 @@ def silent_seconds(house: House) -> float:
     return max(found.values())
 
 
+def build_wheel(house: House) -> Path:
+    """Return the wheel of this tree; it is built once."""
+    built = house.folder / "dist"
+    if not list(built.glob("*.whl")):
+        build = [sys.executable, "-m", "build", "--wheel", "--outdir", str(built), str(ROOT)]
+        subprocess.run(build, check=True, capture_output=True)
+    (wheel,) = built.glob("*.whl")
+    return wheel
+
+
+def install_demo(house: House) -> Path:
+    """Return an environment with what `gripmap demo` needs; it is made once."""
+    place = house.folder / "demo-venv"
+    if not place.exists():
+        wheel = build_wheel(house)
+        venv.create(place, with_pip=True)
+        pip = [str(place / "bin" / "python"), "-m", "pip", "install", "--quiet", "--constraint"]
+        command = [*pip, str(ROOT / "constraints.txt"), f"{wheel}[demo,page]"]
+        subprocess.run(command, check=True, capture_output=True)
+    return place
+
+
+def install_mb(house: House) -> float:
+    """Size of an environment that runs the demo, without the pip in it."""
+    site = next(install_demo(house).glob("lib/*/site-packages"))
+    ignored = ("pip", "pip-", "setuptools", "_distutils_hack", "pkg_resources")
+    files = (
+        file
+        for folder in site.iterdir()
+        if not folder.name.startswith(ignored)
+        for file in (folder.rglob("*") if folder.is_dir() else [folder])
+    )
+    return sum(file.stat().st_size for file in files if file.is_file()) / 1e6
+
+
+def install_packages(house: House) -> float:
+    """Number of packages in that environment, this one included, pip and setuptools not."""
+    site = next(install_demo(house).glob("lib/*/site-packages"))
+    names = {path.name.partition("-")[0].lower() for path in site.glob("*.dist-info")}
+    house.print_measured("packages", sorted(names))
+    return float(len(names - {"pip", "setuptools"}))
+
+
+def silent_reasons(house: House) -> float:
+    """Return how many planted causes why nothing is published are named within five seconds."""
+    path = "tests/edge_agent/app/test_publishing_reasons.py"
+    command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "-k", "planted_cause", path]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    house.print_measured("reasons", done.stdout[-200:])
+    passed = re.search(r"(\d+) passed", done.stdout)
+    return float(passed[1]) if passed else float("nan")
+
+
 def install_to_first_map_s(house: House) -> float:
     """Measure the way from an empty environment and a wheel to a map in a browser."""
-    built = house.folder / "dist"
-    build = [sys.executable, "-m", "build", "--wheel", "--outdir", str(built), str(ROOT)]
-    subprocess.run(build, check=True, capture_output=True)
-    (wheel,) = built.glob("*.whl")
+    wheel = build_wheel(house)
     began = time.monotonic()
     place = house.folder / "venv"
     venv.create(place, with_pip=True)
@@ -286,6 +336,9 @@ PARTS: Final[dict[str, tuple[Callable[[House], float], str, float, str]]] = {
     "silent_seconds": (silent_seconds, "s", 2, "less"),
     "service_ready_s": (service_ready_s, "s", 8, "less"),
     "install_to_first_map_s": (install_to_first_map_s, "s", 90, "less"),
+    "install_mb": (install_mb, "MB", 600, "less"),
+    "install_packages": (install_packages, "", 45, "less"),
+    "silent_reasons": (silent_reasons, "of 8 planted causes", 8, "more"),
     "options_undocumented": (options_undocumented, "", 0, "less"),
     "figures_stale": (figures_stale, "", 0, "less"),
     "first_drive_commands": (first_drive_commands, "", 5, "less"),

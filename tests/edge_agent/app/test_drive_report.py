@@ -25,6 +25,7 @@ from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, Health, S
 from schemas.tables import ESTIMATES_SCHEMA
+from tests.browser import DESK, open_page
 
 ROWS = 4000
 START_NS = 1_700_000_000 * 10**9
@@ -107,3 +108,16 @@ def test_an_unknown_ending_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="known ending"):
         write_report(drive_of(), tmp_path / "drive.xls")
     assert drive_report.ENDINGS == (".html", ".png", ".svg", ".pdf")
+
+
+def test_straight_drive_leaves_all_values_in_the_window(tmp_path: Path) -> None:
+    """A track straight to the north is no taller than the window."""
+    write_report(drive_of(), tmp_path / "drive.html")
+    with open_page(tmp_path / "drive.html") as seen:
+        box = seen.page.locator("#track svg").bounding_box()
+        values = seen.page.locator("#values").bounding_box()
+    assert box is not None
+    assert values is not None
+    assert box["height"] < 0.6 * DESK["height"]
+    assert values["y"] + values["height"] <= DESK["height"]
+    assert seen.errors == []
