@@ -50,9 +50,9 @@ def test_every_pinned_version_has_its_hashes() -> None:
     pinned = re.findall(r"^\S+==\S+", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
     hashed = (ROOT / "deploy" / "constraints-hashes.txt").read_text()
     found = re.findall(r"^(\S+==\S+) \\\n +--hash=sha256:", hashed, re.MULTILINE)
-    assert sorted(map(normalise, pinned)) == sorted(map(normalise, found))
+    assert sorted(map(normalise_name, pinned)) == sorted(map(normalise_name, found))
 
 
-def normalise(requirement: str) -> str:
+def normalise_name(requirement: str) -> str:
     name, _, version = requirement.partition("==")
     return f"{re.sub('[-_.]+', '-', name).lower()}=={version}"

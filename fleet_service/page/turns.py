@@ -1,8 +1,10 @@
-"""Turns for questions about the past, because a service rebuilds one past map at a time.
+"""Turns for requests, so that one client does not take the page, or the past, from the others.
 
-The page asks one question at a time, in the order of arrival, and holds at most MOST_WAITING of one
-client. After each question it pauses for as long as the question took, so that other readers of the
-service get their turn as well.
+At most RUNNING requests of one client are computed at a time; the others wait, one a connection.
+
+A service rebuilds one past map at a time. The page asks one question at a time, in the order of
+arrival, and holds at most MOST_WAITING of one client. After each question it pauses for as long as
+the question took, so that other readers of the service get their turn as well.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Final
 
+RUNNING: Final = 4
 MOST_WAITING: Final = 2  # of one client: one that is answered, and one that waits
 MOST_CLIENTS: Final = 32
 LONGEST_PAUSE_S: Final = 2.0
@@ -21,6 +24,26 @@ LONGEST_PAUSE_S: Final = 2.0
 
 class TooManyQuestionsError(Exception):
     """A client, or all clients together, have too many questions waiting."""
+
+
+class RequestTurns:
+    """Turns of all clients; used in one event loop."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._free: dict[str, asyncio.Semaphore] = {}
+
+    @asynccontextmanager
+    async def take(self, client: str) -> AsyncIterator[None]:
+        """Wait for a turn and hold it while the block runs."""
+        self._counts[client] += 1
+        try:
+            async with self._free.setdefault(client, asyncio.Semaphore(RUNNING)):
+                yield
+        finally:
+            self._counts[client] -= 1
+            if not self._counts[client]:
+                del self._counts[client], self._free[client]
 
 
 class PastTurns:

@@ -29,6 +29,7 @@ from fleet_service.page.moments import Moments
 from fleet_service.page.ogc import FeatureRoutes
 from fleet_service.page.reader import Reader
 from fleet_service.page.roads import RoadMap, learned_lines
+from fleet_service.page.turns import RequestTurns
 from fleet_service.page.watchers import TooManyWatchersError, Watchers
 from schemas import grid, keys
 from schemas.errors import InputError, WireError
@@ -84,8 +85,9 @@ def make_application(
         "/base/{z:int}/{x:int}/{y:int}": routes.picture,
         **routes.features.paths(),
     }
+    turns = RequestTurns()
     app = Starlette(
-        routes=[Route(path, with_errors(answer)) for path, answer in paths.items()],
+        routes=[Route(path, with_turns(turns, answer)) for path, answer in paths.items()],
         lifespan=lifespan,
     )
     return Guarded(
@@ -302,14 +304,19 @@ class Routes:
         return JSONResponse(await run_in_threadpool(overlay.read_overlay, self._of.overlay))
 
 
-def with_errors(
-    answer: Callable[[Request], Awaitable[Response]],
+def with_turns(
+    turns: RequestTurns, answer: Callable[[Request], Awaitable[Response]]
 ) -> Callable[[Request], Awaitable[Response]]:
-    """Wrap a handler so that a bad request gets an answer with the problem and the fix."""
+    """Wrap a handler so that a client waits for its turn, and a bad request gets an answer with
+    the problem and the fix.
+    """
 
     async def answer_or_refuse(request: Request) -> Response:
         try:
-            return await answer(request)
+            async with turns.take(request.client.host if request.client else ""):
+                if await request.is_disconnected():
+                    return Response(status_code=408)
+                return await answer(request)
         except (InputError, WireError) as error:
             return PlainTextResponse(f"{error}\n", 400)
 

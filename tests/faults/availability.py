@@ -238,6 +238,6 @@ ATTACKS: Final[dict[str, tuple[Callable[[Target], Attack], Callable[[Target], bo
     "borrowed tiles": (_loop_borrowed, _ask_cells),
     "half questions": (_hold_half_questions, _ask_start),
     "half second questions": (_hold_second_questions, _ask_start),
-    "unread answers": (_hold_unread_answers, _ask_start),
+    "unread answers": (_hold_unread_answers, _ask_cells),
     "streams": (_hold_streams, _ask_events),
 }

@@ -16,7 +16,13 @@ import uvicorn
 from fleet_service.page import connections
 from fleet_service.page.connections import BoundedProtocol, RareMessages, report_loop_error
 from fleet_service.page.map_mirror import MapMirror
-from fleet_service.page.turns import MOST_WAITING, PastTurns, TooManyQuestionsError
+from fleet_service.page.turns import (
+    MOST_WAITING,
+    RUNNING,
+    PastTurns,
+    RequestTurns,
+    TooManyQuestionsError,
+)
 from fleet_service.page.watchers import TooManyWatchersError, View, Watchers
 
 VIEW = View((-180.0, -85.0, 180.0, 85.0), 0)
@@ -46,6 +52,31 @@ def test_client_with_many_questions_does_not_keep_others_from_the_past() -> None
     assert served.count("greedy") == MOST_WAITING + 1
     assert served.count("greedy refused") == 8 - MOST_WAITING
     assert all(served.count(f"other-{k}") == 1 for k in range(8))
+
+
+def test_client_with_many_requests_waits_while_another_is_answered() -> None:
+    async def count_running() -> int:
+        turns = RequestTurns()
+        gate = asyncio.Event()
+        running: list[str] = []
+
+        async def hold_turn(client: str) -> None:
+            async with turns.take(client):
+                running.append(client)
+                await gate.wait()
+
+        asked = [asyncio.create_task(hold_turn("greedy")) for _ in range(3 * RUNNING)]
+        asked.append(asyncio.create_task(hold_turn("other")))
+        while "other" not in running:
+            await asyncio.sleep(0)
+        at_once = running.count("greedy")
+        gate.set()
+        await asyncio.gather(*asked)
+        assert not turns._free
+        assert running.count("greedy") == 3 * RUNNING
+        return at_once
+
+    assert asyncio.run(count_running()) == RUNNING
 
 
 def test_full_page_takes_a_stream_from_the_client_with_most() -> None:
@@ -137,12 +168,12 @@ def test_connection_that_does_not_end_its_second_request_is_closed(
 ) -> None:
     monkeypatch.setattr(connections, "HEAD_S", 0.2)
 
-    async def answer(_: object, __: object, send: Any) -> None:  # noqa: ANN401 as ASGI has it
+    async def answer_empty(_: object, __: object, send: Any) -> None:  # noqa: ANN401 as ASGI has it
         await send({"type": "http.response.start", "status": 204, "headers": []})
         await send({"type": "http.response.body"})
 
-    async def run() -> bytes:
-        config = uvicorn.Config(answer, http=BoundedProtocol, lifespan="off", ws="none")
+    async def send_both() -> bytes:
+        config = uvicorn.Config(answer_empty, http=BoundedProtocol, lifespan="off", ws="none")
         server = uvicorn.Server(config)
         config.load()
         server.lifespan = config.lifespan_class(config)
@@ -158,7 +189,7 @@ def test_connection_that_does_not_end_its_second_request_is_closed(
         await server.shutdown([listening])
         return head
 
-    assert asyncio.run(run()).startswith(b"HTTP/1.1 204")
+    assert asyncio.run(send_both()).startswith(b"HTTP/1.1 204")
 
 
 def test_repeated_messages_are_logged_once_in_a_while(
