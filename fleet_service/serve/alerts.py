@@ -19,21 +19,21 @@ from schemas.numeric import BoolArray, IntArray
 from schemas.thresholds import NS, SLIPPERY_MU
 from schemas.wire import Alert
 
-# P(slippery). Of the slippery cell-minutes of eight tuning towns .907 were under alert with .9, .936
-# with .7; as many alerts were right (.92), and false ice and attacks were the same.
-RAISE_ABOVE: Final = 0.7
+# P(slippery). Of 20 tuning fleets that take a wet curve gently on winter tyres, one raises a false
+# alert with .9, nine with .8. With .7, .96 of the slippery cell-minutes below are under alert.
+RAISE_ABOVE: Final = 0.9
 # ... and by its own reports alone no less than without any
 LIKELY: Final = float(SLIPPERY_SHARE @ PRIOR)
 CLEAR_BELOW: Final = 0.05  # grip must be as sure as ice was: clearing too early is the dearer error
 # an alert without confirmation ends as soon as ice is less likely than grip
 FADE_BELOW: Final = 0.5
 # Distinct vehicles that reported ice, here or, unless a source of grip opposes, on the stretch: one
-# liar, or one bad sensor, moves nothing. With the stretch .962 of those cell-minutes are under
-# alert, and .54 instead of .46 of the slippery cells of four tuning ways (no false alert).
+# liar, or one bad sensor, moves nothing. Of the slippery cell-minutes of eight tuning towns .926 are
+# under alert with the stretch, .907 without.
 LEAST_SOURCES: Final = 2
-# ... and one more for each opposite source that is not older than they are by this: a road changes,
-# so that earlier visits do not contradict it. With one minute instead of ten, three trusted
-# vehicles that flood a dry cell raised an alert in two of six tuning towns; with ten in none.
+# ... and MOST_SOURCES here where a source of grip is not older than they are by this: a road changes,
+# so that earlier visits do not contradict it. With one minute instead of ten, three trusted vehicles
+# that flood a dry cell raised an alert in two of six tuning towns.
 FRESH_NS: Final = 600 * NS
 MOST_SOURCES: Final = 4
 SOURCE_NS: Final = 3600 * NS  # sources count for an hour; older ice belongs to an older road
@@ -89,7 +89,7 @@ class Alerts:
         time = self._fusion.live.time[slots]
         slippery = self._fusion.slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
-        likely = self._suspects(slots[(slippery > LIKELY) & ~standing])
+        likely = self._suspects(slots[slippery > LIKELY])
         likely = likely[self._fusion.beliefs_for_alerts(likely) @ SLIPPERY_SHARE > RAISE_ABOVE]
         believed = self._fusion.beliefs_at_last_report(likely) @ SLIPPERY_SHARE
         now = time.max(initial=0)  # of an alert to which an update beside its cell led
@@ -133,8 +133,9 @@ class Alerts:
         near = near[~np.isin(near, np.fromiter(self._standing, np.int64, len(self._standing)))]
         own = self._own_sources(near, ICE)
         against = self._own_sources(near, GRIP)
-        opposed = (against > own[:, 1:2] - FRESH_NS).sum(axis=1)
-        enough = (own > 0).sum(axis=1) >= np.minimum(LEAST_SOURCES + opposed, MOST_SOURCES)
+        opposed = against[:, 0] > own[:, 1] - FRESH_NS
+        needed = np.where(opposed, MOST_SOURCES, LEAST_SOURCES)
+        enough = (own > 0).sum(axis=1) >= needed
         along = stretch_sources(fusion, near, fusion.live.time[near] - SOURCE_NS)
         second = along.when[:, 1]
         enough |= (second > 0) & (against[:, 0] <= second - FRESH_NS)

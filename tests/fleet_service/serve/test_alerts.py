@@ -216,7 +216,7 @@ def test_a_cell_between_two_sources_needs_none_of_its_own() -> None:
     bounds = at_least(np.array([0.1]))
     for step in (1, 3):
         fusion.update(observations([float(step)], [9], bounds, int(cells[step])))
-    for vehicle, step in ((1, 0), (2, 2)):
+    for vehicle, step in ((1, 0), (2, 2), (3, 0), (4, 2)):
         seconds = [10.0 * vehicle]
         updated = fusion.update(observations(seconds, [vehicle], value([0.2]), int(cells[step])))
         alerts.update(updated.slots)
