@@ -97,6 +97,8 @@ class WheelSlip:
     held: float  # membership of the last second in "a wheel slides" [1]
     begins: float  # what this block adds to it [1]
     ended: float  # what of it this block no longer shows [1]
+    axle_held: float  # membership of the last second in "an axle slides on a slippery road" [1]
+    axle_ended: float  # what of it this block no longer shows, though its force is the same [1]
     rear_unlike_until: (
         float  # time until which the rear axle is on another surface than the front axle [s]
     )
@@ -157,6 +159,9 @@ class MixtureMemory:
     last_side: Annotated[FloatArray, 2]  # side force over load of the axles in the block before [1]
     usual_rolling: Annotated[FloatArray, 4]  # speed ahead by each wheel, smoothed [m/s]
     usual_force: Annotated[FloatArray, 6]  # force over load of wheels and axles, smoothed [1]
+    usual_slip: Annotated[
+        FloatArray, 2
+    ]  # of axles, across, as linear force over load, smoothed [1]
     # force over load of the axles, along and across, smoothed [1]
     axle_force: Annotated[FloatArray, 2, 2]
     drive_odds: Annotated[

@@ -42,9 +42,9 @@ from edge_agent.estimators.friction_mixture.trust import (
     update_consistency,
 )
 from edge_agent.estimators.friction_mixture.used_grip import used_grip
-from edge_agent.estimators.friction_mixture.weighing import apply_measurement
+from edge_agent.estimators.friction_mixture.weighing import apply_measurement, update_novelty
 from edge_agent.estimators.friction_mixture.wheel_slip import update_slip
-from edge_agent.estimators.friction_mixture.workspace import Scratch
+from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
@@ -71,6 +71,8 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     health = block_features(memory, design, features)
     learn_drive(memory, design.constants, features)
     update_slip(memory, design.constants, features)
+    vx, vy = block_velocity(memory, features)
+    update_novelty(memory, design, features, vx, vy)
     watch_wheels(memory, design.constants, features)
     wake_or_sleep(memory, design, scratch)
     apply_road_change(memory, design, scratch, features.speed * features.duration)
@@ -180,6 +182,17 @@ def _find_side(
     project_weights(memory.weight, design.sides.share[side], scratch.projected)
     alike = nominal_agreement(memory.trust, design.constants)
     find_interval(design, scratch.projected, memory.patch, scratch.blended, alike, friction)
+
+
+@compiled
+def block_velocity(memory: MixtureMemory, features: BlockFeatures) -> tuple[float, float]:
+    """Return the mean (v_x, v_y) [m/s] of the mixture over the block."""
+    x = memory.overall_mean
+    gained_x, gained_y = gained_velocity(features.gain, x)
+    return (
+        features.cos * x[NodeState.VX] + features.sin * x[NodeState.VY] + gained_x,
+        features.cos * x[NodeState.VY] - features.sin * x[NodeState.VX] + gained_y,
+    )
 
 
 @compiled

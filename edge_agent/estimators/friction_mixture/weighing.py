@@ -1,5 +1,10 @@
 """Weights of the friction nodes after a block: likelihoods tempered by the rules, and the
 adaptation of R.
+
+Errors of the tyre curve and of offsets repeat from block to block while nothing changes, so the
+evidence of such blocks counts less. Where a bend turns to ice the forces stay and the slip grows,
+so either may be new. Where an axle has slid and grips again at the same force, the ice has probably
+ended (`mixing.py`).
 """
 
 from __future__ import annotations
@@ -8,7 +13,10 @@ import math
 
 from edge_agent.adaptation.fuzzy import adapted_factor
 from edge_agent.adaptation.rule_base import evidence_share
-from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
+from edge_agent.dynamics.parameters import Parameter
+from edge_agent.dynamics.slip import SLOWEST_M_S as SLOWEST_SLIP_M_S
+from edge_agent.dynamics.tyres import TINY
+from edge_agent.estimators.friction_mixture.constants import NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.friction_grid import multiply_likelihood
 from edge_agent.estimators.friction_mixture.grip_guard import guard_penalty
@@ -18,7 +26,7 @@ from edge_agent.estimators.friction_mixture.mixing import active_nodes, reset_di
 from edge_agent.estimators.friction_mixture.node_filter import update_node
 from edge_agent.estimators.friction_mixture.restart import SLOWEST_M_S
 from edge_agent.estimators.friction_mixture.rolling_motion import take_rolling
-from edge_agent.estimators.friction_mixture.trust import used_evidence_share
+from edge_agent.estimators.friction_mixture.trust import slippery_probability, used_evidence_share
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
 from edge_agent.filters.cholesky import factorize
 from schemas.numeric import FloatArray
@@ -56,7 +64,6 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
     rows = 0
     features = scratch.features
     steady = design.constants.steady_share
-    features.new = force_novelty(memory.usual_force, features, design.constants)
     features.novelty = steady + (1.0 - steady) * features.new
     for j in range(count):
         factorize(memory.covariance[j], scratch.root[j], LEAST_VARIANCE)
@@ -144,18 +151,62 @@ def slip_meaning(features: BlockFeatures, vx: float) -> float:
 
 
 @compiled
-def force_novelty(usual: FloatArray, features: BlockFeatures, constants: Constants) -> float:
-    """Return the membership of the forces in "new": compared with their smoothed past `usual` (6,),
-    which is advanced by a block.
+def update_novelty(
+    memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures, vx: float, vy: float
+) -> None:
+    """Set features.new and memory.slip.axle_ended, and advance the usual forces and slips by a
+    block of mean velocity (vx, vy) [m/s].
     """
+    constants = design.constants
     keep = math.exp(-features.duration / constants.steady_time)
-    most = 0.0
+    force = slip = slides = 0.0
     for r in range(6):
-        force = features.force[r] if r < 4 else features.side[r - 4]
-        if not math.isnan(force):
-            most = max(most, abs(force - usual[r]))
-            usual[r] = keep * usual[r] + (1.0 - keep) * force
-    return most * most / (most * most + constants.steady_half**2)
+        now = features.force[r] if r < 4 else features.side[r - 4]
+        force = max(force, advance_usual(memory.usual_force, r, now, keep))
+    for axle in range(2):
+        now = axle_slip(memory.row, features, vx, vy, axle)
+        slip = max(slip, advance_usual(memory.usual_slip, axle, now, keep))
+        slides = max(slides, saturation(now, memory.friction.median))
+    change = max(force, slip)
+    features.new = change**2 / (change**2 + constants.steady_half**2)
+    slides *= slippery_probability(memory, design)
+    held = memory.slip.axle_held * math.exp(-features.duration / constants.slip_time)
+    memory.slip.axle_held = max(slides, held)
+    steady = min(max(2.0 - 2.0 * force / max(features.demand, TINY), 0.0), 1.0)
+    memory.slip.axle_ended = (memory.slip.axle_held - slides) * steady
+
+
+@compiled
+def saturation(slip: float, mu: float) -> float:
+    """Return the membership of an axle on friction `mu` in "slides": 0 up to a slip (linear force
+    over load) of mu, 1 from 1.5 mu on; 0 where the slip is unknown.
+    """
+    return 0.0 if math.isnan(slip) else min(max(2.0 * (abs(slip) / mu - 1.0), 0.0), 1.0)
+
+
+@compiled
+def advance_usual(usual: FloatArray, i: int, now: float, keep: float) -> float:
+    """Return the distance of `now` from usual[i], and move that towards it; 0 without a reading."""
+    if math.isnan(now):
+        return 0.0
+    apart = abs(now - usual[i])
+    usual[i] = keep * usual[i] + (1.0 - keep) * now
+    return float(apart)
+
+
+@compiled
+def axle_slip(row: FloatArray, features: BlockFeatures, vx: float, vy: float, axle: int) -> float:
+    """Return the lateral slip of an axle at the motion (vx, vy) [m/s], as linear force over load;
+    NaN where its side force is unknown.
+    """
+    if math.isnan(features.side[axle]):
+        return math.nan
+    place = row[Parameter.TO_FRONT] if axle == 0 else -row[Parameter.TO_REAR]
+    left = vy + place * features.yaw_rate
+    cos = features.steer_cos[2 * axle]
+    sin = features.steer_sin[2 * axle]
+    speed = max(abs(cos * vx + sin * left), SLOWEST_SLIP_M_S)
+    return float(-row[Parameter.SLOPE_Y] * (cos * left - sin * vx) / speed)
 
 
 @compiled

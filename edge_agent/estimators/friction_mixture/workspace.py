@@ -33,8 +33,8 @@ class BlockFeatures:
     sin: float
     gain: VelocityGain  # mean over the block
     yaw_rate: float  # mean [rad/s]
-    novelty: float  # share of the forces that is new, with the floor `steady_share` [1]
-    new: float  # membership of the forces in "new" [1]
+    novelty: float  # share of the block that is new, with the floor `steady_share` [1]
+    new: float  # membership of forces and lateral slips in "new" [1]
     demand: float  # larger force over load of the two axles [1]
     change: float  # measured a_x, mean [m/s^2]
     steering: float  # mean angle of the front wheels [rad]

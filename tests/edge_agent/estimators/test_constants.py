@@ -65,19 +65,19 @@ MOVES = {
     "demand_power": Move(
         "penalty", "acceleration", 0.5
     ),  # above the threshold all is evidence, nothing is charged
-    "plausible_loss": Move("least probabilities", "constant-radius", 1.09),
+    "plausible_loss": Move("least probabilities", "constant-radius", 1.03),
     "largest_loss": Move("least probabilities", "j-turn", 0.3),
-    "steady_time": Move("width", "constant-radius", 0.9),  # the force is new for longer
+    "steady_time": Move("width", "constant-radius", 0.92),  # force and slip are new for longer
     "abrupt_share": Move("upper", "joints", 0.9, LESS),  # a bump reads as slip
     "abrupt_time": Move("upper", "joints", 0.99, LESS),  # ... sooner
     "steady_half": Move("width", "constant-radius", 1.05),
-    "steady_share": Move("std VY", "constant-radius", 0.9),
+    "steady_share": Move("least probabilities", "constant-radius", 0.95),
     "sliding_slope": Move(
         "upper", "constant-radius", 1.08
     ),  # more nodes pay for sliding: those of little friction
     "sliding_penalty": Move("lower", "constant-radius", 1.03),
     "axle_penalty": Move(
-        "upper", "constant-radius", 0.8
+        "upper", "constant-radius", 0.85
     ),  # saturated nodes, of little friction, gain
     # limits
     "farthest": Move(

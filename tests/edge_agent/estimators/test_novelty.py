@@ -1,0 +1,110 @@
+"""Novelty of a block: force or lateral slip that differs from its usual value."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import pytest
+
+from edge_agent.adaptation.memberships import Memberships
+from edge_agent.dynamics.parameters import Parameter, parameter_table
+from edge_agent.estimators.friction_mixture.design import MixtureDesign, design_of
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.weighing import saturation, update_novelty
+from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, MixtureContext
+from schemas.runtime.records import put_record, records
+from tests.edge_agent.estimators.drives import drive
+
+SPEED_M_S = 10.0
+BLOCK_S = 0.05
+BEND = 0.15  # side force over load
+ICE = 0.18
+
+
+class Bend:
+    """A car in a steady left bend, whose axles slip as the test says."""
+
+    def __init__(self) -> None:
+        """Begin with the slip of a road with grip, until it is usual."""
+        context = records(MixtureContext, 1)
+        put_record(context["design"][0], design_of(Memberships(), adaptive=True))
+        self.mu = context["design"]["mu"][0]
+        self.design = cast(MixtureDesign, context["design"][0])
+        self.memory = records(MixtureMemory, 1)
+        self.features = records(BlockFeatures, 1)
+        self.memory["row"][0] = parameter_table([drive("straight", 0.85)[2]])[0]
+        self.features["duration"] = BLOCK_S
+        self.features["steer_cos"] = 1.0
+        self.believe_in(0.8)
+        self.drive_block(BEND, seconds=20.0)
+
+    def believe_in(self, mu: float) -> None:
+        """Give all weight to one node of friction."""
+        self.memory["weight"][0] = 0.0
+        self.memory["weight"][0, np.argmin(np.abs(self.mu - mu))] = 1.0
+        self.memory["friction"]["median"] = mu
+
+    def drive_block(self, slip: float, *, force: float = BEND, seconds: float = BLOCK_S) -> float:
+        """Drive with lateral slip and force over load; return the membership in "new"."""
+        slope = self.memory["row"][0, Parameter.SLOPE_Y]
+        across = -slip / slope * SPEED_M_S
+        self.features["side"] = force
+        self.features["demand"] = abs(force)
+        for _ in range(round(seconds / BLOCK_S)):
+            update_novelty(
+                cast(MixtureMemory, self.memory[0]),
+                self.design,
+                cast(BlockFeatures, self.features[0]),
+                SPEED_M_S,
+                across,
+            )
+        return float(self.features["new"][0])
+
+    @property
+    def ice_ended(self) -> float:
+        """Return the membership in "the ice has ended"."""
+        return float(self.memory["slip"]["axle_ended"][0])
+
+
+def test_nothing_is_new_in_a_steady_bend() -> None:
+    assert Bend().drive_block(BEND) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("slip", "force"), [(BEND, 0.25), (0.3, BEND), (0.05, BEND)])
+def test_force_or_slip_alone_is_new(slip: float, force: float) -> None:
+    assert Bend().drive_block(slip, force=force) > 0.9
+
+
+def test_a_missing_side_force_is_not_new() -> None:
+    assert Bend().drive_block(0.3, force=np.nan) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_ice_ends_where_the_slip_falls_and_the_force_stays() -> None:
+    bend = Bend()
+    bend.believe_in(ICE)
+    bend.drive_block(0.3, seconds=3.0)
+    assert bend.ice_ended == 0.0
+    bend.drive_block(BEND)
+    assert bend.ice_ended > 0.8
+
+
+def test_ice_does_not_end_where_the_driver_stops_turning() -> None:
+    bend = Bend()
+    bend.believe_in(ICE)
+    bend.drive_block(0.3, seconds=3.0)
+    bend.drive_block(0.0, force=0.0)
+    assert bend.ice_ended == 0.0
+
+
+def test_a_slide_on_a_road_with_grip_ends_no_ice() -> None:
+    bend = Bend()
+    bend.drive_block(1.5, seconds=3.0)
+    bend.drive_block(BEND)
+    assert bend.ice_ended == 0.0
+
+
+def test_an_axle_slides_between_its_friction_and_half_as_much_again() -> None:
+    assert [saturation(s, ICE) for s in (0.1, ICE, 1.25 * ICE, 2.0 * ICE, np.nan)] == pytest.approx(
+        [0.0, 0.0, 0.5, 1.0, 0.0]
+    )
