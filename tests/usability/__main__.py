@@ -338,7 +338,7 @@ PARTS: Final[dict[str, tuple[Callable[[House], float], str, float, str]]] = {
     "install_to_first_map_s": (install_to_first_map_s, "s", 90, "less"),
     "install_mb": (install_mb, "MB", 600, "less"),
     "install_packages": (install_packages, "", 45, "less"),
-    "silent_reasons": (silent_reasons, "of 8 planted causes", 8, "more"),
+    "silent_reasons": (silent_reasons, "planted causes", 8, "more"),
     "options_undocumented": (options_undocumented, "", 0, "less"),
     "figures_stale": (figures_stale, "", 0, "less"),
     "first_drive_commands": (first_drive_commands, "", 5, "less"),
