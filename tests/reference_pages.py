@@ -23,12 +23,12 @@ from pydantic import BaseModel
 import edge_agent.cli
 import fleet_service.cli
 from edge_agent.app import metrics as agent_metrics
-from edge_agent.lab.evaluation.papers.elements_page import elements_page
 from fleet_service.app import metrics as service_metrics
 from fleet_service.app.engine import Engine
 from schemas import tables
 from schemas.config import AgentConfig, ServiceConfig
 from schemas.runtime.metrics import PREFIX, Metric
+from tests.elements_page import elements_page
 
 COMMAND_LINES: Final[dict[str, Any]] = {
     "edge-agent": edge_agent.cli,
@@ -156,10 +156,9 @@ def all_metrics(root: Path) -> Shown:
         bad_acks=0,
         failures=0,
     )
-    publisher: Any = SimpleNamespace(
+    status: Any = SimpleNamespace(
         unanswered_records=0,
         clock_behind_s=0.0,
-        counts=counts,
         dropped_records=0,
         damage_counts=(0, 0),
         stranded_records=0,
@@ -167,8 +166,8 @@ def all_metrics(root: Path) -> Shown:
         fill_share=0.0,
         links=1,
         link_watches=[],
-        count_unsettled=lambda: 0,
     )
+    publisher: Any = SimpleNamespace(status=status, counts=counts, count_unsettled=lambda: 0)
     progress: Any = SimpleNamespace(behind=0, now_s=0.0, lag_s=0.0)
     return {"service": of_service, "agent": agent_metrics.agent_metrics(publisher, progress)}
 

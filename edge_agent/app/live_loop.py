@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from edge_agent.inputs.block import Block
 from edge_agent.observe.observation_builder import RecordBlock
@@ -43,24 +44,37 @@ class Progress:
     held: int = 0
 
 
+class LoopOptions(NamedTuple):
+    """Options of the loop.
+
+    Attributes:
+        on_status: receives the progress every STATUS_EVERY_S.
+        duration_s: time after which the loop ends [s].
+        clock: monotonic [s].
+        is_admitted: returns True if the records of a block may be published; others are held back
+            and counted.
+        after: called after each block.
+    """
+
+    on_status: Callable[[Progress], None] = lambda _: None
+    duration_s: float = float("inf")
+    clock: Callable[[], float] = time.monotonic
+    is_admitted: Callable[[], bool] = lambda: True
+    after: Callable[[], None] = lambda: None
+
+
 def run_live_loop(
     blocks: Iterator[Block],
     pipeline: Pipeline,
     publisher: Publisher,
     stop: threading.Event,
-    on_status: Callable[[Progress], None],
-    *,
-    duration_s: float = float("inf"),
-    clock: Callable[[], float] = time.monotonic,
+    options: LoopOptions,
     progress: Progress | None = None,
-    admitted: Callable[[], bool] = lambda: True,
-    after: Callable[[], None] = lambda: None,
 ) -> Progress:
-    """Run until the blocks end, `duration_s` has passed or `stop` is set; then close the open
+    """Run until the blocks end, the duration has passed or `stop` is set; then close the open
     visits.
 
-    `progress` is updated while it runs, and returned. Records of blocks that are not `admitted` are
-    held back and counted. `after` is called after each block.
+    `progress` is updated while it runs, and returned.
     """
     progress = progress or Progress()
     status_at = STATUS_EVERY_S
@@ -68,29 +82,29 @@ def run_live_loop(
     started = first = float("nan")
     for block in blocks:
         _, observations, states = pipeline.step(block)
-        _offer_if_admitted(publisher, progress, admitted(), observations, states)
-        after()
+        _offer_if_admitted(publisher, progress, options.is_admitted(), observations, states)
+        options.after()
         _warn_of_flags(pipeline, doubted)
         if not progress.blocks:
             # the first block may have had to load kernels
-            started = clock()
+            started = options.clock()
             first = float(block.t.min())
         length = float(block.t.max()) - first - progress.signals_s
         progress.signals_s += length
         progress.blocks += 1
-        lag = clock() - started - progress.signals_s
+        lag = options.clock() - started - progress.signals_s
         progress.behind += lag > length
         progress.lag_s = max(progress.lag_s, lag)
         progress.now_s = max(lag, 0.0)
-        if stop.wait(max(0.0, -lag)) or clock() - started >= duration_s:
+        if stop.wait(max(0.0, -lag)) or options.clock() - started >= options.duration_s:
             break
-        if clock() - started >= status_at:
+        if options.clock() - started >= status_at:
             status_at += STATUS_EVERY_S
             if not publisher.is_broken:
                 watchdog.notify_alive()
-            on_status(progress)
+            options.on_status(progress)
     if (last := pipeline.finish()) is not None:
-        _offer_if_admitted(publisher, progress, admitted(), last)
+        _offer_if_admitted(publisher, progress, options.is_admitted(), last)
     return progress
 
 
@@ -126,7 +140,7 @@ def final_counts(progress: Progress, publisher: Publisher) -> dict[str, float]:
         "acknowledged": sum(counts.acknowledged.values()),
         "unsettled": publisher.count_unsettled(),
         "rejected": sum(counts.rejected.values()),
-        "dropped": publisher.dropped_records,
+        "dropped": publisher.status.dropped_records,
         "held": progress.held,
         "behind": progress.behind,
         "blocks": progress.blocks,

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from typing import Final
 
 from edge_agent.app.live_loop import Progress
-from edge_agent.publish.publisher import CLOCK_OFF_S, Publisher
+from edge_agent.publish.ack_settlement import CLOCK_OFF_S
+from edge_agent.publish.publisher import Publisher
 from schemas.runtime.link_watch import link_metrics
 from schemas.runtime.metrics import Metric, gauge
 from schemas.wire import Kind
@@ -20,6 +21,7 @@ _NAMES: Final = {Kind.OBSERVATION: "observation", Kind.STATE: "state"}
 def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
     """Return all current values; records are counted by kind."""
     counts = publisher.counts
+    status = publisher.status
     return [
         Metric(
             "published_records",
@@ -46,7 +48,7 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
             "dropped_records",
             "counter",
             "records dropped because the outbox was full",
-            {"": publisher.dropped_records},
+            {"": status.dropped_records},
         ),
         Metric(
             "late_batches",
@@ -59,7 +61,7 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
             "unanswered_records",
             "counter",
             "records given up because only later batches were acknowledged",
-            {"": publisher.unanswered_records},
+            {"": status.unanswered_records},
         ),
         Metric("resent_batches", "counter", "records sent again", {"": counts.resent_batches}),
         Metric(
@@ -69,13 +71,13 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
             "damaged_spools",
             "counter",
             "times that the outbox was found damaged",
-            {"": publisher.damage_counts[0]},
+            {"": status.damage_counts[0]},
         ),
         Metric(
             "damaged_records",
             "counter",
             "records lost because the outbox was damaged",
-            {"": publisher.damage_counts[1]},
+            {"": status.damage_counts[1]},
         ),
         Metric(
             "sender_failures",
@@ -86,26 +88,26 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         gauge(
             "stranded_records",
             "records in the outbox under a previous vehicle name",
-            publisher.stranded_records,
+            status.stranded_records,
         ),
         gauge(
             "unanswered_seconds",
             "time for which sent batches have not been answered",
-            publisher.unanswered_s,
+            status.unanswered_s,
         ),
         gauge(
             "clock_behind_seconds",
             "lag of the vehicle's clock behind the service's",
-            publisher.clock_behind_s,
+            status.clock_behind_s,
         ),
-        gauge("outbox_fill", "share of the outbox that is full", publisher.fill_share),
+        gauge("outbox_fill", "share of the outbox that is full", status.fill_share),
         gauge(
             "unsettled_records",
             "records neither acknowledged nor rejected yet",
             publisher.count_unsettled(),
         ),
-        gauge("sessions", "open sessions", publisher.links),
-        *link_metrics(publisher.link_watches),
+        gauge("sessions", "open sessions", status.links),
+        *link_metrics(status.link_watches),
         gauge("blocks_behind", "blocks that were processed too late", progress.behind),
         gauge("lag_seconds", "lag behind real time at the last block", progress.now_s),
         gauge("longest_lag_seconds", "largest lag behind real time", progress.lag_s),
@@ -114,21 +116,22 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
 
 def health_problems(publisher: Publisher, progress: Progress) -> list[str]:
     """Return one message per problem."""
-    found = [] if publisher.links else ["no session is open"]
-    if publisher.cut_off:
+    status = publisher.status
+    found = [] if status.links else ["no session is open"]
+    if status.cut_off:
         found.append("a session has no router")
-    if publisher.unanswered_s > UNANSWERED_S:
-        found.append(f"nothing was acknowledged for {publisher.unanswered_s:.0f} s")
-    if publisher.fill_share > FULL:
+    if status.unanswered_s > UNANSWERED_S:
+        found.append(f"nothing was acknowledged for {status.unanswered_s:.0f} s")
+    if status.fill_share > FULL:
         found.append("the outbox is full: the oldest states are dropped first")
-    if abs(publisher.clock_behind_s) > CLOCK_OFF_S:
+    if abs(status.clock_behind_s) > CLOCK_OFF_S:
         found.append(
-            f"the clock is {publisher.clock_behind_s:.0f} s behind the service's: reports arrive "
+            f"the clock is {status.clock_behind_s:.0f} s behind the service's: reports arrive "
             "late or are refused"
         )
-    if publisher.stranded_records:
+    if status.stranded_records:
         found.append(
-            f"{publisher.stranded_records} records are stored under a previous vehicle name; "
+            f"{status.stranded_records} records are stored under a previous vehicle name; "
             "run once with that --name"
         )
     if publisher.is_broken:

@@ -10,7 +10,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from edge_agent.inputs.block import Block
-from edge_agent.publish.publisher import Counts
+from edge_agent.publish.ack_settlement import Counts
 from schemas.runtime.process import LogLine
 from schemas.signals import S
 

@@ -118,7 +118,7 @@ def _run_command(
     )
     # pandas, which many libraries load, imports it, and it reports its threads at INFO
     logging.getLogger("numexpr").setLevel(logging.WARNING)
-    from edge_agent.cli.common import left_behind
+    from edge_agent.app.publishing import left_behind
     from schemas.runtime.process import limit_memory
 
     if limited:

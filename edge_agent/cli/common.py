@@ -1,33 +1,16 @@
-"""Shared parts of the commands: estimators by name, closing of a publisher, signals, vehicle
-names.
-"""
+"""Shared parts of the commands: vehicle names, and checks by the signal doctor."""
 
 from __future__ import annotations
 
-import json
 import re
-import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from schemas.config import NAME_PATTERN, AgentConfig
+from schemas.config import NAME_PATTERN
 from schemas.errors import InputError
-from schemas.runtime.process import LogLine, print_line
 
 if TYPE_CHECKING:
-    from types import FrameType
-
-    import zenoh
-
-    from edge_agent.app.live_loop import Progress
     from edge_agent.inputs.doctor.diagnosis import Diagnosis
-    from edge_agent.publish.publisher import Publisher
-
-
-FLEET = "fleet"  # what {name} in the path of an outbox is for many vehicles
 
 
 def checked_name(name: str) -> str:
@@ -43,36 +26,6 @@ def checked_name(name: str) -> str:
             "give --name, 3 to 63 of a-z, 0-9 and -, a letter first",
         )
     return name
-
-
-def publisher_of(
-    names: Sequence[str],
-    config: AgentConfig,
-    estimator: str,
-    on_open: Callable[[str, zenoh.Session], None] = lambda *_: None,
-) -> Publisher:
-    """Return a started publisher on the configured outbox; `on_open` is called with each vehicle's
-    session.
-
-    Raises:
-        InputError: Zenoh refuses its settings, or the outbox is in use or unusable.
-    """
-    from edge_agent.app.estimates_file import prepare_path
-    from edge_agent.publish.outbox import Outbox
-    from edge_agent.publish.publisher import Publisher
-    from schemas.runtime.zenoh_session import configuration
-
-    for (
-        name
-    ) in names:  # a bad setting, or a missing certificate, is to be an error here, not in a thread
-        configuration(config.zenoh, name)
-    spool = prepare_path("spool", config.spool_of(names[0] if len(names) == 1 else FLEET))
-    outbox = Outbox(
-        spool, capacity_bytes=round(config.spool_mb * 1e6), first_resend_s=config.resend_s
-    )
-    publisher = Publisher(names, outbox, config, estimator, on_open=on_open)
-    publisher.start()
-    return publisher
 
 
 def require_valid_signals(diagnosis: Diagnosis) -> None:
@@ -117,61 +70,3 @@ def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
         channels = ", ".join(diagnosis.unknown)
         notes.append(f"note: the signal doctor did not pass this log: it cannot judge {channels}")
     return notes
-
-
-@contextmanager
-def stop_on_signal() -> Iterator[threading.Event]:
-    """Yield an event that SIGTERM and Ctrl-C set; a second signal ends the process at once."""
-    stop = threading.Event()
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-
-    def on_signal(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 the signal interface hands it over
-        stop.set()
-        signal.signal(number, signal.SIG_DFL)
-
-    for number in before:
-        signal.signal(number, on_signal)
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-# Set when a session or a source hangs, on a frozen router, say: what its library does at the exit
-# may wait for it. So the command line ends the process itself, once the command has closed its
-# files and its exit code is known.
-left_behind = threading.Event()
-
-
-def close_publisher(
-    publisher: Publisher, progress: Progress, drain_s: float, **more: float
-) -> None:
-    """Wait for acknowledgements, close, and print counts and extra values as one line of JSON on
-    stdout.
-
-    Unsettled records stay in the outbox for the next start.
-    """
-    from edge_agent.app.live_loop import final_counts
-
-    clean = publisher.close(drain_s)
-    if not clean:
-        print_line(
-            "warning: a session did not close in time; exiting without closing it", sys.stderr
-        )
-        left_behind.set()
-    print(json.dumps(final_counts(progress, publisher) | more), flush=True)
-
-
-def print_status(progress: Progress, publisher: Publisher, log_line: Callable[[str], None]) -> None:
-    """Print one line of progress."""
-    from edge_agent.app.live_loop import final_counts
-
-    counts = publisher.counts
-    late = f", at most {progress.lag_s:.1f} s behind real time" if progress.behind else ""
-    text = (
-        f"{progress.signals_s:7.1f} s  {publisher.links} sessions, "
-        f"{sum(counts.published.values())} records published, "
-        f"{sum(counts.acknowledged.values())} acknowledged, {publisher.count_unsettled()} unsettled{late}"
-    )
-    log_line(LogLine(text, event="status", **final_counts(progress, publisher)))

@@ -58,8 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Drive until the duration has passed or a signal arrives; write the truth before the end."""
     from edge_agent.ahead.lookout import Lookout
+    from edge_agent.app.agent import Agent, AgentOptions, AgentSource
     from edge_agent.app.estimates_file import prepare_path
-    from edge_agent.cli.live import drive_live, warm_up_simulation, warning_lines
+    from edge_agent.cli.live import LookoutPart, warm_up_simulation, warning_lines
     from edge_agent.lab.simulation import SimulatedFleet
     from edge_agent.lab.simulation.blocks import blocks
     from edge_agent.lab.simulation.listeners import WarnedDrivers
@@ -77,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     source = blocks(fleet, args.rate, recorder)
     at_end = partial(recorder.write, args.truth) if recorder is not None else lambda: None
     drivers = WarnedDrivers(fleet, args.warned)
-    lookout = None
+    parts = []
     if drivers.warned.any():
         show = warning_lines(config)
 
@@ -86,15 +87,9 @@ def run(args: argparse.Namespace) -> int:
             drivers.hear(name, warning)
 
         lookout = Lookout(fleet.names, pass_warning, drivers.route_of, drivers.listens)
+        parts.append(LookoutPart(lookout))
         source = drivers.heeding(source)
-    return drive_live(
-        fleet.vehicles,
-        fleet.names,
-        source,
-        config,
-        args.estimator,
-        args.duration,
-        at_end,
-        lookout=lookout,
-        memberships=memberships_of(args),
+    options = AgentOptions(
+        fleet.vehicles, fleet.names, config, args.estimator, memberships_of(args), args.duration
     )
+    return Agent(options, AgentSource(source, end=at_end), parts).drive()

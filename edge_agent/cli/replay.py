@@ -241,11 +241,12 @@ def _publish_log(
     keep: Callable[[Block, Estimates], None],
 ) -> int:
     from edge_agent.app.live_loop import Progress
-    from edge_agent.cli.common import checked_name, close_publisher, publisher_of
+    from edge_agent.app.publishing import close_publisher, open_publisher
+    from edge_agent.cli.common import checked_name
     from edge_agent.observe.pipeline import Pipeline
 
     pipeline = Pipeline(bank, 1, config)
-    publisher = publisher_of([checked_name(name)], config, estimator)
+    publisher = open_publisher([checked_name(name)], config, estimator)
     progress = Progress(signals_s=float(log.t[-1] - log.t[0]))
     try:
         for block in log.blocks(start_ns):

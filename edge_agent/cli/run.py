@@ -16,6 +16,7 @@ from schemas.runtime import progress_messages
 
 if TYPE_CHECKING:
     from edge_agent.ahead.lookout import Lookout
+    from edge_agent.app.agent import AgentOptions, AgentPart
     from edge_agent.inputs.block import Block
     from edge_agent.publish.vss import RoadFrictionOutput
     from schemas.config import AgentConfig
@@ -91,8 +92,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Drive until the source ends, the duration has passed, or a signal arrives."""
     with progress_messages.show_status("loading"):
+        from edge_agent.app.agent import Agent, AgentSource
         from edge_agent.cli.common import checked_name
-        from edge_agent.cli.live import drive_live
         from edge_agent.inputs.live.sources import KINDS, is_live
         from schemas.config import AgentConfig, load
         from schemas.errors import InputError
@@ -130,17 +131,27 @@ def run(args: argparse.Namespace) -> int:
         vehicle, name, blocks = (
             _simulated_source(args) if kind == SIMULATED else _log_source(args, Path(sources[0]))
         )
-    return drive_live(
-        [vehicle],
-        [checked_name(name)],
-        blocks,
-        config,
-        args.estimator,
-        args.duration,
-        lookout=_make_lookout(args, name, config),
-        vss=_make_vss_output(args, name, config),
-        memberships=memberships_of(args),
+    options = _agent_options(args, vehicle, checked_name(name), config)
+    return Agent(options, AgentSource(blocks), _make_parts(args, name, config)).drive()
+
+
+def _agent_options(
+    args: argparse.Namespace, vehicle: Vehicle, name: str, config: AgentConfig
+) -> AgentOptions:
+    from edge_agent.app.agent import AgentOptions
+
+    return AgentOptions(
+        [vehicle], [name], config, args.estimator, memberships_of(args), args.duration
     )
+
+
+def _make_parts(args: argparse.Namespace, name: str, config: AgentConfig) -> list[AgentPart]:
+    from edge_agent.cli.live import LookoutPart, VssPart
+
+    lookout = _make_lookout(args, name, config)
+    output = _make_vss_output(args, name, config)
+    parts: list[AgentPart] = [] if lookout is None else [LookoutPart(lookout)]
+    return parts if output is None else [*parts, VssPart(output)]
 
 
 def _make_lookout(args: argparse.Namespace, name: str, config: AgentConfig) -> Lookout | None:
@@ -183,9 +194,10 @@ def _make_vss_output(
 
 
 def _run_live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> int:
+    from edge_agent.app.agent import Agent, AgentSource
+    from edge_agent.app.publishing import left_behind
     from edge_agent.app.trip import Trip, state_path_for
-    from edge_agent.cli.common import checked_name, left_behind
-    from edge_agent.cli.live import drive_live
+    from edge_agent.cli.common import checked_name
     from edge_agent.inputs.live.rows import LiveRows
     from edge_agent.inputs.live.sources import open_sources
     from schemas.vehicle import load_vehicle
@@ -197,20 +209,14 @@ def _run_live(args: argparse.Namespace, sources: list[str], config: AgentConfig)
     trip = Trip(vehicle, profile, state_path_for(config.spool_of(name), name), trusted=args.trust)
     blocks = trip.corrected_blocks(rows.blocks(), lambda: rows.ground)
     try:
-        return drive_live(
-            [trip.vehicle],
-            [name],
+        source = AgentSource(
             blocks,
-            config,
-            args.estimator,
-            args.duration,
+            trip.is_admitted,
+            lambda: [*rows.health_problems(), *trip.health_problems()],
             trip.learn_rest,
-            admitted=trip.is_admitted,
-            troubled=lambda: [*rows.health_problems(), *trip.health_problems()],
-            lookout=_make_lookout(args, name, config),
-            vss=_make_vss_output(args, name, config),
-            memberships=memberships_of(args),
         )
+        options = _agent_options(args, trip.vehicle, name, config)
+        return Agent(options, source, _make_parts(args, name, config)).drive()
     finally:
         blocks.close()
         trip.close()

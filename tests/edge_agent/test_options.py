@@ -10,7 +10,6 @@ import contextlib
 import importlib
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -18,10 +17,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from edge_agent.adaptation.memberships import Memberships
+from edge_agent.app.agent import Agent
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.app.tuned_memberships import FOLDER
-from edge_agent.cli import COMMANDS, live, main
+from edge_agent.cli import COMMANDS, main
 from edge_agent.inputs.block import Block
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.simulation.blocks import blocks
@@ -287,30 +286,26 @@ def record_arguments(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: 
     """
     seen: list[object] = []
 
-    def note(
-        vehicles: Sequence[Vehicle],
-        names: Sequence[str],
-        source: Iterator[Block],
-        config: AgentConfig,
-        estimator: str | None,
-        duration_s: float,
-        at_end: Callable[[], None] = lambda: None,
-        lookout: object | None = None,
-        memberships: Memberships | None = None,
-        *,
-        vss: bool = False,
-    ) -> int:
-        assert lookout is None
-        assert not vss
-        first = [next(source) for _ in range(3)]
-        at_end()
+    def note(agent: Agent) -> int:
+        assert not agent.parts
+        first = [next(agent.source.blocks) for _ in range(3)]
+        agent.source.end()
         signals = [(block.t.tolist(), np.nan_to_num(block.signals).tolist()) for block in first]
+        options = agent.options
         seen.append(
-            [list(vehicles), list(names), signals, config, estimator, memberships, duration_s]
+            [
+                list(options.vehicles),
+                list(options.names),
+                signals,
+                options.config,
+                options.estimator,
+                options.memberships,
+                options.duration_s,
+            ]
         )
         return 0
 
-    monkeypatch.setattr(live, "drive_live", note)
+    monkeypatch.setattr(Agent, "drive", note)
     assert main(words) == 0
     return seen, sorted(path.name for path in folder.iterdir())
 

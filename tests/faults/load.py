@@ -158,7 +158,7 @@ def main(path: str) -> int:
         json.dumps(
             {
                 **found,
-                "dropped": publisher.dropped_records,
+                "dropped": publisher.status.dropped_records,
                 "resent": publisher.counts.resent_batches,
             }
         ),

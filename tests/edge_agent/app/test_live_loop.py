@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_agent.app.live_loop import STATUS_EVERY_S, Progress, run_live_loop
+from edge_agent.app.live_loop import STATUS_EVERY_S, LoopOptions, Progress, run_live_loop
 from edge_agent.estimators import create
 from edge_agent.inputs.block import Block
 from edge_agent.inputs.context import context_block
@@ -117,7 +117,8 @@ def run(
     basket = Basket()
     reported = []
     report = lambda progress: reported.append(progress.signals_s)  # noqa: E731
-    progress = run_live_loop(parts, pipeline_of(fleet), basket, stop, report, **options)  # type: ignore[arg-type]
+    chosen = LoopOptions(report, **options)  # type: ignore[arg-type]
+    progress = run_live_loop(parts, pipeline_of(fleet), basket, stop, chosen)  # type: ignore[arg-type]
     return progress, basket, reported
 
 

@@ -81,8 +81,8 @@ def test_agent_without_answers_or_with_full_outbox_reports_problems(
     publisher.start()
     for seed in range(6):
         publisher.offer(*drive(seed))
-    until(lambda: publisher.fill_share > metrics.FULL)
-    until(lambda: publisher.unanswered_s > 0.0)
+    until(lambda: publisher.status.fill_share > metrics.FULL)
+    until(lambda: publisher.status.unanswered_s > 0.0)
     late.append(metrics.UNANSWERED_S)
     found = metrics.health_problems(publisher, Progress())
     assert any(text.startswith("nothing was acknowledged for 6") for text in found)
@@ -94,7 +94,7 @@ def test_an_agent_without_a_router_or_behind_its_time_is_in_trouble(
     tmp_path: Path, router: Router
 ) -> None:
     publisher = publisher_of(settings(router, tmp_path))
-    until(lambda: publisher.links == 3)
+    until(lambda: publisher.status.links == 3)
     assert metrics.health_problems(publisher, Progress()) == []
     assert metrics.health_problems(publisher, Progress(now_s=4.0)) == ["4.0 s behind real time"]
     publisher.close(within_s=0.0)

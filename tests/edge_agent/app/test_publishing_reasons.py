@@ -10,7 +10,7 @@ import pytest
 
 from edge_agent.app.publishing_reasons import ReasonReporter, SignalWatch, reasons_not_publishing
 from edge_agent.inputs.block import Block
-from edge_agent.publish.publisher import Counts
+from edge_agent.publish.ack_settlement import Counts
 from schemas.signals import CHANNELS, S
 from schemas.wire import Kind
 

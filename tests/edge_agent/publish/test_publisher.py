@@ -121,7 +121,7 @@ def test_a_lost_router_is_waited_for_and_nothing_is_lost(router: Router, tmp_pat
     with Service(router) as service:
         publisher.offer(before)
         service.wait(lambda batches: rows(batches, Kind.OBSERVATION) == len(before.vehicle))
-    until(lambda: publisher.links == len(NAMES))
+    until(lambda: publisher.status.links == len(NAMES))
     router.stop()
     publisher.offer(after)
     until(lambda: publisher.count_unsettled() >= len(after.vehicle))
@@ -139,7 +139,7 @@ def test_an_agent_may_start_before_the_router(tmp_path: Path) -> None:
     observations, _ = drive()
     publisher.offer(observations)
     until(lambda: publisher.count_unsettled() == len(observations.vehicle))
-    assert publisher.links == 0
+    assert publisher.status.links == 0
     router.start()
     with Service(router) as service:
         until(lambda: publisher.count_unsettled() == 0)
@@ -228,11 +228,11 @@ def test_a_service_that_tells_its_time_shows_that_the_clock_is_off(
     with caplog.at_level(logging.WARNING):
         service.put_ack("car-a", encode_ack("car-a", [settled], time.time_ns() + 130 * NS))
         until(lambda: publisher.counts.late[mine.kind] == 1)
-    until(lambda: abs(publisher.clock_behind_s - 130.0) < 10.0)
+    until(lambda: abs(publisher.status.clock_behind_s - 130.0) < 10.0)
     assert any("clock" in trouble for trouble in health_problems(publisher, Progress()))
     assert "behind the service's" in caplog.text
     service.put_ack("car-a", encode_ack("car-a", [settled], time.time_ns()))
-    until(lambda: abs(publisher.clock_behind_s) < 10.0)
+    until(lambda: abs(publisher.status.clock_behind_s) < 10.0)
     service.put_ack("car-a", encode_ack("car-a", [settled]))  # of a version that does not tell
     until(lambda: publisher.counts.late[mine.kind] == 3)
     assert health_problems(publisher, Progress()) == []
@@ -256,7 +256,7 @@ def test_a_full_disk_is_waited_for(
     assert publisher.count_unsettled() == len(observations.vehicle) + len(states.vehicle)
     database.execute("PRAGMA max_page_count = 1000000")
     assert publisher.close(within_s=20.0)
-    assert publisher.count_unsettled() == publisher.dropped_records == 0
+    assert publisher.count_unsettled() == publisher.status.dropped_records == 0
     assert rows(service.batches, Kind.OBSERVATION) == len(observations.vehicle)
     for stream in {(b.vehicle, b.kind, b.region) for b in service.batches}:
         seqs = {b.seq for b in service.batches if (b.vehicle, b.kind, b.region) == stream}
@@ -282,7 +282,7 @@ def test_each_vehicle_shows_that_it_is_alive_until_it_leaves(
 def test_many_sessions_open_together(router: Router, tmp_path: Path) -> None:
     names = tuple(f"sim-{n:03}" for n in range(36))
     publisher = publisher_of(settings(router, tmp_path), names)
-    until(lambda: publisher.links == 36)
+    until(lambda: publisher.status.links == 36)
     assert publisher.close(within_s=1.0)
 
 

@@ -16,8 +16,6 @@ from edge_agent.estimators.paper_aco_fckf import AS_PRINTED, AT_THE_TRUTH
 from edge_agent.lab.evaluation.papers import reproductions
 from edge_agent.lab.evaluation.papers.conditions import IN_WHEEL, MATCHED
 from edge_agent.lab.evaluation.papers.drawing import draw_plot
-from edge_agent.lab.evaluation.papers.elements_page import PAPERS as ELEMENT_LISTS
-from edge_agent.lab.evaluation.papers.elements_page import elements_page
 from edge_agent.lab.evaluation.papers.outcome import (
     NONE,
     Curve,
@@ -32,6 +30,8 @@ from edge_agent.lab.evaluation.papers.page import limit_text, markdown_tables, r
 from edge_agent.lab.evaluation.papers.reproduction_001 import BOTH, run_drive
 from edge_agent.lab.evaluation.papers.reproduction_004 import run_noise
 from edge_agent.lab.simulation.presets import PRESETS
+from tests.elements_page import PAPERS as ELEMENT_LISTS
+from tests.elements_page import elements_page
 
 HELD = PaperRow("mae_vx", "MAE v_x [m/s]", 0.02, 0.01, 0.03)
 MISSED = PaperRow("mae_vy", "MAE v_y [m/s]", 0.02, 0.021)

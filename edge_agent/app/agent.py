@@ -1,0 +1,232 @@
+"""The agent: estimator bank, pipeline and publisher around the live loop.
+
+It corresponds to `fleet_service.app.service`. Signals come from an `AgentSource`. Parts that use the
+vehicles' sessions next to the publisher, such as warnings of the road ahead, are `AgentPart`s.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+import zenoh
+
+from edge_agent.adaptation.memberships import Memberships
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.app.live_loop import (
+    ENDED_DRAIN_S,
+    STATUS_EVERY_S,
+    STOPPED_DRAIN_S,
+    LoopOptions,
+    Progress,
+    run_live_loop,
+)
+from edge_agent.app.metrics import agent_metrics, health_problems
+from edge_agent.app.publishing import close_publisher, open_publisher, print_status
+from edge_agent.app.publishing_reasons import ReasonReporter, SignalWatch, reasons_not_publishing
+from edge_agent.inputs.block import Block
+from edge_agent.observe.pipeline import Pipeline
+from edge_agent.publish.publisher import Publisher
+from schemas.config import AgentConfig
+from schemas.runtime import progress_messages
+from schemas.runtime.metrics import Metric, serve_metrics
+from schemas.runtime.process import LogLine, line_logger, log_as, print_line
+from schemas.signals import CHANNELS
+from schemas.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+
+@dataclass(frozen=True)
+class AgentOptions:
+    """Settings of an agent.
+
+    Attributes:
+        vehicles: vehicle files.
+        names: names under which the vehicles publish.
+        config: configuration of the agent.
+        estimator: name of the estimator; None for the configuration's.
+        memberships: fuzzy sets that replace the estimator's own.
+        duration_s: time to drive [s].
+    """
+
+    vehicles: Sequence[Vehicle]
+    names: Sequence[str]
+    config: AgentConfig
+    estimator: str | None = None
+    memberships: Memberships | None = None
+    duration_s: float = float("inf")
+
+
+class AgentSource(NamedTuple):
+    """Signals of the vehicles.
+
+    Attributes:
+        blocks: blocks of samples, in real time or faster.
+        is_admitted: returns True if the records of the current block may be published.
+        health_problems: returns one message per problem of the source.
+        end: called when the loop has ended.
+    """
+
+    blocks: Iterator[Block]
+    is_admitted: Callable[[], bool] = lambda: True
+    health_problems: Callable[[], list[str]] = list
+    end: Callable[[], None] = lambda: None
+
+
+class AgentPart(Protocol):
+    """A part that uses the vehicles' sessions next to the publisher."""
+
+    def attach_session(self, name: str, session: zenoh.Session) -> None:
+        """Use the session of a vehicle, which has been opened."""
+
+    def start_part(self) -> None:
+        """Start, before the first block."""
+
+    def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:
+        """Update from the pipeline after a block; `admitted` is True if its records are published."""
+
+    def close_part(self) -> Mapping[str, float]:
+        """Stop, and return counts for the last line of output."""
+
+
+class Agent:
+    """An agent that drives its vehicles once."""
+
+    def __init__(
+        self, options: AgentOptions, source: AgentSource, parts: Sequence[AgentPart] = ()
+    ) -> None:
+        self.options = options
+        self.source = source
+        self.parts = parts
+        self.estimator = options.estimator or options.config.estimator
+        self._progress = Progress()
+        self._publisher: Publisher | None = None
+
+    def drive(self) -> int:
+        """Drive in real time until the source ends, the duration has passed or a signal arrives;
+        then shut down. Print a line of counts and return 0.
+        """
+        config = self.options.config
+        log_as(config.log, sys.stderr)
+        self._warm_up()
+        with (
+            stop_on_signal() as stop,
+            serve_metrics(
+                config.metrics_host, config.metrics_port, self._list_metrics, self._list_problems
+            ) as address,
+        ):
+            if address:
+                print_line(f"metrics: {address}/metrics", sys.stderr)
+            publisher = self._drive_until(stop)
+            counts = {
+                name: value for part in self.parts for name, value in part.close_part().items()
+            }
+            self.source.end()
+            drain_s = STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S
+            close_publisher(publisher, self._progress, drain_s, **counts)
+        return 0
+
+    def _drive_until(self, stop: threading.Event) -> Publisher:
+        options = self.options
+        source = self.source
+        pipeline = Pipeline(
+            bank_of(self.estimator, options.vehicles, options.memberships),
+            len(options.vehicles),
+            options.config,
+        )
+        publisher = open_publisher(
+            options.names, options.config, self.estimator, self._attach_session
+        )
+        self._publisher = publisher
+        log_line = line_logger(options.config.log, sys.stderr)
+        who = options.names[0] if len(options.names) == 1 else f"{len(options.names)} vehicles"
+        log_line(
+            LogLine(
+                f"{who}: driving; a line of counts every {STATUS_EVERY_S:.0f} s",
+                event="ready",
+                vehicles=len(options.names),
+            )
+        )
+        watch = SignalWatch()
+        connect = options.config.zenoh.connect
+        reporter = ReasonReporter(
+            lambda: reasons_not_publishing(
+                watch, publisher.status, connect, source.health_problems()
+            ),
+            log_line,
+        )
+        for part in self.parts:
+            part.start_part()
+
+        def after_block() -> None:
+            reporter.print_if_due()
+            for part in self.parts:
+                part.update_part(pipeline, admitted=source.is_admitted())
+
+        run_live_loop(
+            watch.watch_blocks(source.blocks),
+            pipeline,
+            publisher,
+            stop,
+            LoopOptions(
+                on_status=partial(print_status, publisher=publisher, log_line=log_line),
+                duration_s=options.duration_s,
+                is_admitted=source.is_admitted,
+                after=after_block,
+            ),
+            self._progress,
+        )
+        return publisher
+
+    def _attach_session(self, name: str, session: zenoh.Session) -> None:
+        for part in self.parts:
+            part.attach_session(name, session)
+
+    def _list_metrics(self) -> list[Metric]:
+        return [] if self._publisher is None else agent_metrics(self._publisher, self._progress)
+
+    def _list_problems(self) -> list[str]:
+        if self._publisher is None:
+            return ["the agent is starting"]
+        return [
+            *health_problems(self._publisher, self._progress),
+            *self.source.health_problems(),
+        ]
+
+    def _warm_up(self) -> None:
+        """Load or compile the kernels before the clock runs, on a temporary vehicle."""
+        t = np.zeros((1, 1))
+        time = np.zeros((1, 1), dtype=np.int64)
+        signals = np.full((1, 1, len(CHANNELS)), np.nan)
+        options = self.options
+        with progress_messages.show_status("starting the estimator"):
+            bank = bank_of(self.estimator, options.vehicles[:1], options.memberships)
+            Pipeline(bank, 1, options.config).step(Block(t, time, signals))
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[threading.Event]:
+    """Yield an event that SIGTERM and Ctrl-C set; a second signal ends the process at once."""
+    stop = threading.Event()
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+
+    def on_signal(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 the signal interface hands it over
+        stop.set()
+        signal.signal(number, signal.SIG_DFL)
+
+    for number in before:
+        signal.signal(number, on_signal)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

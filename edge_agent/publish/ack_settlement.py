@@ -1,0 +1,110 @@
+"""Acknowledgements of the services: they settle batches in the outbox, and they show how far the
+vehicle's clock is behind.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from edge_agent.publish.outbox import Outbox, Stream
+from schemas.errors import WireError
+from schemas.thresholds import NS
+from schemas.wire import Kind, StreamAck, decode_ack
+
+CLOCK_OFF_S: Final = 30.0  # between a service's clock and ours: what is further ahead it refuses
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Counts:
+    """Records by kind and by result."""
+
+    offered: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
+    published: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
+    acknowledged: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
+    rejected: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
+    dropped: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
+    late: dict[Kind, int] = field(
+        default_factory=lambda: dict.fromkeys(Kind, 0)
+    )  # batches, not records
+    resent_batches: int = 0
+    bad_acks: int = 0
+    failures: int = 0  # of the sending thread, which goes on
+
+
+class AckSettlement:
+    """Queue of received acknowledgements, applied to an outbox by the sending thread.
+
+    Attributes:
+        clock_behind_s: lag of the vehicle's clock behind the last service that answered [s].
+    """
+
+    def __init__(
+        self, outbox: Outbox, counts: Counts, wall: Callable[[], int] = time.time_ns
+    ) -> None:
+        self._outbox = outbox
+        self._counts = counts
+        self._wall = wall
+        self._acks: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
+        self.clock_behind_s = 0.0
+
+    def receive_ack(self, vehicle: str, payload: bytes) -> None:
+        """Queue an acknowledgement; called on a thread of Zenoh."""
+        self._acks.put((vehicle, payload))
+
+    def settle_received(self) -> None:
+        """Apply all queued acknowledgements. Unreadable ones and those of other vehicles are counted
+        and ignored.
+        """
+        while not self._acks.empty():
+            vehicle, payload = self._acks.get()
+            try:
+                named, streams = decode_ack(payload)
+            except WireError as error:
+                self._counts.bad_acks += 1
+                log.warning("an acknowledgement for %s cannot be read: %s", vehicle, error)
+                continue
+            if named != vehicle:
+                self._counts.bad_acks += 1
+                continue
+            for ack in streams:
+                self._settle_stream(vehicle, ack)
+
+    def _settle_stream(self, vehicle: str, ack: StreamAck) -> None:
+        counts = self._counts
+        stream = Stream(vehicle, ack.boot, ack.kind, ack.region)
+        counts.acknowledged[ack.kind] += self._outbox.settle_ranges(stream, ack.durable)
+        counts.late[ack.kind] += sum(last - first + 1 for first, last in ack.late)
+        self._compare_clocks(ack.time)
+        for seq, row, reason in ack.rejected:
+            records = self._outbox.settle_ranges(stream, [(seq, seq)])
+            counts.rejected[ack.kind] += records
+            if records:
+                log.warning(
+                    "%s batch %d of %s was rejected at row %d: %s",
+                    ack.kind,
+                    seq,
+                    vehicle,
+                    row,
+                    reason,
+                )
+
+    def _compare_clocks(self, reported: int) -> None:
+        """Compare our clock with that of a service [ns], 0 if unknown; an acknowledgement is
+        about a second old.
+        """
+        if not reported:
+            return
+        behind = (reported - self._wall()) / NS
+        if abs(behind) > CLOCK_OFF_S and abs(behind - self.clock_behind_s) > CLOCK_OFF_S:
+            log.warning(
+                "the clock is %.0f s behind the service's: reports arrive late or are refused",
+                behind,
+            )
+        self.clock_behind_s = behind

@@ -1,0 +1,94 @@
+"""Zenoh sessions of all vehicles of a publisher, opened in a thread of their own, and which of them
+has a router.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable
+
+import zenoh
+
+from edge_agent.publish.outbox import StoredBatch
+from edge_agent.publish.zenoh_link import Link
+from schemas.config import ZenohSettings
+from schemas.runtime.link_watch import LinkWatch
+
+
+class SessionLinks:
+    """One session per name. `on_open(name, session)` is called when a session is open, and
+    `on_ack(name, payload)` for each acknowledgement.
+    """
+
+    def __init__(
+        self,
+        names: Iterable[str],
+        settings: ZenohSettings,
+        on_open: Callable[[str, zenoh.Session], None],
+        on_ack: Callable[[str, bytes], None],
+        stop: threading.Event,
+    ) -> None:
+        self._names = names
+        self._settings = settings
+        self._on_open = on_open
+        self._on_ack = on_ack
+        self._stop = stop
+        self._links: dict[str, Link] = {}
+        self._epochs: dict[str, int] = {}
+        self._connected: dict[str, bool] = {}
+        self._opener = threading.Thread(target=self._open_all, name="connector", daemon=True)
+
+    def start(self) -> None:
+        """Start to open the sessions; each waits for a router as long as necessary."""
+        self._opener.start()
+
+    def close(self) -> None:
+        """Close all sessions, once the event `stop` is set."""
+        self._opener.join()
+        for link in self._links.values():
+            link.close()
+
+    @property
+    def session_count(self) -> int:
+        """Number of open sessions."""
+        return len(self._links)
+
+    @property
+    def link_watches(self) -> list[LinkWatch]:
+        """The state of each session's link."""
+        return [link.watch for link in list(self._links.values())]
+
+    @property
+    def is_cut_off(self) -> bool:
+        """True if an open session had no router at the last `update_connections`."""
+        return not all(list(self._connected.values()))
+
+    @property
+    def connected_names(self) -> set[str]:
+        """Names whose session had a router at the last `update_connections`."""
+        return {name for name, connected in self._connected.items() if connected}
+
+    def put_batch(self, batch: StoredBatch) -> bool:
+        """Send a batch on its vehicle's session; False if the session refuses."""
+        return self._links[batch.stream.vehicle].put(batch)
+
+    def update_connections(self) -> list[str]:
+        """Update `connected`, and return the names whose link was replaced by a new one. Batches in
+        flight on the former link are lost, so the caller must send them again.
+        """
+        replaced = []
+        for name, link in list(self._links.items()):
+            epoch = link.watch.epoch
+            if epoch != self._epochs.get(name, 0):
+                self._epochs[name] = epoch
+                replaced.append(name)
+            self._connected[name] = link.is_connected
+        return replaced
+
+    def _open_all(self) -> None:
+        for name in self._names:
+            link = Link.open(self._settings, name, self._on_ack, self._stop)
+            if link is None:
+                return
+            self._links[name] = link
+            self._on_open(name, link.session)
