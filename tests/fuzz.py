@@ -26,13 +26,13 @@ from typing import Any, Final, NamedTuple, cast
 from edge_agent.inputs.readers.dbc import parse_dbc
 from edge_agent.inputs.readers.gnss import parse_gpsd, parse_nmea
 from fleet_service.archive.format.version import parse_version
+from fleet_service.ingest.batch_decoder import decode_many
 from fleet_service.replay.checkpoints import load_checkpoint
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.fence import fence_of
 from fleet_service.replication.lease import _parse_record
 from schemas import keys, query, weather, wire
 from schemas.errors import InputError
-from schemas.runtime.batch_decoder import decode_many
 from schemas.wire import Kind
 from schemas.wire.tile import decode_tile
 from tests.structure import ROOT

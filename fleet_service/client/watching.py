@@ -89,9 +89,9 @@ def watch_map(
     def print_services() -> None:
         nonlocal away
         here = {token.region for token in services.active}
-        left = {token.region for token in services.lost} - here
+        left = {token.region for token in services.lost_tokens} - here
         now = set(regions.unserved_expressions(asked, here)) if asked.bbox else left
-        if now != away and (here or services.lost):
+        if now != away and (here or services.lost_tokens):
             _print_regions(print_line, now - away, away - now, as_json=options.as_json)
             away = now
 

@@ -26,6 +26,7 @@ from fleet_service.archive.identity.pseudonyms import Pseudonyms, pseudonym_numb
 from fleet_service.archive.identity.vehicle_ids import VehicleIds
 from fleet_service.ingest import validation
 from fleet_service.ingest.acks import Acks
+from fleet_service.ingest.batch_decoder import decode_many
 from fleet_service.ingest.budgets import STREAMS_AT_ONCE, STREAMS_PER_HOUR, Bucket
 from fleet_service.ingest.dedup import BatchId, SequenceTracker, SequenceTrackers
 from fleet_service.ingest.rate_limit import RateLimiter
@@ -34,7 +35,6 @@ from schemas.errors import InputError
 from schemas.grid import cell_of
 from schemas.keys import Parsed
 from schemas.numeric import BoolArray, IntArray
-from schemas.runtime.batch_decoder import decode_many
 from schemas.tables import US_STEP
 from schemas.thresholds import NS
 from schemas.wire import Kind

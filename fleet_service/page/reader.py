@@ -127,7 +127,7 @@ class Reader:
         known = [keys.chunks(region, grid.REGION_ZOOM) for region in self._queriers]
         fallen = {
             token.region
-            for token in services.lost
+            for token in services.lost_tokens
             if token.region.startswith(tuple("0123"))
             and not any(regions.covers(one, token.region) for one in here)
             and not any(regions.overlap(one, token.region) for one in known)

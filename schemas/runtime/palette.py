@@ -85,10 +85,10 @@ def shade(value: float, low: float, high: float) -> str:
     """Return the colour of a value on GRIP between `low` and `high`; the pages compute the same."""
     at = min(max((value - low) / (high - low), 0.0), 1.0) * (len(GRIP) - 1)
     k = min(int(at), len(GRIP) - 2)
-    first, second = (_rgb(GRIP[j]) for j in (k, k + 1))
+    first, second = (_to_rgb(GRIP[j]) for j in (k, k + 1))
     mixed = (round(a + (b - a) * (at - k)) for a, b in zip(first, second, strict=True))
     return "#{:02x}{:02x}{:02x}".format(*mixed)
 
 
-def _rgb(text: str) -> tuple[int, ...]:
+def _to_rgb(text: str) -> tuple[int, ...]:
     return tuple(int(text[k : k + 2], 16) for k in (1, 3, 5))

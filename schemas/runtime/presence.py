@@ -44,7 +44,7 @@ class PresenceTracker:
             return set(self._here)
 
     @property
-    def lost(self) -> set[ServiceToken]:
+    def lost_tokens(self) -> set[ServiceToken]:
         """Return the tokens that were active and are not any more."""
         with self._guard:
             return set(self._withdrawn)
@@ -89,7 +89,7 @@ def track_tokens(session: zenoh.Session) -> Iterator[PresenceTracker]:
     for token in active_tokens(
         session
     ):  # a get ends when all were told, which a subscription's history does not
-        if token not in tokens.lost:
+        if token not in tokens.lost_tokens:
             tokens.record(token, stands=True)
     try:
         yield tokens

@@ -2,7 +2,7 @@
 that a sender may leave out.
 
 A column that is not sent is filled: floats with NaN, the cell and the sector from the pose, the
-leaving time with the entering time. `schemas.runtime.batch_decoder` decodes many batches at once.
+leaving time with the entering time. The ingest of the fleet service decodes many batches at once.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN40
         WireError: too large, not the message, no needed column, or columns of unequal length.
     """
     message = parse(payload, encoding, MESSAGES[kind], ENCODING[kind])
-    _check(message, kind)
+    _check_columns(message, kind)
     return message
 
 
@@ -188,7 +188,7 @@ def _read_column(message: Any, name: str, dtype: np.dtype[Any], n: int) -> NDArr
     return np.array(values, np.int64) if values else np.full(n, ABSENT.get(name, 0), np.int64)
 
 
-def _check(message: Any, kind: Kind) -> None:  # noqa: ANN401
+def _check_columns(message: Any, kind: Kind) -> None:  # noqa: ANN401
     """Check that a message's columns have equal lengths.
 
     Raises:
@@ -245,7 +245,7 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
         refuse(nowhere, WireError(name, "has values that are not positions", "send finite degrees"))
         needs_place &= ~nowhere
     if kind is Kind.OBSERVATION:
-        _derive(columns, sent, needs_place)
+        _derive_columns(columns, sent, needs_place)
     heads = _with_regions(found, columns)
     if not bad:
         return found._replace(heads=heads)
@@ -261,7 +261,7 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
     )
 
 
-def _derive(columns: Columns, sent: PresentColumns, unplaced: BoolArray) -> None:
+def _derive_columns(columns: Columns, sent: PresentColumns, unplaced: BoolArray) -> None:
     """Fill the columns that a sender of observations may leave out.
 
     `unplaced` is True for rows that have a finite position but no cell.

@@ -267,7 +267,7 @@ def decode_alert(payload: bytes) -> Alert:
     Raises:
         WireError: not an Alert.
     """
-    return _alert(parse(payload, ALERT_ENCODING, pb.Alert, ALERT_ENCODING))
+    return _alert_of_message(parse(payload, ALERT_ENCODING, pb.Alert, ALERT_ENCODING))
 
 
 def encode_standing(alerts: Sequence[Alert]) -> bytes:
@@ -292,8 +292,8 @@ def decode_standing(payload: bytes) -> list[Alert]:
         raise WireError(
             "payload", "is no StandingAlerts", "encode it as defined in the .proto file"
         ) from error
-    return [_alert(alert) for alert in message.alerts]
+    return [_alert_of_message(alert) for alert in message.alerts]
 
 
-def _alert(message: Any) -> Alert:  # noqa: ANN401 protobuf messages are untyped
+def _alert_of_message(message: Any) -> Alert:  # noqa: ANN401 protobuf messages are untyped
     return Alert(**{name: getattr(message, name) for name in Alert.__dataclass_fields__})

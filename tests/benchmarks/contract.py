@@ -11,8 +11,8 @@ from fleet_service.analytics import synthetic
 from fleet_service.analytics.synthetic import SyntheticFleet
 from fleet_service.archive.format import segments
 from fleet_service.archive.maintenance.compaction import compact
+from fleet_service.ingest.batch_decoder import decode_many
 from schemas import wire
-from schemas.runtime.batch_decoder import decode_many
 from schemas.runtime.figures import Figure
 from schemas.wire import Batch, Kind
 from tests.benchmarks.fabricated import make_visits

@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.app.engine import Engine
+from fleet_service.ingest.batch_decoder import decode_many
 from fleet_service.ingest.inbox import STEP_BYTES, STEP_MESSAGES, Message
 from schemas import grid, keys, mugrid, wire
 from schemas.config import ServiceConfig
-from schemas.runtime.batch_decoder import decode_many
 from schemas.runtime.figures import Figure
 from schemas.wire import Batch, Kind
 from tests.benchmarks.measure import SEED

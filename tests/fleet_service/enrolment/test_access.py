@@ -160,7 +160,7 @@ def test_reader_and_vehicle_see_who_serves_and_cannot_say_that_they_do(running: 
         with presence.track_tokens(reader) as seen:
             assert seen.active == {served}
             token.undeclare()
-            until(lambda: seen.lost == {served})
+            until(lambda: seen.lost_tokens == {served})
 
 
 def test_a_new_vehicle_comes_in_while_routers_are_restarted_one_at_a_time(running: Network) -> None:

@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet_service.ingest.batch_decoder import decode_many
+from fleet_service.ingest.protobuf_scan import NUMBERS, TEXTS, gather_values, walk_fields
 from schemas import mugrid
 from schemas.errors import WireError
 from schemas.proto import gripmap_pb2 as pb
-from schemas.runtime.batch_decoder import decode_many
-from schemas.runtime.protobuf_scan import NUMBERS, TEXTS, gather, walk
 from schemas.wire import ENCODING, MESSAGES, NEEDED, Kind, column_types, decode
 
 compiled = settings(deadline=None)  # the first example waits for the compiler
@@ -55,7 +55,7 @@ def is_agreed(kind: Kind, payload: bytes) -> bool:
     than the library.
     """
     data = np.frombuffer(payload, np.uint8)
-    found = walk(kind, data, np.array([len(payload)]))
+    found = walk_fields(kind, data, np.array([len(payload)]))
     if not found.understood[0]:
         return False
     message = MESSAGES[kind].FromString(payload)
@@ -69,12 +69,12 @@ def is_agreed(kind: Kind, payload: bytes) -> bool:
             assert not found.counts[0, at]
         elif name == "log_likelihood":
             into = np.zeros((rows, mugrid.BINS), np.uint8)
-            gather(data, found, at, kind, into)
+            gather_values(data, found, at, kind, into)
             assert into.tobytes() == values
         else:
             wide = dtype if dtype.kind == "f" else np.dtype(np.int64)
             column = np.zeros(rows, wide)
-            gather(data, found, at, kind, column)
+            gather_values(data, found, at, kind, column)
             assert column.tobytes() == np.array(list(values), wide).tobytes()
     return True
 

@@ -1,10 +1,10 @@
 """Decode many payloads into one set of columns. Python code runs per message and per column, never
 per record.
 
-A compiled scanner (`schemas.runtime.protobuf_scan`) finds the fields in the bytes of all messages.
-Then the values of all messages are read column by column. A message that the scanner does not
-understand, for example JSON, is decoded by the protobuf library and encoded again in the plain
-form. So there is one path from bytes to columns. An error in one message is reported for that
+A compiled scanner (`protobuf_scan`) finds the fields in the bytes of all messages. Then the values
+of all messages are read column by column. A message that the scanner does not understand, for
+example JSON, is decoded by the protobuf library and encoded again in the plain form. So there is
+one path from bytes to columns. An error in one message is reported for that
 message and does not affect the others.
 """
 
@@ -16,10 +16,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fleet_service.ingest.protobuf_scan import (
+    NUMBERS,
+    TEXTS,
+    ScannedFields,
+    gather_values,
+    walk_fields,
+)
 from schemas import mugrid
 from schemas.errors import WireError
 from schemas.numeric import BoolArray, IntArray
-from schemas.runtime.protobuf_scan import NUMBERS, TEXTS, ScannedFields, gather, walk
 from schemas.wire import ENCODING, MAX_BYTES, PLAIN, Columns, Kind, column_types
 from schemas.wire.batches import (
     ABSENT,
@@ -45,7 +51,7 @@ def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
     if not walked.understood.all():
         for index in np.flatnonzero(~walked.understood).tolist():
             try:
-                plain[index] = _reencode(kind, *payloads[index])
+                plain[index] = _reencode_message(kind, *payloads[index])
             except WireError as error:
                 errors.append((index, error))
         wrong = {index for index, _ in errors}
@@ -62,12 +68,12 @@ def _scan_messages(
     kind: Kind, messages: list[bytes], strict: bool
 ) -> tuple[NDArray[np.uint8], ScannedFields]:
     data = np.frombuffer(b"".join(messages), np.uint8)
-    return data, walk(
+    return data, walk_fields(
         kind, data, np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages))), strict
     )
 
 
-def _reencode(kind: Kind, payload: bytes, encoding: str) -> bytes:
+def _reencode_message(kind: Kind, payload: bytes, encoding: str) -> bytes:
     """Return a message as our own encoder writes it.
 
     Raises:
@@ -132,6 +138,6 @@ class _Fields(NamedTuple):
                 column = np.full(n, np.nan, dtype)
             else:
                 column = np.full(n, ABSENT.get(name, 0), np.int64)
-            gather(self.data, self.walked, at, self.kind, column)
+            gather_values(self.data, self.walked, at, self.kind, column)
             out[name] = column
         return self.sizes, out, likelihood

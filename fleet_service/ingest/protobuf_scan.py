@@ -83,7 +83,7 @@ class _Scan(NamedTuple):
 
 
 @cache
-def _layout(kind: Kind) -> _Layout:
+def _make_layout(kind: Kind) -> _Layout:
     fields = MESSAGES[kind].DESCRIPTOR.fields_by_name
     names = list(column_types(kind))
     roles = np.full(_FIELDS, _UNKNOWN)
@@ -97,7 +97,7 @@ def _layout(kind: Kind) -> _Layout:
     )
 
 
-def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> ScannedFields:
+def walk_fields(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> ScannedFields:
     """Scan messages that follow each other in `data`.
 
     Args:
@@ -107,7 +107,7 @@ def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> Sc
         strict: True to leave names that are not ASCII to the library; False if the library wrote
             the bytes.
     """
-    layout = _layout(kind)
+    layout = _make_layout(kind)
     k = len(ends)
     columns = len(layout.widths)
     out = ScannedFields(
@@ -123,17 +123,17 @@ def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> Sc
     return out
 
 
-def gather(
+def gather_values(
     data: ByteArray, walked: ScannedFields, column: int, kind: Kind, into: NDArray[Any]
 ) -> None:
     """Copy a column of all messages, one after the other, into an array (n, …) that is filled with
     the default value."""
-    width = int(_layout(kind).widths[column])
-    each = int(_layout(kind).per_record[column])
+    width = int(_make_layout(kind).widths[column])
+    each = int(_make_layout(kind).per_record[column])
     begins = walked.begins[:, column]
     counts = walked.counts[:, column]
     if width:
-        _copy(
+        _copy_bytes(
             data,
             begins,
             counts * width,
@@ -141,11 +141,11 @@ def gather(
             into.reshape(-1).view(np.uint8),
         )
     else:
-        _unpack(data, begins, counts, walked.sizes, into)
+        _unpack_values(data, begins, counts, walked.sizes, into)
 
 
 @refcount_free
-def _varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
+def _read_varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
     """Return a number and its end; the end is -1 if it is not a number of at most 64 bits."""
     value = 0
     shift = 0
@@ -175,7 +175,7 @@ def _scan_fields(scan: _Scan, ends: IntArray, first: int) -> None:
         seen = 0
         fine = True
         while fine and at < end:
-            tag, at = _varint(data, at, min(end, at + 2))
+            tag, at = _read_varint(data, at, min(end, at + 2))
             number = tag >> 3
             wire = tag & 7
             fine = (
@@ -214,9 +214,9 @@ def _scan_field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) ->
         out.numbers[k, role] = value
         return at + 8
     if role < _TEXT:
-        out.numbers[k, role], at = _varint(data, at, end)
+        out.numbers[k, role], at = _read_varint(data, at, end)
         return at if wire == _VARINT else -1
-    length, at = _varint(data, at, end)
+    length, at = _read_varint(data, at, end)
     if wire != _RUN or at < 0 or not 0 <= length <= end - at:
         return -1
     if role < _COLUMN:
@@ -235,7 +235,7 @@ def _scan_field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) ->
     else:
         position = at
         while position < at + length:
-            value, position = _varint(data, position, at + length)
+            value, position = _read_varint(data, position, at + length)
             if position < 0 or not -(1 << 31) <= value < 1 << 31:
                 return -1
             count += 1
@@ -244,7 +244,7 @@ def _scan_field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) ->
 
 
 @refcount_free
-def _copy(
+def _copy_bytes(
     data: ByteArray, begins: IntArray, lengths: IntArray, lengths_out: IntArray, into: ByteArray
 ) -> None:
     to = 0
@@ -257,12 +257,12 @@ def _copy(
 
 
 @refcount_free
-def _unpack(
+def _unpack_values(
     data: ByteArray, begins: IntArray, counts: IntArray, sizes: IntArray, into: IntArray
 ) -> None:
     to = 0
     for k in range(len(begins)):
         at = begins[k]
         for position in range(counts[k]):
-            into[to + position], at = _varint(data, at, len(data))
+            into[to + position], at = _read_varint(data, at, len(data))
         to += sizes[k]
