@@ -27,6 +27,7 @@ from edge_agent.lab.evaluation.papers.reproductions import REPRODUCTIONS
 from edge_agent.lab.tuning import search_comparison, study_report
 from fleet_service.lab import fading
 from schemas.runtime.figures import Figure
+from schemas.thresholds import GRAVITY
 from tests.structure import ROOT
 
 FOLDER: Final = ROOT / "deploy" / "figures"
@@ -147,6 +148,24 @@ def _render_searches(values: dict[str, float]) -> str:
     return search_comparison.comparison_tables(listed)
 
 
+def _format_fading(values: dict[str, float]) -> str:
+    """Return a table of the lower end, and of the deceleration [m/s²] that it allows, by weather
+    and time.
+    """
+    times = [
+        f"{minutes} min" if minutes < 60 else f"{minutes // 60} h" for minutes in fading.AFTER_MIN
+    ]
+    lines = [
+        f"| weather | {' | '.join(['at once', *times[1:]])} |",
+        f"|{'---|' * (1 + len(times))}",
+    ]
+    for name, title in fading.TITLES.items():
+        lower = [values[f"{fading.PREFIX}.{name}.min{minutes}"] for minutes in fading.AFTER_MIN]
+        cells = [f"{mu:.2f}".removeprefix("0") + f", {GRAVITY * mu:.1f}" for mu in lower]
+        lines.append(f"| {title} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 TABLES: Final = (
     Table(
         "edge",
@@ -172,7 +191,7 @@ TABLES: Final = (
         "A dry road after the last pass: lower end of the interval, and the deceleration it "
         "supports [m/s²]",
         re.compile(re.escape(fading.PREFIX)),
-        fading.format_table,
+        _format_fading,
     ),
     Table(
         "study",

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from fleet_service.lab import fading
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 from tests import results
@@ -97,3 +98,10 @@ def test_an_older_run_replaces_nothing(folder: Path) -> None:
 def test_a_table_without_its_figures_says_so() -> None:
     table = next(table for table in results.TABLES if table.campaign == "fleet")
     assert results._render_table(table, {}).startswith("Not complete: the kept run has no figure ")
+
+
+def test_the_table_of_fading_has_all_weathers_and_times() -> None:
+    names = [f"{fading.PREFIX}.{one}.min{at}" for one in fading.WEATHER for at in fading.AFTER_MIN]
+    rows = results._format_fading(dict.fromkeys(names, 0.3)).splitlines()
+    assert len(rows) == 2 + len(fading.WEATHER)
+    assert {row.count("|") for row in rows} == {2 + len(fading.AFTER_MIN)}

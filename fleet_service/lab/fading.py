@@ -4,7 +4,6 @@ last pass. Pure.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
 from fleet_service.lab.town import START, Visits
 from schemas import grid, mugrid
 from schemas.numeric import FloatArray
-from schemas.thresholds import GRAVITY, NS
+from schemas.thresholds import NS
 
 PREFIX: Final = "fusion.stays_dry"
 DRY = 0.85
@@ -104,19 +103,3 @@ def _hourly_reports(known: WeatherSince) -> Reports:
         np.full(n, known.precipitation),
         np.full((n, mugrid.BINS), np.nan),
     )
-
-
-def format_table(values: Mapping[str, float]) -> str:
-    """Return a table of the lower end, and of the deceleration [m/s²] that it allows, by weather
-    and time.
-    """
-    times = [f"{minutes} min" if minutes < 60 else f"{minutes // 60} h" for minutes in AFTER_MIN]
-    lines = [
-        f"| weather | {' | '.join(['at once', *times[1:]])} |",
-        f"|{'---|' * (1 + len(times))}",
-    ]
-    for name, title in TITLES.items():
-        lower = [values[f"{PREFIX}.{name}.min{minutes}"] for minutes in AFTER_MIN]
-        cells = [f"{mu:.2f}".removeprefix("0") + f", {GRAVITY * mu:.1f}" for mu in lower]
-        lines.append(f"| {title} | {' | '.join(cells)} |")
-    return "\n".join(lines)

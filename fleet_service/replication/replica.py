@@ -421,13 +421,13 @@ class BucketReplica:
     def _list_files(self, folders: Iterable[str]) -> dict[str, Stamp]:
         """Return names and stamps of the files that are copied, in the order of the folders."""
         found: dict[str, Stamp] = {}
-        for folder in folders:
-            for path in sorted((self._root / folder).rglob("*")):
-                name = self._object_name(path)
-                if _is_copied(name):
-                    with suppress(FileNotFoundError):
-                        if path.is_file():
-                            found[name] = stamp_of(path)
+        paths = (path for one in folders for path in sorted((self._root / one).rglob("*")))
+        for path in paths:
+            name = self._object_name(path)
+            if _is_copied(name):
+                with suppress(FileNotFoundError):
+                    if path.is_file():
+                        found[name] = stamp_of(path)
         return found
 
 

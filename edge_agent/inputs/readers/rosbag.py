@@ -49,10 +49,15 @@ def open_bag(path: Path) -> Iterator[Any]:
             with reader:
                 yield reader
         finally:
-            for part in reader.readers:  # a bag that could not be opened leaves its file open
-                for held in (part, *getattr(part, "storages", ()), getattr(part, "storage", None)):
-                    if (file := getattr(held, "bio", None)) is not None:
-                        file.close()
+            for part in reader.readers:
+                _close_files(part)
+
+
+def _close_files(part: Any) -> None:  # noqa: ANN401
+    """Close the files of a reader: a bag that could not be opened leaves its file open."""
+    for held in (part, *getattr(part, "storages", ()), getattr(part, "storage", None)):
+        if (file := getattr(held, "bio", None)) is not None:
+            file.close()
 
 
 def has_frames(reader: Any) -> bool:  # noqa: ANN401

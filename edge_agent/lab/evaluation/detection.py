@@ -221,14 +221,18 @@ def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
             if slid is None:
                 continue
             activity = activity_of(drive, n, slid[0], min(slid[1], end))
-            for among in ("slide", activity):
-                tally.add_case(f"passes.{kind}.{among}", holds=bool(called.any()))
-                tally.add_case(f"flag.passes.{kind}.{among}", holds=bool(flag.any()))
-            for name, found in (("seconds", called), ("flag.seconds", flag)):
+            for name, found in (("", called), ("flag.", flag)):
+                for among in ("slide", activity):
+                    tally.add_case(f"{name}passes.{kind}.{among}", holds=bool(found.any()))
                 if found.any():
                     wait = max(0.0, (first + int(np.argmax(found)) - slid[0]) / RATE_HZ)
-                    for key in (f"{name}.{kind}", f"{name}.{kind}.{activity}"):
-                        tally.seconds.setdefault(key, []).append(wait)
+                    _add_seconds(tally, f"{name}seconds.{kind}", activity, wait)
+
+
+def _add_seconds(tally: DetectionTally, key: str, activity: str, wait: float) -> None:
+    """Add a time to detection [s], over all activities and for its own."""
+    tally.seconds.setdefault(key, []).append(wait)
+    tally.seconds.setdefault(f"{key}.{activity}", []).append(wait)
 
 
 def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:

@@ -16,7 +16,7 @@ from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.bring_in import read_source, write_log
 from edge_agent.inputs.merge import merge_recordings
 from edge_agent.inputs.profile import Channel, Profile, load_profile, shipped_profiles
-from edge_agent.inputs.readers.can_log import log_frames
+from edge_agent.inputs.readers.can_log import Log, log_frames
 from edge_agent.inputs.readers.dbc import LONGEST, Database, parse_dbc, read_dbc
 from edge_agent.inputs.recording import import_optional
 from edge_agent.inputs.signal_log import read_log
@@ -57,15 +57,23 @@ def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
         if recorded is not None:
             log, _ = log_frames(recorded, {message.identifier for message in ours.values()})
             for message in oracle.messages:
-                for (_, identifier, extended), heard in log.items():
-                    if (identifier, extended) == (message.frame_id, message.is_extended_frame):
-                        data = heard.to_columns()[1]
-                        frames[message.name] += [bytes(row[: message.length]) for row in data]
+                frames[message.name] += _recorded_frames(log, message)
         for message in oracle.messages:
             errors, values = _compare_decoders(ours, message, frames[message.name])
             wrong = wrong + errors
             compared = compared + values
     return wrong, compared
+
+
+def _recorded_frames(log: Log, message: Any) -> list[bytes]:  # noqa: ANN401 cantools has no types
+    """Return the payloads of a message on all buses of a recorded log."""
+    wanted = (message.frame_id, message.is_extended_frame)
+    return [
+        bytes(row[: message.length])
+        for (_, *identity), received in log.items()
+        if tuple(identity) == wanted
+        for row in received.to_columns()[1]
+    ]
 
 
 def _compare_decoders(ours: Database, message: Any, frames: Sequence[bytes]) -> tuple[int, int]:  # noqa: ANN401 cantools has no types

@@ -75,11 +75,6 @@ class Network:
     roads: int
     starts: IntArray | None = None
 
-    @property
-    def road_length(self) -> float:
-        """Return the length of all roads [m], each counted once."""
-        return float(((self.size - 1) * self.spacing)[: self.roads].sum() / 2.0)
-
     def lane(self, k: int) -> FloatArray:
         """Return the points of lane k."""
         return self.points[self.first[k] : self.first[k] + self.size[k]]

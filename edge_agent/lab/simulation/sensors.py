@@ -251,6 +251,16 @@ def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int
 
 
 @compiled
+def drop_out(share: float, key: np.uint64, window: int, row: FloatArray) -> None:
+    """Remove the readings of each device from `row` (18,) with probability `share`; all samples of
+    a window have the same devices silent.
+    """
+    for c in range(len(CHANNELS)):
+        if uniform(key, window * len(GROUPS) + GROUP_OF[c]) < share:
+            row[c] = math.nan
+
+
+@compiled
 def sense(
     records: FloatArray,
     errors: FloatArray,
@@ -297,11 +307,5 @@ def sense(
             if rough:
                 quantise_speeds(records[lead + k, n], error[ErrorColumn.MOUNTED :], row)
             if error[ErrorColumn.DROPOUTS] > 0.0:
-                window = sample // per_silence
-                for c in range(len(CHANNELS)):
-                    if (
-                        uniform(silence[n], window * len(GROUPS) + GROUP_OF[c])
-                        < error[ErrorColumn.DROPOUTS]
-                    ):
-                        row[c] = math.nan
+                drop_out(error[ErrorColumn.DROPOUTS], silence[n], sample // per_silence, row)
     return signals

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from fleet_service.analytics.roads.network import DirectedLink, RoadNetwork
 from schemas import grid
 from schemas.errors import InputError
-from schemas.numeric import FloatArray, IntArray
+from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import METRES_PER_DEGREE
 
 # from a cell's centre to a road: half a cell, lanes beside the drawn line, a receiver's error
@@ -59,14 +59,61 @@ class _Marks(NamedTuple):
     yaw: FloatArray
 
 
+class _Joined(NamedTuple):
+    """Cells and sectors on links, each (n,)."""
+
+    cell: IntArray
+    sector: IntArray
+    mark: IntArray
+    distance: FloatArray
+    ambiguous: FloatArray
+    second: BoolArray
+
+
 def join_roads(network: RoadNetwork) -> pa.Table:
     """Return one row per cell and sector on a link; the reference "Columns of the ten questions"
     explains the columns."""
     lengths, marks = _link_marks(network.links)
-    tree = cKDTree(_to_mercator(marks.latitude, marks.longitude))
     scale = np.cos(np.radians(marks.latitude))
-    reach = REACH_M / scale.min()
     side = scale.mean() * METRES_PER_DEGREE * 360.0 / 2**grid.CELL_ZOOM
+    joined = _join_cells(network, marks, scale, side)
+    link = marks.link[joined.mark]
+    middle = marks.run[joined.mark]
+    length = lengths[link]
+    texts = {
+        name: pa.array([getattr(network.links[k], field) for k in link.tolist()], pa.string())
+        for name, field in (
+            ("link", "id"),
+            ("direction", "direction"),
+            ("name", "name"),
+            ("kind", "kind"),
+        )
+    }
+    numbers = {
+        "cell": joined.cell,
+        "sector": joined.sector.astype(np.int8),
+        "from_m": np.maximum(middle - side / 2.0, 0.0),
+        "to_m": np.minimum(middle + side / 2.0, length),
+        "length_m": length,
+        "distance_m": joined.distance,
+        "shared": joined.second,
+    }
+    arrays: dict[str, Any] = {name: pa.array(column) for name, column in numbers.items()} | texts
+    arrays["ambiguous_m"] = pa.array(joined.ambiguous, from_pandas=True)
+    found = pa.table([arrays[name] for name in SCHEMA.names], schema=SCHEMA)
+    found = found.sort_by([("cell", "ascending"), ("sector", "ascending"), ("shared", "ascending")])
+    return found.replace_schema_metadata(
+        {f"roads.{key}": value for key, value in network.source.items()}
+    )
+
+
+def _join_cells(network: RoadNetwork, marks: _Marks, scale: FloatArray, side: float) -> _Joined:
+    """Join the cells near links to the links that go the same way.
+
+    `scale` (marks,) is the cosine of the latitude, and `side` the width of a cell [m].
+    """
+    tree = cKDTree(_to_mercator(marks.latitude, marks.longitude))
+    reach = REACH_M / scale.min()
     cells = _nearby_cells(marks, float(side))
     service = np.array([SERVICE_M if link.kind == "service" else 0.0 for link in network.links])
     start, end = (
@@ -105,37 +152,7 @@ def join_roads(network: RoadNetwork) -> pa.Table:
             other[np.isinf(other)] = np.nan
             columns = (piece[row], np.full(len(row), axis), mark, metre, other[row], ~mine)
             parts.append([column[kept] for column in columns])
-    cell, sector, mark, distance, ambiguous, second = (
-        np.concatenate(column) for column in zip(*parts, strict=True)
-    )
-    link = marks.link[mark]
-    middle = marks.run[mark]
-    length = lengths[link]
-    texts = {
-        name: pa.array([getattr(network.links[k], field) for k in link.tolist()], pa.string())
-        for name, field in (
-            ("link", "id"),
-            ("direction", "direction"),
-            ("name", "name"),
-            ("kind", "kind"),
-        )
-    }
-    numbers = {
-        "cell": cell,
-        "sector": sector.astype(np.int8),
-        "from_m": np.maximum(middle - side / 2.0, 0.0),
-        "to_m": np.minimum(middle + side / 2.0, length),
-        "length_m": length,
-        "distance_m": distance,
-        "shared": second,
-    }
-    arrays: dict[str, Any] = {name: pa.array(column) for name, column in numbers.items()} | texts
-    arrays["ambiguous_m"] = pa.array(ambiguous, from_pandas=True)
-    found = pa.table([arrays[name] for name in SCHEMA.names], schema=SCHEMA)
-    found = found.sort_by([("cell", "ascending"), ("sector", "ascending"), ("shared", "ascending")])
-    return found.replace_schema_metadata(
-        {f"roads.{key}": value for key, value in network.source.items()}
-    )
+    return _Joined(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def read_roads(path: Path) -> pa.Table:

@@ -21,9 +21,3 @@ def test_lower_end_falls_with_time_and_faster_in_rain_and_frost() -> None:
         > after_half_an_hour["mild_rain"]
     )
     assert after_half_an_hour["mild_rain"] >= after_half_an_hour["freezing"]
-
-
-def test_the_table_has_a_row_for_each_weather_and_a_column_for_each_time() -> None:
-    rows = fading.format_table(fading.measure(range(1))).splitlines()
-    assert len(rows) == 2 + len(fading.WEATHER)
-    assert {row.count("|") for row in rows} == {2 + len(fading.AFTER_MIN)}
