@@ -255,11 +255,10 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def moment(text: str, field: str) -> int:
-    """Return a time as people write it (ISO 8601, a day or more) in ns since 1970. A time without a
-    zone is UTC.
+    """Convert an ISO 8601 date, or date and time, to ns since 1970. A time without a zone is UTC.
 
     Raises:
-        InputError: it is none, or lies outside what 64 bits of nanoseconds hold.
+        InputError: `text` is not a time, or lies outside what 64 bits of nanoseconds hold.
     """
     try:
         found = nanoseconds(datetime.fromisoformat(text))

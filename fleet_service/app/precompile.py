@@ -17,11 +17,12 @@ from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.likelihoods import at_least, bound_by_used, level_above_used
 from fleet_service.fusion.reported import as_reported
 from fleet_service.fusion.space import cell_shares
+from fleet_service.ingest.batch_decoder import decode_many
 from fleet_service.ingest.grouping import group_rows, largest_of
 from fleet_service.ingest.paths import VehiclePaths
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.encode import cell_table
-from schemas import mugrid
+from schemas import mugrid, wire
 from schemas.runtime.jit import kernel_cache
 
 CELLS: Final = 1 << 14  # more than a map has room for at first
@@ -62,6 +63,10 @@ def exercise_map() -> None:
     VehiclePaths().find_implausible(column, np.zeros(1, np.int64), np.zeros(1), np.zeros(1))
     cell_shares(np.ones(1), np.ones(1))
     cell_table(fusion, np.arange(2), 10 * EPOCH_NS)
+    for kind in wire.Kind:
+        columns = {name: np.zeros(1, dtype) for name, dtype in wire.column_types(kind).items()}
+        batch = wire.Batch(kind, "precompiled", 1, 1, 1, 1, columns, "none")
+        decode_many(kind, 2 * [(wire.encode(batch), wire.ENCODING[kind])])
 
 
 def _make_visits(time: int, cells: int) -> Observations:

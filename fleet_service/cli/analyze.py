@@ -104,6 +104,11 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(
             "engine", f"{arguments.engine!r} is unknown", f"use one of {', '.join(engines.ENGINES)}"
         )
+    roads = None
+    if arguments.roads is not None and question.name != "contract":
+        from fleet_service.analytics.roads.join import read_roads
+
+        roads = read_roads(arguments.roads)  # a wrong file is an early error
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
     part = Extract(*time_span(arguments), bbox)
     if not arguments.as_it_lies:
@@ -128,10 +133,10 @@ def run(arguments: argparse.Namespace) -> int:
     found = question.ask(engine, options)
     if bbox is not None and not found.num_rows:
         _report_covered_box(arguments, bbox)
-    if arguments.roads is not None and question.name != "contract":
+    if roads is not None:
         from fleet_service.analytics.roads.join import add_road_names
 
-        found = add_road_names(found, arguments.roads)
+        found = add_road_names(found, roads)
     print(
         output.format_json_lines(found, question)
         if arguments.json

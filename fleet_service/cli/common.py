@@ -211,8 +211,9 @@ def compact_first(root: Path) -> None:
 
 
 def describe_covered_box(what: str, box: Sequence[float], asked: Sequence[float]) -> str:
-    """Return a line that names the box of all data, for a queried box without any; both are west,
-    south, east, north [deg].
+    """Return the message for a queried box that holds no data: it states the box that the data
+    cover, and says so if latitude and longitude seem to be exchanged. Boxes are west, south, east,
+    north [deg].
     """
     sides = ",".join(f"{side:.3f}" for side in box)
     words = f"no cell lies in this box; the {what} covers --bbox {sides}"

@@ -71,8 +71,8 @@ class Inbox:
     """Bounded queue.
 
     Args:
-        capacity: maximum number of messages; one more for each further callback thread that puts at
-            the same instant.
+        capacity: maximum number of messages. Threads that call `put` at the same instant may exceed
+            it by one each, because the check takes no lock.
         counts: where drops are counted, under `overload`.
         limits: rate limits per vehicle.
     """

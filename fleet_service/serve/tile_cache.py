@@ -100,7 +100,7 @@ class TileCache:
         return kept if whole else self.make(tile, now)
 
     def make(self, tile: int, now: int) -> ShownTile:
-        """Make a tile as believed at `now` [ns]."""
+        """Make a tile from the state of the map at `now` [ns], and keep it."""
         with self.guard:
             change = self.state.change
             cells = self.seen(self._from_south(self.public(self.state.slots(tile), now)), now)

@@ -199,7 +199,7 @@ def _count_rows(root: Path) -> int:
 
 
 def _room_made(engine: Engine, folder: Path) -> int:
-    """Return the days that retention removes from a full disk."""
+    """Fill the disk, run retention, and return the number of days that it deleted."""
     root = folder / "archive"
     begin_with_old_rows(root)
     with patch.multiple(disk_reserve, SIZE=RESERVE_MB << 20, _LEAST_FREE=2 * RESERVE_MB << 20):

@@ -40,7 +40,7 @@ FLOODER: Final = "flood-001"
 CELLS: Final = 20
 FLOODED_MU: Final = 0.8
 EVERY_S: Final = 0.5  # of each honest vehicle
-RESEND_S: Final = 2.0  # as a outbox does
+RESEND_S: Final = 2.0  # as an outbox does
 START_S: Final = 300.0  # the first start compiles the kernels
 _ASKED: Final = "gripmap/v1/map/**"
 
@@ -103,7 +103,7 @@ class Honest:
         self._put_batch(one)
 
     def resend(self) -> None:
-        """Send again what waits for longer than a outbox waits."""
+        """Send again what waits for longer than an outbox waits."""
         now = time.monotonic()
         for seq in [seq for seq in self._last if seq in self.delays]:
             del self._last[seq]

@@ -81,7 +81,7 @@ class Ground:
         return self.service.engine.counts[wire.Kind.OBSERVATION]
 
     def drive(self, session: zenoh.Session | None = None, name: str = HONEST) -> None:
-        """Put a good batch of one observation until the service has it on disk, as a outbox
+        """Put a good batch of one observation until the service has it on disk, as an outbox
         does.
         """
         self._seq += 1

@@ -137,8 +137,8 @@ JOINT: Final = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """For each quantity, its fault or None, and the margin by which the best explanation that
-    differs costs more.
+    """Result of the search: the fault of each quantity, None if it is sound, and by how much more
+    the best explanation costs that gives this quantity another fault.
     """
 
     faults: dict[str, Mistake | None]

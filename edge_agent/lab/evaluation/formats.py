@@ -29,7 +29,7 @@ def as_log(path: Path, messages: Sequence[Any]) -> Path:
 
 
 def as_mf4(path: Path, messages: Sequence[Any]) -> Path:
-    """Write a bus log by asammdf, in the layout of its standard."""
+    """Write CAN messages as an MDF 4 file in the bus-logging layout of ASAM, with asammdf."""
     asammdf = import_optional("asammdf")
     types = np.dtype(
         [

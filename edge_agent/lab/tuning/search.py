@@ -65,7 +65,7 @@ class Result:
 
     @property
     def evaluations(self) -> int:
-        """Distinct vectors that the objective was asked for."""
+        """Number of distinct vectors for which the objective was evaluated."""
         return self.history[-1].evaluations
 
 

@@ -240,11 +240,11 @@ def _angle_between(yaw: FloatArray, axis: float) -> FloatArray:
     return np.asarray(np.abs((yaw - axis + np.pi) % (2.0 * np.pi) - np.pi))
 
 
-def add_road_names(found: pa.Table, roads: Path) -> pa.Table:
+def add_road_names(found: pa.Table, roads: pa.Table) -> pa.Table:
     """Return an answer with the names of its cells' roads as column `road`; null where no named
-    road is near.
+    road is near. `roads` is a table of `read_roads`.
     """
-    network = read_roads(roads).sort_by("distance_m")
+    network = roads.sort_by("distance_m")
     nearest: dict[Any, str] = {}
     columns = (network[name].to_pylist() for name in ("cell", "sector", "name"))
     for cell, sector, name in zip(*columns, strict=True):

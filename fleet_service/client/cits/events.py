@@ -80,7 +80,7 @@ class EventBook:
 
     @property
     def content(self) -> dict[str, Any]:
-        """Return the book for a file."""
+        """Return the book as values that JSON can hold, to be saved to a file."""
         return {
             "station": self.station,
             "next": self._next,

@@ -239,7 +239,7 @@ def test_what_was_observed_yesterday_says_how_old_it_is(router: Router) -> None:
 
 
 def test_a_map_of_yesterday_neither_warns_nor_replaces_that_of_today(router: Router) -> None:
-    """Report ice of yesterday after a dry road, and then of today the other way round."""
+    """Yesterday's map of ice causes no warning, and does not replace today's map of ice."""
     yesterday = {int(key): 0.85 for key in keys_on()} | {int(key): 0.15 for key in ICE}
     with driving(router) as car:
         with MadeUpService(router.settings, time.time_ns() - DAY, yesterday, kept=True):

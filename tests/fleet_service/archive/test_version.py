@@ -1,5 +1,5 @@
-"""Versions of files: stored files stay readable, other versions are not damage, and a reader
-changes nothing.
+"""Versions of archive files: files of earlier versions stay readable, a file of an unknown version
+is refused but not treated as damaged, and a process that only reads changes no file.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ def replace_bar(row: PaperRow, bar: float) -> PaperRow:
 
 
 def test_summary_names_the_rows_that_miss() -> None:
-    assert summary(made_up(HELD, SHOWN)) == "1 of 1 matched numbers hold their bar."
+    assert summary(made_up(HELD, SHOWN)) == "1 of 1 matched numbers meet their bar."
     assert "Missed: mae_vy" in summary(made_up(HELD, MISSED))
 
 
