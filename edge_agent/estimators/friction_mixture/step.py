@@ -23,7 +23,7 @@ from edge_agent.estimators.friction_mixture.drive_split import learn_drive
 from edge_agent.estimators.friction_mixture.grip_guard import lower_while_sliding
 from edge_agent.estimators.friction_mixture.ice_patch import grow_patches
 from edge_agent.estimators.friction_mixture.intake import begin_block, take_sample
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles, VelocityGain
 from edge_agent.estimators.friction_mixture.mixing import (
     active_nodes,
     apply_road_change,
@@ -44,7 +44,7 @@ from edge_agent.estimators.friction_mixture.trust import (
 from edge_agent.estimators.friction_mixture.used_grip import used_grip
 from edge_agent.estimators.friction_mixture.weighing import apply_measurement, update_novelty
 from edge_agent.estimators.friction_mixture.wheel_slip import update_slip
-from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
+from edge_agent.estimators.friction_mixture.workspace import Scratch
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
@@ -71,7 +71,7 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     health = block_features(memory, design, features)
     learn_drive(memory, design.constants, features)
     update_slip(memory, design.constants, features)
-    vx, vy = block_velocity(memory, features)
+    vx, vy = turned_velocity(memory, features.gain, features.cos, features.sin)
     update_novelty(memory, design, features, vx, vy)
     watch_wheels(memory, design.constants, features)
     wake_or_sleep(memory, design, scratch)
@@ -185,24 +185,21 @@ def _find_side(
 
 
 @compiled
-def block_velocity(memory: MixtureMemory, features: BlockFeatures) -> tuple[float, float]:
-    """Return the mean (v_x, v_y) [m/s] of the mixture over the block."""
-    x = memory.overall_mean
-    gained_x, gained_y = gained_velocity(features.gain, x)
-    return (
-        features.cos * x[NodeState.VX] + features.sin * x[NodeState.VY] + gained_x,
-        features.cos * x[NodeState.VY] - features.sin * x[NodeState.VX] + gained_y,
-    )
+def mean_velocity(memory: MixtureMemory) -> tuple[float, float]:
+    """Return the current (v_x, v_y) [m/s] of the mixture."""
+    block = memory.block
+    return turned_velocity(memory, block.gain, math.cos(block.angle), math.sin(block.angle))
 
 
 @compiled
-def mean_velocity(memory: MixtureMemory) -> tuple[float, float]:
-    """Return the current (v_x, v_y) [m/s] of the mixture."""
+def turned_velocity(
+    memory: MixtureMemory, gain: VelocityGain, cos: float, sin: float
+) -> tuple[float, float]:
+    """Return (v_x, v_y) [m/s] of the mixture after the vehicle has turned by an angle of this cosine
+    and sine, and has gained the velocity `gain`, since the block began.
+    """
     x = memory.overall_mean
-    angle = memory.block.angle
-    cos = math.cos(angle)
-    sin = math.sin(angle)
-    gained_x, gained_y = gained_velocity(memory.block.gain, x)
+    gained_x, gained_y = gained_velocity(gain, x)
     return (
         cos * x[NodeState.VX] + sin * x[NodeState.VY] + gained_x,
         cos * x[NodeState.VY] - sin * x[NodeState.VX] + gained_y,
