@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from schemas.runtime.ports import free_ports
 from tests.waiting import until
 
 BUCKET = "grip"
@@ -24,8 +25,7 @@ class BucketServer:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         (folder / BUCKET).mkdir(parents=True)
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            self._port = int(free.getsockname()[1])
+        (self._port,) = free_ports(1)
         self._process: subprocess.Popen[bytes] | None = None
         self.url = f"s3://{BUCKET}/{PREFIX}"
         self.store = {

@@ -36,6 +36,7 @@ from ruamel.yaml import YAML
 from fleet_service.cli import main as fleet_service
 from schemas.runtime.figures import Figure, markdown, write
 from schemas.runtime.jit import cache_root
+from schemas.runtime.ports import free_ports
 from tests.buckets import BucketServer, bucket_server
 from tests.structure import ROOT
 from tests.waiting import until
@@ -117,15 +118,6 @@ def make_pods(objects: list[Manifest], root: Path) -> list[Pod]:
             pod.ports = dict(zip(numbers, free_ports(len(numbers)), strict=True))
             found.append(pod)
     return found
-
-
-def free_ports(count: int) -> list[int]:
-    """Return unused ports."""
-    with ExitStack() as stack:
-        sockets = [
-            stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)
-        ]
-        return [int(one.getsockname()[1]) for one in sockets]
 
 
 class Cluster:

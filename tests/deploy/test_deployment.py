@@ -26,6 +26,7 @@ from ruamel.yaml import YAML
 from fleet_service.client.map_client import query_map
 from fleet_service.enrolment.fleet import Enrolment
 from schemas.config import AgentConfig, ServiceConfig, load
+from schemas.runtime.ports import free_ports
 from schemas.runtime.zenoh_session import configuration
 from tests.schemas.runtime.test_metrics import fetch_page
 from tests.waiting import until
@@ -44,20 +45,12 @@ MOST_EXPOSED = 3.0  # of systemd's ten
 START_S = 300.0  # the first start compiles the kernels, on a busy machine
 
 
-def free_ports(count: int) -> list[str]:
-    with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for one in sockets:
-            one.bind(("127.0.0.1", 0))
-        return [str(one.getsockname()[1]) for one in sockets]
-
-
 class Site:
     """The folders of a deployment below another root, with other ports."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self._ports = free_ports(len(PORTS))
+        self._ports = [str(port) for port in free_ports(len(PORTS))]
         for name in ("etc", "lib", "cache"):
             (root / name).mkdir()
         for file in (DEPLOY / "secure").glob("*.json"):

@@ -5,7 +5,6 @@ source is killed.
 from __future__ import annotations
 
 import json
-import socket
 import subprocess
 import sys
 import time
@@ -24,6 +23,7 @@ from edge_agent.inputs.live.sources import open_sources
 from edge_agent.lab.live.peers import CHANNELS, DBC, profile_of
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.runtime.figures import Figure
+from schemas.runtime.ports import free_ports
 from schemas.signals import CHANNELS as ALL
 from schemas.vehicle import Vehicle
 
@@ -47,7 +47,8 @@ class Peer:
         for line in _read_lines(self.process.stdout):
             if line == word:
                 return
-        raise RuntimeError(f"the peer ended before it printed {word!r}")
+        code = self.process.wait()
+        raise RuntimeError(f"the peer ended with code {code} before it printed {word!r}")
 
     def send_go(self) -> None:
         """Send the peer the signal to begin or to end."""
@@ -90,16 +91,9 @@ def run_peer(kind: str, address: str, samples: int, rate: float = RATE_HZ) -> It
                 pipe.close()
 
 
-def free_port() -> int:
-    """Return a port that is free now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def peer_addresses(kind: str) -> tuple[str, str]:
     """Return the address of the peer, and the name of the source that listens to it."""
-    port = free_port()
+    (port,) = free_ports(1)
     if kind == "can":
         return f"udp_multicast/{MULTICAST}/{port}", f"can:udp_multicast/{MULTICAST}?port={port}"
     if kind == "ros2":
@@ -178,7 +172,7 @@ def count_crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
         place, source = peer_addresses(kind)
         name, dbc = write_profile("can" if kind == "gpsd" else kind, folder)
         config = folder / f"{kind}.agent.json"
-        port = free_port()
+        (port,) = free_ports(1)
         settings = {
             "spool": str(folder / f"{kind}.sqlite"),
             "estimator": "ckf",

@@ -27,10 +27,10 @@ from edge_agent.inputs.readers.dbc import read_dbc
 from edge_agent.inputs.recording import Series
 from edge_agent.inputs.signal_log import SignalLog, read_log
 from edge_agent.lab.live.databroker import Databroker
-from edge_agent.lab.live.live_benchmark import free_port
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
+from schemas.runtime.ports import free_ports
 from schemas.signals import CHANNELS, CONTEXT, FLAGS, C
 from schemas.thresholds import NS
 from tests.edge_agent.fakes import a_log
@@ -268,7 +268,7 @@ def test_flag_sent_on_change_is_held_only_if_the_profile_says_so() -> None:
 
 
 def test_databroker_sends_lasting_signals_first_and_then_changes() -> None:
-    port = free_port()
+    (port,) = free_ports(1)
     profile = load_profile("vss")[0]
     air, abs_ = (profile.channels[name].signals[0] for name in ("air_temperature", "abs_active"))
     with Databroker(f"127.0.0.1:{port}", [air, abs_, "Vehicle.Acceleration.Lateral"]) as broker:

@@ -29,7 +29,6 @@ from edge_agent.lab.live.databroker import Databroker
 from edge_agent.lab.live.live_benchmark import (
     COUNTED,
     count_lost,
-    free_port,
     peer_addresses,
     run_peer,
     write_profile,
@@ -37,6 +36,7 @@ from edge_agent.lab.live.live_benchmark import (
 from edge_agent.lab.live.peers import CHANNELS, RADIUS, SPEED
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.errors import InputError
+from schemas.runtime.ports import free_ports
 from schemas.signals import CHANNELS as ALL
 from schemas.signals import S
 from schemas.thresholds import NS
@@ -167,7 +167,7 @@ def test_hostile_lines_of_a_receiver_are_counted() -> None:
 def test_databroker_is_queried_and_old_values_are_no_readings(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    port = free_port()
+    (port,) = free_ports(1)
     paths = ["Vehicle.Acceleration.Longitudinal", "Vehicle.Acceleration.Lateral"]
     with Databroker(f"127.0.0.1:{port}", paths) as broker:
         broker.publish({paths[0]: 5.0}, time.time_ns() - 3600 * NS)

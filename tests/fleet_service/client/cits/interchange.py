@@ -5,7 +5,6 @@ gives it.
 from __future__ import annotations
 
 import multiprocessing
-import socket
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -17,6 +16,8 @@ from typing import Any
 import proton
 from proton.handlers import MessagingHandler
 from proton.reactor import ApplicationEvent, Container, EventInjector
+
+from schemas.runtime.ports import free_ports
 
 
 @dataclass
@@ -56,8 +57,7 @@ class _Handler(MessagingHandler):
 
 def free_url() -> str:
     """Address at which nobody listens."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return f"amqp://127.0.0.1:{probe.getsockname()[1]}"
+    return f"amqp://127.0.0.1:{free_ports(1)[0]}"
 
 
 @contextmanager

@@ -1,0 +1,37 @@
+"""Unused ports of this machine, for servers that are started, or started again, later."""
+
+from __future__ import annotations
+
+import random
+import socket
+from pathlib import Path
+from typing import Final
+
+OUTGOING: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
+USUAL_OUTGOING: Final = 32768  # Linux's first port of outgoing connections
+FIRST: Final = 15_000
+
+
+def free_ports(count: int) -> list[int]:
+    """Return different ports of 127.0.0.1 that nothing listens on.
+
+    The system gives the ports from `OUTGOING` on to outgoing connections, so one of these may be
+    taken before its server starts. The ports returned lie below.
+    """
+    try:
+        last = int(OUTGOING.read_text(encoding="ascii").split()[0])
+    except (OSError, ValueError):
+        last = USUAL_OUTGOING
+    if last <= FIRST:
+        last = USUAL_OUTGOING
+    found: list[int] = []
+    for port in random.SystemRandom().sample(range(FIRST, last), last - FIRST):
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+        found.append(port)
+        if len(found) == count:
+            return found
+    raise OSError(f"127.0.0.1 has no {count} free ports from {FIRST} to {last}")
