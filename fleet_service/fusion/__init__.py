@@ -1,5 +1,5 @@
-"""Fusion: one belief per cell and sector on the friction grid. Pure: no clocks, no files, no
-network.
+"""Fusion: the fleet's reports become one belief (probability distribution of friction) per cell and
+sector of the friction grid. The package is pure: it uses no clock, file or network.
 """
 
 from __future__ import annotations

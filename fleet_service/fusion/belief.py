@@ -1,17 +1,17 @@
-"""Belief of one cell, and its change by time and by a vote. Compiled; every function works on one
-row of 32 bins.
+"""Belief about the friction of one cell, and its change by time and by a vote. All functions are
+compiled, and each works on one row of 32 bins.
 
 Legend
     p    belief about the fleet's common reading of the road: probability per bin  (32,)
-    q    a belief at rest: its bins in 16 bits, the largest 65 535               (32,)
+    q    a belief in packed form: bins of 16 bits, the largest is 65 535          (32,)
     L    likelihood of one visit, from its bytes                                (32,)
-    B    bias kernel: B[i, j] = P(the vehicle takes μ_i for μ_j)                (32, 32), rows sum to 1
-    L̃    B·L over its mean: the vote of a vehicle with an error of its own       (32,)
-    s    strength of a vote: its new part, times trust and P(it belongs here)   [-]
-    h    P(the road changed since), 1 - exp(-Δt / CHANGE_S)                     [-]
+    B    bias kernel: B[i, j] = P(the vehicle reads μ_j on a road of μ_i)  (32, 32), rows sum to 1
+    L̃    B·L divided by its mean: the vote of a vehicle with its own bias        (32,)
+    s    strength of a vote: new part × trust × P(the visit was in this cell)   [-]
+    h    P(the road changed within Δt), 1 - exp(-Δt / CHANGE_S)                 [-]
 
-Arithmetic is in single precision, which takes half the memory of double: two digits of a belief are
-significant.
+Arithmetic is in single precision, which takes half the memory of double precision. Only two digits
+of a belief are significant, so this is exact enough.
 """
 
 from __future__ import annotations
@@ -58,8 +58,9 @@ PADDED: Final = _BINS + 2 * REACH
 
 
 def bias_kernel() -> FloatArray:
-    """Return B of one vehicle's own error: a normal of hypot(BIAS_RELATIVE·μ, BIAS_ABSOLUTE),
-    cut at REACH.
+    """Return the bias kernel B (32, 32) of one vehicle: a normal distribution with the standard
+    deviation hypot(BIAS_RELATIVE·μ, BIAS_ABSOLUTE), set to zero more than REACH bins from its
+    centre.
     """
     spread = np.hypot(c.BIAS_RELATIVE * _CENTRES, c.BIAS_ABSOLUTE)[:, None]
     kernel = np.exp(-0.5 * np.square((_CENTRES[None, :] - _CENTRES[:, None]) / spread))
@@ -68,7 +69,9 @@ def bias_kernel() -> FloatArray:
 
 
 def _kernel_diagonals() -> Float32Array:
-    """Return B by diagonals, (2·REACH + 1, 32), so that the bins are contiguous in memory."""
+    """Return the diagonals of the bias kernel B, (2·REACH + 1, 32). In this form the bins that one
+    step reads are contiguous in memory.
+    """
     kernel = bias_kernel()
     taps = np.zeros((2 * REACH + 1, _BINS), np.float32)
     for i in range(_BINS):
@@ -83,8 +86,8 @@ _TAPS: Final = _kernel_diagonals()
 
 @compiled
 def quantiles(belief: FloatArray, levels: tuple[float, ...]) -> FloatArray:
-    """Return the quantiles of beliefs (k, 32), one row per level; bit for bit those of
-    `mugrid.quantiles`, in a tenth of the time.
+    """Return the quantiles of beliefs (k, 32) at the given levels, (levels, k), in units of μ. The
+    results equal those of `mugrid.quantiles` bit for bit and take a tenth of the time.
     """
     out = np.empty((len(levels), len(belief)))
     for k in range(len(belief)):
@@ -106,7 +109,9 @@ def quantiles(belief: FloatArray, levels: tuple[float, ...]) -> FloatArray:
 
 @refcount_free_inlined
 def sum_bins(p: Bins) -> float:
-    """Return the sum of 32 numbers, with eight independent sums that need not wait for each other."""
+    """Return the sum of 32 numbers. Eight partial sums that do not depend on each other run in
+    parallel.
+    """
     a = p[0]
     b = p[1]
     d = p[2]
@@ -163,8 +168,8 @@ def unpack_belief(belief: PackedArray, row: int, p: Bins) -> None:
 
 @refcount_free_inlined
 def pack_belief(p: Bins, belief: PackedArray, row: int) -> None:
-    """Store a belief in packed form; it need not be normalised. After rounding, a non-decreasing
-    belief is still non-decreasing, and a uniform one uniform.
+    """Store a belief `p`, normalised or not, in packed form. Rounding preserves two properties: a
+    non-decreasing belief stays non-decreasing, and a uniform belief stays uniform.
     """
     scale = np.float32(FULL) / np.float32(largest_bin(p))
     for i in range(_BINS):
@@ -173,7 +178,7 @@ def pack_belief(p: Bins, belief: PackedArray, row: int) -> None:
 
 @refcount_free_inlined
 def mix_prior(p: Bins, change: float, prior: Float32Array) -> None:
-    """Mix the prior into a belief in place: p ← (1 - h)·p + h·prior."""
+    """Mix the prior into a belief in place: p ← (1 - h)·p + h·prior, where h is `change`."""
     h = np.float32(change)
     for i in range(_BINS):
         p[i] += h * (prior[i] - p[i])
@@ -181,12 +186,11 @@ def mix_prior(p: Bins, change: float, prior: Float32Array) -> None:
 
 @refcount_free_inlined
 def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded: Bins) -> None:
-    """Let time pass: diffusion over `drift_s` with reflecting ends, then the hazard of a change
-    over `change_s`.
+    """Age a belief in place: diffusion over `drift_s` [s] with reflecting ends, then a possible
+    sudden change of the road over `change_s` [s].
 
-    `p` is changed in place. A uniform belief stays uniform and a non-decreasing one non-decreasing,
-    so that time alone never lowers an upper end below the prior's. `padded` (34 or more) is scratch
-    memory.
+    A uniform belief stays uniform and a non-decreasing one non-decreasing. Therefore time alone
+    never lowers an upper end below the prior's. `padded` (34 or more) is scratch memory.
     """
     if drift_s > 0.0:
         whole = _DIFFUSION * drift_s
@@ -204,8 +208,9 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
 
 @refcount_free_inlined
 def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
-    """Make up what `forget` over `change_s` lacks to CHANGE_LEAST, for a value of which `power`
-    is new. In place.
+    """Raise the probability of a sudden road change to CHANGE_LEAST·`power` if `forget` over
+    `change_s` [s] applied less. `power` is the share of the vote that is new information. `p` is
+    changed in place.
     """
     lacking = c.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / c.CHANGE_S)
     if lacking > 0.0:
@@ -214,8 +219,8 @@ def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -
 
 @refcount_free_inlined
 def kind_of(evidence: ByteArray) -> int:
-    """Return VALUE if the likelihood falls towards the upper end by at least VALUE_DROP_STEPS, else
-    BOUND.
+    """Return VALUE if the likelihood falls by at least VALUE_DROP_STEPS towards the highest
+    friction, so that it limits μ from above. Return BOUND if it is only a lower bound.
     """
     least = np.uint8(255)
     for i in range(_BINS):
@@ -226,10 +231,12 @@ def kind_of(evidence: ByteArray) -> int:
 @refcount_free_inlined
 def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
     """Fill `out` (32) with the likelihood L̃ of a visit, with mean 1, after integrating out the
-    vehicle's bias. A BOUND is made flat above its maximum, because a fall there is noise.
+    vehicle's bias.
 
-    The bias is not applied to a bound: smoothing its step would let many bounds together exceed the
-    grip that any vehicle used. `padded` (PADDED) must hold zeros in its first and last REACH places.
+    The bias is applied only to a VALUE. A BOUND (lower bound of μ) is made flat above its maximum,
+    because a fall there is noise. It is not smoothed: otherwise many bounds together could exceed
+    the grip that any vehicle used. `padded` (PADDED) must hold zeros in its first and last REACH
+    places.
     """
     if kind == VALUE:
         for j in range(_BINS):
@@ -285,8 +292,8 @@ def mean_of(likelihood: Bins) -> float:
 
 @refcount_free_inlined
 def describe_likelihood(likelihood: Bins, mean: float) -> tuple[float, float]:
-    """Return the standard deviation around `mean` and P(slippery) under a uniform prior, for a
-    likelihood whose mean is 1.
+    """Return the standard deviation of μ around `mean` and P(slippery), both under a uniform prior,
+    for a likelihood whose mean over the bins is 1.
     """
     second = 0.0
     slippery = 0.0

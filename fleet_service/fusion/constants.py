@@ -1,5 +1,5 @@
-"""The numbers of the fusion, each with its reason. `fleet_service/fusion/README.md` holds the
-mathematics.
+"""Constants of the fusion, each with the reason for its value. `fleet_service/fusion/README.md`
+explains the mathematics.
 """
 
 from __future__ import annotations

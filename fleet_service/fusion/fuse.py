@@ -1,8 +1,10 @@
-"""The fusion of one service: observations in, beliefs out. Pure: time comes with the observations.
+"""The fusion of one service: observations in, beliefs out. The module is pure: time comes with the
+observations.
 
-T is the latest time seen, in whole epochs; the checkpoint lies at T - L. Trust moves with the
-checkpoint and acts on observations of the epoch that begins there, so that a vote's weight depends
-on its own time and not on when it came.
+T is the latest observation time, in whole epochs (minutes). The checkpoint is at T - L, where L is
+the allowed lateness. Trust in vehicles is updated when the checkpoint advances, and applies to
+observations of the epoch that begins at T. Therefore the weight of a vote depends on the time of
+the visit and not on its time of arrival.
 """
 
 from __future__ import annotations
@@ -39,7 +41,8 @@ SLIPPERY_WEIGHTS: Final = tuple(
 
 
 class Updated(NamedTuple):
-    """Outcome of an update for each observation (n,), and the slots that changed.
+    """Outcome of an update: arrays (n,) with one item per observation, and the slots that changed.
+    A slot is the storage of one cell and sector.
 
     Attributes:
         late: True for an observation that is older than the checkpoint, or that was not fused
@@ -57,7 +60,9 @@ class Updated(NamedTuple):
 
 
 class RecordedResult(NamedTuple):
-    """Values of `Updated` at the first fusion, used when an archive is replayed."""
+    """Columns of `Updated` (n,) as recorded at the first fusion; a replay of the archive uses them
+    again.
+    """
 
     late: BoolArray
     late_by: IntArray
@@ -65,19 +70,20 @@ class RecordedResult(NamedTuple):
 
 
 class Fusion:
-    """Beliefs of all cells, and the state that later updates need.
+    """Beliefs of all cells, and the state that later updates need. A slot is the storage of one
+    cell and sector.
 
     Args:
-        lateness_s: L [s]; an observation older than the checkpoint is late, and is fused with aged
-            evidence.
+        lateness_s: allowed lateness L [s]; an observation older than the checkpoint (latest time -
+            L) is late, and is fused with aged evidence.
         enrolled: True if only vehicles of an enrolment file are fused; an unknown vehicle then has
             full weight.
 
     Attributes:
-        enrolled: as above.
+        enrolled: the argument of that name.
         store: cells, windows, pairs and vehicles.
-        vote_weights: of the vehicles, one record per epoch, the oldest first.
-        reports: the weather that a later update may still need.
+        vote_weights: weights of the vehicles' votes, one record per epoch, the oldest first.
+        reports: weather reports that a later update may still need.
     """
 
     def __init__(self, lateness_s: float, *, enrolled: bool = False) -> None:
@@ -103,12 +109,12 @@ class Fusion:
 
     @property
     def epoch(self) -> int:
-        """Epoch of the latest time; -1 before the first."""
+        """Epoch (minute) of the latest observation; -1 before the first observation."""
         return -1 if self._epoch is None else self._epoch
 
     @property
     def live(self) -> Cells:
-        """The cells as they are now; rows beyond `size` are not in use."""
+        """The current cells; rows from `size` on are unused."""
         return self.store.live
 
     @property
@@ -128,7 +134,9 @@ class Fusion:
 
     @property
     def waiting(self) -> int:
-        """Observations in the window, counted per cell."""
+        """Number of observations in the lateness window; an observation that affects several cells
+        counts once per cell.
+        """
         return self.store.waiting
 
     @property
@@ -138,18 +146,20 @@ class Fusion:
 
     @property
     def next_epoch(self) -> int:
-        """First time [ns] that lies after all fused epochs; 0 before the first observation."""
+        """Start [ns] of the first epoch that has not been fused yet; 0 before the first
+        observation.
+        """
         return 0 if self._epoch is None else (self._epoch + 1) * c.EPOCH_NS
 
     def update(self, o: Observations, before: RecordedResult | None = None) -> Updated:
-        """Fuse observations in any order.
+        """Fuse observations in any order and return the outcome for each.
 
-        A late one is fused at the checkpoint, with its evidence aged to that time
+        A late observation is fused at the checkpoint, with its evidence aged to that time
         (`late.aged_evidence`).
 
         Args:
             o: the observations.
-            before: values of `Updated` at the first fusion, when an archive is replayed.
+            before: recorded outcome of the first fusion, when an archive is replayed.
         """
         n = len(o.time)
         used = np.zeros(n, np.float32)
@@ -195,20 +205,20 @@ class Fusion:
         return Updated(late, late_by, used, distinct_values(np.concatenate(touched)))
 
     def untouched(self, before: int) -> BoolArray:
-        """Return True for each slot (size,) whose last visit was before `before` [ns] and that
-        nothing else refers to; see `drop`.
+        """Return a mask of slots (size,): True if the last visit was before `before` [ns] and no
+        other record refers to the slot. Such slots may be deleted with `drop`.
         """
         return self.store.untouched(before)
 
     def drop(self, dropped: BoolArray) -> IntArray:
-        """Delete slots (size,) that are `untouched`; return the new number of each slot, -1 for
-        deleted ones.
+        """Delete the slots that the mask `dropped` (size,) selects; all must be `untouched`. Return
+        the new number of each slot, -1 for deleted ones.
         """
         return self.store.drop(dropped)
 
     def update_weather(self, reports: Reports) -> None:
-        """Add weather reports. None may apply before `next_epoch`, because otherwise the map would
-        depend on the time of arrival.
+        """Add weather reports. Each must take effect at `next_epoch` or later, because otherwise
+        the map would depend on the time of arrival.
         """
         columns = (
             np.concatenate([getattr(r, f.name) for r in (self.reports, reports)])
@@ -223,24 +233,32 @@ class Fusion:
 
     def beliefs(self, slots: IntArray, now: int, rows: Rows | None = None) -> FloatArray:
         """Return the belief about the road of each slot, (k, 32), predicted to `now` [ns],
-        including the evidence of slippery neighbours; of a copy of the live rows if `rows` is one.
+        including the evidence of slippery neighbours. If `rows` is given, read this copy of the
+        live rows instead.
         """
         kernels = KERNELS[shape_class(self._shape.reader)]
         return self._read(kernels, slots, np.full(len(slots), now), rows)
 
     def beliefs_at_last_report(self, slots: IntArray) -> FloatArray:
-        """Return the belief about the road of each slot, (k, 32), at its last observation."""
+        """Return the belief about the road of each slot, (k, 32), at the time of the slot's last
+        observation.
+        """
         return self._read(KERNELS[shape_class(self._shape.reader)], slots, self.live.time[slots])
 
     def slippery(self, slots: IntArray) -> FloatArray:
-        """Return P(slippery) of each slot (k,) at its last observation, from its own reports alone."""
+        """Return P(slippery) of each slot, (k,), at the slot's last observation, from reports of
+        this cell alone (without neighbours).
+        """
         return _slippery_probability(
             self.store.state.live, SLIPPERY_WEIGHTS[shape_class(self._shape.reader)], slots
         )
 
     def beliefs_for_alerts(self, slots: IntArray) -> FloatArray:
-        """Return the same as `beliefs_at_last_report`, but with the upper end of the range of the
-        slope, which alarms assume for gentle values; see `shared`.
+        """Return the same as `beliefs_at_last_report`, but with a more cautious tyre-shape slope,
+        as alerts require.
+
+        The slope says how far a report may be too low if the vehicle used little grip. Alerts use
+        the upper end of the slope's range; see `shared`.
         """
         return self._read(KERNELS[shape_class(self._shape.alarm)], slots, self.live.time[slots])
 
@@ -251,7 +269,7 @@ class Fusion:
         return road_beliefs(rows, self.store.table, self._weather, kernels, slots, now)
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
-        """Return the slot of each cell and sector, -1 if no vehicle has reported it."""
+        """Return the slot of each pair of cell and sector, -1 if no vehicle has reported the pair."""
         return self.store.slots_of(cell * grid.SECTORS + sector)
 
     def trust(self, vehicle: int) -> float:
@@ -263,11 +281,11 @@ class Fusion:
         return np.where(index < 0, self.store.vehicles, index)
 
     def sources(self, slots: IntArray, side: int, since: IntArray | int) -> IntArray:
-        """Return the report times of the corroborating sources of slots (k,), newest first, (k,
+        """Return the report times of the sources that corroborate slots (k,), newest first, (k,
         SOURCES) [ns].
 
-        A source is a vehicle, still trusted, that reported GRIP or ICE there after `since` [ns]. At
-        most SOURCES are remembered; 0 stands for none.
+        A source is a vehicle, still trusted, that reported `side` (GRIP or ICE) in the cell after
+        `since` [ns]. At most SOURCES are remembered; time 0 means no source.
         """
         _, when = self.find_sources(slots, side, since)
         return -np.sort(-when, axis=1)
@@ -275,8 +293,8 @@ class Fusion:
     def find_sources(
         self, slots: IntArray, side: int, since: IntArray | int
     ) -> tuple[IntArray, IntArray]:
-        """Return index and time [ns] of each remembered source, (k, SOURCES); time 0 if it does
-        not count.
+        """Return the vehicle index and report time [ns] of each remembered source, two arrays (k,
+        SOURCES). The time is 0 if the source does not count (see `sources`).
         """
         row = self.live.reporters[slots]
         reporters = self.store.state.live.reporters
@@ -294,7 +312,9 @@ class Fusion:
         )
 
     def _advance(self, epoch: int) -> None:
-        """Move T to `epoch`, one epoch at a time while the window has entries."""
+        """Advance the latest time T to `epoch`. While the window has entries, advance by one epoch
+        at a time and commit the entries that the checkpoint passes.
+        """
         if self._epoch is None:
             self._epoch = epoch
         while self._epoch < epoch:
@@ -359,14 +379,16 @@ def _make_arrivals(
 
 
 def voted_keys(o: Observations) -> IntArray:
-    """Return the keys that observations vote on, with repetitions."""
+    """Return the keys (cell · 4 + sector) that observations vote on, with repetitions."""
     return _spread_votes(o, np.arange(len(o.time)))[1]
 
 
 def _spread_votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
-    """Return the votes of some observations, sorted by time: row, key and share.
+    """Return the votes of the selected observations, sorted by time, as three arrays: row of the
+    observation, key, and share of the vote.
 
-    An observation may also vote on a second sector and on neighbouring cells.
+    Besides its own cell and sector, an observation may vote on a second sector and on neighbouring
+    cells.
     """
     own = 1.0 - o.other_share[rows].sum(axis=1)
     key = o.cell[rows] * grid.SECTORS
@@ -393,7 +415,7 @@ def _spread_votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, 
 
 
 def _drop_old_reports(reports: Reports, oldest: int) -> Reports:
-    """Return the reports without those that ended before `oldest` [ns]."""
+    """Return the weather reports without those that ended before `oldest` [ns]."""
     return reports.take(reports.time >= oldest - 4 * 3600 * NS)
 
 

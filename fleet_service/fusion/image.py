@@ -1,9 +1,9 @@
-"""Complete state of a fusion as plain arrays, and back, so that a restored fusion continues exactly
+"""Complete state of a fusion as plain arrays, for snapshots. A restored fusion continues exactly
 where the snapshot was taken. Pure.
 
-A column is a one-dimensional array; records are a column of bytes. Columns of equal length form a
-table, and `Image` maps names to tables. LAYOUT describes the bytes: name, place and byte order of
-every field.
+An `Image` maps table names to tables; a table is a set of one-dimensional columns of equal length.
+An array of records is stored as one column of bytes. LAYOUT describes these bytes: name, offset and
+byte order of every field.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ LAYOUT: Final = hashlib.blake2b(
 
 
 def image_of(fusion: Fusion) -> Image:
-    """Return the complete state of a fusion. Windows, entries and pairs keep their indices, because
-    they refer to each other.
+    """Return the complete state of a fusion. Windows, entries and pairs keep their row numbers,
+    because they refer to each other by row.
     """
     store = fusion.store
     state = fusion.store.state
@@ -105,7 +105,9 @@ def image_of(fusion: Fusion) -> Image:
 
 
 def fusion_of(image: Image, lateness_s: float) -> Fusion:
-    """Return the fusion that an image describes, with the lateness that it had."""
+    """Return the fusion that an image describes; `lateness_s` [s] must be the allowed lateness of
+    the original.
+    """
     fusion = Fusion(lateness_s)
     records = {
         name: _restore_records(image[name]["bytes"], kind) for name, kind in _RECORDS.items()

@@ -1,16 +1,16 @@
 """Observations that arrive after the checkpoint. Each is fused at the checkpoint, with its
 likelihood aged from the time of the visit to the checkpoint. Pure.
 
-A road that changes is a Markov chain which leaves the uniform belief uniform and which is
-reversible: a diffusion that reflects at the ends, and a change to anything. So the likelihood of
-the road at the checkpoint, given a measurement at time t before it, is
+The model of a changing road is a Markov chain: a diffusion with reflecting ends, and sudden changes
+to any friction. The chain is reversible and leaves the uniform belief uniform. So the likelihood of
+the road at the checkpoint C, given a measurement at an earlier time t, is
 
     L_C(μ) = Σ_ν P(μ_t = ν | μ_C = μ)·L(ν) = forgetting applied to L over C - t
 
-If no other vehicle visited the cell meanwhile, the result equals that of an observation in time.
-Otherwise the late visit counts in addition to the others, as an old report about the road now. Late
-visits enter the window like all others, the newest first. So the newest of a vehicle's own visits
-counts, and the order of arrival between two checkpoints does not matter.
+If no other vehicle visited the cell between t and C, the result equals that of an observation in
+time. Otherwise the late visit counts in addition to the others, as an old report about the present
+road. Late visits enter the window like all others, the newest first. So the newest visit of each
+vehicle counts, and the order of arrival between two checkpoints does not matter.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ _FLOOR: Final = mugrid.FLOOR_STEPS
 
 
 def fused_at(time: IntArray, checkpoint: int) -> IntArray:
-    """Return the times [ns] at which late visits of `time` (n,) enter the window: within one second
-    after the checkpoint, the newest first, in whole µs.
+    """Return the times [ns] at which late visits with end times `time` (n,) enter the window:
+    within one second after the checkpoint, the newest first, in whole µs.
     """
     age = np.clip(checkpoint - time, 0, LATE_MOST_NS)
     return np.asarray(checkpoint + age // (LATE_MOST_NS // _PLACES_NS) // 1000 * 1000)
@@ -60,8 +60,8 @@ def delay_observations(o: Observations, late_by: IntArray, weather: Weather) -> 
 def aged_evidence(
     evidence: ByteArray, key: IntArray, begin: IntArray, end: IntArray, weather: Weather
 ) -> ByteArray:
-    """Return the evidence (n, 32), in steps, that observations of roads `key` (n,) at `begin` [ns]
-    still give about the same roads at `end` [ns].
+    """Return aged evidence (n, 32), in steps: the likelihood of the roads `key` (n,) at time `end`
+    [ns] that follows from observations at time `begin` [ns].
     """
     out = np.empty_like(evidence)
     likelihood = np.empty(mugrid.BINS, np.float32)

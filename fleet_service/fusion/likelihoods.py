@@ -1,10 +1,10 @@
-"""Likelihood of μ from one visit: from a log-likelihood, a posterior with interval, or the grip
-used. Vectorised, pure.
+"""Likelihood of the friction μ from one visit. The sender reports a log-likelihood, or a posterior
+with interval, or only the grip used. Vectorised, pure.
 
 Legend
     ℓ    log-likelihood on the friction grid, maximum 0        (n, 32), nats
     μ̂    posterior median that a sender gave                    (n,)
-    u    grip used, "μ is at least this"                        (n,)
+    u    grip used, a lower bound of μ                           (n,)
     Φ    standard normal distribution function
 """
 
@@ -32,17 +32,18 @@ _USED_STEP: Final = 0.005
 
 
 def make_evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> Evidence:
-    """Return the log-likelihood of each visit in steps of 1/16 nat below its maximum, (n, 32), and
+    """Return the log-likelihood of each visit, (n, 32), in steps of 1/16 nat below its maximum, and
     the values as reported.
 
     Args:
         columns: `log_likelihood` (n, 32); `mu`, `mu_lower`, `mu_upper`, `mu_utilised`, each (n,),
             NaN where absent.
-        with_likelihood: (n,) whether the sender gave a likelihood.
+        with_likelihood: (n,) True if the sender gave a likelihood.
 
-    A likelihood that falls towards the upper end is a value, any other a bound; see `level_above_used`. A
-    posterior counts as a value where `mu_utilised ≥ 0.6·mu`; otherwise, and where there is no `mu`,
-    only "at least mu_utilised" remains. A visit with none of them is flat.
+    A likelihood that falls towards the highest friction is a value; any other is a lower bound, see
+    `level_above_used`. A posterior counts as a value where `mu_utilised ≥ 0.6·mu`. In all other
+    cases only the statement "μ is at least mu_utilised" is used. A visit without any of these
+    columns gives a flat likelihood.
     """
     sent = columns["log_likelihood"]
     steps, reported = as_reported(sent)
@@ -63,12 +64,12 @@ def make_evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArra
 
 
 def bound_by_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
-    """Return likelihoods (n, 32) that claim at least as much as the grip used (n,) supports: in
-    each bin the more informative of the two.
+    """Return likelihoods (n, 32) that are at least as informative as the grip used (n,): in each
+    bin the more informative of the reported likelihood and the lower bound.
 
-    An estimator reports an uninformative likelihood when its model is contradicted, but the grip
-    that its accelerometers measured still holds. Both come from one visit, so they are not
-    multiplied.
+    An estimator reports an uninformative likelihood when its model is contradicted. The grip that
+    its accelerometers measured is a lower bound all the same. Both come from one visit, so they are
+    not multiplied.
     """
     out = steps.copy()
     _bound_rows(out, np.asarray(used, np.float64), _levelled_bounds())
@@ -77,8 +78,8 @@ def bound_by_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
 
 @cache
 def _levelled_bounds() -> ByteArray:
-    """Return a table of levelled bounds in steps, for grip used from 0 to UTILISED_MOST in steps of
-    _USED_STEP.
+    """Return the table of lower bounds in steps, after `level_above_used`, (m, 32). Rows are the
+    grip used from 0 to UTILISED_MOST in steps of _USED_STEP.
     """
     used = np.arange(0.0, c.UTILISED_MOST + 0.5 * _USED_STEP, _USED_STEP)
     return level_above_used(mugrid.encode_log_likelihood(at_least(used)), used)
@@ -101,9 +102,9 @@ def _bound_rows(steps: ByteArray, used: FloatArray, bounds: ByteArray) -> None:
 def level_above_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     """Return likelihoods (n, 32) that claim no more grip than the grip used (n,) supports.
 
-    A bound is made flat from the bin on that holds `used` less half its own error: a hundred of
-    them then leave a lower end of .95·used + .04 at most. A value stays as it is, and so does
-    everything where `used` is NaN.
+    A bound is made flat from the bin that contains `used` minus half its standard deviation. A
+    hundred such bounds together then raise the lower end to at most .95·used + .04. A value is not
+    changed, nor is a row where `used` is NaN.
     """
     out = steps.copy()
     _level_rows(out, np.asarray(used, np.float64))
@@ -122,8 +123,8 @@ def _level_rows(steps: ByteArray, used: FloatArray) -> None:
 
 
 def at_least(used: FloatArray) -> FloatArray:
-    """Return the log-likelihoods (n, 32) of lower bounds: ln Φ((μ - u) / σ_u) with the grip used u.
-    They are flat if u is NaN.
+    """Return the log-likelihoods (n, 32) of lower bounds: ln Φ((μ - u) / σ_u), where u is the grip
+    used and σ_u its standard deviation. They are flat if u is NaN.
     """
     known_use = np.minimum(np.nan_to_num(used, nan=-np.inf), c.UTILISED_MOST)[:, None]
     std = np.hypot(c.UTILISED_STD, c.UTILISED_RELATIVE * np.maximum(known_use, 0.0))
@@ -131,8 +132,8 @@ def at_least(used: FloatArray) -> FloatArray:
 
 
 def interval_likelihood(mu: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Return the log-likelihoods (n, 32) of medians with 5 % and 95 % bounds: normal, with one
-    standard deviation per side.
+    """Return the log-likelihoods (n, 32) of reports that consist of a median and 5 % and 95 %
+    bounds: normal, with one standard deviation below the median and one above.
     """
     below = _side_std(mu - lower)[:, None]
     above = _side_std(upper - mu)[:, None]

@@ -1,36 +1,36 @@
-"""A belief as it is read: aged to the time of reading, combined with messages of slippery
-neighbours, and widened by the error that all values share. Compiled.
+"""Beliefs for readers of the map: aged to the time of reading, combined with messages of slippery
+neighbours, and widened by the error that all reports share. Compiled.
 
-A surface rarely ends with a cell: snow and ice lie in stretches. So a cell with slippery neighbours
-is more probably slippery than a cell without any information. Each side of a cell (before, behind,
-and the other direction of the road) sends it one message, from the most informative neighbour on
-that side:
+A surface rarely ends at the border of a cell: snow and ice cover stretches. So a cell with slippery
+neighbours is more probably slippery than a cell without any information. Each side of a cell
+(before, behind, and the other direction of the road) sends it one message, from the most
+informative neighbour on that side:
 
     m_i = 1 - w + w·n_i/p₀_i,    w = SAME_SURFACE^d·max(s - s₀, 0)/(1 - s₀),    s₀ = s of p₀
 
-and the cell is read as K·(b·m·m·m) over its sum.
+and a reader gets the normalised product K·(b·m₁·m₂·m₃).
 
 Messages use only the reports of a neighbour's own visitors, never messages that it received, so no
 information travels in a circle. They are computed when the map is read, so that no cell's own
-belief depends on another's. The common error also applies to the neighbours' values, so K comes
-last, once.
+belief depends on another's. The common error also applies to the neighbours' values, so K is
+applied once, at the end.
 
-Only slippery neighbours send messages. An untested cell is not dry because others are (a message of
-grip would say so), and cells without information send nothing (s < s₀). The least value of m is 1 -
-w, .1 next to ice: a cell whose own visitors found grip keeps it. A neighbour with grip lets no
-message pass: the stretch has ended there. A cell that was only perhaps visited (see `space`)
-receives no message.
+Only slippery neighbours send messages. A message of grip would call an untested cell dry because
+others are dry, and cells without information send no message (s < s₀). The least value of m is 1 -
+w, which is .1 next to ice. So a cell in which its own visitors found grip stays a cell with grip. A
+neighbour with grip stops the messages of cells beyond it, because the stretch has ended there. A
+cell without a certain visit (see `space`) receives no message.
 
-Source of messages: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4; here of one
-step.
+Source of the method: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4; here
+messages travel one step only.
 
 Legend
     b      belief about the cell from its own reports                                     (32,)
-    n      belief about the road of a neighbour, by its own reports                       (32,)
+    n      belief about the road of a neighbour from its own reports                       (32,)
     s      P(slippery) of n
     p₀     prior of an unmeasured road of the region                                      (32,)
     K      shared kernel, see `shared`                                                    (32, 32)
-    d      cells from one to the other; 1 to the other direction's
+    d      distance in cells; 1 to the cell of the other direction
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ _EAST, _NORTH, _WEST, _SOUTH = range(grid.SECTORS)
 
 @refcount_free_inlined
 def next_cell(cell: int, heading: int) -> int:
-    """Return the next cell in a sector's direction, also across the date line."""
+    """Return the next cell in the direction of a sector `heading`, also across the date line."""
     x = cell & _X
     y = cell & _Y
     if heading == _EAST:
@@ -87,8 +87,8 @@ def road_beliefs(
     slots: IntArray,
     now: IntArray,
 ) -> FloatArray:
-    """Return the belief about each slot's road at a time [ns] per slot, (k, 32); `table` finds
-    slots by key.
+    """Return the belief about the road of each slot, (k, 32), at one time [ns] per slot. `table` is
+    the hash table that finds slots by key.
     """
     out = np.empty((len(slots), _BINS))
     scratch = np.empty((3, SCRATCH))
@@ -154,7 +154,7 @@ def road_beliefs(
 @compiled
 def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
     """Return each slot (k,) and the slots before and behind it that may belong to the same slippery
-    stretch, (k, 1 + 2·NEIGHBOURS); NONE for the others.
+    stretch, (k, 1 + 2·NEIGHBOURS). Positions without such a slot are NONE.
 
     A stretch ends at a cell whose own reports make slippery road unlikely.
     """
@@ -186,7 +186,7 @@ def _slippery_probability(road: Bins) -> float:
 
 @refcount_free_inlined
 def _stored_slippery(live: Rows, row: int) -> float:
-    """Return P(slippery) of a stored belief without unpacking it, in a tenth of the time."""
+    """Return P(slippery) of a stored belief without unpacking it, which takes a tenth of the time."""
     whole = 0.0
     slippery = 0.0
     for i in range(_BINS):
@@ -197,7 +197,9 @@ def _stored_slippery(live: Rows, row: int) -> float:
 
 @refcount_free
 def _age_belief(live: Rows, weather: Weather, slot: int, now: int, scratch: Bins) -> int:
-    """Age a slot's belief to `now` [ns] into the scratch; return the row of its region's prior."""
+    """Age a slot's belief to `now` [ns] and write it to the scratch memory; return the row of its
+    region's prior.
+    """
     cells = live.cells
     p = scratch[P]
     unpack_belief(live.belief, slot, p)

@@ -1,6 +1,6 @@
 """Standard normal distribution for arrays of any shape.
 
-It is compiled here because importing a library for it would cost the service 15 MB of memory.
+The functions are compiled here, because a library for them would cost the service 15 MB of memory.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ def normal_cdf(x: FloatArray) -> FloatArray:
 
 
 def log_distribution(x: FloatArray) -> FloatArray:
-    """Return ln Φ(x).
+    """Return ln Φ(x), the logarithm of the standard normal distribution function.
 
-    Below _FAR it is the asymptotic series -½x² - ln(-x·√(2π)) + ln(1 - 1/x² + 3/x⁴).
+    Below _FAR the function uses the asymptotic series -½x² - ln(-x·√(2π)) + ln(1 - 1/x² + 3/x⁴).
     """
     return _log_distribution(np.ravel(x)).reshape(x.shape)
 

@@ -1,6 +1,4 @@
-"""Observations as the fusion takes them, and how they are made of the columns of messages or of
-the archive. Pure.
-"""
+"""Observations for the fusion, made from the columns of messages or of the archive. Pure."""
 
 from __future__ import annotations
 
@@ -31,23 +29,24 @@ _US: Final = 1000  # ns: the archive keeps whole microseconds
 
 @dataclass(frozen=True, kw_only=True)
 class Observations:
-    """Admitted visits, arrays of shape (n,).
+    """Admitted visits, arrays of shape (n,). A visit is one pass of a vehicle through a cell.
 
     Attributes:
         time: end of the visit [ns].
-        cell, sector, second: where; `second` is a sector whose edge is near, or -1.
+        cell, sector, second: place and direction; `second` is a sector whose edge is near, or -1.
         vehicle, boot, region, sequence: identity; `vehicle` is a number that stands for the
             vehicle, `sequence` counts rows in the stream of (vehicle, boot, region).
         evidence: (n, 32) log-likelihood in steps, see `likelihoods.make_evidence`.
-        reported: (n, 3) mean, standard deviation and P(slippery) of a value as it was reported, NaN
-            to read them in `make_evidence`.
-        used: (n,) grip used; below EXCITED_SHARE of a value where the sender does not report it.
-        manoeuvre: (n,) how it was used, see `shared.manoeuvre_of`.
+        reported: (n, 3) mean, standard deviation and P(slippery) of a value as it was reported; NaN
+            for a lower bound.
+        used: (n,) grip used; an estimate below EXCITED_SHARE of the value if the sender does not
+            report it.
+        manoeuvre: (n,) kind of manoeuvre, see `shared.manoeuvre_of`.
         limited: (n,) True if a slip controller intervened at so little grip used that only slippery
             road explains it.
-        other: (n, k) other cells in which the vehicle may have been instead, -1 where there is
-            none.
-        other_share: (n, k) probability that it was there; the rest belongs to `cell`.
+        other: (n, k) other cells in which the vehicle may have been instead; -1 for none.
+        other_share: (n, k) probability that the vehicle was in the other cell; the rest belongs to
+            `cell`.
     """
 
     time: IntArray
@@ -75,11 +74,11 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
     """Return the columns (n,) of admitted rows as observations for the fusion.
 
     Args:
-        columns: those of the archive, times in ns; `with_likelihood` (n,) is true for rows with a
+        columns: columns of the archive, times in ns; `with_likelihood` (n,) is true for rows with a
             `log_likelihood`.
         vehicle: (n,) number of each vehicle.
 
-    Times are those that the archive keeps, in whole microseconds.
+    Times are rounded down to whole microseconds, as in the archive.
     """
     _, second = grid.sectors_touched(np.nan_to_num(columns["yaw"]))
     first = columns["sector"].astype(np.int8)
@@ -111,12 +110,12 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
 
 
 def find_limited(columns: Mapping[str, NDArray[Any]], used: NDArray[Any]) -> BoolArray:
-    """Return where ABS, ESC or traction control intervened although less than slippery road's grip
-    was used, (n,).
+    """Return a mask (n,): True where ABS, ESC or traction control intervened although the grip used
+    was below the slippery limit.
 
-    `used` (n,) is raised by one standard deviation of its error. A controller that works at more is
-    no news: on dry road it does so as well. A flag that a sender leaves out, or does not know, is
-    no intervention.
+    `used` (n,) is first raised by one standard deviation of its error. An intervention at more grip
+    is not informative, because it also happens on dry road. A flag that is missing or unknown
+    counts as no intervention.
     """
     active = np.zeros(len(used), np.bool_)
     for name in FLAGS:

@@ -1,8 +1,8 @@
 """Values as vehicles reported them: mean, standard deviation and P(slippery) of a likelihood.
 Compiled, pure.
 
-The reported values decide three questions: do vehicles agree, is a report new, and which vehicle
-may an alert name as its source. The belief uses a wider likelihood (`belief.convolve_bias`).
+Reported values decide three questions: whether vehicles agree, whether a report is new, and which
+vehicles an alert may name as sources. The belief uses a wider likelihood (`belief.convolve_bias`).
 """
 
 from __future__ import annotations
@@ -23,16 +23,21 @@ _LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT)
 
 
 class Evidence(NamedTuple):
-    """Likelihoods as they are used (n, 32) in steps, and values as they were reported (n, 3): mean,
-    standard deviation and P(slippery) against the uniform prior; NaN for a bound."""
+    """Likelihoods for the fusion, and the values that vehicles reported.
+
+    Attributes:
+        steps: (n, 32) log-likelihood in steps below its maximum.
+        reported: (n, 3) mean, standard deviation and P(slippery) under the uniform prior; NaN for a
+            lower bound.
+    """
 
     steps: ByteArray
     reported: Float32Array
 
 
 def as_reported(steps: NDArray[Any]) -> Evidence:
-    """Return likelihoods (n, 32) in steps with maximum 0, and a description of those that are
-    values.
+    """Return likelihoods (n, 32) in steps, with best step 0, together with mean, standard deviation
+    and P(slippery) of those that are values.
     """
     out = steps.astype(np.uint8)
     reported = np.full((len(steps), 3), np.nan, np.float32)

@@ -1,10 +1,11 @@
-"""Error that all values of a place have in common, and the belief after it is integrated out. Pure.
+"""Error that all reports from one place have in common, and the belief after this error is
+integrated out. Pure.
 
-Vehicles that do the same manoeuvre in the same place err alike. One cause is the tyre's shape,
-which they assume: its error grows as the share of grip used falls. Others depend on the manoeuvre.
-More vehicles do not average this error out; other manoeuvres and a larger share of grip do. So the
-stored belief is about the *fleet's* common reading of a road, and a reader of the map gets the road
-itself:
+Vehicles that do the same manoeuvre in the same place make the same error. One cause is the shape of
+the tyre's force curve, which each vehicle assumes: this error grows as the share of grip used
+falls. Other causes depend on the manoeuvre. More vehicles do not average this error out; other
+manoeuvres and a larger share of grip do. So the stored belief p is about the *fleet's* common
+reading of a road, and a reader of the map gets a belief about the road itself:
 
     road_i = Σ_j K_ij·p_j,    K_ij ∝ exp(-½·((μ_j - μ_i)/(μ_i·σ±))²),    rows sum to 1
     σ₋² = σ_c² + (COMMON_ABSOLUTE/μ_i)² + clip(slope·(SHARED_SHARE - ū/μ_i), 0, SHARED_MOST)²
@@ -13,18 +14,20 @@ itself:
     σ_c² = COMMON_ALWAYS² + COMMON_MANOEUVRE²/n_eff + σ_s²·(a + (1 - a)/n_eff)
     n_eff = (Σ w_k)²/Σ w_k²
 
-The error of the shape is one-sided, since only a reading that is too low falls enough towards the
-upper end to be a value. Its slope is the one found by `trust.shape_of`, and SHAPE_DOUBT. An alarm
-uses the upper end of the slope's range, so that the larger doubt of an alarm ends once the fleet's
-shape is known.
+The shape error is one-sided: only readings that are too low are treated as values, because their
+likelihood falls towards the upper end. Its slope is the estimate of `trust.shape_of` plus
+SHAPE_DOUBT. An alarm uses the upper end of the slope's confidence range. This extra doubt
+disappears once the fleet's slope is known.
 
-A sender states its whole error. The part of it that does not show between senders of the same
-manoeuvre is the part they share: σ_s² = SHARED_PART·stated², relative, of the cell's values by
-weight; a = SHARED_ALWAYS.
+A sender states its whole error. A part of it is common to all senders of the same manoeuvre, so it
+cannot be seen by comparing them: σ_s² = SHARED_PART·stated² (relative, weighted mean of the cell's
+values).
 
 Legend
-    ū     grip used by the vehicles that gave values, mean by weight
-    w_k   weight of the values of manoeuvre k that newer values have not replaced
+    ū     mean grip used by the vehicles that gave values, weighted
+    a     SHARED_ALWAYS, the part of σ_s that other manoeuvres do not average out
+    n_eff effective number of kinds of manoeuvre
+    w_k   weight of the values of manoeuvre k; newer values replace older ones
 """
 
 from __future__ import annotations
@@ -56,7 +59,9 @@ _MOST: Final = 255.0
 
 
 def manoeuvre_of(longitudinal: FloatArray, lateral: FloatArray) -> NDArray[np.int8]:
-    """Return the manoeuvre of visits (n,), from how they used the grip; UNKNOWN where that is NaN."""
+    """Return the kind of manoeuvre of visits (n,), DRIVING, BRAKING, LEFT or RIGHT, from the
+    longitudinal and lateral grip used; UNKNOWN where either is NaN.
+    """
     along = np.abs(longitudinal) >= np.abs(lateral)
     kind = np.where(
         along,
@@ -67,7 +72,9 @@ def manoeuvre_of(longitudinal: FloatArray, lateral: FloatArray) -> NDArray[np.in
 
 
 def shared_parts(reported: Float32Array) -> ByteArray:
-    """Return σ_s of values (n, 3) in parts of 1/SHARED; 0 of bounds."""
+    """Return the relative error σ_s that each value (n, 3) shares with others, in units of
+    1/SHARED; 0 for lower bounds.
+    """
     mean = np.nan_to_num(reported[:, 0], nan=1.0)
     std = np.nan_to_num(reported[:, 1])
     stated = np.square(std / np.maximum(mean, mugrid.LOWER)) - c.BIAS_RELATIVE**2
@@ -76,8 +83,8 @@ def shared_parts(reported: Float32Array) -> ByteArray:
 
 
 class Shape(NamedTuple):
-    """Slope of the fleet's values over the share of the grip that was left unused, and its
-    standard deviation.
+    """Effect of the tyre's shape: how far the fleet's values are too low per unit of grip left
+    unused (slope), and the standard deviation of this slope.
     """
 
     slope: float
@@ -85,17 +92,16 @@ class Shape(NamedTuple):
 
     @property
     def reader(self) -> float:
-        """Return the slope that a reader has to doubt."""
+        """Slope that the interval for a reader of the map allows for."""
         return self.slope + c.SHAPE_DOUBT
 
     @property
     def alarm(self) -> float:
-        """Return the slope that an alarm has to doubt: the upper end of its one-sided 95 %
-        interval.
+        """Slope that an alarm allows for: the upper end of its one-sided 95 % interval.
 
-        A new service assumes .5; a service that knows its fleet assumes little more than a reader.
-        With .5 for all, .044 of the icy cell-minutes of a clean fleet had no alert, with this .010
-        (tuning).
+        A new service assumes .5. A service that knows its fleet assumes little more than a reader.
+        Missed ice on tuning seeds: with .5 for all, .044 of the icy cell-minutes of a clean fleet
+        had no alert; with this rule .010.
         """
         return self.reader + Z_95 * self.std
 
@@ -107,8 +113,8 @@ UNKNOWN_SHAPE: Final = Shape(c.SHAPE_PRIOR, c.SHAPE_STD)
 def shared_kernel(
     used: float, kinds: float, stated: float, slope: float = UNKNOWN_SHAPE.reader
 ) -> FloatArray:
-    """Return K, (32, 32), for a mean grip used, a number of kinds of manoeuvre and the shared part
-    of the stated error.
+    """Return the kernel K, (32, 32), for a mean grip used, an effective number of kinds of
+    manoeuvre and the shared part of the stated error (relative).
     """
     centres = mugrid.CENTRES
     always = c.COMMON_ALWAYS**2 + c.COMMON_MANOEUVRE**2 / kinds
@@ -120,21 +126,23 @@ def shared_kernel(
 
 
 def base_kernel() -> FloatArray:
-    """Return the kernel K (32, 32) of cells that have only bounds."""
+    """Return the kernel K, (32, 32), of cells that have only lower bounds and no values."""
     relative = c.COMMON_RELATIVE * mugrid.CENTRES
     return _two_sided(np.hypot(relative, c.COMMON_ABSOLUTE), np.hypot(relative, c.COMMON_HIGH))
 
 
 def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
-    """Return the kernel K for standard deviations (32,) of readings that are too low and too high."""
+    """Return the kernel K, (32, 32), from two standard deviations per bin (32,): of readings below
+    the true friction and of readings above it.
+    """
     away = mugrid.CENTRES[None, :] - mugrid.CENTRES[:, None]
     kernel = np.exp(-0.5 * np.square(away / np.where(away < 0.0, below[:, None], above[:, None])))
     return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
 
 
 def _kernel_table(slope: float) -> Float32Array:
-    """Return the kernels transposed, so that the bins of a road are contiguous in memory;
-    `kernel_of` finds them, (…, 32, 32).
+    """Return the table of all kernels for a slope, (…, 32, 32); `kernel_of` gives the index. Each
+    kernel is transposed, so that the bins of a road are contiguous in memory.
     """
     rows = [
         shared_kernel((row + 0.5) * USED_STEP, kinds, stated, slope).T
@@ -150,14 +158,14 @@ KERNELS: Final = tuple(_kernel_table(slope) for slope in SHAPES)
 
 
 def shape_class(slope: float) -> int:
-    """Return the index in SHAPES of the value nearest to a slope."""
+    """Return the index of the value in SHAPES that is nearest to a slope."""
     away = [abs(shape - slope) for shape in SHAPES]
     return away.index(min(away))
 
 
 @refcount_free_inlined
 def kernel_of(cells: RecordArray, row: int) -> int:
-    """Return the index of the kernel for a row of cells."""
+    """Return the index in the kernel table for a cell: row `row` of `cells`."""
     whole = 0.0
     squares = 0.0
     for k in range(MANOEUVRES):
@@ -183,8 +191,8 @@ def kernel_of(cells: RecordArray, row: int) -> int:
 def read_road(
     kernels: Float32Array, cells: RecordArray, row: int, p: FloatArray, road: FloatArray
 ) -> None:
-    """Compute the belief about the road from a belief `p` (32) about the fleet's common reading;
-    sums to one.
+    """Compute the belief about the road, `road` (32), from a belief `p` (32) about the fleet's
+    common reading. The result sums to one.
     """
     kernel = kernels[kernel_of(cells, row)]
     for i in range(mugrid.BINS):
@@ -203,8 +211,10 @@ def read_road(
 def note_value(
     cells: RecordArray, row: int, entries: RecordArray, entry: int, strength: float
 ) -> None:
-    """Add an entry's value to its cell: manoeuvre, grip used, and the error it shares with others;
-    a value with less grip used or a wider interval counts less.
+    """Add an entry's value to the means of its cell: kind of manoeuvre, grip used, and the error
+    that it shares with others.
+
+    The entry's weight is smaller if the vehicle used less grip or stated a wider interval.
     """
     used = entries[entry].used / USED
     shared = entries[entry].shared / SHARED
@@ -235,8 +245,8 @@ def _moving_mean(before: int, new: float, part: float) -> np.uint8:
 
 @refcount_free
 def fade_weights(cells: RecordArray, row: int, begin: int, end: int) -> None:
-    """Let the weights of the manoeuvres, and the votes of those that are not trusted, fade
-    between two times [ns].
+    """Let two weights of a cell fade between the times `begin` and `end` [ns]: the weights of the
+    manoeuvres, and the number of votes by untrusted vehicles.
     """
     borders = min(end // TENTH_NS - begin // TENTH_NS, len(_FADES) - 1)
     if borders > 0:

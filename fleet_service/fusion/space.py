@@ -7,8 +7,9 @@ Legend
     π_k    P(the measurement belongs to the k-th cell further on)    (n,)
     G(x)   x·Φ(x) + φ(x), the integral of the normal distribution function
 
-A visit lies anywhere in its cell, so that π_k is a uniform of width w and a normal error, seen by
-cells of width w: π_k = σ/w · [G((k+1)·w/σ) - 2·G(k·w/σ) + G((k-1)·w/σ)]. All of them sum to one.
+The true position is uniform over the reported cell (width w), plus a normal error. Integrated over
+the k-th cell this gives π_k = σ/w · [G((k+1)·w/σ) - 2·G(k·w/σ) + G((k-1)·w/σ)]. The sum over all k
+is one.
 """
 
 from __future__ import annotations
@@ -31,12 +32,13 @@ _STEPS: Final = np.array([k for k in range(-c.SPREAD_CELLS, c.SPREAD_CELLS + 1) 
 def other_cells(
     cell: IntArray, latitude: FloatArray, yaw: FloatArray, position_std: FloatArray
 ) -> tuple[IntArray, Float32Array]:
-    """Return other cells in which the vehicles of visits (n,) may have been, and the probability of
-    each, both (n, 2·SPREAD_CELLS).
+    """Return the other cells in which the vehicles of visits (n,) may have been, and the
+    probability of each; both arrays are (n, 2·SPREAD_CELLS).
 
-    -1 and 0 where it is less than SPREAD_LEAST, where yaw or the standard deviation is unknown, and
-    in another region, which another service may hold. The probabilities leave at least nothing for
-    `cell`: no vote is doubled.
+    An item is -1 with probability 0 in three cases: the probability is below SPREAD_LEAST, yaw or
+    the standard deviation is unknown, or the other cell lies in another region, which another
+    service may own. The probabilities sum to at most 1 and `cell` gets the rest, so no vote counts
+    twice.
     """
     cosine = np.cos(np.nan_to_num(yaw))
     sine = np.sin(np.nan_to_num(yaw))
@@ -55,8 +57,8 @@ def other_cells(
 
 
 def cell_shares(std: FloatArray, length: FloatArray) -> FloatArray:
-    """Return the probabilities π of the cells behind and ahead, (n, 2·SPREAD_CELLS), for σ and w
-    (n,).
+    """Return the probabilities π of the cells behind and ahead, (n, 2·SPREAD_CELLS), from the
+    position's standard deviation and the cell length along the heading, both (n,) [m].
     """
     ratio = (length / np.maximum(std, 1e-6 * length))[:, None]
     return np.asarray(

@@ -1,23 +1,25 @@
-"""Trust in vehicles, from comparison with other vehicles in the same cells. Pure, compiled where
-per row.
+"""Trust in vehicles, computed by comparison with other vehicles in the same cells. Pure; loops over
+rows are compiled.
 
 Each vehicle keeps a table of the others that it met: how often (`met`) and how well they agreed
-(`agreed`). Every other vehicle counts once, however often they met, weighted by its own trust. So a
-group that agrees only with itself counts by the number of its members, in however many cells it
-drives alone. Once the majority distrusts it, its reports about others have no weight.
+(`agreed`). Every other vehicle counts once, weighted by its own trust; the number of meetings does
+not matter. So a colluding group counts only by the number of its members, not by the number of
+cells in which it drives alone. Once the majority distrusts it, its reports about others have no
+weight.
 
-No error of a vehicle is learned from its differences to others. Such differences show only relative
-errors, and an error that value and grip used have in common looks like a slope of the one over the
-other. Differences between two visits of one vehicle to one cell do not contain that error: they
-show how values fall with the grip that was left unused (`shape_of`).
+The module does not learn a vehicle's error from its differences to others. Such differences show
+only relative errors. In addition, an error that affects both the value and the grip used looks like
+a slope between them. This error cancels in the difference between two visits of one vehicle to one
+cell. Such differences therefore show how values fall with the grip that was left unused
+(`shape_of`).
 
 Legend
     q    agreement of two values: 1 within PEERS_AGREE standard deviations, 0 from PEERS_DISAGREE on
     ā    mean q of a pair of vehicles over their last meetings
-    m    how much the other counts: its trust, at least TRUST_HEARD_LEAST
-    g    share that agreed, (a₀ + Σ m·ā) / (n₀ + Σ m)
+    m    weight of the other vehicle: its trust, at least TRUST_HEARD_LEAST
+    g    share of agreement, (a₀ + Σ m·ā) / (n₀ + Σ m); a₀, n₀: prior agreement and count
     T    trust, clip((g - TRUST_NONE) / (TRUST_FULL - TRUST_NONE), 0, 1)
-    r    weight: T·min(g, 1 - CONTAMINATION_LEAST) / (1 - CONTAMINATION), T for the least known
+    r    vote weight: T·min(g, 1 - CONTAMINATION_LEAST) / (1 - CONTAMINATION)
 """
 
 from __future__ import annotations
@@ -49,11 +51,11 @@ def compare_reports(
     entries: RecordArray,
     entry: int,
 ) -> None:
-    """Compare a value with those that others gave here lately; it replaces the earlier value of its
-    vehicle, or the oldest one.
+    """Compare a vehicle's value with the recent values of other vehicles in the cell, then store it
+    there. The new value replaces the vehicle's earlier value, or else the oldest one.
 
-    `names` (V,) are the vehicles' numbers, by index. A value that is late, or more probably belongs
-    to another cell, is compared with none.
+    `names` (V,) are the vehicles' numbers, by index. No comparison is made if the value is late or
+    probably belongs to another cell.
     """
     here = reporters[row]
     if entries[entry].share < c.HERE_SHARE or entries[entry].late:
@@ -107,12 +109,12 @@ def compare_reports(
 def judge_flag(
     reporters: RecordArray, row: int, peers: RecordArray, entries: RecordArray, entry: int
 ) -> None:
-    """Compare a slip controller's intervention with the newest value that another vehicle gave here
-    lately.
+    """Compare a slip controller's intervention with the newest value that another vehicle recently
+    gave in this cell; count a confirmation or a contradiction.
 
-    A value supports one side if it is at least its standard deviation away from SLIPPERY. The
-    vehicle's own value of the same visit is no confirmation: the flag and the value come from one
-    slip.
+    A value supports a side (slippery or not) only if it is at least its standard deviation away
+    from SLIPPERY. The vehicle's own value of the same visit is not a confirmation, because the flag
+    and the value come from the same slip.
     """
     if entries[entry].share < c.HERE_SHARE or entries[entry].late:
         return
@@ -142,8 +144,8 @@ def judge_flag(
 def _note_shape(
     peers: RecordArray, vehicle: int, used: float, difference: float, variance: float
 ) -> None:
-    """Record how a vehicle's values of one cell change with the grip that it used; its gain error
-    is the same in both values.
+    """Record how a vehicle's values in one cell change with the grip that it used. Its gain error
+    is the same in both values and therefore cancels.
     """
     this = peers[vehicle]
     this.used_squares += np.float32(used * used / variance)
@@ -155,17 +157,18 @@ def _note_shape(
 
 @refcount_free
 def _own_variance(mean: float, std: float) -> float:
-    """Return the relative variance of a value without its bias."""
+    """Return the relative variance of a value without the variance of the vehicle's bias."""
     return max((std / max(mean, mugrid.LOWER)) ** 2 - c.BIAS_RELATIVE**2, _LEAST_VARIANCE)
 
 
 @refcount_free
 def _pair_rank(vehicle: int, other: int) -> int:
-    """Return a fixed pseudo-random number of a pair, which depends on the two vehicles' numbers and
-    not on their order of arrival.
+    """Return a fixed pseudo-random number of a pair of vehicles. It depends on the two vehicle
+    numbers and not on their order of arrival.
 
-    Of all that share a place the lowest stays, so that a rare companion is as likely to be kept as
-    a frequent one; or those that report most would displace the others.
+    If several other vehicles compete for one place of the table, the pair with the lowest number
+    stays. So a rare companion is as likely to be kept as a frequent one; otherwise the vehicles
+    that report most would displace the others.
     """
     mixed = np.uint64(vehicle) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(other) * np.uint64(
         0xBF58476D1CE4E5B9
@@ -198,11 +201,12 @@ def _record_meeting(
 def compute_vote_weights(
     peers: RecordArray, before: VoteWeights, epoch: int, *, enrolled: bool
 ) -> VoteWeights:
-    """Return the vote weights of the vehicles (V,) from an epoch on, computed from their meetings
-    and the earlier weights `before` of the vehicles that they met.
+    """Return the vote weights of the vehicles (V,) from `epoch` on, from their agreement with other
+    vehicles. `before` contains the earlier weights of these other vehicles.
 
-    In an established service, a vehicle that has met few trusted vehicles is a newcomer. If only
-    `enrolled` vehicles are fused, no vehicle can take a new name, so there are no newcomers.
+    In an established service, a vehicle that has met few trusted vehicles is a newcomer with less
+    weight. If only `enrolled` vehicles are fused, no vehicle can take a new name, so there are no
+    newcomers.
     """
     weight = np.empty(len(before.weight), np.float32)
     established = _update_weights(peers, before.weight, weight, enrolled)
@@ -215,8 +219,8 @@ def compute_vote_weights(
 def _update_weights(
     peers: RecordArray, before: Float32Array, out: Float32Array, enrolled: bool
 ) -> bool:
-    """Fill the weights of vehicles (V,), from those `before`; return True if the service is
-    established, so that newcomers weigh less.
+    """Fill `out` (V,) with the new weights of the vehicles, computed from the earlier weights
+    `before`. Return True if the service is established, so that newcomers get less weight.
     """
     known = np.empty(len(out), np.bool_)
     trusted = 0
@@ -246,11 +250,12 @@ def _update_weights(
 
 
 def heeded_flags(peers: RecordArray) -> BoolArray:
-    """Return whose slip controllers (V,) may support an alert.
+    """Return a mask of vehicles (V,): True if the vehicle's slip controllers may support an alert.
 
-    A flag has a record of its own: at first TRUST_PRIOR_PEERS imagined cells confirmed it in
-    TRUST_PRIOR; below TRUST_NONE it supports nothing. So a vehicle whose flag is always on is out
-    after two dry cells.
+    The flags of a vehicle have a record of their own. It starts with TRUST_PRIOR_PEERS imagined
+    cells, in a share TRUST_PRIOR of which the flag was confirmed. Below a share of TRUST_NONE the
+    flags support no alert. A vehicle whose flag is always on is therefore excluded after two dry
+    cells.
     """
     right = c.TRUST_PRIOR * c.TRUST_PRIOR_PEERS + peers["flags_confirmed"]
     whole = c.TRUST_PRIOR_PEERS + peers["flags_confirmed"] + peers["flags_contradicted"]
@@ -259,11 +264,11 @@ def heeded_flags(peers: RecordArray) -> BoolArray:
 
 def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:
     """Return the slope λ in [0, 1] by which the fleet's values are too low per unit of μ left
-    unused, and its error.
+    unused, and its standard error.
 
-    From differences of single vehicles with themselves, in which an error common to value and use
-    cancels. λ corrects no value; it determines how far a gentle value's interval is widened upwards
-    (`shared.Shape`).
+    The slope comes from differences between visits of the same vehicle, in which an error common to
+    value and grip used cancels. λ corrects no value. It determines how far the interval of a value
+    is widened upwards if little grip was used (`shared.Shape`).
     """
     vehicles = len(weight)
     trust = np.minimum(weight.astype(np.float64), 1.0)

@@ -20,7 +20,7 @@ class VoteWeights(NamedTuple):
         epoch: first epoch in which the weights are used; -1: from the beginning.
         weight: weight of each vehicle's votes, (V,); more than 1 after agreement with many others.
         initial: weight of a vehicle that the service does not know yet.
-        heeded: whether each vehicle's slip controllers may support an alert, (V,).
+        heeded: mask (V,), True if the vehicle's slip controllers may support an alert.
     """
 
     epoch: int
@@ -29,18 +29,20 @@ class VoteWeights(NamedTuple):
     heeded: BoolArray
 
     def weights(self, vehicle: IntArray) -> Float32Array:
-        """Return the weights of vehicles (n,) by index."""
+        """Return the weights of vehicles (n,), given by index; an unknown index gets the initial
+        weight.
+        """
         known = np.append(self.weight, np.float32(self.initial))
         return np.asarray(known[np.minimum(vehicle, len(self.weight))])
 
     def may_support_alerts(self, vehicle: IntArray) -> BoolArray:
-        """Return True for vehicles (n,) whose slip controllers may support an alert; also True for
-        unknown vehicles.
+        """Return a mask for vehicles (n,): True if the vehicle's slip controllers may support an
+        alert. Unknown vehicles also get True.
         """
         known = np.append(self.heeded, True)
         return np.asarray(known[np.minimum(vehicle, len(self.heeded))])
 
 
 def initial_vote_weights(initial: float) -> VoteWeights:
-    """Return the weights in a service that knows no vehicle."""
+    """Return the vote weights of a service that knows no vehicle yet."""
     return VoteWeights(-1, np.zeros(0, np.float32), initial, np.zeros(0, np.bool_))

@@ -1,4 +1,6 @@
-"""One vote: how much of it is new, and how it updates a row of cells. Compiled."""
+"""A vote is the effect of one observation on one cell. This module computes how much of a vote is
+new information and updates the cell's row. Compiled.
+"""
 
 from __future__ import annotations
 
@@ -65,10 +67,11 @@ _WITNESS_SLOPE: Final = UNKNOWN_SHAPE.alarm
 
 @refcount_free_inlined
 def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scratch: Bins) -> None:
-    """Set the kind of an entry's vote and its mean, deviation and P(slippery); leave its likelihood
-    in the scratch.
+    """Set the kind of an entry's vote (VALUE or BOUND), its mean, standard deviation and
+    P(slippery); leave its likelihood in the scratch memory.
 
-    A `reported` value (3,) is described as it was reported, even if only a part of it is used.
+    If the vehicle reported a value (`reported` (3,) is not NaN), these numbers are taken from the
+    report, even if only a part of its likelihood is used.
     """
     evidence = entries[entry].evidence
     likelihood = scratch[LIKELIHOOD]
@@ -92,7 +95,7 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
 
 @refcount_free
 def load_likelihood(entries: RecordArray, entry: int, scratch: Bins) -> None:
-    """Compute the likelihood of a stored entry again, into `scratch`."""
+    """Compute the likelihood of a stored entry again and write it to `scratch`."""
     _clear_padding(scratch)
     this = entries[entry]
     convolve_bias(this.evidence, int(this.kind), scratch[PADDED], scratch[LIKELIHOOD])
@@ -107,10 +110,10 @@ def _clear_padding(scratch: Bins) -> None:
 
 @refcount_free_inlined
 def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
-    """Compute how much of a vote is new, from earlier reports of its vehicle here: in the window,
-    or before the checkpoint.
+    """Compute how much of a vote is new information, given the vehicle's earlier reports in this
+    cell. These are in the window, or in the record of reports before the checkpoint.
 
-    Times are whole seconds from either, so that the result is the same for both.
+    All times are rounded to whole seconds, so that the result is the same for both sources.
     """
     kind = int(entries[entry].kind)
     pair = entries[entry].pair
@@ -194,8 +197,8 @@ def update(
     weather: Weather,
     scratch: Bins,
 ) -> None:
-    """Update a row of cells by one entry, whose likelihood is in the scratch; `sources` is where
-    its sources lie.
+    """Update a row of cells by one entry, whose likelihood is in the scratch memory. `sources` is
+    the row of the cell's corroborating sources.
     """
     belief = rows.belief
     cells = rows.cells
@@ -256,11 +259,11 @@ def update(
 
 @refcount_free_inlined
 def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
-    """Lower P(slippery) of a belief by a visit that gave no value and in which no slip controller
-    worked, where visitors of the slippery road give a value with probability `noticed`.
+    """Lower P(slippery) of a belief after a visit without a value and without an intervention of a
+    slip controller. `noticed` is the probability that a visitor of a slippery road gives a value.
 
-    P(slippery) falls to UNSURE or that of the prior at most: silence ends the knowledge of ice, but
-    shows no grip.
+    P(slippery) does not fall below UNSURE or the prior's P(slippery), whichever is larger: such a
+    visit can end the certainty of ice, but it does not show grip.
     """
     if noticed <= 0.0:
         return
@@ -283,17 +286,18 @@ def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
 
 @refcount_free_inlined
 def _remembered_parts(seconds: float) -> np.uint16:
-    """Return a time, at most FORGET_S, as an integer in units of 1/AGED."""
+    """Return a time [s], limited to FORGET_S, as an integer in units of 1/AGED s."""
     return np.uint16(min(seconds, c.FORGET_S) * AGED + 0.5)
 
 
 @refcount_free_inlined
 def is_ice_source(entries: RecordArray, entry: int) -> bool:
-    """Return True if a visit supports an alert: by its value, or by a slip controller that no value
-    contradicts.
+    """Return True if a visit supports an alert: by its value, or by the intervention of a slip
+    controller that no value of the visit contradicts.
 
-    A controller that intervenes while little grip is used corroborates others. It never enters the
-    belief, because it and the likelihood of the same visit come from one slip.
+    An intervention while little grip is used corroborates the reports of other vehicles. It never
+    enters the belief, because the intervention and the likelihood of the same visit come from one
+    slip.
     """
     slippery = entries[entry].slippery
     if slippery >= c.SOURCE_SHARE and ice_evidence(entries, entry) >= c.WITNESS_NATS:
@@ -308,9 +312,9 @@ def ice_evidence(entries: RecordArray, entry: int) -> float:
 
     A vehicle that used grip u on a road μ may report a value that is too low, with a standard
     deviation of d(μ) = μ·clip(λ·(SHARED_SHARE - u/μ), 0, SHARED_MOST). λ is the slope that an alarm
-    assumes for an unknown fleet, because each witness is judged alone. With L scaled to maximum 1,
-    the likelihood of grip is therefore the maximum over μ ≥ SLIPPERY and r ≤ μ of
-    L(r)·exp(-½·((μ - r)/d(μ))²).
+    assumes for an unknown fleet, because each report is judged alone. Let L be the reported
+    likelihood, scaled to maximum 1. The likelihood of grip is the maximum of L(r)·exp(-½·((μ -
+    r)/d(μ))²) over all roads μ ≥ SLIPPERY and readings r ≤ μ.
     """
     evidence = entries[entry].evidence
     used = entries[entry].used / USED
@@ -331,8 +335,8 @@ def ice_evidence(entries: RecordArray, entry: int) -> float:
 
 @refcount_free_inlined
 def needs_reporters(entries: RecordArray, entry: int) -> bool:
-    """Return True if a cell needs reporters for an entry: it is a value, a source of grip, or a
-    controller worked.
+    """Return True if the cell must keep a record of reporters for this entry: the entry is a value
+    or a source of grip, or a slip controller intervened.
     """
     return bool(
         entries[entry].kind == VALUE
@@ -343,7 +347,9 @@ def needs_reporters(entries: RecordArray, entry: int) -> bool:
 
 @refcount_free_inlined
 def _count_visit(cells: RecordArray, row: int, entries: RecordArray, entry: int) -> None:
-    """Count visits and vehicles; a visit that was probably elsewhere is not counted."""
+    """Count the visit and, if new, its vehicle. A visit that was probably in another cell is not
+    counted.
+    """
     if entries[entry].share < c.HERE_SHARE:
         return
     cells[row].visits += np.uint32(1)
@@ -355,11 +361,11 @@ def _count_visit(cells: RecordArray, row: int, entries: RecordArray, entry: int)
 def _untrusted_weight(
     cells: RecordArray, row: int, kind: int, power: float, weight: float
 ) -> float:
-    """Return the weight of a vote among the votes of other untrusted vehicles: the k-th new one
-    counts 1/k², so all together count at most 1.6 votes.
+    """Return the weight of an untrusted vehicle's vote, reduced by earlier votes of other untrusted
+    vehicles in the cell. The k-th new vehicle counts 1/k², so all together count at most 1.6 votes.
 
-    So names cost nothing and bring nothing. A vehicle's repeated vote is discounted by its `power`
-    already.
+    Therefore an attacker gains nothing from many new names. Repeated votes of one vehicle are
+    already discounted by their `power`. The weight of a trusted vehicle is returned unchanged.
     """
     if not 0.0 < weight < c.SOURCE_TRUST:
         return weight
@@ -370,7 +376,9 @@ def _untrusted_weight(
 
 @refcount_free
 def _note_source(reporters: RecordArray, row: int, side: int, vehicle: int, time: int) -> None:
-    """Note a corroborating source: at its own place if it has one, else at that of the oldest."""
+    """Record a corroborating source: in the vehicle's own place if it has one, otherwise in place
+    of the oldest source.
+    """
     source = reporters[row].source
     source_time = reporters[row].source_time
     place = 0

@@ -1,11 +1,11 @@
 """Influence of the weather on forgetting: how fast a region's roads age, and the prior belief about
 an unmeasured road.
 
-Roads of a region without weather reports age by the clock. A report holds from its time on, until
-the next one or for VALID_S. Pure; the ageing is compiled.
+Roads of a region without weather reports age in real time. A report applies from its time on, until
+the next report or for VALID_S. Pure; the ageing is compiled.
 
 Legend
-    τ_d, τ_c   road time of drift and of change: ∫ rate dt                     [s]
+    τ_d, τ_c   weather-scaled age ("road time") of drift and change: ∫ rate dt     [s]
     T_a, T_r   temperature of the air, of the road                             [°C]
     R          precipitation, as water                                         [mm/h]
 """
@@ -48,9 +48,12 @@ UNIFORM_SHARE: Final = 0.5
 
 @dataclass(frozen=True)
 class Reports:
-    """Weather of regions, arrays of shape (n,): region, time from which it acts [ns], air and road
-    temperature [°C], precipitation [mm/h], each NaN where unknown; `prior` (n, 32), NaN where there
-    is none."""
+    """Weather reports, arrays of shape (n,).
+
+    `time` is the time [ns] from which a report applies to its `region`. Air and road temperature
+    are in °C and precipitation in mm/h, each NaN where unknown. `prior` (n, 32) is the belief about
+    an unmeasured road, NaN for none.
+    """
 
     region: IntArray
     time: IntArray
@@ -65,15 +68,15 @@ class Reports:
 
 
 class Weather(NamedTuple):
-    """Road time of regions: rows `start[k]` to `start[k + 1]` belong to `region[k]`, in order of
-    time; row 0 to none.
+    """Road time (weather-scaled age) of regions. Rows `start[k]` to `start[k + 1]` belong to
+    `region[k]`, in order of time; row 0 is for regions without reports.
 
     Attributes:
         region: (r,) sorted.
         start: (r + 1,) first row of each region.
-        time: (m,) from which a row acts [ns].
-        clock: (m, 2) τ_d and τ_c at that time [s].
-        rate: (m, 2) at which they run from then on.
+        time: (m,) time from which a row applies [ns].
+        clock: (m, 2) road time of drift τ_d and of change τ_c at that time [s].
+        rate: (m, 2) rates of τ_d and τ_c from that time on, 1 without weather.
         prior: (m, 32) belief about an unmeasured road; uniform in row 0.
     """
 
@@ -86,7 +89,9 @@ class Weather(NamedTuple):
 
 
 def report_rates(reports: Reports) -> FloatArray:
-    """Return factors on the rates of drift and of change, (n, 2); 1 where the weather is unknown."""
+    """Return factors on the rates of drift and of change for each weather report, (n, 2); 1 where
+    the weather is unknown.
+    """
     road = np.where(
         np.isnan(reports.road_temperature),
         reports.air_temperature - AIR_ABOVE_ROAD_C,
@@ -105,7 +110,7 @@ def report_rates(reports: Reports) -> FloatArray:
 
 
 def report_priors(reports: Reports) -> Float32Array:
-    """Return the priors of reports (n, 32), mixed with the uniform prior."""
+    """Return the prior of each weather report, (n, 32), mixed with a share of the uniform prior."""
     given = np.where(np.isnan(reports.prior), mugrid.PRIOR, reports.prior)
     given = given / given.sum(axis=1, keepdims=True)
     mixed: FloatArray = UNIFORM_SHARE * mugrid.PRIOR + (1.0 - UNIFORM_SHARE) * given
@@ -113,8 +118,8 @@ def report_priors(reports: Reports) -> Float32Array:
 
 
 def weather_of(reports: Reports) -> Weather:
-    """Return the road time of all regions in `reports`; the last of several reports with the same
-    region and time counts.
+    """Return the road time of all regions in `reports`. If several reports have the same region and
+    time, the last one counts.
     """
     last = np.lexsort((np.arange(len(reports.time)), reports.time, reports.region))
     keep = np.append(np.diff(reports.region[last]) != 0, True) | np.append(
@@ -169,8 +174,8 @@ _SHIFT: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM) + 2  # from a slot's key
 
 @refcount_free
 def road_time(weather: Weather, key: int, begin: int, end: int) -> tuple[float, float, int]:
-    """Return the road time of drift and of change between two times [ns], and the row whose prior
-    applies at the end; row 0 if there is none.
+    """Return the road time (weather-scaled age) of drift and of change between two times [ns] as
+    [s], and the row whose prior applies at the end; row 0 if no report applies.
     """
     seconds = (end - begin) * 1e-9
     if len(weather.region) == 0:

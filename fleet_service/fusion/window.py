@@ -1,12 +1,13 @@
-"""The observations of the lateness window, per cell in order of time. The belief contains them in
-that order, in whatever order they arrive.
+"""The observations of the lateness window, per cell in order of time. The belief takes them in this
+order, whatever their order of arrival.
 
-A slot's live row is its belief after all observations. While the slot has observations younger than
-the checkpoint it has a window: these observations, and its base, the row as it was before them. An
-observation at the end of the order updates the live row. One in between makes the window stale, and
-after the batch all stale windows are computed again from their bases. When all of a window is older
-than the checkpoint, the live row equals the base after a commit, and the window is freed. Both rows
-go through the same operations in the same order, so that they agree bit for bit.
+A slot's live row is its belief after all observations. While a slot has observations younger than
+the checkpoint it has a window: these observations, and the base, a copy of the row before them. An
+observation that is newer than all others updates the live row. An observation in between makes the
+window stale; after the batch all stale windows are computed again from their bases. A commit moves
+observations that the checkpoint has passed into the base. When the last has been moved, the base
+equals the live row and the window is freed. Both rows go through the same operations in the same
+order, so that they agree bit for bit.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ from schemas.runtime.records import RecordArray
 class Arrivals(NamedTuple):
     """A batch of observations, arrays of shape (n,): see `Observations`.
 
-    `vehicle` is the index of the vehicle, `number` its number; `weight` is the trust in it; the
-    others are as an entry has them.
+    `vehicle` is the index of the vehicle in this service, `number` its permanent number, and
+    `weight` the trust in it. The other fields are the same as in `EntryRecord`.
     """
 
     time: IntArray
@@ -68,9 +69,9 @@ class Arrivals(NamedTuple):
 
 class Votes(NamedTuple):
     """Votes of a batch, arrays of shape (k,): row of the observation, slot, and P(the vehicle was
-    there).
+    in this cell).
 
-    Of the votes of an observation its own cell's comes first.
+    Among the votes of one observation, the vote for its own cell comes first.
     """
 
     row: IntArray
@@ -79,8 +80,8 @@ class Votes(NamedTuple):
 
 
 class Marks(NamedTuple):
-    """Marks of a batch: observations left out (n,), observations seen (n,), windows that must be
-    computed again (k,).
+    """Marks of a batch: observations left out (n,), observations accepted (n,), windows that must
+    be computed again (k,).
     """
 
     left_out: BoolArray
@@ -91,11 +92,11 @@ class Marks(NamedTuple):
 def absorb_votes(
     state: State, weather: Weather, arrivals: Arrivals, votes: Votes, most: int
 ) -> BoolArray:
-    """Take the votes of a batch into the windows of their slots, and update the beliefs.
+    """Add the votes of a batch to the windows of their slots, and update the beliefs.
 
-    Every pool must have k free places. Returns which observations (n,) were left out, because
-    `most` of their vehicle wait in their cell already; of the votes of an observation its own
-    cell's decides.
+    Every pool must have k free places. Return a mask of observations (n,) that were left out,
+    because `most` observations of their vehicle already wait in the same cell. For an observation
+    with several votes, its own cell decides.
     """
     n = len(arrivals.time)
     k = len(votes.row)
@@ -116,7 +117,7 @@ def _absorb_votes(
     marks: Marks,
     scratch: Bins,
 ) -> int:
-    """Absorb the votes and fill the marks; return the number of stale windows."""
+    """Add the votes to the windows and fill the marks; return the number of stale windows."""
     cells = state.live.cells
     windows = state.windows
     entries = state.entries
@@ -159,7 +160,7 @@ def _absorb_votes(
 
 @refcount_free_inlined
 def _fill_entry(state: State, arrivals: Arrivals, row: int) -> int:
-    """Fill a free entry with the data of an observation."""
+    """Fill a free entry with the data of an observation; return the row of the entry."""
     state.used[FREE_ENTRIES] -= 1
     entry = int(state.free_entries[state.used[FREE_ENTRIES]])
     new = state.entries[entry]
@@ -181,11 +182,11 @@ def _fill_entry(state: State, arrivals: Arrivals, row: int) -> int:
 
 @refcount_free_inlined
 def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, begin: int, end: int) -> None:
-    """Prefetch all memory that votes `begin` to `end` will touch; last the records whose place is
-    known only after another load.
+    """Prefetch the memory that the votes from `begin` to `end` will access. Records whose position
+    is known only after another load come last.
 
-    No branch waits for memory, because a processor that mispredicts it discards its
-    prefetches.
+    The code has no branch that waits for memory, because a processor that mispredicts a branch
+    discards its prefetches.
     """
     live = state.live
     base = state.base
@@ -216,7 +217,9 @@ def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, begin: int, 
 
 @refcount_free_inlined
 def _open_window(state: State, slot: int) -> int:
-    """Open a window for a slot that has none, with a copy of the slot's row; return its index."""
+    """Open a window for a slot without one, with a copy of the slot's row; return the row of the
+    window.
+    """
     state.used[FREE_WINDOWS] -= 1
     window = int(state.free_windows[state.used[FREE_WINDOWS]])
     live = state.live
@@ -236,7 +239,7 @@ def _open_window(state: State, slot: int) -> int:
 
 @refcount_free
 def _open_reporters(state: State, slot: int, window: int) -> None:
-    """Allocate a row of reporters for a slot with a window that has none."""
+    """Allocate a row of reporters for a slot that has a window but no reporters yet."""
     row = state.used[REPORTERS_USED]
     state.used[REPORTERS_USED] += 1
     state.live.cells[slot].reporters = row
@@ -273,8 +276,8 @@ def commit_windows(
     due_windows: IntArray,
     before: int,
 ) -> None:
-    """Let the checkpoint pass to `before` [ns] in the windows (k,), one after the other: older
-    entries leave them.
+    """Advance the checkpoint of the windows (k,) to `before` [ns], one window after the other.
+    Older entries are committed to the base and removed from the window.
     """
     _commit_windows(
         state, weather, peers, names, due_windows, before, np.zeros((3, SCRATCH), np.float32)
@@ -283,7 +286,9 @@ def commit_windows(
 
 @refcount_free_inlined
 def _prefetch_due(state: State, due_windows: IntArray, begin: int, end: int) -> None:
-    """Prefetch all that the commit of windows `begin` to `end` will touch, in the same way."""
+    """Prefetch the memory that the commit of the windows from `begin` to `end` will access, in the
+    same way as `_prefetch_votes`.
+    """
     live = state.live
     base = state.base
     windows = state.windows
@@ -351,7 +356,7 @@ def _commit_windows(
 
 @refcount_free_inlined
 def _shorten_window(state: State, slot: int, window: int, entry: int) -> None:
-    """Let a window begin with `entry`; free the window if `entry` is NONE."""
+    """Make `entry` the first entry of a window; free the window if `entry` is NONE."""
     windows = state.windows
     windows[window].head = entry
     if entry == NONE:
@@ -366,7 +371,9 @@ def _shorten_window(state: State, slot: int, window: int, entry: int) -> None:
 
 @refcount_free_inlined
 def _link_entry(windows: RecordArray, entries: RecordArray, window: int, entry: int) -> None:
-    """Put an entry at its place in time; from the end, where nearly all belong."""
+    """Insert an entry into its window in order of time. The search starts at the newest entry,
+    because nearly all entries belong there.
+    """
     after = windows[window].tail
     while after != NONE and comes_before(entries, entry, after):
         after = entries[after].previous

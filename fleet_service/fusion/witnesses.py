@@ -1,4 +1,6 @@
-"""Sources of ice on the slippery stretch around a cell: the reports that confirm an alert. Pure."""
+"""Vehicles that reported ice on the slippery stretch around a cell; their reports confirm an alert.
+Pure.
+"""
 
 from __future__ import annotations
 
@@ -13,19 +15,19 @@ from schemas.numeric import BoolArray, IntArray
 
 
 def stretch_slots(fusion: Fusion, slots: IntArray) -> IntArray:
-    """Return the slots of the slippery stretch around each slot (k,), the slot itself first; NONE
-    for places without one.
+    """Return the slots of the slippery stretch around each slot (k,), the slot itself first;
+    positions without a slot are NONE.
     """
     return stretches(fusion.store.state.live, fusion.store.table, slots)
 
 
 class StretchSources(NamedTuple):
-    """Sources of ice on the stretches around k slots, the newest first.
+    """Vehicles that reported ice on the stretches around k slots, the newest first.
 
     Attributes:
         who: index of the vehicle, (k, n).
-        when: time of its newest report [ns], (k, n); 0 where there is none.
-        around: True for slots with sources both before and behind them, (k,).
+        when: time of the vehicle's newest report [ns], (k, n); 0 for no vehicle.
+        around: mask (k,), True for slots with such vehicles both before and behind them.
     """
 
     who: IntArray
@@ -34,8 +36,8 @@ class StretchSources(NamedTuple):
 
 
 def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> StretchSources:
-    """Return the sources of ice on the stretches around slots (k,) after `since` (k,) [ns]; a
-    vehicle counts once.
+    """Return the vehicles that reported ice on the stretches around slots (k,) after `since` (k,)
+    [ns]; each vehicle counts once per stretch.
     """
     along = stretch_slots(fusion, slots)
     places = along.shape[1]
@@ -50,7 +52,9 @@ def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> Stretch
 
 
 def witnesses_of(fusion: Fusion, slot: int, since: int) -> list[int]:
-    """Return the numbers of the sources of ice on the stretch around a slot after `since` [ns]."""
+    """Return the numbers of the vehicles that reported ice on the stretch around a slot after
+    `since` [ns].
+    """
     who, when, _ = stretch_sources(fusion, np.array([slot]), np.array([since]))
     return [int(fusion.store.names["key"][index]) for index in who[0][when[0] > 0].tolist()]
 

@@ -1,4 +1,4 @@
-"""The cells by columns for reading, and operations on their rows."""
+"""Columns of the stored cells for reading, and operations on their rows."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ from schemas.runtime.records import RecordArray
 
 
 class Cells(NamedTuple):
-    """Stored state of each slot: `belief` (n, 32) in 16 bits, see `belief.unpack_belief`, and the columns
-    (n,) of `records.CellRecord`; `untrusted` is (n, 2), `manoeuvres` (n, 4).
+    """Stored state of each slot as columns (n,) with the fields of `records.CellRecord`;
+    `untrusted` is (n, 2), `manoeuvres` (n, 4). `belief` (n, 32) is packed in 16 bits, see
+    `belief.unpack_belief`.
     """
 
     belief: PackedArray
@@ -51,8 +52,8 @@ def cells_of(rows: Rows) -> Cells:
 
 
 def rows_of_lines(rows: int, kind: np.dtype[Any], *shape: int) -> NDArray[Any]:
-    """Return zeros (rows, *shape) aligned to cache lines (LINE), so that a row of 64 bytes costs
-    one read of memory.
+    """Return an array of zeros (rows, *shape) aligned to cache lines (LINE bytes), so that a row of
+    64 bytes costs one memory access.
     """
     size = rows * kind.itemsize * int(np.prod(shape, dtype=np.int64))
     memory = np.zeros(size + LINE, np.uint8)
@@ -61,13 +62,13 @@ def rows_of_lines(rows: int, kind: np.dtype[Any], *shape: int) -> NDArray[Any]:
 
 
 def no_beliefs(rows: int) -> PackedArray:
-    """Return memory for packed beliefs."""
+    """Return zeroed memory for packed beliefs, (rows, 32)."""
     return rows_of_lines(rows, np.dtype(np.uint16), mugrid.BINS)
 
 
 @refcount_free
 def begin_slot(live: Rows, slot: int, key: int) -> None:
-    """Initialise a slot for a key with the prior."""
+    """Initialise a slot for a key with the uniform prior."""
     live.belief[slot] = FULL
     cell = live.cells[slot]
     cell.key = key
@@ -77,8 +78,8 @@ def begin_slot(live: Rows, slot: int, key: int) -> None:
 
 @refcount_free_inlined
 def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
-    """Copy the state of a slot from one row to another, except for the places of its window and its
-    reporters.
+    """Copy the state of a slot from one row to another. The row numbers of the target's window and
+    reporters stay unchanged.
     """
     for i in range(mugrid.BINS):
         target.belief[to, i] = source.belief[at, i]

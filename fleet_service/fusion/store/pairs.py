@@ -1,5 +1,5 @@
 """Earlier reports of a vehicle in a cell: its linked entries in the window, and a record of the
-older ones.
+older reports.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def comes_before(entries: RecordArray, a: int, b: int) -> bool:
 
 @refcount_free_inlined
 def pair_of(pairs: RecordArray, used: IntArray, slot: int, vehicle: int) -> int:
-    """Return the place of a pair; create the pair if there is none."""
+    """Return the row of the pair of `slot` and `vehicle`; create the pair if it does not exist."""
     pair = pair_place(pairs, slot, vehicle)
     if pairs[pair].slot == NONE:
         pairs[pair].slot = slot
@@ -46,7 +46,9 @@ def pair_of(pairs: RecordArray, used: IntArray, slot: int, vehicle: int) -> int:
 
 @refcount_free_inlined
 def link_pair(entries: RecordArray, pairs: RecordArray, pair: int, entry: int) -> None:
-    """Put an entry among those of its vehicle in its window."""
+    """Insert an entry, in order of time, into the linked list of its vehicle's entries in its
+    window.
+    """
     pairs[pair].waiting += 1
     entries[entry].pair = pair
     before = int(pairs[pair].last)
@@ -66,7 +68,7 @@ def link_pair(entries: RecordArray, pairs: RecordArray, pair: int, entry: int) -
 @refcount_free_inlined
 def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
     """Move an entry's report into the record of its vehicle's reports before the checkpoint, and
-    unlink it from later entries.
+    unlink the entry from later entries.
     """
     pair = int(entries[entry].pair)
     kind = int(entries[entry].kind)
@@ -84,14 +86,16 @@ def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 
 @refcount_free_inlined
 def _must_stay(pairs: RecordArray, place: int, least: int) -> bool:
-    """Return True if a pair reported since `least` [s], or waits in the window."""
+    """Return True if a pair reported at `least` [s] or later, or has entries in the window."""
     pair = pairs[place]
     return bool(pair.last != NONE or pair.time[0] >= least or pair.time[1] >= least)
 
 
 @compiled
 def count_staying(pairs: RecordArray, least: int) -> int:
-    """Count the pairs that reported since `least` [s]."""
+    """Return the number of pairs that must stay: they reported at `least` [s] or later, or have
+    entries in the window.
+    """
     count = 0
     for place in range(len(pairs)):
         count += pairs[place].slot != NONE and _must_stay(pairs, place, least)
@@ -100,8 +104,8 @@ def count_staying(pairs: RecordArray, least: int) -> int:
 
 @compiled
 def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: int) -> IntArray:
-    """Move the pairs that reported since `least` [s] to another table; returns the places of the
-    others.
+    """Move the pairs that must stay (see `_must_stay`) to another table; return the rows of the
+    pairs that are dropped, in the old table.
     """
     dropped = np.empty(len(old), np.int64)
     count = 0
@@ -128,13 +132,15 @@ def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: 
 
 @refcount_free_inlined
 def returning_bit(number: int) -> np.uint64:
-    """Return the bit that represents a vehicle in `Cells.returned`."""
+    """Return the bit that represents a vehicle in `Cells.returned`; several vehicles share a bit."""
     return np.uint64(1) << ((np.uint64(number) * _FIBONACCI) >> np.uint64(58))
 
 
 @compiled
 def mark_returned(state: State, slots: IntArray, numbers: IntArray) -> None:
-    """Mark in cells (k,) that vehicles (k,) were there, though their reports are forgotten."""
+    """Mark in cells (k,) that vehicles (k,) have been there, because their reports are about to be
+    forgotten.
+    """
     for k in range(len(slots)):
         slot = slots[k]
         bit = returning_bit(numbers[k])

@@ -1,9 +1,9 @@
-"""The records of a fusion: what belongs together lies together in memory. Kernels see a row as an
-object.
+"""The records of a fusion. Data that are used together are adjacent in memory. Compiled functions
+see a row as an object.
 
-Record arrays and not columns: a visit to a cell that was not lately in use then costs two reads of
-memory and not one for every column, and handing a kernel a few arrays of records costs nothing,
-where dozens of columns would.
+The state consists of record arrays instead of columns for two reasons. A visit to a cell that was
+not used recently costs two memory accesses instead of one per column. Compiled functions receive a
+few arrays of records instead of dozens of columns, which makes calls cheap.
 """
 
 from __future__ import annotations
@@ -44,27 +44,28 @@ UInt16Array = NDArray[np.uint16]
 
 
 class CellRecord:
-    """A slot: one visited cell and sector. Its belief is a row of its own, see `belief.unpack_belief`.
+    """A slot: one visited cell and sector. Its belief is stored in another array, see
+    `belief.unpack_belief`.
 
     Attributes:
         key: cell · 4 + sector.
-        time: last observation that is in the belief [ns]; 0 before the first.
-        first: first one [ns].
-        returned: a bit for each remainder of the vehicles whose visits were forgotten, so that a
-            returning vehicle is not counted twice.
-        visits: observations.
-        vehicles: distinct vehicles.
-        values: votes with a value, fractions of repeated ones summed.
+        time: time of the latest observation in the belief [ns]; 0 before the first observation.
+        first: time of the first observation [ns].
+        returned: set of bits of the vehicles whose visits were forgotten, so that a returning
+            vehicle is not counted twice; see `pairs.returning_bit`.
+        visits: number of observations.
+        vehicles: number of distinct vehicles.
+        values: number of votes with a value; a repeated vote counts as a fraction.
         window: row of the slot's window, or NONE.
-        reporters: row of its recent reporters, or NONE if no vehicle gave a value or corroborated
-            anything lately.
-        aged: time before `time` that the belief has not forgotten yet, in parts of 1/AGED s.
-        used: grip used by the vehicles that gave values, mean by weight; in parts of 1/USED.
-        shared: relative standard deviation that their values share, mean by weight; in parts of
-            1/SHARED.
-        untrusted: bounds and values of untrusted vehicles, without those that newer ones replaced;
-            in parts of 1/UNTRUSTED.
-        manoeuvres: weight of the values by manoeuvre, see `shared`; in parts of 1/WEIGHT.
+        reporters: row of its recent reporters, or NONE if no vehicle recently gave a value or
+            corroborated an alert.
+        aged: time before `time` that the belief has not forgotten yet, in units of 1/AGED s.
+        used: weighted mean grip used by the vehicles that gave values, in units of 1/USED.
+        shared: weighted mean of the relative standard deviation that these values share, in units
+            of 1/SHARED.
+        untrusted: number of bounds and of values from untrusted vehicles, fading with time, in
+            units of 1/UNTRUSTED.
+        manoeuvres: weight of the values by manoeuvre, see `shared`; in units of 1/WEIGHT.
     """
 
     key: int
@@ -84,32 +85,33 @@ class CellRecord:
 
 
 class EntryRecord:
-    """One observation in one cell, younger than the checkpoint. The fields that a commit reads lie
+    """One observation in one cell, younger than the checkpoint. The fields that a commit reads are
     in the first of its two cache lines.
 
     Attributes:
-        previous, following: entries of the slot's window, in order of time.
-        before, after: entries of the same vehicle in it.
-        pair: place of the pair of slot and vehicle.
+        previous, following: neighbouring entries of the slot's window, in order of time.
+        before, after: neighbouring entries of the same vehicle in this window.
+        pair: row of the pair of slot and vehicle.
         vehicle: index of the vehicle.
         kind: BOUND or VALUE.
-        fresh: True if the vehicle reported nothing here lately.
-        last_mean, last_std, spent: reports of the vehicle here so far, this entry included; in
-            parts of 1/FINE.
+        fresh: True if the vehicle has not reported in this cell recently.
+        last_mean, last_std, spent: summary of the vehicle's reports in this cell, this entry
+            included; in units of 1/FINE.
         time: end of the visit [ns].
         weight: trust in the vehicle.
         share: P(the vehicle was in this cell).
-        power: how much of the vote is new.
-        mean, std, slippery: of the vote.
-        number, boot, sequence: order entries of equal times: the vehicle's number, its start, the
-            row in its stream.
+        power: share of the vote that is new information.
+        mean, std, slippery: mean, standard deviation and P(slippery) of the vote.
+        number, boot, sequence: the vehicle's number, its start, the row in its stream; they order
+            entries of equal times.
         evidence: likelihood in steps, see `likelihoods.make_evidence`.
-        used, shared: grip used, and the error that its value shares with others, in parts of 1/USED
+        used, shared: grip used, and the error that its value shares with others, in units of 1/USED
             and 1/SHARED.
-        manoeuvre: see `shared`.
-        late: True if it came after the checkpoint, and is compared with no other vehicle.
-        limited: CLAIMED where a slip controller says slippery, HEEDED where the vehicle's flags
-            have a good record.
+        manoeuvre: kind of manoeuvre, see `shared`.
+        late: True if the observation came after the checkpoint; it is then compared with no other
+            vehicle.
+        limited: CLAIMED if a slip controller reports a slippery road, HEEDED if in addition the
+            vehicle's controllers have a good record, else 0.
     """
 
     previous: np.int32
@@ -142,9 +144,14 @@ class EntryRecord:
 
 
 class WindowRecord:
-    """The window of a slot: its first and last entry, a flag that the live row must be computed
-    again, the first entry's time [ns], and the number of entries that are values. A window that is
-    not in use has slot NONE.
+    """The window of a slot.
+
+    Attributes:
+        slot: the slot; NONE if the window is not in use.
+        head, tail: first and last entry.
+        stale: 1 if the live row must be computed again.
+        first: time of the first entry [ns].
+        values: number of entries that are values.
     """
 
     slot: np.int32
@@ -157,15 +164,16 @@ class WindowRecord:
 
 class PairRecord:
     """Last reports of a vehicle in a cell before the checkpoint. A record is half a cache line
-    long, so that none crosses a line.
+    long, so that no record crosses the border of a line.
 
     Attributes:
-        slot, vehicle: whose; a free place has slot NONE.
-        last: the newest of the pair's entries in the window, or NONE.
-        waiting: how many these are.
-        std: of the last value, in parts of 1/FINE.
-        time: of the last bound and value [s]; 0 where there was none.
-        mean, spent: of the last bound and value, in parts of 1/FINE.
+        slot, vehicle: the pair; a free place has slot NONE.
+        last: newest of the pair's entries in the window, or NONE.
+        waiting: number of the pair's entries in the window.
+        std: standard deviation of the last value, in units of 1/FINE.
+        time: times of the last bound and the last value [s]; 0 for none.
+        mean, spent: mean and used-up votes at the last bound and the last value, in units of
+            1/FINE.
     """
 
     slot: np.int32
@@ -179,7 +187,9 @@ class PairRecord:
 
 
 class SourcesRecord:
-    """The last SOURCES vehicles that reported grip and ice in a slot, and when [s]."""
+    """The last SOURCES vehicles that reported grip, and those that reported ice, in a slot, with
+    the times of their reports [s].
+    """
 
     source: Annotated[Int32Array, 2, SOURCES]
     source_time: Annotated[UIntArray, 2, SOURCES]
@@ -187,7 +197,9 @@ class SourcesRecord:
 
 class ReportersRecord:
     """The recent reporters of a slot: the last REPORTERS vehicles that gave a value before the
-    checkpoint, when [s] and what, and the grip used; and the corroborating sources."""
+    checkpoint, with time [s], mean, standard deviation and grip used. The record also contains the
+    corroborating sources, as in `SourcesRecord`.
+    """
 
     reporter: Annotated[Int32Array, c.REPORTERS]
     time: Annotated[UIntArray, c.REPORTERS]
@@ -199,10 +211,18 @@ class ReportersRecord:
 
 
 class PeersRecord:
-    """Vehicles with which a vehicle was compared: the other, the rank of their pair, agreement and
-    comparisons, summed; squares of the differences of its own use between two visits to one cell,
-    and their products with those of its values, by weight; how often others' values confirmed and
-    contradicted its slip controllers."""
+    """Comparisons of one vehicle with others.
+
+    Attributes:
+        other: index of the other vehicle.
+        rank: pseudo-random rank of the pair, which decides between competing vehicles.
+        agreed, met: summed agreement, and number of comparisons.
+        used_squares: weighted squares of the differences in grip used between two visits of the
+            vehicle to one cell.
+        used_products: weighted products of these differences with the differences in value.
+        flags_confirmed, flags_contradicted: how often values of other vehicles confirmed and
+            contradicted the vehicle's slip controllers.
+    """
 
     other: Annotated[Int32Array, c.PEERS]
     rank: Annotated[Int32Array, c.PEERS]
@@ -215,7 +235,7 @@ class PeersRecord:
 
 
 class VehicleRecord:
-    """A vehicle: its number."""
+    """A vehicle; the key is its permanent number."""
 
     key: int
 
@@ -231,8 +251,13 @@ VEHICLE: Final = record_type(VehicleRecord)
 
 
 class Rows(NamedTuple):
-    """Beliefs of slots (n, 32), their records (n,) and, by rows of their own, their reporters or
-    only sources.
+    """State of slots, in three arrays.
+
+    Attributes:
+        belief: packed beliefs, (n, 32).
+        cells: `CellRecord` of each slot, (n,).
+        reporters: `ReportersRecord`, or for copies only `SourcesRecord`, with their own row
+            numbers.
     """
 
     belief: PackedArray
@@ -249,13 +274,13 @@ class State(NamedTuple):
     """State of the store in arrays, for compiled code.
 
     Attributes:
-        live: the slots as they are now.
-        base: row by row of `windows`, the slots as they were before the window; of the reporters
-            only the sources.
+        live: the current slots.
+        base: copies of slots before their window, one row per row of `windows`; of the reporters
+            only the sources are copied.
         windows, entries: pools.
         free_windows, free_entries: stacks of the pools' free rows.
-        pairs: hash table that holds its records.
-        used: (4,) see FREE_WINDOWS.
+        pairs: hash table that contains the pair records.
+        used: (4,) counts, see FREE_WINDOWS.
     """
 
     live: Rows

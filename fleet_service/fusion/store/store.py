@@ -1,4 +1,6 @@
-"""The store of a fusion: tables and pools that grow. Compiled code finds all of it in `State`."""
+"""The store of a fusion: tables and pools that grow. Compiled code receives all arrays as one
+`State`.
+"""
 
 from __future__ import annotations
 
@@ -54,11 +56,11 @@ class Store:
     """Complete state of a fusion, empty at first.
 
     Attributes:
-        state: of compiled code.
-        peers: (…) whom each vehicle met.
-        names: (…) the vehicles' numbers by index; `vehicles` of them are known.
-        size, vehicles: slots and vehicles in use.
-        hour: until which pairs were dropped [s].
+        state: arrays for compiled code.
+        peers: (…) comparisons of each vehicle with others.
+        names: (…) permanent numbers of the vehicles, by index; the first `vehicles` are in use.
+        size, vehicles: number of slots and of vehicles in use.
+        hour: hour [s] for which old pairs were last dropped.
     """
 
     def __init__(self) -> None:
@@ -97,21 +99,21 @@ class Store:
 
     @property
     def live(self) -> Cells:
-        """The slots by columns."""
+        """All slots as columns."""
         return cells_of(self.state.live)
 
     @property
     def waiting(self) -> int:
-        """Number of entries in use."""
+        """Number of window entries in use."""
         return len(self.state.free_entries) - int(self.state.used[FREE_ENTRIES])
 
     def due_windows(self, before: int) -> tuple[IntArray, IntArray]:
         """Return the windows with entries before `before` [ns]: first those without a value, then
-        those with one, sorted by cell.
+        those with a value, sorted by cell.
 
-        Values that pass the checkpoint are compared with others, which is what reputation is made
-        of; so their order may not depend on who came first. All else is done in the order of
-        memory.
+        Values that pass the checkpoint are compared with other values to compute trust. The order
+        of these comparisons must not depend on the order of arrival, so windows with values are
+        sorted. All others stay in the order of memory, which is faster.
         """
         plain, valued = find_due_windows(self.state.windows, before)
         return plain, valued[
@@ -119,7 +121,7 @@ class Store:
         ]
 
     def slots_of(self, keys: IntArray) -> IntArray:
-        """Return the slot of each key, NONE if the key has none."""
+        """Return the slot of each key; NONE if the key has no slot."""
         return rows_of(self._slots, self.state.live.cells, np.asarray(keys, np.int64))
 
     @property
@@ -128,7 +130,7 @@ class Store:
         return self._slots
 
     def slots_for(self, keys: IntArray) -> IntArray:
-        """Return the slot of each key; new slots begin with the prior."""
+        """Return the slot of each key. An unknown key gets a new slot, which begins with the prior."""
         slots = self.slots_of(keys)
         new = np.flatnonzero(slots == NONE)
         if not len(new):
@@ -147,7 +149,7 @@ class Store:
         return slots
 
     def known(self, vehicle: IntArray) -> IntArray:
-        """Return the index of each vehicle, NONE for an unknown one."""
+        """Return the index of each vehicle; NONE for an unknown vehicle."""
         return rows_of(self._known, self.names, vehicle)
 
     def vehicles_of(self, vehicle: IntArray) -> IntArray:
@@ -168,7 +170,7 @@ class Store:
         return index
 
     def reserve(self, rows: int) -> None:
-        """Make room for the votes of a batch in every pool."""
+        """Grow every pool so that it has free rows for `rows` more votes."""
         used = self.state.used
         if used[FREE_ENTRIES] < rows:
             self._more_entries(self.waiting + rows)
@@ -202,8 +204,8 @@ class Store:
         self.state = old._replace(windows=windows, base=base, free_windows=free)
 
     def forget(self, checkpoint_s: int) -> None:
-        """Drop old records once per hour of the checkpoint: reports of vehicles from FORGOTTEN_S
-        before it (`votes.discount_vote`), and reporters and sources from an hour before it
+        """Drop old records, once per hour of the checkpoint time: reports of vehicles older than
+        FORGOTTEN_S (`votes.discount_vote`), and reporters and sources older than an hour
         (`trust.compare_reports`, `Fusion.sources`).
         """
         hour = checkpoint_s - checkpoint_s % _HOUR
@@ -213,8 +215,8 @@ class Store:
             self._rebuild_reporters(hour - _HOUR - _AHEAD)
 
     def untouched(self, before: int) -> BoolArray:
-        """Return True for each slot (size,) whose last visit was before a time [ns] and that
-        nothing else refers to.
+        """Return a mask of slots (size,): True if the last visit was before `before` [ns] and no
+        other record refers to the slot.
         """
         cells = self.state.live.cells[: self.size]
         pairs = self.state.pairs
@@ -223,8 +225,8 @@ class Store:
         return np.asarray(found)
 
     def drop(self, gone: BoolArray) -> IntArray:
-        """Delete slots (size,) that are `untouched`; return the new number of each slot, NONE for
-        deleted ones.
+        """Delete the slots that the mask `gone` (size,) selects; all must be `untouched`. Return
+        the new number of each slot, NONE for deleted ones.
         """
         stay = np.flatnonzero(~gone)
         place = np.full(self.size, NONE, np.int64)
@@ -243,7 +245,7 @@ class Store:
         return place
 
     def _rebuild_pairs(self, least: int, most: int) -> None:
-        """Drop pairs that last reported before `least` [s], and make room for `most`."""
+        """Drop pairs that last reported before `least` [s], and make room for `most` pairs."""
         state = self.state
         old = state.pairs
         count = count_staying(old, least)
@@ -254,7 +256,9 @@ class Store:
         self.state = state._replace(pairs=new)
 
     def _rebuild_reporters(self, least: int) -> None:
-        """Drop reporters whose last report was before `least` [s], but for those of a window."""
+        """Drop reporters whose last report was before `least` [s]. Slots with a window keep their
+        reporters.
+        """
         live = self.state.live
         cells = self.state.live.cells[: self.size]
         slots = np.flatnonzero(cells["reporters"] != NONE)
@@ -272,8 +276,8 @@ class Store:
 
 @compiled
 def find_due_windows(windows: RecordArray, before: int) -> tuple[IntArray, IntArray]:
-    """Return the windows with entries before `before` [ns]: first those without a value, then those
-    with one.
+    """Return two arrays: the windows without a value and the windows with a value, among those with
+    entries before `before` [ns].
     """
     plain = np.empty(len(windows), np.int64)
     valued = np.empty(len(windows), np.int64)
@@ -298,8 +302,8 @@ def no_peers(vehicles: int) -> RecordArray:
 
 
 def distinct_values(values: IntArray) -> IntArray:
-    """Return the distinct values in ascending order, by sorting, which is several times faster than
-    a set for such numbers.
+    """Return the distinct values in ascending order. Sorting is several times faster than a set
+    here.
     """
     ordered = np.sort(values)
     return np.asarray(
@@ -323,8 +327,8 @@ def _grow_rows(old: Array, rows: int) -> Array:
 
 
 def _free_rows(old: Int32Array, used: IntArray, which: int, rows: int) -> Int32Array:
-    """Free rows of a grown pool: those of the old one, and the new ones; counted in
-    `used[which]`.
+    """Return the stack of free rows after a pool has grown to `rows`: the earlier free rows and the
+    new ones. The number of free rows is stored in `used[which]`.
     """
     count = int(used[which])
     more = rows - len(old)

@@ -1,11 +1,14 @@
-"""Open-addressing hash tables: arrays of row numbers whose keys lie in the rows themselves.
-Compiled; at least one place must be free.
+"""Open-addressing hash tables: arrays of row numbers; the keys are stored in the rows themselves.
+Compiled. At least one place of a table must be free.
 
-A place holds the row in its lower half and some of the key's hash in the upper one, so that a row
-of another key is hardly ever looked at: that would be a wait for memory.
+A place contains the row number in its lower half and a part of the key's hash in its upper half.
+Comparing the hash parts first avoids nearly all reads of rows with another key, each of which would
+wait for memory.
 
-A key's place is its hash as a share of the table: any length will do, and a longer table holds its
-rows in the same order, so that it is filled from one end to the other."""
+The first place for a key is proportional to its hash. Therefore a table may have any length. A
+longer table contains its rows in the same order, so that it can be filled from one end to the
+other.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +34,8 @@ AHEAD: Final = 128
 
 @refcount_free_inlined
 def _hash_key(key: int | np.int64) -> np.uint64:
-    """Return the hash of a key: mixing steps of the splitmix64 generator, so that every bit of it
-    moves all.
+    """Return the hash of a key, computed with the mixing steps of the splitmix64 generator, so that
+    every bit of the key affects every bit of the hash.
     """
     h = np.uint64(key)
     h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -42,13 +45,13 @@ def _hash_key(key: int | np.int64) -> np.uint64:
 
 @refcount_free_inlined
 def _first_place(mixed: np.uint64, places: int) -> int:
-    """Return the place at which the search for a key begins."""
+    """Return the place at which the search for a key with hash `mixed` begins."""
     return int(np.int64(((mixed >> np.uint64(32)) * np.uint64(places)) >> np.uint64(32)))
 
 
 @refcount_free_inlined
 def _row_at(held: int) -> int:
-    """Return the row stored in a place; NONE if the place is free."""
+    """Return the row number in the content of a place; NONE if the place is free."""
     return int(np.int32(held & _LOWER))
 
 
@@ -60,7 +63,7 @@ def _place_content(mixed: np.uint64, row: int) -> int:
 
 @refcount_free_inlined
 def locate_key(table: IntArray, rows: RecordArray, key: int) -> int:
-    """Return the place of the row with `key`, or the free place where it belongs."""
+    """Return the place of the row with `key`; if there is none, the free place where it belongs."""
     mixed = _hash_key(key)
     place = _first_place(mixed, len(table))
     tag = np.int64(mixed & np.uint64(_TAG))
@@ -96,7 +99,7 @@ def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
 @compiled
 def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int) -> tuple[IntArray, int]:
     """Return the slot of each key, (n,), and the number of slots in use afterwards. An unknown key
-    gets the next slot; the table must have room for it.
+    gets the next free slot; the table must have room for it.
     """
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
@@ -114,7 +117,7 @@ def assign_rows(
     table: IntArray, rows: RecordArray, wanted: IntArray, used: int
 ) -> tuple[IntArray, int]:
     """Return the row of each key, (n,), and the number of rows in use afterwards. An unknown key is
-    written to the next of `rows`.
+    written to the next free row.
     """
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
@@ -144,8 +147,8 @@ def first_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
 
 @refcount_free_inlined
 def pair_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
-    """Return the place of a pair in a table that holds the pairs themselves, or the free place
-    (slot NONE) where it belongs.
+    """Return the place of a pair in a table that contains the pair records themselves; if the pair
+    is unknown, the free place (slot NONE) where it belongs.
     """
     place = first_place(pairs, slot, vehicle)
     while pairs[place].slot != NONE and (
@@ -163,8 +166,8 @@ def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
 
 
 def places_for(entries: int, most: float) -> int:
-    """Return the number of places for `entries` and a third more at a load of `most`; for pairs
-    that is one hour of growth after three.
+    """Return the number of places of a table for `entries` and 35 % more at a load of `most`. For
+    pairs, which live three hours, this is the growth of one more hour.
     """
     return max(LEAST, int(1.35 * entries / most))
 
