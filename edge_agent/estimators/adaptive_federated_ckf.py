@@ -1,13 +1,15 @@
-"""`adaptive-federated-ckf`: the federated cubature filter with fuzzy R and adaptive shares of paper
-001.
+"""`adaptive-federated-ckf`: paper 001, a federated cubature filter with fuzzy R and adaptive
+information shares.
 
 "Driving state estimation of distributed drive electric vehicles by an adaptive fuzzy federated
 Kalman filter", Sustainability 2023, 15, 13446 (paper 001). Motion and sub-filters: see
-`gaussian/federated_motion`. Factor on R of each sub-filter from the window mismatch of its
-innovations and the mismatch's rate by 7 x 5 rules (section 3.1, table 1, see `rules`); shares from
-the predicted residuals, (30) to (33): beta_i = min(1, c/gamma_i), normalised.
+`gaussian/federated_motion`. A fuzzy rule base of 7 x 5 rules scales R of each sub-filter (section
+3.1, table 1, see `rules`). Its inputs are the mismatch between actual and expected innovation
+variance over a window, and the rate of that mismatch. The information shares follow from the
+predicted residuals, (30) to (33): beta_i = min(1, c/gamma_i), normalised.
 
-Friction is not a state: it is set by hand (section 4.1), here to DRY, and the prior is reported.
+Friction is not a state of the filter. It is set by hand (section 4.1), here to DRY, and the bank
+reports the friction prior.
 
 ELEMENTS lists each element of the paper and every departure with its reason.
 """
@@ -50,7 +52,7 @@ ORDINARY = 1.0  # c of (32): gamma up to here is no sign of trouble; the paper's
 
 
 class AdaptiveMemory(FederatedMemory):
-    """State of one filter."""
+    """Memory of the filter of one vehicle."""
 
     actual: Annotated[FloatArray, 2, ROWS]  # windowed squared innovations
     expected: Annotated[FloatArray, 2, ROWS]  # windowed innovation variances
@@ -58,7 +60,9 @@ class AdaptiveMemory(FederatedMemory):
 
 
 class AdaptiveDesign:
-    """Parameters that are set by hand."""
+    """Parameters that are set by hand: friction of the four wheels [1] and levels of the fuzzy
+    rules.
+    """
 
     friction: Annotated[FloatArray, 4]
     adaptive: bool
@@ -66,7 +70,7 @@ class AdaptiveDesign:
 
 
 class AdaptiveSetting(NamedTuple):
-    """Options of the filter."""
+    """Options of the filter of paper 001."""
 
     adaptive: bool = True  # False: R and shares stay as they are, which is the comparator FKF
     tyre: TyreOption = TyreOption()
@@ -94,7 +98,7 @@ which nothing printed measures, by decimetres per second.
 def make_bank(
     vehicles: Sequence[Vehicle], friction: float = DRY, setting: AdaptiveSetting | None = None
 ) -> EstimatorBank:
-    """Return a bank of N of these filters, on a road whose friction is given."""
+    """Return a bank of filters, one per vehicle, on a road with the given friction [1]."""
     chosen = AdaptiveSetting() if setting is None else setting
     design = records(AdaptiveDesign, 1)
     design["friction"] = friction
@@ -125,7 +129,9 @@ def _step_filter(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> b
 
 @compiled
 def _adapt_noise_and_shares(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> None:
-    """Compute the factors on R and the shares for the next sample."""
+    """Compute the factors on R of both sub-filters and their information shares for the next
+    sample.
+    """
     motion = memory.motion
     keep = 0.5 ** (dt / WINDOW_S)
     raw = np.ones(2)

@@ -1,7 +1,7 @@
-"""The estimator bank: N vehicles estimated in one pass through one compiled path.
+"""The estimator bank: a compiled kernel steps the filters of N vehicles in one call.
 
-Vehicles do not share numbers, and everything carried from sample to sample is in the vehicle's own
-record. Therefore results are bit-equal whatever N is and however the samples are split into calls.
+The state of a vehicle is in its own record, and vehicles do not share numbers. Therefore results
+are bit-equal whatever N is and however the samples are split into calls.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ read, and arrays that a step writes before it reads them.
 
 
 class EstimatorBank:
-    """N estimators of one kind; `create` makes it."""
+    """Filters of N vehicles, all of one estimator; `create` makes the bank."""
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class EstimatorBank:
         """Advance all vehicles by the next samples.
 
         Args:
-            t: (T, N) measurement time [s]; a sample whose time does not increase is left out, and
+            t: (T, N) measurement time [s]; a sample whose time does not increase is skipped, and
                 health reports it.
             signals: (T, N, 18) in the order of schemas.signals.CHANNELS; NaN is a missing reading.
             closes: (T, N), True at the first sample that belongs to a new visit; None for no
@@ -75,11 +75,11 @@ class EstimatorBank:
             threads: number of threads that share the vehicles; changes no bit of the result.
 
         Returns:
-            Estimates at the same samples; none of them is NaN, except evidence away from closes and
-            jumps.
+            Estimates at the same samples. Only `evidence` contains NaN, at all samples that are
+            neither closes nor jumps.
 
         Raises:
-            InputError: shapes do not agree with the bank, or threads is below 1.
+            InputError: an array has the wrong shape for the bank, or threads is below 1.
         """
         count = len(self._filters)
         t, signals = check_arrays(t, signals, closes, count)
@@ -106,16 +106,18 @@ class EstimatorBank:
         return _pack_estimates(values, evidence, closes)
 
     def memory(self, name: str) -> FloatArray:
-        """Return a copy of the field `name` of all filters, (N, ...), for plots of a filter's
-        internal state.
+        """Return a copy of the field `name` of the filter records of all vehicles, shape (N, …).
+
+        Plots use it to show the internal state of a filter.
         """
         return np.array(self._filters[name])
 
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return the current beliefs, log(posterior/uniform), and the evidence of the visit so far;
-        (N, 32) each, maximum 0.
+        """Return the current beliefs about friction on the 32 bins of the friction grid, or None.
 
-        Return None where the estimator has no such belief.
+        The result is a pair of (N, 32) arrays: log(posterior/uniform) of the filter, and the
+        log-likelihood of the current visit so far. Each row has maximum 0. Return None where the
+        estimator has no belief on the grid.
         """
         if self._beliefs is None:
             return None

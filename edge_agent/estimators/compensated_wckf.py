@@ -1,20 +1,21 @@
-"""`compensated-wckf`: weighted square-root cubature filters on the electric drive wheel, with force
-compensation (002).
+"""`compensated-wckf`: paper 002, weighted square-root cubature filters on the electric drive wheel,
+with force compensation.
 
 Chen, Cai, Chen, Xu, Jiang, Sun, "Design of vehicle running states-fused estimation strategy using
 Kalman filters and tire force compensation method", IEEE Access 2019, doi
 10.1109/ACCESS.2019.2925370 (paper 002).
 
-WCKF-A: 19 states [v_x, v_y, r, tau x 4, omega x 4, F_x x 4, F_x' x 4], measurement [r, tau x 4,
-omega x 4] (30) to (32), see `drive_wheel`. Forces: Magic Formula (12), compensated by (33). WCKF-B:
-[v_x, v_y, r], measurement [r, a_x, a_y] (35), (36). Both with R from a weighted moving window (25),
-see `adaptation.windows`.
+Filter WCKF-A: 19 states [v_x, v_y, r, tau x 4, omega x 4, F_x x 4, F_x' x 4], measurement [r, tau x
+4, omega x 4] (30) to (32), see `drive_wheel`. Tyre forces: Magic Formula (12), compensated by (33).
+Filter WCKF-B: states [v_x, v_y, r], measurement [r, a_x, a_y] (35), (36). Both filters compute R
+from a weighted moving window (25), see `adaptation.windows`.
 
-Friction is not a state: it is set by hand, here to DRY, and the prior is reported.
+Friction is not a state of the filters. It is set by hand, here to DRY, and the bank reports the
+friction prior.
 
-A's states are `EstimatorBank.memory("mean")`, the compensated forces `memory("compensated")`;
-figures compare A with B. ELEMENTS lists each element of the paper and every departure with its
-reason.
+`EstimatorBank.memory("mean")` returns the states of WCKF-A, and `memory("compensated")` the
+compensated forces; the paper's figures compare A with B. ELEMENTS lists each element of the paper
+and every departure with its reason.
 """
 
 from __future__ import annotations
@@ -72,7 +73,9 @@ B_NOISE = np.array([1e-4, 0.04, 0.04])  # variances of r, a_x, a_y, with some mo
 
 
 class DriveWheelState(IntEnum):
-    """Index of a state of both filters; for a wheel quantity of A, the index of its first wheel."""
+    """Index of a state of WCKF-A and WCKF-B; for four wheel values of A, the index of the front
+    left wheel.
+    """
 
     VX = 0
     VY = 1
@@ -84,7 +87,7 @@ class DriveWheelState(IntEnum):
 
 
 class CompensatedMemory(PaperMemory):
-    """State of one pair of filters."""
+    """Memory of the two filters, WCKF-A and WCKF-B, of one vehicle."""
 
     mean: Annotated[FloatArray, A_STATES]
     root: Annotated[FloatArray, A_STATES, A_STATES]
@@ -96,9 +99,7 @@ class CompensatedMemory(PaperMemory):
 
 
 class FrictionSet:
-    """Parameters that are set by hand, and scratch arrays that a step writes before it reads
-    them.
-    """
+    """Friction that is set by hand, and scratch arrays that a step writes before it reads them."""
 
     friction: Annotated[FloatArray, 4]
     points: Annotated[FloatArray, 2 * A_STATES, A_STATES]
@@ -108,8 +109,9 @@ class FrictionSet:
 def make_bank(
     vehicles: Sequence[Vehicle], friction: float = DRY, tyre: TyreOption | None = None
 ) -> EstimatorBank:
-    """Return a bank of N of these filters, on a road whose friction is given; the tyre holds C_f
-    and C_r of table 1.
+    """Return a bank of filters, one per vehicle, on a road with the given friction [1].
+
+    The tyre option corresponds to C_f and C_r of the paper's table 1.
     """
     context = records(FrictionSet, 1)
     context["friction"] = friction
@@ -165,8 +167,10 @@ def _compensated_forces(
     force_x: FloatArray,
     force_y: FloatArray,
 ) -> None:
-    """Compute the compensated forces (4,) [N] in the motion x (3,), from the tyre model and the
-    forces `observed` by A.
+    """Compute the compensated longitudinal forces (4,) [N] at the motion x (3,) (equation 33).
+
+    The result is a blend of the forces of the tyre model and of the forces `observed` by WCKF-A. It
+    is written into `force_x`; the lateral forces of the tyre model are written into `force_y`.
     """
     X = DriveWheelState
     motion = np.array([x[X.VX], x[X.VY], x[X.YAW_RATE], use[S.AX], use[S.AY]])
@@ -187,7 +191,9 @@ def _compensated_forces(
 
 @compiled
 def _step_wheel_filter(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
-    """Run WCKF-A; its lateral forces come from the tyre model at the last motion of B."""
+    """Run a step of WCKF-A. Its lateral forces come from the tyre model at the last motion of
+    WCKF-B.
+    """
     row = memory.row
     mean = memory.mean
     root = memory.root
@@ -241,7 +247,7 @@ def _step_wheel_filter(memory: CompensatedMemory, context: FrictionSet, dt: floa
 
 @compiled
 def _step_motion_filter(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
-    """Run WCKF-B: estimate the motion from the compensated forces."""
+    """Run a step of WCKF-B: estimate the motion from the compensated forces."""
     row = memory.row
     track = memory.track
     mean = memory.fused

@@ -1,6 +1,6 @@
-"""Elements of the papers: one entry per equation, table or figure, with how the code implements it.
+"""List entries that describe how the code implements each equation, table and figure of a paper.
 
-Each paper's module holds its list. Documentation and reports are generated from these lists.
+The module of each paper has its own list. Documentation and reports are generated from these lists.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ VERDICTS: Final[tuple[Verdict, ...]] = ("as printed", "option", "corrected", "le
 
 
 class Element(NamedTuple):
-    """One element of a paper.
+    """One equation, table, figure or section of a paper, and how the code treats it.
 
     Attributes:
-        place: equation, table, figure or section of the paper.
-        what: the element.
-        verdict: "as printed"; "option": as printed if it is asked for, because the default needs
-        something else; "corrected"; "left out".
-        why: the reason, for everything but "as printed".
-        where: module, function or option that holds it.
+        place: number of the equation, table, figure or section in the paper.
+        what: content of the element.
+        verdict: "as printed"; "option" (implemented as printed, but not the default); "corrected";
+            "left out".
+        why: the reason, required for every verdict except "as printed".
+        where: module, function or option that implements the element.
     """
 
     place: str
@@ -31,7 +31,7 @@ class Element(NamedTuple):
 
 
 def elements_without_reason(elements: tuple[Element, ...]) -> list[str]:
-    """Return the places of elements that lack a reason or a home."""
+    """Return the `place` of each element that lacks a required reason or a required code location."""
     found = []
     for element in elements:
         lacks_reason = element.verdict != "as printed" and not element.why

@@ -1,6 +1,4 @@
-"""Output of a bank: numbers per sample and vehicle, written by the kernels, and its columns by
-name.
-"""
+"""Output of a bank: the array that kernels write, with a named column per estimated quantity."""
 
 from __future__ import annotations
 
@@ -16,7 +14,7 @@ FlagArray: TypeAlias = NDArray[np.int64]
 
 
 class Column(IntEnum):
-    """Index of a reported number of a sample; none of them is NaN."""
+    """Index of an estimated quantity in the output of a sample; no column is ever NaN."""
 
     VX = 0  # [m/s]
     VY = 1  # [m/s]
@@ -44,8 +42,9 @@ FOUR_FRICTIONS = int(Column.WHEELS) + 12
 
 
 class _View:
-    """One column of all samples as a view, made on first access because a live loop reads few
-    columns.
+    """Descriptor that returns one column of all samples as a view.
+
+    The view is created at each access, because a live loop reads few columns.
     """
 
     def __init__(self, place: Column) -> None:
@@ -60,8 +59,8 @@ def _view_column(place: Column) -> Any:  # noqa: ANN401 the annotation beside it
 
 
 class Estimates:
-    """Output of a bank for T samples of N vehicles; columns are arrays of shape (T, N), documented
-    in `Column`.
+    """Output of a bank for T samples of N vehicles. Each column is an array of shape (T, N),
+    documented in `Column`.
     """
 
     __slots__ = ("evidence", "jumps", "values")
@@ -93,13 +92,14 @@ class Estimates:
 
     @property
     def health(self) -> FlagArray:
-        """Flags of schemas.signals.Health, (T, N)."""
+        """Return the health flags (`schemas.signals.Health`), (T, N)."""
         return self.values[..., Column.HEALTH].astype(np.int64)
 
     @property
     def mu_wheel(self) -> FloatArray | None:
-        """Median, lower and upper end of friction per wheel, (T, N, 4, 3); None where the estimator
-        has one friction for all wheels.
+        """Return median, lower and upper end of friction per wheel, (T, N, 4, 3).
+
+        Return None where the estimator has one friction for all wheels.
         """
         if self.values.shape[-1] == ONE_FRICTION:
             return None

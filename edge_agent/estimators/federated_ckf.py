@@ -1,18 +1,19 @@
-"""`federated-ckf`: joint federated cubature filters for motion and for the friction of four wheels,
-paper 000.
+"""`federated-ckf`: paper 000, joint federated cubature filters for motion and for the friction of
+four wheels.
 
 Wu, Li, Fan, "Joint estimation of driving state and road adhesion coefficient for distributed drive
-electric vehicle", IEEE Access 2021, doi 10.1109/ACCESS.2021.3081443. Motion: see
-`gaussian/federated_motion`. Friction: state [mu_fl, mu_fr, mu_rl, mu_rr], random walk (28),
-measurements [a_x, a_y, r] and [a_y, r] in two sub-filters again (40) to (48), fused (51), (52). The
-motion goes to the friction filter and the friction to the motion filter's tyres (figure 3). Shares
-by (54).
+electric vehicle", IEEE Access 2021, doi 10.1109/ACCESS.2021.3081443. Motion filter: see
+`gaussian/federated_motion`. Friction filter: state [mu_fl, mu_fr, mu_rl, mu_rr], random walk (28).
+It also has two sub-filters, with measurements [a_x, a_y, r] and [a_y, r] (40) to (48), fused by
+(51), (52). The friction filter uses the estimated motion, and the tyres of the motion filter use
+the estimated friction (figure 3). Information shares by (54).
 
 The printed Q = I and R = 10 000 (57) are a sensible tuning where slip stiffness is proportional to
-friction: see `literal.federated_friction`, which holds the friction filter as printed. On a real
-tyre it is not. Therefore R here is sensor noise plus model error, and friction returns to the prior
-over the metres driven, so that an unobservable friction is as wide as the prior. ELEMENTS lists
-each element of the paper and every departure with its reason.
+friction; `literal.federated_friction` contains the friction filter as printed. On a real tyre
+stiffness does not depend on friction. Therefore R here is sensor noise plus model error, and the
+estimate returns to the prior over the metres driven. An unobservable friction then becomes as
+uncertain as the prior. ELEMENTS lists each element of the paper and every departure with its
+reason.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ AY_SHARE = 0.05  # of a_y that the tyre model may miss
 
 
 class JointMemory(FederatedMemory):
-    """State of one joint filter."""
+    """Memory of the joint filter of one vehicle."""
 
     mean: Annotated[FloatArray, WHEELS]  # friction
     root: Annotated[FloatArray, WHEELS, WHEELS]
@@ -92,8 +93,8 @@ def make_bank(
     tyre: TyreOption | None = None,
     motion: MotionSetting | None = None,
 ) -> EstimatorBank:
-    """Return a bank of N of these filters, with the given tyre and motion setting if there are
-    any.
+    """Return a bank of joint filters, one per vehicle. `tyre` and `motion` replace the default
+    options.
     """
     filters = new_filters(JointMemory, vehicles, tyre)
     set_motion(filters, MotionSetting() if motion is None else motion)
@@ -120,8 +121,9 @@ def _step_filter(memory: JointMemory, nothing: EmptyRecord, dt: float) -> bool: 
 
 @compiled
 def share_by_information(first: float, second: float) -> float:
-    """Return the share of sub-filter 1 [1] from the traces of the two covariances: the better
-    sub-filter gets more (54, with the ratio inverted).
+    """Return the information share of sub-filter 1 [1] from the traces of the two covariances.
+
+    The sub-filter with the smaller trace gets the larger share: (54) with the ratio inverted.
     """
     return min(max(second / (first + second), LEAST_BETA), 1.0 - LEAST_BETA)
 

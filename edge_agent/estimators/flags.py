@@ -1,4 +1,4 @@
-"""The health flags as plain integers, because compiled kernels cannot combine enumerations."""
+"""Health flags as plain integers, because compiled kernels cannot combine enumeration members."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`paper-aco-fckf`: the fuzzy cubature Kalman filter of paper 004, as printed with the errata
+"""`paper-aco-fckf`: the fuzzy cubature Kalman filter of paper 004 as printed, with errata
 corrected.
 
 Xiong, Liu, Zhang, Zhu, Liu, "An accurate vehicle and road condition estimation algorithm for
@@ -6,10 +6,10 @@ vehicle networking applications", IEEE Access 2019, doi 10.1109/ACCESS.2019.2895
 
 State [v_x, v_y, a_x, a_y, r, mu], input [omega, delta], measurement [a_x, a_y, r] (below equation
 29); motion (1) to (3), Dugoff tyres (7) to (12), cubature filter (13) to (28), fuzzy factor on R
-(30), sets tuned by ants (31) to (33).
+(30), fuzzy sets tuned by the ant colony (31) to (33).
 
 ELEMENTS lists each element of the paper and every departure with its reason. Friction is limited to
-its range, and its spread to that of the prior.
+its range, and its standard deviation to that of the prior.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ LARGEST_FACTOR = 20.0
 
 
 class Setting(NamedTuple):
-    """Variances of the filter and its initial state."""
+    """Variances of the filter, its initial state, and options of the model."""
 
     process: tuple[float, ...] = (1e-6, 1e-6, 1e-3, 1e-3, 1e-6, 1e-5)  # Q per STEP_S (errata)
     start: tuple[float, ...] = (
@@ -100,7 +100,7 @@ With Q = .1*I per step the yaw-rate error stays near .13 rad/s, which the printe
 
 
 class FuzzyMemory(PaperMemory):
-    """State of one filter."""
+    """Memory of the filter of one vehicle."""
 
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]
@@ -110,8 +110,8 @@ class FuzzyMemory(PaperMemory):
 
 
 class FuzzyContext:
-    """Setting and scratch arrays that the filters of a thread share; a step writes the arrays
-    before it reads them.
+    """Setting and scratch arrays that the filters of a thread share. A step writes each scratch
+    array before it reads it.
     """
 
     process: Annotated[FloatArray, STATES]  # standard deviations per STEP_S
@@ -132,8 +132,8 @@ def make_bank(
     memberships: Memberships | LowerVertices,
     setting: Setting | None = None,
 ) -> EstimatorBank:
-    """Return a bank of N of these filters; `setting` replaces the default for ordinary sensors and
-    an unknown road.
+    """Return a bank of filters, one per vehicle. `setting` replaces the default, which is for
+    ordinary sensors and an unknown road.
     """
     chosen = Setting() if setting is None else setting
     context = records(FuzzyContext, 1)
@@ -154,7 +154,7 @@ def make_bank(
 
 @compiled
 def _begin_filter(memory: FuzzyMemory, context: FuzzyContext) -> None:
-    """Start at the speed of the wheels, straight ahead."""
+    """Begin the filter straight ahead at the speed of the wheels."""
     mean = memory.mean
     root = memory.root
     use = memory.track.inputs
@@ -205,7 +205,7 @@ def _step_filter(memory: FuzzyMemory, context: FuzzyContext, dt: float) -> bool:
 
 @compiled
 def _adapt_noise(memory: FuzzyMemory, context: FuzzyContext, pace: float, keep: float) -> None:
-    """Compute context.adapted = R of this sample, and the factors on R for the next."""
+    """Compute R of this sample (context.adapted), and the factors on R for the next sample."""
     for r in range(ROWS):
         context.adapted[r] = memory.factor[r] * context.noise[r]
         innovation = memory.track.now[r] - memory.mean[PlanarState.AX + r]

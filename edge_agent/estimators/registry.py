@@ -1,11 +1,11 @@
-"""The estimators by name.
+"""The estimators by name, and `create`, which makes a bank of them.
 
 `aco-fckf`, `fckf` and `ckf` are one filter: a Rao-Blackwellised mixture over friction with
 square-root cubature filters as its nodes. They differ in the fuzzy adaptation of the measurement
-noise: tuned by the ant colony, untuned, none. Departures from paper 004, on which the filter is
-based: kinematic prediction, wheel speed as a measurement, force from torque, residuals by total
-least squares, friction as a mixture instead of a state, stiffness, leaks and offsets as states,
-bounded adaptation in the direction of the errata.
+noise: tuned by the ant colony, untuned, or none. The filter is based on paper 004 and departs from
+it in these points: kinematic prediction; wheel speed as a measurement; force from torque; residuals
+by total least squares; friction as a mixture instead of a state; stiffness, leaks and offsets as
+states; bounded adaptation in the direction of the errata.
 """
 
 from __future__ import annotations
@@ -65,10 +65,9 @@ def create(
     Args:
         name: a key of ESTIMATORS.
         vehicles: nominal vehicles, N of them.
-        memberships: the fuzzy sets; required by the estimators in TUNED, and replacing the untuned
-            sets of others.
-        curve: of the tyres, in place of the usual one; for the default estimator and its two
-            ablations.
+        memberships: the fuzzy sets. Estimators in TUNED require them; in other estimators they
+            replace the untuned sets.
+        curve: tyre curve in place of the default one; only for `aco-fckf`, `fckf` and `ckf`.
 
     Raises:
         InputError: the name is unknown, no vehicle is given, tuned memberships are missing,

@@ -1,5 +1,5 @@
-"""Work around the kernel of every bank: check the samples, and distribute the vehicles to threads
-in equal shares.
+"""Work around the kernel of every bank: check the samples, and divide the vehicles equally among
+threads.
 
 Kernels release the interpreter's lock and share no state.
 """
@@ -40,8 +40,8 @@ def check_arrays(
 
 
 def in_shares(work: Callable[[int, int, int], None], count: int, threads: int) -> None:
-    """Call work(share, first, last) concurrently for `threads` ranges of vehicles that together
-    cover all `count`.
+    """Call work(share, first, last) concurrently for `threads` ranges [first, last) of vehicles
+    that together cover 0 to `count`.
 
     Raises:
         InputError: threads is below 1.

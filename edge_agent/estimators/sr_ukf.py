@@ -1,18 +1,19 @@
-"""`sr-ukf`: the square-root unscented filter for the friction of four wheels of paper 003.
+"""`sr-ukf`: the square-root unscented filter of paper 003 for the friction of four wheels.
 
 "Estimation of the road adhesion coefficient by a square-root unscented Kalman filter" for
 distributed drive vehicles (paper 003; the equations are lost in the text copy, so its sections are
 cited). Seven degrees of freedom with Dugoff tyres (section 2), unscented points, time and
 measurement update (3.1), posterior factor by downdates (3.2).
 
-State [v_x, v_y, r, mu_fl, mu_fr, mu_rl, mu_rr]. The four wheels' degrees of freedom are their
-torque balances, taken as measurements: F_x = (T - J*omega')/R. With them each driven wheel is
-observable. With the paper's a_x, a_y, r alone, at most two of four frictions are (errata).
+State [v_x, v_y, r, mu_fl, mu_fr, mu_rl, mu_rr]. The four rotational degrees of freedom of the
+wheels are torque balances, used as measurements: F_x = (T - J*omega')/R. With these rows the
+friction of each driven wheel is observable. With the paper's a_x, a_y, r alone, at most two of the
+four frictions are (errata).
 
-The filter as printed, with four states and given motion, is `literal.wheel_friction_ukf`. This
-filter is for a car, where v_x and v_y are not given: they are states, a_x and a_y are inputs of the
-kinematics, and the wheel torques replace the measurement a_x. ELEMENTS lists each element of the
-paper and every departure with its reason.
+`literal.wheel_friction_ukf` is the filter as printed, with four states and given motion. The filter
+in this module is for a car, where v_x and v_y are not given: they are states, a_x and a_y are
+inputs of the kinematics, and the wheel torques replace the measurement a_x. ELEMENTS lists each
+element of the paper and every departure with its reason.
 """
 
 from __future__ import annotations
@@ -100,7 +101,7 @@ OMEGA_STD = 0.03
 
 
 class WheelFrictionState(IntEnum):
-    """Index of a state."""
+    """Index of a state of the filter."""
 
     VX = 0
     VY = 1
@@ -109,7 +110,7 @@ class WheelFrictionState(IntEnum):
 
 
 class UnscentedMemory(PaperMemory):
-    """State of one filter."""
+    """Memory of the filter of one vehicle."""
 
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]
@@ -117,7 +118,7 @@ class UnscentedMemory(PaperMemory):
 
 
 def make_bank(vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> EstimatorBank:
-    """Return a bank of N of these filters."""
+    """Return a bank of filters, one per vehicle."""
     return EstimatorBank(
         new_filters(UnscentedMemory, vehicles, tyre),
         records(EmptyRecord, 1),
@@ -148,8 +149,9 @@ def _begin_filter(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noq
 
 @compiled
 def _point_friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArray) -> None:
-    """Compute mu (4,) of a point x (7,), within the range of friction; its deviation from the mean
-    is scaled by `share`.
+    """Compute the friction mu (4,) of a point x (7,), limited to the range of friction.
+
+    The deviation of the point's friction from the mean is multiplied by `share`.
     """
     for wheel in range(4):
         i = WheelFrictionState.MU + wheel
@@ -160,7 +162,9 @@ def _point_friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArra
 def _tyre_accelerations(
     row: FloatArray, x: FloatArray, track: InputTrack, mu: FloatArray
 ) -> tuple[float, float]:
-    """Return (a_y, yaw acceleration) from the tyres at x (7,)."""
+    """Return (a_y [m/s^2], yaw acceleration [rad/s^2]) that the tyre forces cause at state x (7,)
+    with friction mu (4,).
+    """
     use = track.inputs
     unknown = (math.nan, math.nan, math.nan, math.nan)
     motion = PlanarMotion(x[0], x[1], x[WheelFrictionState.YAW_RATE], use[S.AX], use[S.AY])

@@ -1,3 +1,3 @@
-"""Parts that all estimators share: checked readings, grip in use, arrays and records of small
-filters.
+"""Parts that all estimators share: plausibility check of readings, grip in use, array helpers, and
+the sample loop of the papers' filters.
 """

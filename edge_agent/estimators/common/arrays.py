@@ -1,5 +1,6 @@
-"""Plain loops that copy and clear small arrays: each slice assignment would cost seconds of
-compilation.
+"""Loops that copy and clear small arrays in compiled code.
+
+They replace slice assignments, because each slice assignment adds seconds of compile time.
 """
 
 from __future__ import annotations
@@ -10,14 +11,14 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def copy_vector(target: FloatArray, source: FloatArray) -> None:
-    """Copy: target (n,) = source (n,)."""
+    """Copy source (n,) to target (n,)."""
     for i in range(target.shape[0]):
         target[i] = source[i]
 
 
 @compiled
 def put_square(target: FloatArray, source: FloatArray) -> None:
-    """Copy: target (n, n) = source (n, n)."""
+    """Copy source (n, n) to target (n, n)."""
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             target[i, j] = source[i, j]
@@ -25,14 +26,14 @@ def put_square(target: FloatArray, source: FloatArray) -> None:
 
 @compiled
 def clear_vector(target: FloatArray) -> None:
-    """Clear: target (n,) = 0."""
+    """Set all elements of target (n,) to zero."""
     for i in range(target.shape[0]):
         target[i] = 0.0
 
 
 @compiled
 def clear_rows(target: FloatArray) -> None:
-    """Clear: target (m, n) = 0."""
+    """Set all elements of target (m, n) to zero."""
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             target[i, j] = 0.0

@@ -1,4 +1,4 @@
-"""The largest share of grip used in the last second, from a ring of slots."""
+"""Largest grip used (force over load) within the last second, kept in a ring of time slots."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SLOT_S = 0.02
 
 
 class Excitation:
-    """Force over load [1] of the wheel that uses most grip, slot by slot."""
+    """Ring of time slots; each slot holds the largest force over load [1] of any wheel in its time."""
 
     time: Annotated[FloatArray, SLOTS]  # at which a slot began [s]
     used: Annotated[FloatArray, SLOTS]
@@ -50,7 +50,7 @@ def note_excitation(ring: Excitation, time: float, used: float) -> None:
 
 @compiled
 def _find_largest(ring: Excitation, time: float) -> None:
-    """Find `largest` again from all slots, because the slot it came from has expired."""
+    """Search all slots for `largest` again, because the slot of the previous maximum has expired."""
     ring.largest = 0.0
     for k in range(SLOTS):
         if ring.time[k] > time - UTILISED_WINDOW_S and ring.used[k] >= ring.largest:

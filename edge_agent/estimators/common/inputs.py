@@ -1,10 +1,11 @@
-"""Readings of one vehicle, prepared for a filter that steps once per sample: refusals, gaps,
-replacements, grip in use.
+"""Readings of one vehicle, prepared for a filter that steps once per sample.
 
-A reading that is missing, infinite or implausible is NaN in `now`, and that row of a measurement is
-left out. A filter that takes the reading as an input finds a replacement in `inputs`: zero and
-r*v_x for the accelerations, the last value for yaw rate and steering, the share of m*a_x for
-torque. A wheel without speed stays NaN and is assumed to roll freely.
+This module refuses implausible readings, detects gaps in time, replaces missing inputs and computes
+the grip in use. A reading that is missing, infinite or implausible is NaN in `now`; the filter
+leaves out that row of the measurement. Where the filter needs a reading as an input, `inputs` holds
+a replacement: zero and r*v_x for the accelerations, the last value for yaw rate and steering, and
+the wheel's share of m*a_x for torque. A missing wheel speed stays NaN, and that wheel is assumed to
+roll freely.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ STEPPED = 2
 
 
 class InputTrack:
-    """State of one vehicle's input stream, carried from sample to sample."""
+    """State of one vehicle's input stream that is kept between samples."""
 
     started: bool
     time: float  # of the last sample [s]
@@ -53,8 +54,9 @@ class InputTrack:
 def take_sample_in(
     track: InputTrack, row: FloatArray, time: float, sample: FloatArray
 ) -> tuple[int, int, float]:
-    """Process sample (18,) of a vehicle at `time` [s]: return (health flags, REFUSED | BEGUN |
-    STEPPED, seconds elapsed).
+    """Process sample (18,) of a vehicle at `time` [s].
+
+    Return (health flags, REFUSED | BEGUN | STEPPED, seconds since the sample before).
     """
     begins = not track.started
     dt = time - track.time
@@ -78,7 +80,7 @@ def take_sample_in(
 
 @compiled
 def _reset_track(track: InputTrack) -> None:
-    """Reset the track: no sample has been seen, and the wheels point straight ahead."""
+    """Reset the track to its state before the first sample, with the wheels straight ahead."""
     track.started = True
     track.position_time = -math.inf
     for wheel in range(4):
@@ -98,8 +100,8 @@ def _store_inputs(track: InputTrack) -> None:
 
 @compiled
 def _fill_inputs(track: InputTrack, row: FloatArray, anew: bool) -> None:
-    """Fill `inputs`. If the last argument is True, the previous inputs are not used as
-    replacements.
+    """Fill `inputs` from the readings, and replace missing values. If the last argument is True,
+    previous inputs do not serve as replacements.
     """
     now = track.now
     use = track.inputs
@@ -124,8 +126,10 @@ def _fill_inputs(track: InputTrack, row: FloatArray, anew: bool) -> None:
 
 @compiled
 def _grip_used(track: InputTrack, row: FloatArray) -> float:
-    """Return the grip used now by the wheel that uses most [1]: the hypotenuse of torque over
-    radius and load, and lateral g.
+    """Return the largest grip used now by any wheel, as force over load [1].
+
+    It is the hypotenuse of the longitudinal part (torque over radius and load, largest of the four
+    wheels) and of the lateral acceleration in g.
     """
     use = track.inputs
     loads = wheel_loads(body_of(row), use[S.AX], use[S.AY])
@@ -137,8 +141,9 @@ def _grip_used(track: InputTrack, row: FloatArray) -> float:
 
 @compiled
 def wheel_force(row: FloatArray, track: InputTrack, wheel: int, step: float) -> float:
-    """Return F_x = (T - J*omega')/R [N] of a wheel from inputs that are `step` [s] apart (paper
-    000, equation 10).
+    """Return the longitudinal force F_x = (T - J*omega')/R [N] of a wheel (paper 000, equation 10).
+
+    The two inputs that give omega' are `step` [s] apart.
     """
     gain = track.inputs[S.OMEGA + wheel] - track.inputs_before[S.OMEGA + wheel]
     turning = 0.0 if math.isnan(gain) or step <= 0.0 else gain / step

@@ -1,4 +1,4 @@
-"""Initial motion of a filter, and the test that detects a diverged motion estimate."""
+"""Test for a diverged motion estimate, and the health flag for sliding wheels."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ FASTEST_TURN = 20.0  # [rad/s]
 
 @compiled
 def has_diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
-    """Return True if a filter has diverged. Its first states are v_x and v_y; state `yaw_rate` is
-    the yaw rate.
+    """Return True if a filter has diverged, that is, if its motion is not finite or physically
+    impossible.
+
+    States 0 and 1 of `mean` are v_x and v_y; `yaw_rate` is the index of the yaw rate.
     """
     bad = not (abs(mean[0]) < FASTEST_M_S and abs(mean[1]) < FASTEST_M_S)
     bad = bad or not abs(mean[yaw_rate]) < FASTEST_TURN
@@ -33,8 +35,8 @@ def has_diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
 
 @compiled
 def sliding_flag(row: FloatArray, track: InputTrack, vx: float, vy: float, mu: float) -> int:
-    """Return the health flag of a wheel whose longitudinal slip is past the peak, at the inputs in
-    use.
+    """Return the health flag SLIDING if the longitudinal slip of any wheel is beyond the peak of
+    the tyre curve at the current inputs; else return 0.
     """
     health = 0
     yaw_rate = track.inputs[S.YAW_RATE]

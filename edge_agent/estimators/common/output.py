@@ -1,8 +1,9 @@
-"""The output columns that every estimator writes; friction as the interval of a Gaussian.
+"""Writers of the output columns that every estimator fills.
 
-Friction is reported as the Gaussian's median and 5 % and 95 % quantiles, clipped to the range of
-the friction grid. The papers' filters cannot separate the evidence of one visit from their prior.
-Therefore their bank has no evidence, and the agent publishes friction with its interval.
+The papers' filters report friction as the median and the 5 % and 95 % quantiles of a Gaussian,
+clipped to the range of the friction grid. These filters cannot separate the evidence of one visit
+from their prior. Therefore their bank has no evidence, and the agent publishes friction with its
+interval.
 """
 
 from __future__ import annotations
@@ -33,7 +34,10 @@ def write_motion(
     var_y: float,
     var_rate: float,
 ) -> None:
-    """Write the motion [m/s, rad/s] with its variances."""
+    """Write velocity [m/s], yaw rate [rad/s] and sideslip [rad] with their standard deviations.
+
+    `var_x`, `var_y` and `var_rate` are the variances of v_x, v_y and the yaw rate.
+    """
     speed = max(abs(vx), SLOWEST_M_S)
     output[Column.VX], output[Column.VY], output[Column.YAW_RATE] = vx, vy, yaw_rate
     output[Column.SIDESLIP] = math.atan2(vy, speed)
@@ -44,8 +48,8 @@ def write_motion(
 
 @compiled
 def write_states(output: FloatArray, mean: FloatArray, root: FloatArray, yaw_rate: int) -> None:
-    """Write the motion of a filter whose first states are v_x and v_y, and whose state `yaw_rate`
-    is the yaw rate.
+    """Write the motion of a filter. States 0 and 1 of `mean` are v_x and v_y; `yaw_rate` is the
+    index of the yaw rate.
     """
     write_motion(
         output,
@@ -62,14 +66,18 @@ def write_states(output: FloatArray, mean: FloatArray, root: FloatArray, yaw_rat
 def write_quality(
     output: FloatArray, utilised: float, nis: float, adaptation: float, log_likelihood: float
 ) -> None:
-    """Write the grip in use and the statistics of the innovations."""
+    """Write the grip in use, the innovation statistics and the largest factor on R."""
     output[Column.MU_UTILISED], output[Column.INNOVATION_NIS] = utilised, nis
     output[Column.ADAPTATION], output[Column.INNOVATION_LOG_LIKELIHOOD] = adaptation, log_likelihood
 
 
 @compiled
 def write_friction(output: FloatArray, first: int, mu: float, std: float) -> None:
-    """Write median, 5 % and 95 % of friction within its range, from column `first` on."""
+    """Write the median, 5 % and 95 % quantiles of friction into columns `first` to `first` + 2.
+
+    `mu` and `std` are mean and standard deviation; each quantile is clipped to the range of the
+    grid.
+    """
     wide = Z_95 * std
     output[first] = min(max(mu, LOWER), UPPER)
     output[first + 1], output[first + 2] = (
@@ -80,8 +88,8 @@ def write_friction(output: FloatArray, first: int, mu: float, std: float) -> Non
 
 @compiled
 def write_prior(output: FloatArray, first: int) -> None:
-    """Write median, 5 % and 95 % of the uniform prior from column `first` on, for an unknown
-    road.
+    """Write the median, 5 % and 95 % quantiles of the uniform prior, for an unknown road, into
+    columns `first` to `first` + 2.
     """
     output[first] = 0.5 * (LOWER + UPPER)
     output[first + 1], output[first + 2] = 0.95 * LOWER + 0.05 * UPPER, 0.05 * LOWER + 0.95 * UPPER
@@ -89,8 +97,8 @@ def write_prior(output: FloatArray, first: int) -> None:
 
 @compiled
 def write_unknown(output: FloatArray) -> None:
-    """Write the output before the first usable sample: the prior of friction, and zero motion with
-    a wide spread.
+    """Write the output before the first usable sample: the friction prior, and zero motion with a
+    large standard deviation.
     """
     write_motion(output, 0.0, 0.0, 0.0, UNKNOWN_V_STD**2, 1.0, 1.0)
     output[Column.SIDESLIP_STD] = 1.0
@@ -102,7 +110,7 @@ def write_unknown(output: FloatArray) -> None:
 
 @compiled
 def limit_friction(mean: FloatArray, root: FloatArray, i: int, largest_std: float) -> None:
-    """Limit friction, state i, to its range, and its spread to `largest_std`."""
+    """Clip the friction in state i to its range, and its standard deviation to `largest_std`."""
     mean[i] = min(max(mean[i], LOWER), UPPER)
     std = math.sqrt(variance(root, i))
     if std > largest_std:

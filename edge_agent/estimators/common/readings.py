@@ -1,4 +1,4 @@
-"""Plausibility check of the readings of a sample, and the health flags for missing ones."""
+"""Plausibility check of a sample's readings, and health flags for missing readings."""
 
 from __future__ import annotations
 
@@ -41,8 +41,9 @@ POSITION_S = 1.5  # a longer silence of the receiver is reported
 
 @compiled
 def read_plausible(sample: FloatArray, now: FloatArray) -> int:
-    """Fill now (15,) with the readings of a sample (18,), NaN where missing, infinite or
-    implausible; return the health flags.
+    """Copy the readings of a sample (18,) to now (15,) and return the health flags.
+
+    A reading that is missing, infinite or implausible becomes NaN in `now`.
     """
     odd = 0
     missing = 0
@@ -58,7 +59,9 @@ def read_plausible(sample: FloatArray, now: FloatArray) -> int:
 
 @compiled
 def position_time(sample: FloatArray, time: float, last: float) -> float:
-    """Return the time [s] of the last position, after a sample (18,) at `time`."""
+    """Return the time [s] of the last valid position: `time` if the sample (18,) has one, else
+    `last`.
+    """
     return (
         time if math.isfinite(sample[S.LATITUDE]) and math.isfinite(sample[S.LONGITUDE]) else last
     )
@@ -66,14 +69,17 @@ def position_time(sample: FloatArray, time: float, last: float) -> float:
 
 @compiled
 def position_health(time: float, last: float) -> int:
-    """Return the health flag of a receiver that has been silent for too long."""
+    """Return the health flag NO_POSITION if the last position is more than POSITION_S old, else 0."""
     return 0 if time - last <= POSITION_S else flags.NO_POSITION
 
 
 @compiled
 def rolling_speed(row: FloatArray, now: FloatArray) -> float:
-    """Return the second largest rolling speed [m/s], because two wheels may be locked and one may
-    spin; NaN without any wheel.
+    """Return the second largest rolling speed (radius times wheel speed) of the wheels [m/s].
+
+    Two wheels may be locked and one may spin, so the second largest is the best guess of the
+    vehicle's speed. If only one wheel has a reading, return its speed; if no wheel has one, return
+    NaN.
     """
     first = second = math.nan
     for wheel in range(4):

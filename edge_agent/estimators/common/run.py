@@ -1,7 +1,8 @@
-"""The sample loop of every paper's filter: take a sample in, begin or step, report.
+"""Sample loop of all filters from papers: check the sample, begin or step the filter, report.
 
-A paper's module holds the record of its filter (`PaperMemory` with its own fields), three compiled
-functions and the citation. `kernel_of` builds the bank's kernel from them.
+The module of a paper contains the record of its filter (`PaperMemory` with fields of its own),
+three compiled functions and the citation. `kernel_of` builds the bank's kernel from these
+functions.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from schemas.vehicle import Vehicle
 
 
 class PaperMemory:
-    """State that every paper's filter carries for one vehicle."""
+    """Memory of one vehicle that all filters from papers have in common."""
 
     row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
     track: InputTrack
@@ -42,13 +43,13 @@ def kernel_of(
     step: Callable[[Memory, Context, float], bool],
     report: Callable[[Memory, Context, FloatArray], float],
 ) -> Kernel:
-    """Return the kernel of a filter.
+    """Return the kernel of a filter for `EstimatorBank`.
 
     Args:
         begin: begins the filter at the sample in memory.track.
         step: predicts by the given seconds and updates; returns False if the filter has diverged.
-        report: writes motion and friction into the output; returns the friction that decides
-            whether a wheel slides.
+        report: writes motion and friction into the output; returns the friction [1] that is used to
+            decide whether a wheel slides.
     """
 
     @nogil
@@ -98,8 +99,10 @@ def kernel_of(
 def new_filters(
     kind: type[PaperMemory], vehicles: Sequence[Vehicle], tyre: TyreOption | None = None
 ) -> RecordArray:
-    """Return a record of `kind` per vehicle, with its `row`; all else is zero, as `take` expects
-    it.
+    """Return an array of records of type `kind`, one per vehicle, with the vehicle's parameters in
+    `row`.
+
+    All other fields are zero, as the kernel requires before the first sample.
     """
     filters = records(kind, len(vehicles))
     filters["row"] = parameter_table(vehicles)

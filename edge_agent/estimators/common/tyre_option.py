@@ -1,13 +1,14 @@
-"""Options of the papers' tyres: how slip stiffness depends on friction, on load and on the axle.
+"""Tyre options of the papers' filters: how slip stiffness depends on friction, load and axle.
 
-Legend: K slip stiffness, F_z load, mu friction, F_0 = m*g/4, k the vehicle file's stiffness over
-F_0 [1].
+Legend: K slip stiffness, F_z load, mu friction, F_0 = m*g/4 static load, k stiffness in the vehicle
+file over F_0 [1].
 
     similarity                 K = k*F_z                        as on a real tyre
-    proportional-to-friction   K = mu*k*F_z                     as papers 000, 003 and 004 print it
-    quadratic e                K = k*F_z*(1 + e - e*F_z/F_0)    the polynomial m*F_z - n*F_z^2,
-    (14) of paper 001 rear_slope q               K of the rear tyres is q times as large per load
-    (C_f and C_r of paper 002)
+    proportional-to-friction   K = mu*k*F_z                     as in papers 000, 003 and 004
+    quadratic e                K = k*F_z*(1 + e - e*F_z/F_0)    polynomial m*F_z - n*F_z^2,
+                                                                (14) of paper 001
+    rear_slope q               K over load of the rear tyres is q times that of the front tyres
+                               (C_f and C_r of paper 002)
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ PROPORTIONAL: Final = TyreOption("proportional-to-friction")
 
 
 def fit_tyres(filters: RecordArray, tyre: TyreOption) -> None:
-    """Write the tyre option into the rows of the filters.
+    """Write the tyre option into the parameter rows of the filters.
 
     Raises:
-        InputError: the stiffness is unknown, or a number is out of range.
+        InputError: the name of the stiffness is unknown, or a number is out of range.
     """
     if tyre.stiffness not in STIFFNESSES:
         choices = ", ".join(STIFFNESSES)

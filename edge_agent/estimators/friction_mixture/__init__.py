@@ -1,10 +1,11 @@
-"""The default family: friction as a chain of nodes, each with a square-root cubature filter of the
-motion.
+"""Default estimator: a grid of friction hypotheses (nodes), each with a square-root cubature filter
+of the motion.
 
-Modules in the order of the data: `intake` checks a sample and adds it to the sums of the block.
-`block_features` computes the inputs of the equations from these sums. `node_filter` with
-`residuals` and `tyre_curve` updates and predicts one node. `weighing` turns the update into weights
-of the friction nodes. `mixing` and `friction_grid` with `split_sides` treat the nodes together.
-Then follow `restart`, `step` (the order of all this) and `bank` (the output). `constants` holds
-every number, `design` the tables made of them, `memory` and `workspace` the records.
+The modules in the order of data flow: `intake` checks a sample and adds it to the sums of the block
+(samples of 0.05 s). `block_features` computes the inputs of the measurement equations from these
+sums. `node_filter` with `residuals` and `tyre_curve` updates and predicts one node. `weighing`
+turns the result of the update into weights of the nodes. `mixing` and `friction_grid` with
+`split_sides` combine the nodes. Then follow `restart`, `step` (the order of all operations) and
+`bank` (the output). `constants` holds all numbers, `design` the tables computed from them, `memory`
+and `workspace` the records.
 """

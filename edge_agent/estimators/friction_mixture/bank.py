@@ -1,4 +1,4 @@
-"""The friction mixture as a bank's kernel, and its output."""
+"""Bank kernel and output of the friction mixture."""
 
 from __future__ import annotations
 
@@ -31,10 +31,11 @@ def mixture_bank(
     spreads: FloatArray | None = None,
     means: FloatArray | None = None,
 ) -> EstimatorBank:
-    """Return friction mixtures of vehicles with parameters `rows` (N, 15).
+    """Return a bank of friction mixtures, one per vehicle; `rows` (N, 15) are the vehicles'
+    parameters.
 
-    `spreads` and `means` (N, STATES) are standard deviations and means of the priors of their
-    states; without them those of the design are used.
+    `spreads` and `means` (N, STATES) are standard deviations and means of the priors of the states.
+    The default is the prior of the design.
     """
     context = records(MixtureContext, 1)
     put_record(context["design"][0], design)
@@ -88,7 +89,11 @@ def _advance_filters(
 def close_visit(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, evidence: FloatArray
 ) -> None:
-    """Write the evidence (32,) of the visit that ends, and begin the next visit from the prior."""
+    """Write the evidence (32,) of the visit that ends, and start the next visit from the prior.
+
+    The evidence is the log-likelihood of the visit's measurements on the friction grid, with
+    maximum 0.
+    """
     if not memory.started:
         clear_vector(evidence)
     elif memory.split:
@@ -104,7 +109,7 @@ def close_visit(
 
 @compiled
 def write_estimates(memory: MixtureMemory, design: MixtureDesign, output: FloatArray) -> None:
-    """Write the current estimates of the vehicle's filter, except health."""
+    """Write the current estimates of a vehicle's filter into `output`, except health."""
     if not memory.started:
         report_prior(design, output)
         return
@@ -136,8 +141,8 @@ def _report_friction(friction: Quantiles, upper: float, output: FloatArray, firs
 
 @compiled
 def report_prior(design: MixtureDesign, output: FloatArray) -> None:
-    """Write the output before the first usable sample: the prior of friction, and zero motion with
-    a wide spread.
+    """Write the output before the first usable sample: the friction prior, and zero motion with a
+    large standard deviation.
     """
     write_unknown(output)
     for k, level in enumerate((0.5, LOWER_END, UPPER_END)):

@@ -1,4 +1,4 @@
-"""Read-only access to the current beliefs of the filters."""
+"""Read-only access to the current friction beliefs of the filters."""
 
 from __future__ import annotations
 
@@ -21,8 +21,11 @@ def report_beliefs(
     own: FloatArray,
     visit: FloatArray,
 ) -> None:
-    """Write log(posterior/uniform) of each filter, and its evidence of the visit so far; both (N,
-    32), maximum 0.
+    """Write the friction belief and the visit evidence of each filter on the 32 bins of the
+    friction grid.
+
+    `own` (N, 32) receives log(posterior/uniform), `visit` (N, 32) the log-likelihood of the current
+    visit so far. Each row has maximum 0.
     """
     design = contexts[0].design
     scratch = contexts[0].scratch

@@ -1,8 +1,10 @@
-"""Inputs of the measurement equations (`BlockFeatures`), computed from the sums of a block.
+"""Inputs of the measurement equations (`BlockFeatures`), computed from the sums of a block of
+samples.
 
-Longitudinal force comes from torque, F_x = (T - J*omega')/R. Where torque or speed is missing, a_x
-is shared out over the axles, with a spread to match (`drive_split.py`). An accelerometer feels
-slope and bank as tyres do, so they count as force; offsets of the sensor do not. Lateral axle
+Longitudinal force comes from torque, F_x = (T - J*omega')/R. Where torque or speed is missing, the
+force m*a_x is divided among the axles, with a correspondingly larger standard deviation
+(`drive_split.py`). An accelerometer measures gravity on a slope or bank, and the tyres must provide
+the same force. Therefore slope and bank count as force; offsets of the sensor do not. Lateral axle
 forces come from m*a_y and Iz*r' (paper 004, equation 2; errata 000 on signs and arms).
 """
 
@@ -44,7 +46,9 @@ LIKELY = 2.0  # and of what is unknown of the radii
 
 @compiled
 def block_features(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> int:
-    """Fill `features` except duration and speed, which the caller sets; return the health flags."""
+    """Fill all fields of `features` except duration and speed, which the caller sets; return the
+    health flags.
+    """
     row = memory.row
     last = memory.last
     block = memory.block
@@ -93,7 +97,7 @@ def _average_kinematics(block: BlockSums, features: BlockFeatures) -> None:
 
 @compiled
 def _steer_rate(memory: MixtureMemory, duration: float) -> float:
-    """Return the rate of the mean front steering angle [rad/s]."""
+    """Return the rate of change of the mean front steering angle within the block [rad/s]."""
     now = memory.last.delta
     before = memory.last.delta_before
     return float(0.5 * (now[0] + now[1] - before[0] - before[1]) / duration)
@@ -103,7 +107,9 @@ def _steer_rate(memory: MixtureMemory, duration: float) -> float:
 def _compute_wheel_forces(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures
 ) -> int:
-    """Compute force and the force part of noise_std of the four wheels; return the health flags."""
+    """Compute the force over load of the four wheels and the force part of `noise_std`; return the
+    health flags.
+    """
     health = 0
     loads = features.loads
     row = memory.row
@@ -146,8 +152,8 @@ def _compute_wheel_forces(
 
 @compiled
 def lone_axle(memory: MixtureMemory, features: BlockFeatures) -> int:
-    """Return the only axle whose torque is known, front 0 or rear 1; -1 where both or neither are
-    known.
+    """Return the only axle with known torque, 0 front or 1 rear; return -1 if torque is known on
+    both axles or on no axle.
     """
     known = 0
     axle = -1
@@ -164,9 +170,10 @@ def lone_axle(memory: MixtureMemory, features: BlockFeatures) -> int:
 
 @compiled
 def brakes_untold(memory: MixtureMemory, features: BlockFeatures, axle: int) -> bool:
-    """Return True if the torque signal of an axle leaves out its brakes: the car brakes, and the
-    known torque has less than half of the usual brake torque of that axle. Powertrain torque does
-    not include the brakes.
+    """Return True if the torque signal of an axle does not include its brakes.
+
+    This is the case while the car brakes but the known torque is less than half of the usual brake
+    torque of that axle. A signal of powertrain torque does not include the brakes.
     """
     usual = BRAKES_FRONT if axle == 0 else 1.0 - BRAKES_FRONT
     least = 0.5 * usual * memory.row[Parameter.MASS] * features.change
@@ -188,8 +195,9 @@ def axle_force(memory: MixtureMemory, features: BlockFeatures, axle: int) -> flo
 
 @compiled
 def _compute_side_forces(memory: MixtureMemory, features: BlockFeatures) -> None:
-    """Compute the side force with its derivatives, and the load share, of both axles; NaN without
-    a_y.
+    """Compute the lateral force over load with its derivatives, and the load shares, of both axles.
+
+    The lateral force is NaN if a_y is missing.
     """
     row = memory.row
     loads = features.loads
@@ -219,7 +227,9 @@ def _compute_side_forces(memory: MixtureMemory, features: BlockFeatures) -> None
 
 @compiled
 def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
-    """Set side forces to NaN where slip or moment was not measured; return the health flags."""
+    """Set the lateral force of an axle to NaN where its slip or the yaw moment was not measured;
+    return the health flags.
+    """
     health = 0
     counts = memory.block.counts
     if (
@@ -237,7 +247,7 @@ def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
 
 @compiled
 def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> None:
-    """Combine slip noise and force noise: each enters the total-least-squares residual with half
+    """Combine slip noise and force noise. Each enters the total-least-squares residual with half of
     the variance.
     """
     row = memory.row
@@ -299,10 +309,10 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
 def wheel_speed_jump(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures, wheel: int
 ) -> float:
-    """Return the difference between a wheel's speed and its smoothed speed, advanced by the car's
-    acceleration [m/s]; 0 where it is unknown.
+    """Return the difference [m/s] between a wheel's speed and its smoothed speed; 0 where unknown.
 
-    A wheel that spins up or locks stays away for some blocks; a bump is over within one or two.
+    The smoothed speed is advanced by the car's acceleration first. A wheel that spins up or locks
+    keeps its difference for several blocks; a bump in the road lasts one or two blocks.
     """
     now = at_centre(memory.row, features, wheel)
     usual = memory.usual_rolling
@@ -315,8 +325,8 @@ def wheel_speed_jump(
 
 @compiled
 def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
-    """Return the forward speed [m/s] of the centre of gravity, from a wheel that rolls freely; NaN
-    without a reading.
+    """Return the forward speed [m/s] of the centre of gravity computed from one wheel that rolls
+    freely; NaN without a reading.
     """
     px, py = wheel_position(row, wheel)
     across = features.steer_sin[wheel] * (row[Parameter.TO_REAR] + px) * features.yaw_rate
@@ -328,8 +338,10 @@ def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
 
 @compiled
 def _compute_information(constants: Constants, features: BlockFeatures) -> None:
-    """Compute informs_x and informs_y. Below some force, the stiffness that slip suggests is only
-    noise.
+    """Compute informs_x and informs_y: how much [0 to 1] a wheel or axle informs the stiffness
+    states.
+
+    At small forces the stiffness suggested by slip is only noise.
     """
     for axle in range(2):
         along = max(abs(features.force[2 * axle]), abs(features.force[2 * axle + 1]))
@@ -344,11 +356,12 @@ def _compute_information(constants: Constants, features: BlockFeatures) -> None:
 def unexplained_slip_difference(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures
 ) -> float:
-    """Return the largest slip difference between the sides of an axle (as linear force over load)
-    that no force explains.
+    """Return the largest slip difference between left and right wheel of an axle that no force
+    explains.
 
-    Wheels of unequal radius always differ: the estimated difference is subtracted, and its
-    uncertainty is allowed for.
+    The unit is linear force over load [1]. Wheels of unequal radius always differ in slip.
+    Therefore the estimated difference of the radii is subtracted, with an allowance for its
+    uncertainty.
     """
     row = memory.row
     block = memory.block
@@ -380,10 +393,10 @@ def unexplained_slip_difference(
 @compiled
 def grip_demand(features: BlockFeatures) -> float:
     """Return the larger force over load of the two axles [1]; a missing lateral force counts as
-    none.
+    zero.
 
-    An axle is taken as a whole, because an almost unloaded inner wheel does not show how the wheels
-    share the force.
+    The two wheels of an axle are combined, because the share of an almost unloaded inner wheel is
+    unreliable.
     """
     most = 0.0
     for axle in range(2):

@@ -1,4 +1,4 @@
-"""Prior of the filter's states after the calibration of a vehicle file is applied."""
+"""Prior of the filter's states for vehicles whose vehicle file contains a calibration."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ EACH_COMPLIANCE: Final = 0.003  # [rad] that another load and other tyres make o
 
 
 def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:
-    """Return the standard deviations (N, STATES) of the priors: `std` (STATES,), narrower where a
+    """Return the standard deviations (N, STATES) of the priors: `std` (STATES,), reduced where a
     vehicle's calibration has a value.
 
-    Signals are already corrected by the calibration (inputs.correct), so the means do not change.
+    The means do not change, because the calibration already corrects the signals (inputs.correct).
     """
     spreads = np.repeat(std[None, :STATES], len(vehicles), axis=0)
     for row, vehicle in zip(spreads, vehicles, strict=True):
@@ -54,8 +54,8 @@ def means_of(vehicles: Sequence[Vehicle], mean: FloatArray) -> FloatArray:
     """Return the means (N, STATES) of the priors: `mean` (STATES,), with the understeer of a
     vehicle where it is known.
 
-    Understeer learned from drives takes precedence over that of the vehicle file's axles. Without
-    both, the mean of all vehicles is used.
+    Understeer learned from drives takes precedence over the value computed from the axle data of
+    the vehicle file. Without both, the mean over all vehicles is used.
     """
     means = np.repeat(mean[None, :STATES], len(vehicles), axis=0)
     for row, vehicle in zip(means, vehicles, strict=True):

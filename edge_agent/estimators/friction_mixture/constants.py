@@ -1,8 +1,9 @@
-"""Every number of the filter family, with unit and reason: one table, one record for the kernels.
+"""All numbers of the friction mixture, with unit and reason: one table, and one record for the
+kernels.
 
-Figures marked (vehicle) follow from how well a vehicle and its sensors are known: mass 3 %, inertia
-5 %, stiffness 10 to 12 %, torque 3 %, white noise and offsets of ordinary inertial sensors. Figures
-marked (errata) were found by measurement.
+Figures marked (vehicle) follow from typical uncertainty of a vehicle and its sensors: mass 3 %,
+inertia 5 %, stiffness 10 to 12 %, torque 3 %, and white noise and offsets of ordinary inertial
+sensors. Figures marked (errata) were found by measurement.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ ROWS = 6  # of measurement: four wheels along, two axles across
 
 
 class NodeState(IntEnum):
-    """Index of a state of a node."""
+    """Index of a state of a node's filter."""
 
     VX = 0  # [m/s]
     VY = 1  # [m/s], at the centre of gravity
@@ -47,8 +48,9 @@ class NodeState(IntEnum):
 
 
 class Constants(NamedTuple):
-    """The numbers, each with its unit and reason above it. `Constants(name=value)` changes one for
-    a study.
+    """Constants of the filter. A comment above each one gives its unit and reason.
+
+    For a study, `Constants(name=value)` replaces one value.
     """
 
     # [s] one measurement update per block: model error is correlated over more, so nothing is lost

@@ -1,4 +1,4 @@
-"""Tables that the kernels read and that do not change while driving, made from the constants."""
+"""Tables that the kernels read, computed once from the constants; they do not change while driving."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ from schemas.numeric import FloatArray
 
 
 class Nominal(NamedTuple):
-    """Prior of the states that are properties of vehicle or sensor; velocity has none."""
+    """Prior of the states that describe the vehicle, its sensors or the road; the velocity states
+    have no prior.
+    """
 
     mean: Annotated[FloatArray, STATES]
     std: Annotated[FloatArray, STATES]
@@ -30,7 +32,7 @@ class Nominal(NamedTuple):
 
 
 class MixtureDesign(NamedTuple):
-    """Tables of one filter family."""
+    """All tables of one variant of the friction mixture."""
 
     constants: Constants
     mu: Annotated[FloatArray, NODES]  # nodes of one friction
@@ -46,7 +48,7 @@ class MixtureDesign(NamedTuple):
 
 
 def nominal_states(constants: Constants) -> Nominal:
-    """Return the prior of the states of a node."""
+    """Return the prior (mean, standard deviation, return time) of the states of a node."""
     mean = np.zeros(STATES)
     std = np.ones(STATES)
     time = np.full(STATES, np.inf)

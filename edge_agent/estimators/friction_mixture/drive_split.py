@@ -1,10 +1,10 @@
-"""Split of the longitudinal force between front and rear axle where torque is missing; the driven
-axles are learned from their slip.
+"""Split of the longitudinal force between front and rear axle where torque is missing.
 
-The driven axle of an accelerating car turns faster than the other, by the slip that its force
-needs. Brisk driving separates front, rear and all-wheel drive within a second. Brakes favour the
-front on all cars. On low friction, slip looks like more force than is demanded. Therefore an axle
-may slip more than its kind of drive predicts, but not less.
+Which axles are driven is learned from their slip. When a car accelerates, its driven axle turns
+faster than the other one, by the slip that its force needs. Brisk driving distinguishes front, rear
+and all-wheel drive within a second. When a car brakes, the front axle takes the larger share on all
+cars. On low friction, slip suggests more force than is demanded. Therefore an axle may slip more
+than its kind of drive predicts, but not less.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ LEAST_ODDS = 1e-4  # a wrong certainty is left within seconds
 
 @compiled
 def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, float]:
-    """Return the share of the front axle in the longitudinal force at a_x [m/s^2], and its
-    spread.
+    """Return the front axle's share of the longitudinal force at acceleration `ax` [m/s^2], and the
+    share's standard deviation.
     """
     front = row[Parameter.DRIVE_FRONT]
     spread = SHARE_STD
@@ -63,7 +63,9 @@ def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, fl
 
 @compiled
 def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
-    """Update the odds of the three kinds of drive from the slip of the axles in the block."""
+    """Update the probabilities of front, rear and all-wheel drive from the slip of the axles in the
+    block.
+    """
     row = memory.row
     odds = memory.drive_odds
     rolling = features.rolling

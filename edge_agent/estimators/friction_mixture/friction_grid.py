@@ -1,4 +1,5 @@
-"""The friction hypotheses: a fixed grid of nodes, its prior, road change, quantiles and evidence.
+"""The friction hypotheses: a fixed grid of nodes with its prior, road change, quantiles and
+evidence.
 
 Legend
     mu          node values, equidistant in sqrt(mu)              (K,)
@@ -21,8 +22,10 @@ SMALLEST = 1e-12  # a probability that mixing by road change will raise again
 
 
 def node_table(count: int) -> tuple[FloatArray, FloatArray]:
-    """Return (mu, prior), (K,) each: middles in sqrt(mu) of K equal cells, and the uniform mass of
-    each cell.
+    """Return (mu, prior), shape (K,) each, for K = `count` nodes.
+
+    The range of sqrt(mu) is divided into K equal cells. `mu` has the friction at the middle of each
+    cell, `prior` the probability of each cell under a uniform distribution of mu.
     """
     edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), count + 1)
     middle = 0.5 * (edges[:-1] + edges[1:])
@@ -39,12 +42,12 @@ def change_road(
     drift: float,
     out: FloatArray,
 ) -> None:
-    """Compute out = w after a road change: to anywhere with probability hazard, to a neighbour with
-    probability about drift.
+    """Compute the node probabilities `out` after a possible road change.
 
-    Only the first `chain` nodes have neighbours; the others change to anywhere also with
-    probability `leaving`. The exchange between neighbours is in detailed balance with the prior,
-    which therefore does not change.
+    The road changes to any friction with probability `hazard`, and to a neighbouring node with
+    probability of about `drift`. Only the first `chain` nodes have neighbours; the other nodes
+    change to any friction also with probability `leaving`. The exchange between neighbours is in
+    detailed balance with the prior, so the prior does not change.
     """
     count = w.shape[0]
     left = 0.0
@@ -66,7 +69,9 @@ def change_road(
 
 @compiled
 def multiply_likelihood(w: FloatArray, log_likelihood: FloatArray) -> None:
-    """Compute w *= exp(log_likelihood), normalised; log_likelihood (K,) about 0 or below."""
+    """Multiply the probabilities w (K,) by exp(log_likelihood) and normalise. `log_likelihood` (K,)
+    must be about 0 or below.
+    """
     total = 0.0
     for j in range(w.shape[0]):
         w[j] = max(w[j] * math.exp(log_likelihood[j]), SMALLEST)
@@ -77,8 +82,8 @@ def multiply_likelihood(w: FloatArray, log_likelihood: FloatArray) -> None:
 
 @compiled
 def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> float:
-    """Return the q-quantile of mu under the density that is linear between nodes and constant
-    beyond the outer ones.
+    """Return the q-quantile of mu under a density that is linear between nodes and constant beyond
+    the first and last node.
     """
     count = mu.shape[0]
     total = 0.0
@@ -101,7 +106,9 @@ def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> floa
 
 @compiled
 def _segment_mass(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
-    """Return the mass between nodes j - 1 and j (with the ends of the range for nodes -1 and K)."""
+    """Return the unnormalised probability mass between nodes j - 1 and j. Node -1 and node K are
+    the ends of the friction range.
+    """
     count = mu.shape[0]
     if j == 0:
         return float((mu[0] - LOWER) * w[0] / prior[0])
@@ -114,7 +121,9 @@ def _segment_mass(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> f
 def visit_evidence(
     mu: FloatArray, prior: FloatArray, w: FloatArray, centres: FloatArray, out: FloatArray
 ) -> None:
-    """Compute out = log(w/prior) at the centres (32,), linear between nodes, maximum 0."""
+    """Compute out = log(w/prior) at the bin centres (32,), interpolated between nodes, with maximum
+    0.
+    """
     count = mu.shape[0]
     top = -math.inf
     j = 0

@@ -1,5 +1,5 @@
-"""The grip in use, and the friction values that it rules out: friction below the grip in use is
-neither believed nor reported.
+"""The grip in use as a lower limit of friction: values below it are penalised and never reported as
+the upper end.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ AT_PEAK = 0.95
 
 @compiled
 def note_grip(grip: GripInUse, ax: float, ay: float, dt: float) -> None:
-    """Update the grip in use with measured accelerations [m/s^2] of the last dt [s]."""
+    """Update the grip in use with the measured accelerations [m/s^2] of the last dt [s]."""
     size = math.hypot(ax, ay) / GRAVITY
     grip.slow += (1.0 - math.exp(-dt / SLOW_S)) * (size - grip.slow)
     grip.fast += (1.0 - math.exp(-dt / FAST_S)) * (size - grip.fast)
@@ -39,30 +39,32 @@ def note_grip(grip: GripInUse, ax: float, ay: float, dt: float) -> None:
 
 @compiled
 def guard_penalty(grip: GripInUse, constants: Constants, side_mu: FloatArray) -> float:
-    """Return the penalty [nat] of friction side_mu (2,) for lying below the grip in use."""
+    """Return the penalty [nat] of a node whose friction side_mu (2,) lies below the grip in use."""
     lack = grip.slow - constants.guard_margin - 0.5 * (side_mu[0] + side_mu[1])
     return float(min(0.5 * (max(lack, 0.0) / constants.guard_std) ** 2, LARGEST_LOSS))
 
 
 @compiled
 def reported_upper(grip: GripInUse, friction: Quantiles) -> float:
-    """Return the upper end of a friction, never below the grip in use: racing tyres exceed 1.2, the
-    end of the grid.
+    """Return the upper end of the friction interval, raised to the grip in use if necessary.
+
+    The result may exceed 1.2, the end of the grid, because racing tyres do.
     """
     return max(friction.upper, grip.held + ABOVE)
 
 
 @compiled
 def lower_while_sliding(slides: float, used: float, lower: float) -> float:
-    """Return the lower end of friction of sliding wheels: a sliding tyre may be at its peak.
+    """Return the lower end of the friction interval while wheels slide.
 
-    The force of a sliding tyre lies between its peak and the smaller force of full sliding. Slip
-    separates the two only as well as the speed is known, and in a slide no wheel rolls that would
-    give the speed.
+    A sliding tyre may be at its peak: its force lies between the peak and the smaller force of full
+    sliding. Only slip distinguishes these two cases, and slip is uncertain because in a slide no
+    wheel rolls freely and shows the speed. Therefore the lower end is at most AT_PEAK times the
+    grip in use.
 
     Args:
         slides: membership in "a wheel slides" [1].
-        used: grip in the last second of the axle that uses more [1].
-        lower: lower end by the belief [1].
+        used: grip used within the last second, of the axle that uses more [1].
+        lower: lower end according to the node probabilities [1].
     """
     return lower - slides * max(lower - AT_PEAK * used, 0.0)

@@ -1,12 +1,13 @@
-"""Model of short ice patches: on bridges, in shade, where water ran over the road. After a few
-metres without grip demand, the road may be icy again, so the lower end falls. The median is
-unaffected.
+"""Model of short ice patches: on bridges, in shade, where water ran over the road.
 
-The mixture's road changes to anywhere once in hundreds of metres, so that learned friction lasts.
-With the mixture alone, the lower end would fall to ice only long after the car has passed a patch.
-Therefore this module keeps, for each node of ice, the probability that a patch is here. Within the
-length of a patch it grows to the prior's share of that node that the mixture lacks, and evidence
-against ice reduces it. Only the reported lower end uses it.
+After a few metres without grip demand the road may be icy again, so the lower end of the interval
+falls. The median is unaffected. In the mixture the road changes only once in hundreds of metres, so
+that learned friction lasts. With the mixture alone, the lower end would fall to ice only long after
+the car has passed a patch.
+
+Therefore this module stores, for each ice node, the probability that the car is now on a patch.
+Within the length of a patch this probability grows to the prior of the node minus the mixture's
+weight. Evidence against ice reduces it. Only the reported lower end uses it.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def grow_patches(memory: MixtureMemory, design: MixtureDesign, metres: float) -> None:
-    """Increase the probability of patches over `metres`."""
+    """Increase the patch probabilities for `metres` driven."""
     share = 1.0 - math.exp(-metres / design.constants.patch_length)
     for j in range(PATCH_NODES):
         memory.patch[j] += share * (max(design.prior[j] - memory.weight[j], 0.0) - memory.patch[j])
@@ -30,8 +31,8 @@ def grow_patches(memory: MixtureMemory, design: MixtureDesign, metres: float) ->
 
 @compiled
 def shrink_patches(patch: FloatArray, weight: FloatArray, log_likelihood: FloatArray) -> None:
-    """Reduce the probability of patches (PATCH_NODES,) where a block supports them less than the
-    mixture (K,).
+    """Reduce the patch probabilities (PATCH_NODES,) where the block's likelihood is smaller under
+    the patch than under the mixture of all nodes (K,).
     """
     usual = 0.0
     for j in range(weight.shape[0]):

@@ -1,9 +1,9 @@
-"""Intake of a sample: refusal of impossible readings, the yaw-rate filter, kinematics and sums of
+"""Intake of a sample: rejection of impossible readings, a filter of the yaw rate, and the sums of
 the block.
 
-Replacements of missing readings: zero for a_x and r*v_x for a_y, both with a random walk to match;
-the difference of the rear wheels for the yaw rate; the last value for steering. Other missing
-readings are left out of the sums.
+Missing readings are replaced: a_x by zero and a_y by r*v_x, both with the process noise of a random
+walk; the yaw rate by the speed difference of the rear wheels; steering by its last value. All other
+missing readings are left out of the sums.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ LOST_AY = 0.7  # [m/s/s^.5] random walk without a_y or yaw rate
 def take_sample(
     memory: MixtureMemory, design: MixtureDesign, time: float, sample: FloatArray
 ) -> tuple[int, bool]:
-    """Add a sample to the block; return its health flags and whether the block is complete."""
+    """Add a sample to the block; return the health flags of the sample, and True if the block is
+    complete.
+    """
     last = memory.last
     dt = time - last.time
     if not dt > 0.0:
@@ -76,7 +78,7 @@ def take_sample(
 
 @compiled
 def begin_block(memory: MixtureMemory) -> None:
-    """Clear the sums; the block begins at the last sample."""
+    """Clear the sums and begin a new block at the last sample."""
     last = memory.last
     block = memory.block
     block.time = last.time
@@ -100,8 +102,10 @@ def _clear_gain(gain: VelocityGain) -> None:
 
 @compiled
 def _filter_yaw_rate(memory: MixtureMemory, dt: float) -> None:
-    """Run a scalar Kalman filter: random walk, gyroscope, and the rear wheels where the gyroscope
-    is missing.
+    """Run one step of a scalar Kalman filter of the yaw rate.
+
+    The model is a random walk. The measurement is the gyroscope or, where it is missing, the speed
+    difference of the rear wheels.
     """
     last = memory.last
     now = memory.last.now
@@ -124,7 +128,7 @@ def _filter_yaw_rate(memory: MixtureMemory, dt: float) -> None:
 
 @compiled
 def _drop_outlier(value: float, used: float, read: float) -> float:
-    """Return the accelerometer's reading; NaN where it is far from both the last used and the last
+    """Return the accelerometer's reading, or NaN if it is far from both the last used and the last
     read value.
     """
     jumps = abs(value - read) > JUMP_M_S2 and abs(value - used) > JUMP_M_S2
@@ -135,10 +139,11 @@ def _drop_outlier(value: float, used: float, read: float) -> float:
 def _integrate_motion(
     memory: MixtureMemory, constants: Constants, dt: float, ax: float, ay: float, turning: bool
 ) -> None:
-    """Integrate the velocity gained since the block began, in the current axes: the exact solution
-    for inputs constant over dt.
+    """Integrate the velocity gained since the block began, in the current vehicle axes, over a step
+    of dt [s].
 
-    ax, ay are NaN where they are missing; `turning` is True if the yaw rate is known.
+    The solution is exact for inputs that are constant over dt. `ax` and `ay` [m/s^2] are NaN where
+    missing; `turning` is True if the yaw rate is known.
     """
     last = memory.last
     block = memory.block

@@ -1,4 +1,4 @@
-"""State that a bank carries from sample to sample: one record per vehicle."""
+"""Memory of the friction mixture that is kept between samples: one record per vehicle."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class PlanarVector:
 
 
 class VelocityGain:
-    """Velocity [m/s] gained since the block began, in the axes of now."""
+    """Velocity [m/s] gained since the block began, in the current vehicle axes."""
 
     measured: PlanarVector  # by the measured accelerations
     leak_y: PlanarVector  # the part of it from a_y
@@ -70,7 +70,7 @@ class LastInputs:
 
 
 class GripInUse:
-    """Grip in use as the accelerometers show it, over g [1]."""
+    """Grip in use according to the accelerometers: horizontal acceleration over g [1]."""
 
     slow: float  # smoothed, for the nodes
     fast: float  # smoothed less
@@ -92,7 +92,7 @@ class RollingMotion:
 
 
 class WheelSlip:
-    """Slip derived from the wheel speeds alone."""
+    """Slip indicators that are derived from the wheel speeds alone."""
 
     held: float  # membership of the last second in "a wheel slides" [1]
     begins: float  # what this block adds to it [1]
@@ -105,7 +105,7 @@ class WheelSlip:
 
 
 class Trust:
-    """State of the test whether any friction explains the measurements."""
+    """State of the consistency test: does any friction explain the measurements?"""
 
     # squared innovations of the axles over their stated variance, smoothed, as far as unexplained
     # [1]
@@ -121,7 +121,7 @@ class Trust:
 
 
 class Quantiles:
-    """Friction with its interval."""
+    """Median and ends of the friction interval."""
 
     median: float
     lower: float  # 5 %
@@ -129,7 +129,7 @@ class Quantiles:
 
 
 class MixtureMemory:
-    """State of one filter."""
+    """Memory of the friction mixture of one vehicle."""
 
     row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
     nominal: Nominal  # prior of its states, by what its file knows of them
@@ -183,10 +183,11 @@ class MixtureMemory:
 def new_filters(
     rows: FloatArray, nominal: Nominal, means: FloatArray, spreads: FloatArray
 ) -> RecordArray:
-    """Return filters of vehicles with parameters `rows` (N, 15) that have not seen a sample.
+    """Return new filter records for vehicles with the parameters `rows` (N, 15); no sample has been
+    processed.
 
-    The prior of their states is `nominal`, with the means and standard deviations `means`,
-    `spreads` (N, STATES).
+    `means` and `spreads` (N, STATES) are the means and standard deviations of the state priors; the
+    return times are those of `nominal`.
     """
     filters = records(MixtureMemory, len(rows))
     prior = filters["nominal"]

@@ -4,10 +4,11 @@ nodes.
 Legend
     m_j, P_j, w_j   mean (n,), covariance (n, n) and probability of node j
     m, P            mean and covariance of the whole mixture
-    zeta            share of a node's predicted mass that came from anywhere by a road change [1]
+    zeta            share of a node's predicted probability that came from any other node by a
+                    road change [1]
 
 The state of a node after mixing is (1 - zeta)*N(m_j, P_j) + zeta*N(m, P), matched in its first two
-moments. An improbable node thus keeps the vehicle's state and is ready to explain the next sample
+moments. An improbable node thus keeps a plausible vehicle state and can explain the next sample
 (interacting multiple models, Blom and Bar-Shalom 1988). Covariances are only added here, never
 subtracted.
 """
@@ -41,7 +42,7 @@ LARGEST_DRIFT = 0.5
 
 @compiled
 def active_nodes(memory: MixtureMemory) -> int:
-    """Return the number of active nodes."""
+    """Return the number of active nodes: NODES, or ALL_NODES while the split nodes are active."""
     return ALL_NODES if memory.split else NODES
 
 
@@ -76,8 +77,8 @@ def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
 def apply_road_change(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, metres: float
 ) -> None:
-    """Apply the road change over `metres`: move probability between nodes, and mix each node with
-    its inflow.
+    """Apply the road change over `metres`: move probability between nodes, and mix the state of
+    each node with the state of the probability that flows in.
     """
     count = active_nodes(memory)
     constants = design.constants
@@ -117,7 +118,7 @@ def mix_node(
     overall_mean: FloatArray,
     overall_covariance: FloatArray,
 ) -> None:
-    """Mix one node (mean (n,), covariance (n, n), changed in place) with the whole mixture."""
+    """Mix one node with the whole mixture: mean (n,) and covariance (n, n) are changed in place."""
     if zeta < LEAST_MIXING:
         return
     n = mean.shape[0]
@@ -139,7 +140,9 @@ def match_moments(
     overall_mean: FloatArray,
     overall_covariance: FloatArray,
 ) -> None:
-    """Compute mean (n,) and covariance (n, n) of the mixture of the first K nodes, weight (K,)."""
+    """Compute mean (n,) and covariance (n, n) of the mixture of the first K nodes with weights
+    (K,).
+    """
     count = weight.shape[0]
     n = mean.shape[1]
     clear_vector(overall_mean)
@@ -165,7 +168,7 @@ def match_moments(
 def reset_diverged(
     mean: FloatArray, root: FloatArray, weight: FloatArray, constants: Constants
 ) -> None:
-    """Give nodes (K, n) whose motion has diverged the state of the most probable node, and weight
+    """Reset diverged nodes: each gets the state of the most probable node, and a weight of almost
     zero.
     """
     best = int(np.argmax(weight))

@@ -1,16 +1,16 @@
-"""One node of the mixture: the cubature filter of the vehicle, given the friction under its two
-sides.
+"""Filter of one node: a cubature Kalman filter of the vehicle, given the friction under its left
+and right wheels.
 
 Legend
     m, L        mean (n,) and square root of the covariance, L*L' = P          (n, n)
     A           measurement deviations in the axes of L's columns              (6, ACTIVE)
-    f, a        row of A that is taken in, and its variance f'f + r^2
+    f, a        row of A that is applied, and its variance f'f + r^2
     D           derivative of the rows by a state that they depend on linearly
 
-The rows are linear but for velocity and stiffness: the third-degree cubature rule is taken in those
-four dimensions, and leak, steering, shape and gain enter by D, exactly (a Rao-Blackwellised rule).
-Rows are taken in one after the other (Potter 1963): L <- L*(I - g*f*f'), with g such that no
-covariance is ever subtracted.
+The measurement rows are nonlinear only in velocity and stiffness. Therefore the third-degree
+cubature rule is applied in these four dimensions. Leak, steering, shape and gain enter exactly, by
+the derivative D (a Rao-Blackwellised rule). Rows are applied one after the other (Potter 1963): L
+<- L*(I - g*f*f'), with g such that no covariance is ever subtracted.
 """
 
 from __future__ import annotations
@@ -63,14 +63,14 @@ class NodeUpdate(NamedTuple):
 def update_node(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int, inflation: float
 ) -> NodeUpdate:
-    """Run the cubature update of node j with R times `inflation`: its mean and scratch.root[j] are
-    changed.
+    """Run the cubature update of node j with R times `inflation`. The update changes the node's
+    mean and scratch.root[j].
 
-    R of the axles is larger still where they are distrusted, and where the inputs are steady.
+    R of the axles is larger still where the axles are distrusted, and where the inputs are steady.
     Errors of curve and offsets then repeat from block to block; if they were treated as noise, the
     filter would average them into stiffness and shape.
 
-    Writes the innovation and its theoretical variance without the inflation.
+    The function also writes the innovation and its theoretical variance without the inflation.
     """
     constants = design.constants
     nominal = memory.nominal
@@ -115,10 +115,10 @@ def update_node(
 
 @compiled
 def linearize_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
-    """Fill node.derivative of node j, leave node.force as at the mean, and return the penalty of
-    sliding.
+    """Fill node.derivative of node j, compute node.force at the node's mean, and return the penalty
+    of sliding [nat].
 
-    Leak and offset of a_y move the same forces, so one derivative gives the other.
+    Leak and offset of a_y change the same forces, so one derivative gives the other.
     """
     constants = design.constants
     curve = design.curve
@@ -174,11 +174,11 @@ def linearize_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratc
 def _by_wheel_speeds(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int
 ) -> None:
-    """Compute the derivatives by the radii and by the lag of the wheel speeds; the row of a wheel
-    depends on its own speed.
+    """Compute the derivatives of the rows by the wheel radii and by the lag of the wheel speeds.
 
-    All radii are moved at once, because they hardly change the rows of the axles; node.force is as
-    at the mean.
+    Each wheel's row depends on the speed of this wheel. All radii are changed at the same time,
+    because they hardly change the rows of the axles. node.force must already be computed at the
+    mean.
     """
     row = memory.row
     mean = memory.mean[j]
@@ -208,11 +208,11 @@ def _by_wheel_speeds(
 def weigh_slopes(
     curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, flat: float, node: NodeWorkspace
 ) -> float:
-    """Fill node.noise with the variances of the rows' noise at node.slip, and return the penalty of
-    sliding.
+    """Fill node.noise with the noise variances of the rows at node.slip, and return the penalty of
+    sliding [nat].
 
     The penalty applies to wheels on the flat part of the curve: a sliding wheel may have any slip,
-    so its density is spread thin.
+    so its probability density is low.
     """
     slip = node.slip
     price = 0.0
@@ -243,21 +243,21 @@ def weigh_slopes(
 @compiled
 def slip_noise_correction(slope: float) -> float:
     """Return the share of slip noise that does not enter a residual on a curve of this slope,
-    relative to the half that enters on slope 1.
+    relative to the half that enters at slope 1.
 
-    Along the normal of a line of slope k, noise of the slip counts by k^2/(1 + k^2) (errors in
-    variables). If it counted as much on the flat as on the rise, it would favour nodes whose wheels
-    slide, because slip noise does not enter their residuals.
+    In the direction normal to a line of slope k, slip noise counts by k^2/(1 + k^2) (errors in
+    variables). If the noise counted equally on the flat and on the rising part of the curve, it
+    would favour nodes whose wheels slide, because slip noise does not enter their residuals.
     """
     return 0.5 - slope * slope / (1.0 + slope * slope)
 
 
 @compiled
 def spread_points(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> None:
-    """Fill node.deviation (A), node.residual with the predicted rows, and node.nonlinearity with
-    its variance.
+    """Evaluate the measurement rows at the cubature points of node j.
 
-    scratch.root[j] is lower triangular.
+    Fill node.deviation (A), node.residual with the predicted rows, and node.nonlinearity with the
+    variance caused by nonlinearity. scratch.root[j] is lower triangular.
     """
     row = memory.row
     mean = memory.mean[j]
@@ -293,8 +293,10 @@ def spread_points(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
 
 @compiled
 def doubted_noise(trust: Trust, constants: Constants) -> float:
-    """Return the factor on R of the axles: readings that contradict the model must not move the
-    motion while the test runs.
+    """Return the factor on R of the axles during the consistency test.
+
+    It grows with the evidence against the model, so that contradicting readings do not change the
+    motion estimate.
     """
     if trust.distrust > 0.0:
         return 1.0 + constants.distrust_noise
@@ -311,8 +313,8 @@ def rear_noise(memory: MixtureMemory, constants: Constants) -> float:
 
 @compiled
 def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
-    """Return the distance of a node's vehicle and sensor states from their prior [nat]; mean
-    (n,).
+    """Return the penalty [nat] of a node's vehicle and sensor states: half of their squared
+    distance from the prior in standard deviations. `mean` has shape (n,).
     """
     total = 0.0
     for i in range(NodeState.LN_KX, mean.shape[0]):
@@ -324,10 +326,11 @@ def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
 def take_rows(
     mean: FloatArray, root: FloatArray, node: NodeWorkspace, axle_penalty: float
 ) -> tuple[float, int]:
-    """Apply the innovations node.residual (6,) one by one; return half the normalised square with
-    its penalty, and the number of rows.
+    """Apply the innovations node.residual (6,) one by one.
 
-    axle_penalty scales the cost of ln det S for the axles; the wheels' rows have no such cost.
+    Return (negative log-likelihood [nat] without constants, number of rows applied): half of the
+    normalised squares plus the ln det S terms. `axle_penalty` scales the ln det S term of the
+    axles; the rows of the wheels have no such term.
     """
     loss = 0.0
     used = 0
@@ -349,10 +352,10 @@ def take_rows(
 
 @compiled
 def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> None:
-    """Limit the states of vehicle and sensors to their possible range; mean (n,).
+    """Limit the vehicle and sensor states in `mean` (n,) to their possible range.
 
-    Radii are only observable relative to each other. A common error scales the speed, and no sensor
-    here measures that scale.
+    Only the ratios of the wheel radii are observable. A common error of all radii scales the speed,
+    and no sensor here measures that scale. Therefore the mean of the radius errors is set to zero.
     """
     far = constants.farthest
     common = 0.0
@@ -370,12 +373,12 @@ def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> Non
 def predict_node(
     memory: MixtureMemory, scratch: Scratch, j: int, turn_cos: float, turn_sin: float
 ) -> None:
-    """Advance node j over the block: exact rotation, gained velocity, process variances
+    """Predict node j to the end of the block: exact rotation, gained velocity, process variances
     scratch.process.
 
-    The map is affine, and the cubature of an affine map is the map itself: covariance <- F*L*(F*L)'
-    + diag(noise). States of vehicle and sensors return to their prior by scratch.keep.
-    scratch.root[j] is changed to F*L.
+    The prediction is affine, so cubature is exact: covariance <- F*L*(F*L)' + diag(noise). Vehicle
+    and sensor states return to their prior by the factors scratch.keep. The function changes
+    scratch.root[j] to F*L.
     """
     nominal = memory.nominal
     keep = scratch.keep

@@ -1,11 +1,12 @@
-"""The reported interval of friction, whose coverage matches its stated level at both ends.
+"""The reported friction interval, with levels at both ends that give the stated coverage.
 
-Evidence is tempered so that a repeated error does not count twice. Therefore the belief is wider
-than its errors where much has been measured, and equal to the prior, which has the right width,
-where nothing has been measured. The level of the upper end moves between the two with the amount
-learned, the divergence of the belief from its prior (Kullback and Leibler 1951). It moves further
-for a car that matches its vehicle file (`trust.nominal_agreement`). The upper end never falls below a
-slippery friction unless the belief itself holds 99 % below it.
+Evidence is tempered so that a repeated error does not count twice. Therefore, after many
+measurements, the node probabilities are wider than the actual errors. Without measurements they
+equal the prior, which has the right width. The level of the upper end moves from one case to the
+other with the information gained, which is the divergence of the node probabilities from the prior
+(Kullback and Leibler 1951). It moves further for a car that matches its vehicle file
+(`trust.nominal_agreement`). The upper end falls below the slippery limit only if at least 99 % of
+the probability lies below the reported value.
 """
 
 from __future__ import annotations
@@ -46,10 +47,11 @@ def find_interval(
     likeness: float,
     friction: Quantiles,
 ) -> None:
-    """Compute median and interval of the nodes of one friction (NODES,), with patches
-    (PATCH_NODES,) of possible ice.
+    """Compute median and interval of friction from the probabilities (NODES,) of the
+    single-friction nodes.
 
-    blended (NODES,) is scratch; `likeness`, 0 to 1, is the agreement of the car with its file.
+    `patch` (PATCH_NODES,) are the probabilities of a possible ice patch. `blended` (NODES,) is
+    scratch. `likeness`, 0 to 1, is the agreement of the car with its vehicle file.
     """
     friction.median = quantile(design.mu, design.prior, weight, 0.5)
     friction.upper = upper_end(design, weight, likeness)
@@ -63,8 +65,10 @@ def find_interval(
 
 @compiled
 def upper_end(design: MixtureDesign, weight: FloatArray, likeness: float) -> float:
-    """Return the upper end of nodes of one friction with weight (NODES,): the truth lies above it
-    in at most one case of twenty.
+    """Return the upper end of the friction interval for node probabilities (NODES,).
+
+    The level is chosen so that the true friction lies above the result in at most one case of
+    twenty.
     """
     learned = 0.0
     for j in range(weight.shape[0]):

@@ -9,11 +9,11 @@ Legend
                 force over load [1]
     e           sign(e_b)*|e_a*e_b|/sqrt(e_a^2 + e_b^2): distance to the tyre curve [1]
 
-Rows: the four wheels along, then the two axles across. In the linear range e weighs slip and force
-alike. On the flat part and beyond the peak the force decides, so the row of a sliding wheel
-measures its friction (errata, what made the difference, 1). An axle takes one mean slip; its wheels
-share the side force by load. The vehicle states of a node (leak, gain of torque, shape of the tyre)
-correct the measured force.
+Rows: the longitudinal residuals of four wheels, then the lateral residuals of two axles. In the
+linear range e weights slip and force equally. On the flat part and beyond the peak only the force
+counts, so the row of a sliding wheel measures its friction (errata, what made the difference, 1).
+An axle has one mean slip; its wheels share the lateral force in proportion to load. The states of a
+node (leak, gain of torque, shape of the tyre) correct the measured force.
 """
 
 from __future__ import annotations
@@ -42,8 +42,9 @@ FLATTEST = 0.03  # a sliding wheel's slip is not quite arbitrary: its inertia ho
 
 @compiled
 def curve_distance(along: float, across: float) -> float:
-    """Return e of e_a = along and e_b = across; an infinite e_a (force beyond the peak) leaves
-    e_b.
+    """Return the distance e to the tyre curve for e_a = along and e_b = across.
+
+    If e_a is infinite (the force exceeds the peak), return e_b.
     """
     if math.isinf(along):
         return across
@@ -53,10 +54,10 @@ def curve_distance(along: float, across: float) -> float:
 
 @compiled
 def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
-    """Return the velocity gained (forward, left) [m/s] with the leak, offsets, slope and bank of
-    state x (n,).
+    """Return the velocity (forward, left) [m/s] gained in the block, corrected by the leak,
+    offsets, slope and bank in state x (n,).
 
-    An offset of a_y has the same effect as one of a_x, rotated by 90 degrees.
+    An offset of a_y has the same effect as an offset of a_x, rotated by 90 degrees.
     """
     leak_y = x[NodeState.LEAK_Y]
     bias_x = x[NodeState.BIAS_X] + x[NodeState.SLOPE]
@@ -71,8 +72,9 @@ def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
 
 @compiled
 def slope_along(curve: TyreCurve, g_x: float, g_y: float, mu: float) -> float:
-    """Return the change of the longitudinal force with the linear longitudinal force, at least
-    FLATTEST: 1 at small slip, 0 on the flat.
+    """Return the derivative of the longitudinal force by the linear longitudinal force.
+
+    It is 1 at small slip, 0 on the flat part of the curve, and limited to at least FLATTEST.
     """
     square = g_x * g_x + g_y * g_y
     if square < TINY:
@@ -94,10 +96,11 @@ def find_slips(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Fill node.slip at node.point, a state at the beginning of the block; mean (n,) is the node's.
+    """Fill node.slip with the slips of wheels and axles at node.point, a state at the beginning of
+    the block.
 
-    A log stiffness is drawn towards the node's mean where the force is too small to separate
-    stiffness from slip noise.
+    `mean` (n,) is the node's mean. Where the force is too small to distinguish stiffness from slip
+    noise, the log stiffness of the point is moved towards the mean.
     """
     x = node.point
     slip = node.slip
@@ -136,10 +139,10 @@ def find_slips(
 
 @compiled
 def steering_offset(x: FloatArray, features: BlockFeatures) -> float:
-    """Return the true minus the measured angle of the front wheels [rad], positive to the left,
-    with state x (n,).
+    """Return the true minus the measured steering angle of the front wheels [rad], positive to the
+    left, for state x (n,).
 
-    The front axle yields to its own side force: steering column and bushings of production cars
+    The front axle yields to its own lateral force: steering column and bushings of production cars
     yield up to 35 mrad/g.
     """
     lagged = x[NodeState.STEER] + x[NodeState.LAG_STEER] * features.steer_rate
@@ -154,8 +157,10 @@ def steering_offset(x: FloatArray, features: BlockFeatures) -> float:
 def find_shape_force(
     curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace
 ) -> None:
-    """Fill node.shape_force at node.slip; side_mu (2,) is the friction under the left and right
-    wheels.
+    """Fill node.shape_force at node.slip: the change of force over load per standard deviation of
+    the curve's shape.
+
+    side_mu (2,) is the friction under the left and right wheels.
     """
     slip = node.slip
     out = node.shape_force
@@ -183,12 +188,12 @@ def correct_forces(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Fill node.force and node.slip_at_force with the measured values, corrected by leak, offsets,
-    gain of torque and shape of node.point.
+    """Fill node.force and node.slip_at_force with the measured values, corrected by the leak,
+    offsets, torque gain and shape of node.point.
 
-    Without torque only the sum of both sides is measured. On a split road the slippery side carries
-    at most SPLIT_LIMIT of its friction, and the other side carries the rest. The unequal forces
-    turn the car, and the side forces of the axles balance that moment.
+    Without torque only the sum of both sides is measured. On a split road the slippery side then
+    takes at most SPLIT_LIMIT of its friction, and the other side takes the rest. The unequal forces
+    turn the car, and the lateral forces of the axles balance that moment.
     """
     leak = node.point[NodeState.LEAK_Y]
     shape = node.point[NodeState.SHAPE]
@@ -233,8 +238,9 @@ def correct_forces(
 
 @compiled
 def share_by_sides(mean: float, most: float, most_other: float) -> float:
-    """Return the force over load of one side where `mean` acts on both: equal until the slippery
-    side is at its limit.
+    """Return the force over load of one side if both sides together have the mean `mean`.
+
+    The sides are equal until the slippery side reaches its limit.
 
     Args:
         mean: mean of both sides, signed [1].
@@ -249,8 +255,10 @@ def share_by_sides(mean: float, most: float, most_other: float) -> float:
 
 @compiled
 def _slip_at_force(curve: TyreCurve, mu: float, force: float, other: float) -> float:
-    """Return the linear force over load in the direction of `force` while the component `other`
-    acts across it.
+    """Return the slip that gives `force` over load while the component `other` acts at right angles
+    to it.
+
+    The slip is expressed as linear force over load [1]; it is infinite at or beyond the peak.
     """
     size = math.sqrt(force * force + other * other)
     if math.isnan(size) or size < TINY:
@@ -267,8 +275,8 @@ def find_residuals(
     node: NodeWorkspace,
     out: FloatArray,
 ) -> None:
-    """Compute out (6,) = e of each row at node.slip and node.force; NaN where its readings are
-    missing.
+    """Compute out (6,): the distance e of each row at node.slip and node.force, NaN where a reading
+    of the row is missing.
     """
     slip = node.slip
     force = node.force

@@ -1,5 +1,5 @@
-"""Start and restart of a filter: at the first sample, after a gap, and when wheels contradict every
-node for long.
+"""Start and restart of a filter: at the first sample, after a gap in time, and when wheel speeds
+contradict every node for a long time.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ SLOWEST_M_S = 1.5
 def start_vehicle(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray
 ) -> int:
-    """Start the vehicle at its first sample with a finite time; all of its memory is zero."""
+    """Start the filter of a vehicle at its first sample with a finite time; return the health
+    flags. All fields of the memory must be zero before the call.
+    """
     if not math.isfinite(time):
         return flags.TIME_GAP
     last = memory.last
@@ -95,7 +97,7 @@ def start_vehicle(
 
 @compiled
 def forget_vehicle(memory: MixtureMemory) -> None:
-    """Reset the mixture's moments of vehicle and sensor states to their prior."""
+    """Reset the vehicle and sensor states in the moments of the mixture to their prior."""
     nominal = memory.nominal
     covariance = memory.overall_covariance
     for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
@@ -108,7 +110,7 @@ def forget_vehicle(memory: MixtureMemory) -> None:
 
 @compiled
 def put_split_to_sleep(memory: MixtureMemory) -> None:
-    """Deactivate the split nodes."""
+    """Deactivate the split nodes, and normalise the weights of the other nodes."""
     if not memory.split:
         return
     memory.split = False
@@ -122,8 +124,9 @@ def put_split_to_sleep(memory: MixtureMemory) -> None:
 
 @compiled
 def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
-    """Set all nodes to `speed` [m/s] or, where that is NaN, keep their own speed with standard
-    deviation `spread`.
+    """Set v_x of all nodes to `speed` [m/s] and v_y to zero.
+
+    If `speed` is NaN, all nodes keep the mixture's v_x with standard deviation `spread` [m/s].
     """
     if not math.isnan(speed):
         memory.overall_mean[NodeState.VX], spread = speed, FIRST_V_STD
@@ -143,8 +146,10 @@ def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
 
 @compiled
 def bridge_gap(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
-    """Bridge a gap of dt [s]: friction is forgotten over the metres driven meanwhile, and the
-    motion restarts.
+    """Bridge a gap of dt [s] and return the health flag RESET.
+
+    Friction returns towards the prior over the metres driven during the gap, and the motion
+    restarts.
     """
     last = memory.last
     now = memory.last.now
@@ -170,13 +175,13 @@ def bridge_gap(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
 def reset_to_wheel_speed(
     memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
 ) -> int:
-    """Reset the motion where it is far from the speed of wheels that agree and roll; return the
-    health flags.
+    """Reset the motion where it is far from the speed of wheels that agree and roll freely; return
+    the health flags.
 
-    Where wheels have agreed for long, vehicle and friction are forgotten together with the motion.
-    Where wheels have just begun to roll without force, after a slide, only the motion is set. Nodes
-    that take these wheels for sliding would not recover on their own, because the tyre curve is
-    flat there. Noise that a slide has raised triggers neither.
+    If wheels have agreed for a long time, vehicle states and friction are reset together with the
+    motion. If wheels have just begun to roll without force, after a slide, only the motion is
+    reset. Without a reset, nodes that assume these wheels slide would not recover, because the tyre
+    curve is flat there. The larger noise during a slide causes neither of these resets.
     """
     rolling = memory.rolling
     if not math.isnan(rolling.ahead):
@@ -199,8 +204,8 @@ def reset_to_wheel_speed(
 
 @compiled
 def free_speed(memory: MixtureMemory, features: BlockFeatures) -> float:
-    """Return the speed [m/s] of wheels that turn alike and without force, so that they roll; NaN
-    where there are none.
+    """Return the speed [m/s] of wheels that turn alike and without force, and therefore roll
+    freely; NaN if the wheels do not.
     """
     slowest = math.inf
     fastest = -math.inf
@@ -217,8 +222,8 @@ def free_speed(memory: MixtureMemory, features: BlockFeatures) -> float:
 
 @compiled
 def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> int:
-    """Restart the motion at `speed` [m/s], or at the current estimate where that is NaN, and all
-    other states at the prior.
+    """Restart the motion at `speed` [m/s], or at the current estimate if `speed` is NaN. Reset all
+    other states and the friction to the prior.
     """
     forget_vehicle(memory)  # what was learned while lost is as wrong as the motion was
     restart_motion(memory, speed, LOST_SPREAD_M_S)

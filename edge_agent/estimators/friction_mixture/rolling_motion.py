@@ -1,12 +1,12 @@
-"""Motion without a tyre model: from wheels that stand, wheels that roll alike, and a rear axle that
-follows.
+"""Motion without a tyre model, in three cases: all wheels stand, all wheels roll alike, or the rear
+axle does not slide.
 
-A tyre beyond its peak does not hold its slip: it locks or spins up within a tenth of a second
-unless something controls it, and four never do so alike. So four wheels that agree for a second
-give the speed, apart from the slip that their force needs. Without this rule, a lasting
-accelerometer offset has one explanation, four wheels sliding on ice. That explanation predicts
-anything, so the filter would never leave it. In the same way, a rear axle with hardly any side
-force does not slide sideways.
+A tyre beyond its peak does not keep a constant slip: it locks or spins up within a tenth of a
+second unless a controller acts, and four tyres never do so alike. Therefore four wheels that agree
+for a second give the speed, apart from the slip that their force needs. Without this rule, the
+filter could explain a lasting accelerometer offset only by four wheels sliding on ice. This
+explanation fits any data, so the filter would keep it forever. In the same way, a rear axle with
+hardly any lateral force does not slide sideways, so it gives the lateral velocity.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ FARTHEST_FOLLOWED = 0.8  # a_y over g to which the rear axle is then taken to fo
 
 @compiled
 def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
-    """Update memory.rolling with the block."""
+    """Update memory.rolling with the wheel speeds of the block."""
     rolling = memory.rolling
     row = memory.row
     time = memory.last.time
@@ -109,7 +109,11 @@ def _update_standstill(
 def _compute_velocities(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures, middle: float, step: float
 ) -> None:
-    """Return the velocities that wheels at `middle` [m/s] imply, and their spreads."""
+    """Compute v_x and v_y that rolling wheels at the speed `middle` [m/s] imply, and their standard
+    deviations.
+
+    The results are written into memory.rolling.
+    """
     rolling = memory.rolling
     row = memory.row
     pull = features.change / GRAVITY
@@ -136,7 +140,9 @@ def _compute_velocities(
 
 @compiled
 def take_rolling(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
-    """Apply the motion from the wheels to node j; return the penalty for its disagreement [nat]."""
+    """Update node j with the velocity derived from the wheels; return the penalty for its
+    disagreement [nat].
+    """
     rolling = memory.rolling
     constants = design.constants
     features = scratch.features
@@ -178,7 +184,9 @@ def _take_velocity(
     reading: tuple[float, float, float],
 ) -> float:
     """Update node j with a velocity reading (innovation, variance, Huber threshold) along
-    `direction` (x, y); return half of its normalised square.
+    `direction` (x, y).
+
+    Return half of its normalised squared innovation [nat].
     """
     root = scratch.root[j]
     row = scratch.velocity_row

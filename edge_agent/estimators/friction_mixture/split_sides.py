@@ -1,8 +1,9 @@
-"""Split roads: a low and a high friction under the two sides of the vehicle, either way round.
+"""Split roads: a low friction under one side of the vehicle and a high friction under the other,
+either way round.
 
-The frictions of a side are cells of a coarse grid. A node represents a triangular density about the
-middle of its cell that reaches to the middles of the neighbours, so that both cover a friction
-between two nodes.
+The friction of each side is divided into cells of a coarse grid. A node represents a triangular
+density around the middle of its cell that extends to the middles of the neighbouring cells.
+Therefore a friction between two nodes is covered by both.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ LEFT, RIGHT, BOTH = range(3)  # whose friction a share of cells is of; BOTH is t
 
 
 class Sides(NamedTuple):
-    """Friction under the left and right wheels of all nodes: those of one friction first, then
-    the split ones.
+    """Friction under the left and right wheels for all nodes: first the single-friction nodes, then
+    the split nodes.
     """
 
     mu: Annotated[FloatArray, ALL_NODES, 2]  # left, right
@@ -45,7 +46,11 @@ class Triangle(NamedTuple):
 
 
 def triangular_cells(edges: tuple[float, ...]) -> list[Triangle]:
-    """Return one triangle per cell, about its middle; the outermost ones end at the outer edges."""
+    """Return one triangle per cell with its maximum at the middle of the cell.
+
+    Each triangle extends to the middles of the neighbouring cells; the first and last extend to the
+    outer edges.
+    """
     middles = [0.5 * (a + b) for a, b in pairwise(edges)]
     lefts = [edges[0], *middles[:-1]]
     rights = [*middles[1:], edges[-1]]
@@ -54,8 +59,9 @@ def triangular_cells(edges: tuple[float, ...]) -> list[Triangle]:
 
 
 def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
-    """Return all nodes, where a share `split_prior` of the roads has unequal sides; mu and prior
-    (K,).
+    """Return the table of all nodes. Split nodes together have the prior probability `split_prior`.
+
+    mu and prior (K,) are those of the single-friction nodes.
     """
     edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), len(mu) + 1) ** 2
     pairs = []
@@ -80,7 +86,7 @@ def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
 
 
 def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
-    """Return the share of a triangular density in each cell between the edges."""
+    """Return the share of a triangular density that lies in each cell between the edges."""
     left, middle, right, _ = triangle
     rising = np.clip(edges - left, 0.0, middle - left)
     falling = np.clip(right - edges, 0.0, right - middle)
@@ -92,8 +98,10 @@ def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
 
 @compiled
 def project_weights(w: FloatArray, share: FloatArray, out: FloatArray) -> None:
-    """Compute out (K,) = probabilities of the cells of the K nodes; the probabilities of the split
-    nodes are distributed by `share` (SPLIT_NODES, K).
+    """Compute out (K,): the probabilities of the single-friction nodes plus those of the split
+    nodes.
+
+    `share` (SPLIT_NODES, K) distributes the probability of each split node over the K nodes.
     """
     chain = out.shape[0]
     for j in range(chain):

@@ -1,8 +1,10 @@
-"""One sample of one vehicle: sums of the block, and at the block's end one step of the mixture.
+"""Processing of one sample of one vehicle: update the sums of the block and, at its end, run one
+step of the mixture.
 
-Order at the end of a block: road change per metre and mixing; measurement update of every node at
-the state of the block's beginning; reweighing with the evidence tempered by demand; adaptation of
-R; prediction to the block's end. Between block ends the same exact kinematics advance the velocity.
+Order at the end of a block: road change and mixing; measurement update of every node at the state
+of the block's beginning; update of the node weights with the evidence tempered by demand;
+adaptation of R; prediction to the block's end. Within a block, the same exact kinematics advance
+the velocity.
 """
 
 from __future__ import annotations
@@ -53,7 +55,7 @@ from schemas.runtime.jit import compiled
 def step(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray
 ) -> int:
-    """Process one sample (18,); return the health flags of this sample alone."""
+    """Process one sample (18,); return the health flags of this sample only."""
     if not memory.started:
         return start_vehicle(memory, design, scratch, time, sample) | flags.RESET
     health, whole = take_sample(memory, design, time, sample)
@@ -64,7 +66,7 @@ def step(
 
 @compiled
 def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Close the block and begin the next at the same instant."""
+    """Finish the block with a step of the mixture, and begin the next block at the same time."""
     features = scratch.features
     features.duration = memory.last.time - memory.block.time
     features.speed = abs(memory.overall_mean[NodeState.VX])
@@ -133,8 +135,8 @@ def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
 
 @compiled
 def conclude_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Compute friction with its interval, the grip used in the last second, and whether wheels
-    slide.
+    """Compute the friction interval, the grip used in the last second, and the health flag for
+    sliding wheels.
     """
     _find_friction(memory, design, scratch)
     note_excitation(memory.excitation, memory.last.time, used_grip(memory, scratch.features))
@@ -156,8 +158,8 @@ def conclude_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scr
 
 @compiled
 def _find_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Compute quantiles of the friction under the left wheels, under the right, and of their
-    mean.
+    """Compute median and interval of the friction under the left wheels, under the right wheels,
+    and of the mean of both.
     """
     if memory.split:
         _find_side(memory, design, scratch, LEFT, memory.friction_left)
@@ -195,8 +197,10 @@ def mean_velocity(memory: MixtureMemory) -> tuple[float, float]:
 def turned_velocity(
     memory: MixtureMemory, gain: VelocityGain, cos: float, sin: float
 ) -> tuple[float, float]:
-    """Return (v_x, v_y) [m/s] of the mixture after the vehicle has turned by an angle of this cosine
-    and sine, and has gained the velocity `gain`, since the block began.
+    """Return the mixture's current (v_x, v_y) [m/s] in vehicle axes.
+
+    Since the block began, the vehicle has turned by an angle with this cosine and sine, and has
+    gained the velocity `gain`.
     """
     x = memory.overall_mean
     gained_x, gained_y = gained_velocity(gain, x)

@@ -1,22 +1,23 @@
-"""Trust in the model: from its strain, and from a test whether any friction explains the
-measurements.
+"""Trust in the model: its strain, and a test for contradictions between model and measurements.
 
-**Strain** is the chi-square of the estimated vehicle and sensor states against their prior, over
-the degrees of freedom that have been learned (Birge 1932). Errors share their cause: where offsets,
-radii, lags and steering are small, the other errors of the axles are small as well, and where these
-states are large, they are not. So strain scales R of the axles, and is an input of the rules that
-take a share of the evidence on friction.
+**Strain** is the chi-square of the estimated vehicle and sensor states against their prior, divided
+by the degrees of freedom that have been learned (Birge 1932). Errors have common causes: where
+offsets, radii, lags and steering errors are small, the other errors of the axles are small too, and
+where these states are large, so are the other errors. Therefore strain scales R of the axles. It is
+also an input of the rules that decide how much of the evidence on friction is used.
 
-**Contradiction** is a sequential test of two hypotheses (after Page 1954): that the model holds,
-and that the axles' innovations have FACTOR times the stated variance, as with late steering or a
-race track's bank. Ice that explains the data does not count against the model, nor do unusual
-states alone. Log-likelihood ratios against the model add up to `odd` [nat] and fade within minutes;
-a straight, on which the model cannot fail, does not count for it. At `odd_least` the filter draws
-no conclusions: the interval returns to the prior, the axles do not affect the motion, and states
-learned meanwhile are forgotten. The test leaves out slides, slippery road and walking pace
-(`unexplained_ratio`). After `patience` [s] without a possible test the model is tried again, and each
-relapse makes that time four times as long because sensors do not repair themselves. A motion reset
-by the wheels counts as half a contradiction.
+**Contradiction** is a sequential test of two hypotheses (after Page 1954): that the model holds, or
+that the axles' innovations have FACTOR times the stated variance. The second happens with delayed
+steering signals or on the banking of a race track. Ice that explains the data does not count
+against the model, nor do unusual states alone. Log-likelihood ratios against the model add up to
+`odd` [nat] and fade within minutes. Straight driving, on which the model cannot fail, does not
+count for it. At `odd_least` the filter draws no conclusions: the interval returns to the prior, the
+axles do not affect the motion, and states learned meanwhile are reset. The test leaves out slides,
+slippery road and walking pace (`unexplained_ratio`).
+
+After `patience` [s] without a possible test the model is tried again. Each further contradiction
+makes that time four times as long, because sensors do not repair themselves. A motion reset by the
+wheel speeds counts as half a contradiction.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def update_consistency(
 ) -> None:
     """Update memory.trust with the states, the innovations and the health of the block.
 
-    `ratio` is the axles' squared innovation of the block over its stated variance.
+    `ratio` is the sum of the axles' squared innovations of the block over their stated variance.
     """
     if not design.adaptive:
         return
@@ -93,11 +94,11 @@ def update_consistency(
 
 @compiled
 def unexplained_ratio(memory: MixtureMemory, design: MixtureDesign, ratio: float) -> float:
-    """Return the part of `ratio`, squared innovations over their variance, that neither a slide nor
+    """Return the part of `ratio` (squared innovations over their variance) that neither a slide nor
     slippery road explains.
 
-    A wheel that slides, or a road that is believed slippery, makes the axles' forces unlike those
-    of the model for a while. Tight turns at walking pace are outside the model's range.
+    While a wheel slides, or the road is estimated to be slippery, the axles' forces differ from the
+    model for a while. Tight turns at walking pace are outside the model's range.
     """
     speed = abs(memory.overall_mean[NodeState.VX])
     moving = min(max((speed - SLOW_FOOT) / (SLOW_PEAK - SLOW_FOOT), 0.0), 1.0)
@@ -118,16 +119,19 @@ def slippery_probability(memory: MixtureMemory, design: MixtureDesign) -> float:
 
 @compiled
 def belief_strain(cost: float, learned: float, prior: float) -> float:
-    """Return chi-square over degrees of freedom of a belief of `cost` [nat]; 1 where nothing was
-    learned.
+    """Return the strain: chi-square per degree of freedom of a belief with penalty `cost` [nat].
+
+    `learned` is the number of learned degrees of freedom. The result is 1 if nothing was learned.
     """
     return (2.0 * cost + prior) / (learned + prior)
 
 
 @compiled
 def degrees_of_freedom(covariance: FloatArray, nominal: Nominal) -> float:
-    """Return the number of learned states of vehicle and sensors: the share of their prior variance
-    (n,) that is gone.
+    """Return the effective number of learned vehicle and sensor states.
+
+    Each state counts by the share of its prior variance that the measurements have removed;
+    `covariance` (n, n).
     """
     total = 0.0
     for i in range(NodeState.LN_KX, covariance.shape[0]):
@@ -137,28 +141,30 @@ def degrees_of_freedom(covariance: FloatArray, nominal: Nominal) -> float:
 
 @compiled
 def strained_noise(trust: Trust, constants: Constants) -> float:
-    """Return the factor on R of the axles by strain."""
+    """Return the factor on R of the axles that follows from the strain."""
     factor = (trust.strain / constants.strain_usual) ** constants.strain_power
     return float(min(max(factor, constants.strain_least), constants.strain_most))
 
 
 @compiled
 def nominal_agreement(trust: Trust, constants: Constants) -> float:
-    """Return the agreement of the car with its vehicle file, 0 to 1; 0 from the usual strain on."""
+    """Return the agreement of the car with its vehicle file, 0 to 1; 0 if the strain is at least
+    the usual one.
+    """
     return max(1.0 - trust.strain / constants.strain_usual, 0.0)
 
 
 @compiled
 def used_evidence_share(trust: Trust, constants: Constants) -> float:
-    """Return the share of the evidence that is used: less while a contradiction grows, none once it
-    is accepted.
+    """Return the share of the evidence that is used: it decreases as a contradiction grows, and is
+    0 once the contradiction is accepted.
     """
     return max(1.0 - (trust.odd / constants.odd_least) ** 2, 0.0)
 
 
 @compiled
 def axles_ratio(ratio: float) -> float:
-    """Return the log-likelihood ratio of FACTOR times the stated variance against the stated
-    one.
+    """Return the log-likelihood ratio [nat] of FACTOR times the stated variance against the stated
+    variance, for normalised squared innovations `ratio`.
     """
     return (1.0 - 1.0 / FACTOR) * ratio - math.log(FACTOR)

@@ -1,13 +1,13 @@
-"""The tyre curve of the nodes as tables: force, slope, slip at a force, and how tyres differ in
-shape.
+"""Tables of the tyre curve: force, slope, slip at a given force, and the difference in shape
+between tyres.
 
 Legend
     theta    normalised slip, see edge_agent.dynamics.tyres           [1]
     f        force over mu*F_z, peak 1                                  [1]
     shape    half the difference between a sharp and a round tyre: one standard deviation of shape;
-             it changes sign at the peak, for what rises steeply also falls steeply [1]
-    u        theta/(1 + theta), where the tables of theta are even       [1]
-    t        sqrt(1 - f), where the inverse is smooth up to the peak     [1]
+             it changes sign at the peak, because a steep rise is followed by a steep fall [1]
+    u        theta/(1 + theta); the tables over theta are equidistant in u [1]
+    t        sqrt(1 - f); the inverse curve is smooth in t up to the peak  [1]
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ class TyreCurve(NamedTuple):
 
 
 def magic_formulas(theta: FloatArray, c: float, e: float) -> FloatArray:
-    """Return the Magic Formula of an array of slips, with slope 1 at zero slip."""
+    """Return the Magic Formula force (peak 1) at an array of normalised slips, with slope 1 at zero
+    slip.
+    """
     b = theta / c
     return np.asarray(np.sin(c * np.arctan(b - e * (b - np.arctan(b)))))
 
@@ -50,7 +52,7 @@ falling beyond.
 
 
 def check_curve(curve: Curve) -> Curve:
-    """Return the curve if it is valid; raise ValueError with the fault otherwise."""
+    """Return the curve if it is valid; otherwise raise ValueError with the reason."""
     theta = np.linspace(0.0, 10.0, 10_001)
     f = np.asarray(curve(theta), dtype=np.float64)
     if f.shape != theta.shape or not np.isfinite(f).all():
@@ -65,7 +67,7 @@ def check_curve(curve: Curve) -> Curve:
 
 
 def curve_tables(curve: Curve) -> TyreCurve:
-    """Return the tables of a curve, and of the spread of tyres about it."""
+    """Return the tables of a curve, including the spread of shapes between tyres."""
     u = np.linspace(0.0, 1.0, CELLS + 1)
     theta = u / np.maximum(1.0 - u, 1e-9)
     f = curve(theta)
@@ -84,7 +86,9 @@ def curve_tables(curve: Curve) -> TyreCurve:
 
 @compiled
 def interpolate_table(table: FloatArray, place: float) -> float:
-    """Return the value of a table over [0, 1] at `place`, linear between its cells."""
+    """Return the value of a table over [0, 1] at `place`, with linear interpolation between its
+    points.
+    """
     cells = table.shape[0] - 1
     scaled = place * cells
     cell = min(int(scaled), cells - 1)
@@ -94,7 +98,7 @@ def interpolate_table(table: FloatArray, place: float) -> float:
 
 @compiled
 def ratio_at(curve: TyreCurve, theta: float) -> float:
-    """Return f/theta at theta >= 0; the curve is constant beyond the table."""
+    """Return f/theta at theta >= 0; beyond the table the force is constant."""
     last = curve.ratio.shape[0] - 2
     if theta >= last:
         return float(curve.ratio[last] * last / theta)
@@ -103,7 +107,7 @@ def ratio_at(curve: TyreCurve, theta: float) -> float:
 
 @compiled
 def theta_at(curve: TyreCurve, force: float) -> float:
-    """Return theta at 0 <= force over mu*F_z on the rising branch; infinite at and beyond the
-    peak.
+    """Return theta on the rising branch at a given force over mu*F_z (0 or more); infinite at and
+    beyond the peak.
     """
     return math.inf if force >= 1.0 else interpolate_table(curve.inverse, math.sqrt(1.0 - force))

@@ -1,12 +1,12 @@
 """Reported grip in use: force over load of the axle that uses more, smoothed over SMOOTH_S.
 
-The evidence on friction is weighed by the demand of each block. A report takes the largest value of
-the last second, and the largest of twenty noisy blocks would reflect the sensors more than the
-tyres.
+The demand that weights the evidence on friction is not smoothed. The report is smoothed because it
+takes the largest value of the last second: the largest of twenty noisy blocks would show the sensor
+noise more than the tyres.
 
-Where torque is missing, brakes are assumed to load the axles alike. ABS and brake-force
-distribution do so near the limit, and a fixed share would demand more of an unloaded rear axle than
-any tyre can give.
+Where torque is missing, the brakes are assumed to load both axles in proportion to their load. ABS
+and brake-force distribution do so near the limit. A fixed share would demand more of an unloaded
+rear axle than any tyre can give.
 """
 
 from __future__ import annotations

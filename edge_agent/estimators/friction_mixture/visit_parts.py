@@ -1,11 +1,12 @@
-"""Friction jumps inside a visit: the evidence of the first part of the visit, before the surface
-changed.
+"""Friction jumps inside a visit: detection, and evidence of the part of the visit before the
+surface changed.
 
-The belief of a visit starts from the prior and follows the road, so at the end it describes the
-last surface alone. In addition the most informative belief of the visit so far is kept, measured by
-information over the prior. If almost all of the current belief lies at frictions that this kept
+The belief of a visit starts from the prior and follows the road, so at the end it describes only
+the last surface. In addition, the most informative belief of the visit so far is kept, measured by
+its information over the prior. If almost all of the current belief lies at frictions that this kept
 belief excludes, the friction has jumped. Then the kept belief becomes the evidence of the part that
-ends, and the next part begins. A belief in transition between the two replaces neither.
+ends, and the next part begins. A belief in transition between the two surfaces neither replaces the
+kept belief nor counts as a jump.
 
 Legend
     w, s       probabilities of the nodes in the visit, and those of the kept belief   (K,)
@@ -37,15 +38,15 @@ KNOWING = 0.7
 
 @compiled
 def begin_part(memory: MixtureMemory, design: MixtureDesign) -> None:
-    """Reset the part: it has no evidence yet."""
+    """Begin a new part of the visit, without evidence so far."""
     copy_vector(memory.surest, design.prior)
     memory.information = 0.0
 
 
 @compiled
 def end_part(memory: MixtureMemory, design: MixtureDesign, evidence: FloatArray) -> None:
-    """Keep the most informative belief; where friction has jumped, write the evidence (32,) of the
-    part that ends and begin another.
+    """Update the most informative belief of the visit. If friction has jumped, write the evidence
+    (32,) of the part that ends, and begin the next part.
     """
     if memory.split:
         return

@@ -1,10 +1,10 @@
-"""Weights of the friction nodes after a block: likelihoods tempered by the rules, and the
-adaptation of R.
+"""Weights of the friction nodes after a block: likelihoods tempered by the rules, and adaptation of
+R.
 
-Errors of the tyre curve and of offsets repeat from block to block while nothing changes, so the
-evidence of such blocks counts less. Where a bend turns to ice the forces stay and the slip grows,
-so either may be new. Where an axle has slid and grips again at the same force, the ice has probably
-ended (`mixing.py`).
+While nothing changes, errors of the tyre curve and of offsets repeat from block to block. Therefore
+the evidence of such blocks counts less. Where a bend becomes icy the forces stay the same and the
+slip grows, so a change of either counts as new. Where an axle has slid and grips again at the same
+force, the ice has probably ended (`mixing.py`).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ LEAST_DEMAND = 1e-3  # [1] below it no evidence is left
 
 @compiled
 def apply_measurement(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Update all nodes, reweigh them, and adapt R."""
+    """Update all nodes, recompute their weights, and adapt R."""
     update_all(memory, design, scratch)
     temper_evidence(memory, design, scratch)
     weight = memory.weight[: active_nodes(memory)]
@@ -52,7 +52,9 @@ def apply_measurement(memory: MixtureMemory, design: MixtureDesign, scratch: Scr
 
 @compiled
 def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Update every active node; store NIS and the predictive log-likelihood of the mixture."""
+    """Update every active node; store the NIS (normalised squared innovation) and the predictive
+    log-likelihood of the mixture.
+    """
     inflation = max(design.constants.correlation_time / scratch.features.duration, 1.0)
     count = active_nodes(memory)
     for group in range(2):
@@ -93,9 +95,9 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
 def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Replace scratch.log_likelihood by the tempered evidence of the block for each node [nat].
 
-    A node below the grip in use pays its penalty whatever the demand. At full distrust no evidence
-    is used. Without accelerations, yaw rate or steering, sliding cannot be separated from rolling,
-    so there is no evidence on friction either.
+    A node below the grip in use gets its penalty at any demand. At full distrust no evidence is
+    used. Without accelerations, yaw rate or steering, sliding cannot be distinguished from rolling,
+    so no evidence on friction is used either.
     """
     constants = design.constants
     features = scratch.features
@@ -126,12 +128,14 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
 
 @compiled
 def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
-    """Return the penalty [nat] for the vehicle states that a node has moved to; a refund is at most
-    the amount charged before.
+    """Charge a node for its vehicle states that moved away from the prior, and return the charge
+    [nat].
 
-    Tempered evidence charges this cost only in part, while the node's state has moved by the full
-    measurement. Without this penalty, on gentle drives a low friction would survive almost free
-    with a stiffness or an offset three standard deviations from the prior.
+    `price` is the change of the node's penalty. A negative charge (refund) never exceeds the amount
+    charged before. Tempered evidence charges this cost only in part, while the measurement has
+    changed the node's state in full. Without this penalty, on drives with little grip demand a low
+    friction would remain probable with a stiffness or an offset three standard deviations from the
+    prior.
     """
     charged = max(price, -memory.penalty[node])
     memory.penalty[node] += charged
@@ -140,8 +144,8 @@ def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
 
 @compiled
 def slip_meaning(features: BlockFeatures, vx: float) -> float:
-    """Return the share of slip evidence that counts at low speed: none at walking pace, all from
-    twice that speed on.
+    """Return the share of slip evidence that counts at low speed: 0 up to SLOWEST_M_S, 1 from twice
+    that speed.
     """
     fastest = abs(vx)
     for wheel in range(4):
@@ -154,8 +158,9 @@ def slip_meaning(features: BlockFeatures, vx: float) -> float:
 def update_novelty(
     memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures, vx: float, vy: float
 ) -> None:
-    """Set features.new and memory.slip.axle_ended, and advance the usual forces and slips by a
-    block of mean velocity (vx, vy) [m/s].
+    """Set features.new and memory.slip.axle_ended, and update the smoothed usual forces and slips.
+
+    (vx, vy) [m/s] is the mean velocity of the block.
     """
     constants = design.constants
     keep = math.exp(-features.duration / constants.steady_time)
@@ -178,15 +183,19 @@ def update_novelty(
 
 @compiled
 def saturation(slip: float, mu: float) -> float:
-    """Return the membership of an axle on friction `mu` in "slides": 0 up to a slip (linear force
-    over load) of mu, 1 from 1.5 mu on; 0 where the slip is unknown.
+    """Return the membership of an axle in "slides" on friction `mu`.
+
+    It is 0 up to a slip (as linear force over load) of mu, and 1 from 1.5 mu on; 0 where the slip
+    is unknown.
     """
     return 0.0 if math.isnan(slip) else min(max(2.0 * (abs(slip) / mu - 1.0), 0.0), 1.0)
 
 
 @compiled
 def advance_usual(usual: FloatArray, i: int, now: float, keep: float) -> float:
-    """Return the distance of `now` from usual[i], and move that towards it; 0 without a reading."""
+    """Return the distance of `now` from usual[i], and smooth usual[i] towards `now`. Without a
+    reading return 0.
+    """
     if math.isnan(now):
         return 0.0
     apart = abs(now - usual[i])
@@ -196,8 +205,8 @@ def advance_usual(usual: FloatArray, i: int, now: float, keep: float) -> float:
 
 @compiled
 def axle_slip(row: FloatArray, features: BlockFeatures, vx: float, vy: float, axle: int) -> float:
-    """Return the lateral slip of an axle at the motion (vx, vy) [m/s], as linear force over load;
-    NaN where its side force is unknown.
+    """Return the lateral slip of an axle at the velocity (vx, vy) [m/s], as linear force over load;
+    NaN if its lateral force is unknown.
     """
     if math.isnan(features.side[axle]):
         return math.nan

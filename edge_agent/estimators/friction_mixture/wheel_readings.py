@@ -1,5 +1,5 @@
-"""Readings of a wheel speed: impossible jumps, and the width of the steps in which the speed is
-read.
+"""Checks of a wheel speed signal: impossible jumps, and the step width (resolution) of its
+readings.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ STEP_PACE = 0.1  # share of a new step in the mean
 
 @compiled
 def refuse_jumps(row: FloatArray, now: FloatArray) -> int:
-    """Set wheel speeds of readings (15,) to NaN where they are far above the others; return the
-    health flags.
+    """Set wheel speeds in the readings (15,) to NaN where they are far above the other wheels;
+    return the health flags.
     """
     slowest = second = math.inf
     for wheel in range(4):
@@ -45,8 +45,9 @@ def refuse_jumps(row: FloatArray, now: FloatArray) -> int:
 
 @compiled
 def note_step(last: LastInputs, wheel: int, omega: float) -> None:
-    """Update the step width with a reading: a speed that stands still and then jumps is read in
-    steps.
+    """Update the estimated step width of a wheel speed signal with a reading.
+
+    A speed that stays constant over several readings and then jumps is quantised in steps.
     """
     change = abs(omega - last.omega[wheel])
     if change < SAME_RAD_S:

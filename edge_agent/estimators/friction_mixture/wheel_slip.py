@@ -1,10 +1,10 @@
 """Slip derived from the wheel speeds alone, without an estimate of friction or motion.
 
-A wheel slides when it runs at another speed than the other wheels by more than tyre radii explain,
-or when it changes its speed faster than the car does. This is the evidence that anti-lock and
-traction control work with. The filter uses it in three places: as an input of the rule base
-(`adaptation/rule_base.py`), as an explanation of large innovations (`trust.py`), and as a sign that
-the road has just changed (`mixing.py`).
+A wheel slides if its speed differs from the other wheels by more than tyre radii explain, or if its
+speed changes faster than the car's. Anti-lock and traction control use the same evidence. The
+filter uses it in three places: as an input of the rule base (`adaptation/rule_base.py`), as an
+explanation of large innovations (`trust.py`), and as a sign that the road has just changed
+(`mixing.py`).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def update_slip(memory: MixtureMemory, constants: Constants, features: BlockFeat
 
 @compiled
 def slip_membership(memory: MixtureMemory, features: BlockFeatures) -> float:
-    """Return the membership, 0 to 1, of the block in "a wheel slides"."""
+    """Return the membership of the block in "a wheel slides", 0 to 1."""
     slowest = math.inf
     fastest = -math.inf
     spin = 0.0
@@ -69,9 +69,7 @@ def slip_membership(memory: MixtureMemory, features: BlockFeatures) -> float:
 
 @compiled
 def front_slides_more(memory: MixtureMemory, features: BlockFeatures) -> bool:
-    """Return True if a front wheel is farther from the speed of the car than the rear wheels
-    are.
-    """
+    """Return True if the largest deviation from the car's speed is that of a front wheel."""
     front = 0.0
     rear = 0.0
     for wheel in range(4):
@@ -87,8 +85,8 @@ def front_slides_more(memory: MixtureMemory, features: BlockFeatures) -> bool:
 
 @compiled
 def wheel_speed(memory: MixtureMemory, features: BlockFeatures, wheel: int) -> float:
-    """Return the forward speed [m/s] from one wheel, with its estimated radius; NaN without a
-    reading.
+    """Return the forward speed [m/s] of the car computed from one wheel with its estimated radius;
+    NaN without a reading.
     """
     radius = 1.0 + memory.overall_mean[NodeState.RADIUS + wheel]
     return float(at_centre(memory.row, features, wheel) * radius)

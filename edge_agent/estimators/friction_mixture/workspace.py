@@ -1,5 +1,5 @@
-"""Records that a step writes before it reads them: intermediate results of one block of one
-vehicle.
+"""Scratch records for intermediate results of one block of one vehicle. A step writes each field
+before it reads it.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from schemas.numeric import FloatArray
 
 
 class BlockFeatures:
-    """Inputs of the measurement equations, of one block.
+    """Inputs of the measurement equations for one block.
 
-    The mean velocity of the block is rotation(cos, sin)*v + gains, v at the block's beginning.
-    Wheels are in the order fl, fr, rl, rr, axles front, rear; rows of measurement are the four
-    wheels along, then the two axles across.
+    The mean velocity of the block is rotation(cos, sin)*v + gains, with v at the block's beginning.
+    The order of wheels is fl, fr, rl, rr, and of axles front, rear. The order of measurement rows
+    is the four wheels (longitudinal), then the two axles (lateral).
     """
 
     duration: float  # [s]
@@ -64,7 +64,7 @@ class BlockFeatures:
 
 
 class NodeSlip:
-    """Slip of wheels and axles at a state of a node."""
+    """Slip of wheels and axles at one state of a node."""
 
     along: Annotated[FloatArray, 4]  # g_x, linear force over load [1]
     across: Annotated[FloatArray, 4]  # g_y
@@ -73,7 +73,7 @@ class NodeSlip:
 
 
 class NodeWorkspace:
-    """Arrays of one node's update."""
+    """Scratch arrays for the update of one node."""
 
     gained: PlanarVector  # mean velocity gained in the block, by the node's mean [m/s]
     point: Annotated[FloatArray, STATES]
@@ -102,7 +102,7 @@ class NodeWorkspace:
 
 
 class Scratch:
-    """Arrays of one block."""
+    """Scratch arrays for one block."""
 
     features: BlockFeatures
     node: NodeWorkspace

@@ -1,3 +1,3 @@
-"""Parts that the papers' filters share: a bank with one Gaussian per vehicle, the intake of
-samples, planar motion.
+"""Parts that several papers' filters share: planar process model, federated motion filter, and
+friction of four wheels.
 """

@@ -1,14 +1,14 @@
-"""Two cubature sub-filters and a master on the planar motion: what papers 000 and 001 have in
-common.
+"""Federated filter of planar motion with two cubature sub-filters and a master, common to papers
+000 and 001.
 
-State [v_x, v_y, a_x, a_y, r, r'] (the papers carry the moment Gamma = I_z*r'). Sub-filter 1
-measures [a_x, a_y, r], sub-filter 2 [a_y, r] (000, below equation 53). A step: share (15) to (17),
-predict (21) to (25), update (31) to (39), fuse (49), (50).
+State [v_x, v_y, a_x, a_y, r, r'] (the papers use the moment Gamma = I_z*r' instead of r').
+Sub-filter 1 measures [a_x, a_y, r], sub-filter 2 [a_y, r] (000, below equation 53). A step: share
+the information (15) to (17), predict (21) to (25), update (31) to (39), fuse (49), (50).
 
-Departures: a_y and r are measured once but used by both sub-filters, so each takes them with twice
-the variance, and the fused estimate is that of one filter; sub-filter 1 also measures the speed of
-the wheels, freed of the slip that their force needs, because nothing in the printed measurements
-observes v_x.
+Departures from the papers: (1) Both sub-filters use the same measured a_y and r. Therefore each
+sub-filter uses twice the variance, so that the fused estimate equals that of one filter. (2)
+Sub-filter 1 also measures the speed of the wheels, corrected for the slip that their force needs,
+because nothing in the printed measurements observes v_x.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ LEAST_BETA = 0.1  # of the information, that no sub-filter is starved
 
 
 class MotionSetting(NamedTuple):
-    """Variances of the motion filter: process per STEP_S, at the start, and noise of each
-    sub-filter's rows.
+    """Variances of the motion filter: process noise per STEP_S, initial state, and measurement
+    noise of each sub-filter.
     """
 
     process: tuple[float, ...] = tuple(map(float, PROCESS**2))
@@ -69,7 +69,7 @@ class MotionSetting(NamedTuple):
 
 
 class FederatedMotion:
-    """Setting and master's state of one filter, its shares, and the innovations of the step."""
+    """Setting, master state, information shares and latest innovations of one motion filter."""
 
     process: Annotated[FloatArray, STATES]  # standard deviations per STEP_S
     start: Annotated[FloatArray, STATES]  # standard deviations
@@ -88,13 +88,13 @@ class FederatedMotion:
 
 
 class FederatedMemory(PaperMemory):
-    """State that the filters of both papers carry."""
+    """Memory that the filters of papers 000 and 001 have in common."""
 
     motion: FederatedMotion
 
 
 class SubFilter(NamedTuple):
-    """State of a sub-filter during a step, with scratch arrays."""
+    """Mean and covariance root of a sub-filter during a step, with scratch arrays."""
 
     number: int  # 0 or 1
     mean: FloatArray
@@ -104,7 +104,7 @@ class SubFilter(NamedTuple):
 
 
 def set_motion(filters: RecordArray, setting: MotionSetting) -> None:
-    """Write the setting into the filters, once, before their first sample."""
+    """Write the setting into the filter records; call this once, before the first sample."""
     motion = filters["motion"]
     # of the rounded squares: the square roots are those of before, bit for bit, where nothing is
     # set
@@ -118,7 +118,7 @@ def set_motion(filters: RecordArray, setting: MotionSetting) -> None:
 
 @compiled
 def begin_motion(memory: FederatedMemory) -> None:
-    """Start at the speed of the wheels."""
+    """Begin the motion filter: initial v_x is the speed of the wheels."""
     motion = memory.motion
     use = memory.track.inputs
     mean = motion.mean
@@ -139,8 +139,10 @@ def begin_motion(memory: FederatedMemory) -> None:
 
 @compiled
 def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> None:
-    """Distribute the fused state, predict by `dt` [s], update both sub-filters and fuse them;
-    friction (4,) is given.
+    """Run one step of the motion filter: share the information, predict by `dt` [s], update both
+    sub-filters and fuse them.
+
+    The friction (4,) of the wheels is given.
     """
     motion = memory.motion
     track = memory.track
@@ -220,8 +222,9 @@ def _update_sub_filter(memory: FederatedMemory, at: SubFilter, dt: float) -> Non
 
 @compiled
 def mean_wheel_velocity(row: FloatArray, track: InputTrack, x: FloatArray, yaw_rate: int) -> float:
-    """Return the mean speed [m/s] along the wheels whose speed is measured, in a state x of v_x,
-    v_y, ..., x[yaw_rate].
+    """Return the mean speed [m/s] in the rolling direction of the wheels whose speed is measured.
+
+    x[0] and x[1] of the state are v_x and v_y; x[yaw_rate] is the yaw rate.
     """
     total = 0.0
     count = 0
@@ -235,16 +238,22 @@ def mean_wheel_velocity(row: FloatArray, track: InputTrack, x: FloatArray, yaw_r
 
 @compiled
 def widened_speed_std(std: float, innovation: float) -> float:
-    """Return the standard deviation [m/s] of the wheels' speed, at most twice `std` for spinning or
-    locked wheels.
+    """Return the standard deviation [m/s] of the measured wheel speed, increased for a large
+    innovation.
+
+    The innovation is then at most FARTHEST standard deviations, so spinning or locked wheels have
+    little effect.
     """
     return std if math.isnan(innovation) else max(std, abs(innovation) / FARTHEST)
 
 
 @compiled
 def slip_free_speed(row: FloatArray, track: InputTrack, dt: float) -> tuple[float, float]:
-    """Return (mean of R*omega/(1 + slip), its standard deviation) [m/s], with slip F_x/K; NaN
-    without any wheel.
+    """Return the mean over the wheels of R*omega/(1 + slip) and its standard deviation, both in
+    [m/s].
+
+    The slip of a wheel is F_x/K (force over slip stiffness). The result is NaN if no wheel speed is
+    measured.
     """
     use = track.inputs
     loads = wheel_loads(body_of(row), use[S.AX], use[S.AY])

@@ -1,10 +1,9 @@
-"""The papers' three-degree-of-freedom process model, by Heun's rule: state [v_x, v_y, a_x, a_y, r,
-z].
+"""Process model of the papers with three degrees of freedom, integrated by Heun's rule.
 
-Papers 000 (1) to (14), 001, 004 (1) to (12): v_x' = a_x + r*v_y, v_y' = a_y - r*v_x (004 prints the
-wrong sign), I_z*r' = moment of the tyres' forces; a_x and a_y follow from the forces. z is friction
-(004) or the yaw acceleration (000, 001). The papers carry the moment itself; divided by I_z it is
-of the same size as the other states.
+State [v_x, v_y, a_x, a_y, r, z]. Papers 000 (1) to (14), 001, 004 (1) to (12): v_x' = a_x + r*v_y,
+v_y' = a_y - r*v_x (004 prints the wrong sign), I_z*r' = moment of the tyres' forces; a_x and a_y
+follow from the forces. z is friction (004) or the yaw acceleration (000, 001). The papers use the
+moment itself as state; divided by I_z it has the same magnitude as the other states.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class PlanarState(IntEnum):
 
 
 class HeunInputs(NamedTuple):
-    """Inputs of one of Heun's steps."""
+    """Inputs of one integration step of Heun's rule."""
 
     begin: WheelInputs
     end: WheelInputs
@@ -58,8 +57,8 @@ class HeunInputs(NamedTuple):
 
 @compiled
 def stable_steps(speed: float, dt: float) -> int:
-    """Return the number of equal steps of Heun's rule that are stable over `dt` [s] at `speed`
-    [m/s].
+    """Return the number of equal Heun steps needed for a stable integration over `dt` [s] at
+    `speed` [m/s].
     """
     longest = LONGEST_S * min(max(speed / CALM_M_S, SHORTEST_SHARE), 1.0)
     return max(1, math.ceil(dt / longest - 1e-6))
@@ -75,14 +74,14 @@ def propagate_points(
     by_torque: bool,
     by_motor: bool = False,
 ) -> None:
-    """Advance the states `columns` (6, POINTS) by `dt` [s], in place; inputs change linearly from
-    the previous sample to this one.
+    """Advance the states in the columns (6, POINTS) by `dt` [s], in place.
 
-    by_torque: longitudinal forces come from the wheels' torque, z is the yaw acceleration and
-    friction (4,) is given; the velocity follows a_x and a_y of the state alone, which measurements
-    correct for drag and slopes. Otherwise forces come from slip and z is the friction of all
-    wheels. by_motor: longitudinal forces come from the torque of each axle's motor, half to each
-    wheel; z is still friction.
+    Inputs change linearly from the previous sample to this one. With `by_torque`, longitudinal
+    forces come from the wheels' torque, z is the yaw acceleration, and friction (4,) is given. The
+    velocity then follows only the states a_x and a_y, which measurements correct for drag and
+    slopes. Without `by_torque`, forces come from slip and z is the friction of all wheels. With
+    `by_motor`, longitudinal forces come from the torque of each axle's motor, half to each wheel; z
+    is still friction.
     """
     slowest = abs(columns[0, 0])
     for p in range(1, POINTS):
@@ -114,8 +113,9 @@ def propagate_points(
 def _apply_heun_step(
     vehicle: Body, columns: FloatArray, first: int, last: int, drive: HeunInputs
 ) -> None:
-    """Apply one of Heun's steps to the columns [first, last), in place. It is pure arithmetic, so
-    that the points are computed in parallel.
+    """Apply one Heun step to the columns first to last - 1, in place.
+
+    The function is pure arithmetic, so that the compiler can process several points in parallel.
     """
     begin, end, step, by_torque = drive
     column_v = columns[0]
@@ -165,13 +165,13 @@ def _apply_heun_step(
 
 @inlined
 def _with_friction(wheels: WheelInputs, mu: Four) -> WheelInputs:
-    """Return the same inputs on another friction."""
+    """Return the same wheel inputs with another friction."""
     return WheelInputs(wheels.cos, wheels.sin, wheels.omega, wheels.force_x, mu)
 
 
 @inlined
 def _interpolate_inputs(track: InputTrack, share: float, force_x: Four, mu: Four) -> WheelInputs:
-    """Return the inputs at a share of the way from the previous sample to this one."""
+    """Return the wheel inputs between the previous sample (share 0) and this one (share 1)."""
     before = track.inputs_before
     use = track.inputs
     keep = 1.0 - share
@@ -197,7 +197,9 @@ def _interpolate_inputs(track: InputTrack, share: float, force_x: Four, mu: Four
 
 @inlined
 def _motor_forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
-    """Return the longitudinal forces [N] from one motor per axle, (4) to (6) of paper 004."""
+    """Return the longitudinal forces [N] of the four wheels for one motor per axle, (4) to (6) of
+    paper 004.
+    """
     front = _half_axle_force(row, track, 0, dt)
     rear = _half_axle_force(row, track, 2, dt)
     return front, front, rear, rear
@@ -205,7 +207,7 @@ def _motor_forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
 
 @inlined
 def _half_axle_force(row: FloatArray, track: InputTrack, first: int, dt: float) -> float:
-    """Return half of the force [N] of the axle whose left wheel is `first`."""
+    """Return half of the longitudinal force [N] of the axle whose left wheel has index `first`."""
     use = track.inputs
     before = track.inputs_before
     omega = S.OMEGA + first
@@ -219,7 +221,7 @@ def _half_axle_force(row: FloatArray, track: InputTrack, first: int, dt: float) 
 
 @inlined
 def _torque_forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
-    """Return the longitudinal forces [N] from the wheels' torque."""
+    """Return the longitudinal forces [N] of the four wheels, computed from their torques."""
     return (
         wheel_force(row, track, 0, dt),
         wheel_force(row, track, 1, dt),

@@ -1,10 +1,10 @@
-"""The friction of four wheels as states of a Gaussian filter: forgetting over distance, and its
-mean.
+"""The friction of four wheels as states of a Gaussian filter: return to the prior over distance,
+and the mean of the wheels.
 
-Legend: mu_i friction of a wheel, its prior mean m_0 and standard deviation s_0 (moments of the
-uniform prior), lambda metres after which it is forgotten, rho correlation of the wheels' roads.
-Over d metres mu' = m_0 + k*(mu - m_0), P' = k^2*P + (1 - k^2)*P_0, k = exp(-d/lambda). Without
-evidence friction returns to the prior.
+Legend: mu_i friction of a wheel, m_0 and s_0 its prior mean and standard deviation (moments of the
+uniform prior), lambda distance constant of forgetting [m], rho correlation between the wheels'
+friction. Over d metres mu' = m_0 + k*(mu - m_0), P' = k^2*P + (1 - k^2)*P_0, k = exp(-d/lambda).
+Without evidence friction returns to the prior.
 """
 
 from __future__ import annotations
@@ -27,8 +27,10 @@ SIDE_CORRELATION = 0.9
 
 
 def prior_root() -> FloatArray:
-    """Return the factor (4, 4) of P_0: wheels of a side are almost equal, sides are correlated;
-    wheel order fl, fr, rl, rr.
+    """Return the Cholesky factor (4, 4) of the prior covariance P_0 of the wheels' friction.
+
+    The wheels of one side are almost equal, and the two sides are correlated. Wheel order fl, fr,
+    rl, rr.
     """
     same = 0.99
     other = SIDE_CORRELATION
@@ -48,8 +50,9 @@ PRIOR_ROOT = prior_root()
 
 @compiled
 def return_to_prior(mean: FloatArray, root: FloatArray, metres: float, work: FloatArray) -> None:
-    """Forget the friction of four wheels over `metres`, in place; mean (4,), root (4, 4), work
-    (4, 8) or larger.
+    """Move the friction of four wheels towards the prior over `metres`, in place.
+
+    Shapes: mean (4,), root (4, 4), scratch array `work` (4, 8) or larger.
     """
     keep = math.exp(-metres / FORGET_M)
     fresh = math.sqrt(max(1.0 - keep * keep, 0.0))
@@ -66,8 +69,8 @@ def return_to_prior(mean: FloatArray, root: FloatArray, metres: float, work: Flo
 
 @compiled
 def dependence_factor(demand: float, dt: float) -> float:
-    """Return the factor on the standard deviation of a sample `dt` [s] after the last, at `demand`
-    [g] of force.
+    """Return the factor on the measurement standard deviation of a sample, `dt` [s] after the
+    previous one, at a force of `demand` [g].
 
     Model error lasts, so many samples count as one measurement. Without demand, only slip noise is
     left, which carries no information on friction.
@@ -77,8 +80,8 @@ def dependence_factor(demand: float, dt: float) -> float:
 
 @compiled
 def visible_share(demand: float) -> float:
-    """Return the share of friction's spread that a measurement at `demand` [g] of force may see:
-    none at low demand, all at high demand.
+    """Return the share of friction's standard deviation that a measurement may use at a force of
+    `demand` [g]: near 0 at low demand, near 1 at high demand.
     """
     used = (demand / DEMAND_HALF) ** 4
     return used / (1.0 + used)
@@ -86,7 +89,9 @@ def visible_share(demand: float) -> float:
 
 @compiled
 def mean_friction(mean: FloatArray, root: FloatArray, first: int) -> tuple[float, float]:
-    """Return (mean of the four frictions from state `first` on, its standard deviation)."""
+    """Return (mean, standard deviation) of the average of the four frictions in states `first` to
+    `first` + 3.
+    """
     total = 0.0
     square = 0.0
     for j in range(first + 4):

@@ -1,9 +1,10 @@
-"""The friction filter of paper 000 as printed: two cubature sub-filters and a master, given motion.
+"""The friction filter of paper 000 as printed: two cubature sub-filters and a master, with given
+motion.
 
 State mu_fl, mu_fr, mu_rl, mu_rr, a random walk (28); measurements [a_x, a_y, r] and [a_y, r] (53);
-F_x from wheel torque (10); shares by (54), which gives more information to the worse filter, from
-one half because zero divides by zero. P_f, not its inverse, in (52). Cubature points by singular
-values (40), (41).
+F_x from wheel torque (10). Information shares by (54), which gives more information to the worse
+sub-filter. They start from one half, because a start from zero divides by zero. (52) uses P_f, not
+its inverse. Cubature points by singular values (40), (41).
 
 Legend: beta_i share of sub-filter i; P_i = P_f/beta_i, Q_i = Q/beta_i (15) to (20).
 """
@@ -25,7 +26,7 @@ LEAST_SHARE: Final = 0.01  # of the information of a sub-filter
 
 
 class FederatedSetting(NamedTuple):
-    """Variances of the filter, and its tyre."""
+    """Variances and initial friction of the filter, and its tyre option."""
 
     process: float = 1.0  # Q of each friction per sample
     start: float = 1.0  # P_0
@@ -40,7 +41,7 @@ AS_PRINTED: Final = FederatedSetting()
 
 
 def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:
-    """Run the filter over a drive."""
+    """Run the filter over a drive; return the friction of the four wheels at each sample."""
     forces = WheelForces.for_drive(given, proportional=setting.proportional, single=False)
     given_x = given.wheel_forces()
     signals = given.signals
@@ -77,7 +78,9 @@ def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:
 
 
 def _cubature_points(mean: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return cubature points (8, 4) by singular values."""
+    """Return cubature points (8, 4) for a mean (4,) and covariance (4, 4), with the square root by
+    singular values.
+    """
     axes, sizes, _ = np.linalg.svd(covariance)
     spread = np.sqrt(STATES) * (axes * np.sqrt(sizes)).T
     return np.concatenate([mean + spread, mean - spread])
@@ -91,7 +94,9 @@ def _update_sub_filter(
     reading: FloatArray,
     noise: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean and covariance after a sub-filter's measurement (42) to (48)."""
+    """Return mean (4,) and covariance (4, 4) of a sub-filter after its measurement update (42) to
+    (48).
+    """
     predicted = outcomes.mean(axis=0)
     apart = outcomes - predicted
     off = points - mean

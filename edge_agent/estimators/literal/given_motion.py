@@ -1,4 +1,4 @@
-"""The motion of one drive, as papers 000 and 003 give it to their friction filters.
+"""The motion of one drive that the friction filters of papers 000 and 003 require as input.
 
 Wheel order fl, fr, rl, rr; ISO 8855 signs.
 """
@@ -18,15 +18,15 @@ from schemas.vehicle import Vehicle
 
 @dataclass(frozen=True)
 class GivenMotion:
-    """One drive: motion of the body, and what sensors measure of wheels and body.
+    """One drive with T samples: true motion of the body, and sensor readings.
 
     Attributes:
-        vehicle: its parameters.
+        vehicle: parameters of the vehicle.
         t: time [s] (T,).
-        vx, vy: speed of the centre of gravity in the body [m/s] (T,).
+        vx, vy: forward and left velocity of the centre of gravity [m/s] (T,).
         signals: readings in the order of schemas.signals.CHANNELS (T, 18).
         rolling: rolling resistance over load [1], known to the filter.
-        drag: force of the air per squared speed [N s^2/m^2], known to the filter.
+        drag: air drag force per squared speed [N s^2/m^2], known to the filter.
     """
 
     vehicle: Vehicle
@@ -39,17 +39,20 @@ class GivenMotion:
 
     @property
     def step(self) -> float:
-        """Sampling interval [s]."""
+        """Return the sampling interval [s]."""
         return float(self.t[1] - self.t[0])
 
     @property
     def row(self) -> FloatArray:
-        """Parameters of the vehicle, indexed by `Parameter`."""
+        """Return the parameters of the vehicle as an array indexed by `Parameter`."""
         return parameter_row(self.vehicle)
 
     def wheel_forces(self) -> FloatArray:
-        """Return F_x = (T - J*omega')/R - k_r*F_z [N] of the wheels, (T, 4), from torque and
-        speed."""
+        """Return the longitudinal forces F_x = (T - J*omega')/R - k_r*F_z [N] of the wheels, (T,
+        4).
+
+        They are computed from torque T and wheel speed omega; k_r is the rolling resistance.
+        """
         row = self.row
         omega = self.signals[:, S.OMEGA : S.OMEGA + 4]
         torque = self.signals[:, S.TORQUE : S.TORQUE + 4]
@@ -58,7 +61,7 @@ class GivenMotion:
         return np.asarray(force - self.rolling * self.wheel_loads())
 
     def wheel_loads(self) -> FloatArray:
-        """Return the loads of the wheels [N], (T, 4), at the measured accelerations (9)."""
+        """Return the wheel loads [N], (T, 4), at the measured accelerations (equation 9)."""
         row = self.row
         p = Parameter
         ax = self.signals[:, S.AX]

@@ -1,13 +1,15 @@
-"""Tyre forces of one sample for many values of friction at once, in double or single precision.
+"""Tyre forces at one sample for many values of friction at the same time, in double or single
+precision.
 
-Legend: s_x, s_y slip along and across; k_x, k_y slip stiffness over load [1]; f Dugoff's curve;
-F_z load; mu friction.
+Legend: s_x, s_y longitudinal and lateral slip; k_x, k_y slip stiffness over load [1]; f Dugoff's
+curve; F_z load; mu friction.
 
-    proportional   F = mu*F_z*f(theta)*direction, theta = |(k_x*s_x, k_y*s_y)|      stiffness mu*k*F_z, as printed
-    similarity     the same with theta over mu                                      stiffness k*F_z
+    proportional   F = mu*F_z*f(theta)*direction    theta = |(k_x*s_x, k_y*s_y)|
+                   stiffness mu*k*F_z, as printed in the papers
+    similarity     the same with theta over mu      stiffness k*F_z
 
-With the printed tyre the force is linear in friction, so friction below zero is allowed between
-two samples.
+With the printed tyre the force is linear in friction, so the filter may use negative friction
+between two samples.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ LEAST_MU = 0.02  # of a tyre that is not proportional: its slip over friction ne
 
 @dataclass(frozen=True)
 class WheelForces:
-    """Slips, loads and angles of each sample of a drive, and the kind of stiffness."""
+    """Slips, loads and steering angles at each sample of a drive, with the kind of tyre stiffness."""
 
     free: FloatArray  # (T, 4, 2) k*s of the wheels
     loads: FloatArray  # (T, 4) [N]
@@ -41,7 +43,7 @@ class WheelForces:
 
     @classmethod
     def for_drive(cls, given: GivenMotion, *, proportional: bool, single: bool) -> WheelForces:
-        """Prepare the drive; single: in single precision."""
+        """Return the wheel data of a drive, in single precision if `single` is True."""
         kind: Any = np.float32 if single else np.float64
         row = given.row
         p = Parameter
@@ -76,8 +78,9 @@ class WheelForces:
         )
 
     def tyre_forces(self, k: int, mu: FloatArray) -> FloatArray:
-        """Return the forces [N] in the wheels' axes at sample `k`, (P, 4, 2), for frictions (P,
-        4)."""
+        """Return the tyre forces [N] in the wheels' axes at sample `k`, (P, 4, 2), for P sets of
+        frictions (P, 4).
+        """
         free = self.free[k]
         size = np.maximum(np.hypot(free[:, 0], free[:, 1]), TINY)
         theta = size if self.proportional else size / np.maximum(mu, LEAST_MU)
@@ -88,8 +91,9 @@ class WheelForces:
         return np.asarray(pull[..., None] * free)
 
     def body_accelerations(self, k: int, force: FloatArray) -> FloatArray:
-        """Return a_x, a_y [m/s^2] and yaw acceleration [rad/s^2], (P, 3), of forces (P, 4, 2) at
-        sample `k`."""
+        """Return a_x, a_y [m/s^2] and yaw acceleration [rad/s^2], (P, 3), for tyre forces (P, 4, 2)
+        at sample `k`.
+        """
         cos = self.turned[k, :, 0]
         sin = self.turned[k, :, 1]
         ahead = cos * force[..., 0] - sin * force[..., 1]

@@ -1,22 +1,22 @@
-"""The friction filter of paper 003 as printed: four states, given motion, unscented points; and its
-comparator.
+"""The friction filter of paper 003 as printed, and the filter that the paper compares it with.
 
-State mu_fl, mu_fr, mu_rl, mu_rr, a random walk. Measurement [a_x, a_y, r] (section 3.1): yaw rate
-over a sample, so the row is its difference r' [rad/s^2]. With `torque_rows` the torque balance of
-each wheel follows, F_x of that wheel. Without these rows, only two of four frictions are observable
-on a straight road.
+The filter has four states, given motion and unscented points. State mu_fl, mu_fr, mu_rl, mu_rr, a
+random walk. Measurement [a_x, a_y, r] (section 3.1). The filter measures the yaw rate r over one
+sample, so this row is the yaw acceleration r' [rad/s^2]. With `torque_rows`, the measurement also
+has the longitudinal force F_x of each wheel from its torque balance. Without these rows, only two
+of the four frictions are observable on a straight road.
 
 Legend: X_i, Z_i points of state and measurement, side weight w = 1/(2*alpha^2*n), e_i = Z_i - Z_0,
 d = sum of w*e_i.
 
-Square root (section 3.2): roots by singular values. With the printed alpha = .001 the centre has a
-weight of -10^6, which has no root. But sum(W_i*(Z_i - z)*(Z_i - z)') = sum(w*e_i*e_i') + (beta -
-alpha^2)*d*d' exactly, and there all weights are positive. This form is used here, in both
-precisions.
+Square-root form (section 3.2): roots by singular values. With the printed alpha = .001 the central
+point has a weight of -10^6, which has no root. But sum(W_i*(Z_i - z)*(Z_i - z)') = sum(w*e_i*e_i')
++ (beta - alpha^2)*d*d' exactly, and in the right-hand form all weights are positive. That form is
+used here, in both precisions.
 
-Covariance (section 3.1, "UKF"): the textbook sums with weights of 10^6, whose digits cancel. In
-single precision the covariance then loses its Cholesky factor, and the last one that existed is
-used instead.
+Covariance form (section 3.1, "UKF", the comparator): the textbook sums with weights of 10^6, whose
+digits cancel. In single precision the covariance then has no Cholesky factor at some steps, and the
+last valid factor is used instead.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ UKF_SINGLE: Final = UnscentedSetting(square_root=False, single=True)
 
 @dataclass(frozen=True)
 class FrictionRun:
-    """Friction of the wheels over a drive (T, 4), and the share of the steps whose covariance had
-    no factor.
+    """Result of a run: friction of the wheels over a drive (T, 4), and the share of steps whose
+    covariance had no Cholesky factor.
     """
 
     mu: FloatArray
@@ -70,7 +70,7 @@ class FrictionRun:
 
 
 def estimate(given: GivenMotion, setting: UnscentedSetting) -> FrictionRun:
-    """Run the filter over a drive."""
+    """Run the filter over a drive; return the friction of the four wheels at each sample."""
     model = _Model(given, setting)
     steps = len(given.t)
     mu = np.empty((steps, STATES))
@@ -88,7 +88,7 @@ def estimate(given: GivenMotion, setting: UnscentedSetting) -> FrictionRun:
 
 
 class _Model:
-    """Measurements of a drive and their model, in the precision of the filter."""
+    """Measurements of a drive, and the function that predicts them, in the precision of the filter."""
 
     def __init__(self, given: GivenMotion, setting: UnscentedSetting) -> None:
         self.setting = setting
@@ -118,12 +118,14 @@ class _Model:
         self.bend = self.kind(np.sqrt(setting.beta - setting.alpha**2))
 
     def sigma_points(self, mean: FloatArray, root: FloatArray) -> FloatArray:
-        """Return points (9, 4) of the state."""
+        """Return the unscented points (9, 4) of the state for its mean (4,) and covariance root (4,
+        4).
+        """
         spread = self.spread * root.T
         return np.concatenate([mean[None], mean + spread, mean - spread])
 
     def predicted_measurements(self, k: int, points: FloatArray) -> FloatArray:
-        """Return measurements (9, rows) of the points at sample `k`."""
+        """Return the predicted measurements (9, rows) of the points (9, 4) at sample `k`."""
         force = self.forces.tyre_forces(k, points)
         felt = self.forces.body_accelerations(k, force)
         if not self.setting.torque_rows:
@@ -132,8 +134,8 @@ class _Model:
 
 
 def _root_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return axes and sizes (U, s) of columns*columns' = U*s^2*U', by singular values, which are
-    never negative.
+    """Return U and s such that columns*columns' = U*s^2*U', by singular values, which are never
+    negative.
     """
     axes, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return axes, sizes
@@ -142,7 +144,10 @@ def _root_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _square_root_step(
     model: _Model, k: int, mean: FloatArray, covariance: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
-    """Run one step in square-root form; the covariance is not used."""
+    """Run one step in square-root form; `covariance` is returned unchanged.
+
+    Return (mean, covariance, root, False); False states that no Cholesky factor was missing.
+    """
     axes, sizes = _root_of(np.concatenate([root, model.process_root], axis=1))
     points = model.sigma_points(mean, axes * sizes)
     outcomes = model.predicted_measurements(k, points)
@@ -162,7 +167,7 @@ def _square_root_step(
 
 
 def _cholesky_or_last(covariance: FloatArray, last: FloatArray) -> tuple[FloatArray, bool]:
-    """Return (Cholesky factor, False), or (the last one, True) where there is none."""
+    """Return (Cholesky factor of `covariance`, False), or (`last`, True) if it has none."""
     try:
         return np.asarray(np.linalg.cholesky(covariance)), False
     except np.linalg.LinAlgError:
@@ -172,7 +177,10 @@ def _cholesky_or_last(covariance: FloatArray, last: FloatArray) -> tuple[FloatAr
 def _covariance_step(
     model: _Model, k: int, mean: FloatArray, covariance: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
-    """Run one step of the textbook filter."""
+    """Run one step of the textbook filter.
+
+    Return (mean, covariance, root, True if a Cholesky factor was missing).
+    """
     root, lost = _cholesky_or_last(covariance, root)
     points = model.sigma_points(mean, root)
     mean = model.mean_weights @ points
