@@ -1,3 +1,1 @@
-"""The contract of GripMap: messages, tables on disk, keys and queries, for people and for
-programs.
-"""
+"""The contract of GripMap, for people and programs: messages, tables on disk, keys and queries."""

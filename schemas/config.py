@@ -19,8 +19,8 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 class Settings(BaseModel):
-    """Base of every settings table: unknown names are refused, so that a misspelt one is not
-    silently ignored.
+    """Base of every settings table: unknown names are refused, so that a misspelt name is reported
+    and not ignored.
     """
 
     model_config = ConfigDict(
@@ -42,7 +42,7 @@ class ZenohSettings(Settings):
 
 
 class MonitoringSettings(Settings):
-    """Settings for metrics, health and log format."""
+    """Settings of metrics, health checks and log format."""
 
     metrics_port: int | None = Field(
         default=None,
@@ -108,7 +108,9 @@ class AgentConfig(MonitoringSettings):
     )
 
     def spool_of(self, name: str) -> Path:
-        """Return the path of a vehicle's outbox, or of a process's."""
+        """Return the path of the outbox of a vehicle, or of a process; `{name}` in the setting is
+        replaced.
+        """
         return Path(str(self.spool).replace("{name}", name))
 
 
@@ -133,7 +135,7 @@ class ArchiveSettings(Settings):
 
     @property
     def options(self) -> dict[str, str]:
-        """Return `store` with its secrets."""
+        """Return the options in `store` with their secrets in plain text."""
         return {name: value.get_secret_value() for name, value in self.store.items()}
 
 
@@ -255,10 +257,11 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def moment(text: str, field: str) -> int:
-    """Convert an ISO 8601 date, or date and time, to ns since 1970. A time without a zone is UTC.
+    """Convert an ISO 8601 date, with or without a time of day, to ns since 1970. A time without a
+    zone is UTC.
 
     Raises:
-        InputError: `text` is not a time, or lies outside what 64 bits of nanoseconds hold.
+        InputError: `text` is not a time, or lies outside the range of 64-bit nanoseconds.
     """
     try:
         found = nanoseconds(datetime.fromisoformat(text))
@@ -301,7 +304,9 @@ def load(path: Path | str | None, model: type[Model]) -> Model:
 
 
 def explain(error: ValidationError, where: str) -> InputError:
-    """Return the first validation error of pydantic as an error that names the field and the fix."""
+    """Return the first of pydantic's validation errors as an InputError that names the field and
+    the fix.
+    """
     first = error.errors(include_url=False)[0]
     field = ".".join(str(part) for part in first["loc"]) or "content"
     secret = "store" in first["loc"]

@@ -2,9 +2,9 @@
 
 InputError          misuse or bad input: names the field and the fix (exit code 2 at the command
                     line)
-├── UnreachableError  nobody answers where an answer was expected (exit code 1)
-└── WireError       a payload that is not the message it claims to be (a counted refusal in the
-                    service)
+├── UnreachableError  a router or service does not answer (exit code 1)
+└── WireError       a payload is not the message that it claims to be; the service refuses and
+                    counts it
 """
 
 from __future__ import annotations

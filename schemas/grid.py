@@ -1,14 +1,14 @@
-"""Places on earth: quadint cells, tiles, regions, zones, and heading sectors. All functions are
-vectorised.
+"""Places on earth: cells, tiles, regions and zones of the Web-Mercator grid, and heading sectors.
+All functions are vectorised.
 
 A *quadint* at zoom z interleaves the bits of the Web-Mercator tile column x and row y (x in the
-even bits), so that its base-4 digits are the quadkey and a parent is a shift: `parent = cell >>
-2·(21 - z)`.
+even bits), so that its base-4 digits are the quadkey. The cell's ancestor at zoom z is a shift:
+`parent = cell >> 2·(21 - z)`.
 
     cell     zoom 21   10 m (60° north) to 19 m (equator)   the canonical cell, int64
-    tile     zoom 14   one map message
-    region   zoom 10   one key of observations
-    zone     zoom 7    one folder of the archive
+    tile     zoom 14   area of one map message
+    region   zoom 10   area of one key of observations
+    zone     zoom 7    area of one folder of the archive
     sector   0 east, 1 north, 2 west, 3 south   quarter of the compass that the vehicle heads for
 
 Sectors keep the carriageways of a road apart.
@@ -66,18 +66,20 @@ def _gather_bits(v: IntArray) -> IntArray:
 
 
 def interleave(x: IntArray, y: IntArray) -> IntArray:
-    """Return tile column and row as a quadint of the same zoom."""
+    """Return the quadint of a tile column and row of the same zoom."""
     return _spread_bits(x) | (_spread_bits(y) << 1)
 
 
 def deinterleave(cell: ArrayLike) -> tuple[IntArray, IntArray]:
-    """Return column and row of a quadint."""
+    """Return the tile column and row of a quadint."""
     c = np.asarray(cell, dtype=np.int64)
     return _gather_bits(c), _gather_bits(c >> 1)
 
 
 def cell_of(latitude: ArrayLike, longitude: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
-    """Return the cell that holds a position [deg]; (…,) int64. Positions must be finite."""
+    """Return the cell that contains a position [deg], as int64 of the same shape. Positions must be
+    finite.
+    """
     n = 1 << zoom
     phi = np.radians(np.clip(np.asarray(latitude, dtype=np.float64), -MAX_LATITUDE, MAX_LATITUDE))
     x = np.floor((np.asarray(longitude, dtype=np.float64) + 180.0) / 360.0 * n).astype(np.int64) % n
@@ -86,7 +88,7 @@ def cell_of(latitude: ArrayLike, longitude: ArrayLike, zoom: int = CELL_ZOOM) ->
 
 
 def parent(cell: ArrayLike, zoom: int, of: int = CELL_ZOOM) -> IntArray:
-    """Return the ancestor at `zoom` of a cell at zoom `of`."""
+    """Return the ancestor at `zoom` of a cell whose own zoom is `of`."""
     return np.asarray(cell, dtype=np.int64) >> (2 * (of - zoom))
 
 
@@ -122,17 +124,17 @@ def centre(cell: ArrayLike, zoom: int = CELL_ZOOM) -> tuple[FloatArray, FloatArr
 def bounds(
     cell: ArrayLike, zoom: int = CELL_ZOOM
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return west, south, east, north [deg] of a cell."""
+    """Return the west, south, east and north edges [deg] of a cell."""
     x, y = deinterleave(cell)
     return _longitude(x, zoom), _latitude(y + 1, zoom), _longitude(x + 1, zoom), _latitude(y, zoom)
 
 
 def outline(cell: ArrayLike, sector: ArrayLike | None = None) -> tuple[FloatArray, FloatArray]:
-    """Return longitudes and latitudes [deg] of corners, counter-clockwise: (n, 4) of cells (n,),
-    from the south-west on.
+    """Return longitudes and latitudes [deg] of the corners of cells (n,), each (n, 4),
+    counter-clockwise from the south-west.
 
-    With heading sectors (n,): (n, 3) of the quarter of the cell on the side of the heading, from
-    the centre on, so that the sectors of a cell do not overlap.
+    With heading sectors (n,), return triangles (n, 3) instead: the quarter of the cell on the side
+    of the heading, starting at the cell's centre. The triangles of a cell do not overlap.
     """
     west, south, east, north = bounds(cell)
     x = np.stack([west, east, east, west], axis=-1)
@@ -159,8 +161,9 @@ def touches(
 
 
 def neighbours(cell: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
-    """Return the eight cells around a cell, (…, 8), row by row from the north-west; columns wrap,
-    -1 beyond the poles."""
+    """Return the eight cells around a cell, (…, 8), row by row from the north-west. Columns wrap
+    around the earth; a cell beyond the poles is -1.
+    """
     n = 1 << zoom
     x, y = deinterleave(cell)
     dx = np.array([-1, 0, 1, -1, 1, -1, 0, 1])
@@ -171,7 +174,7 @@ def neighbours(cell: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
 
 
 def quadkey(cell: int, zoom: int) -> str:
-    """Return the digits of one quadint: a string of `zoom` digits 0–3."""
+    """Return the quadkey of one quadint: a string of `zoom` digits 0–3."""
     digits = f"{cell:x}".translate(_BASE_4).zfill(zoom)
     return digits[len(digits) - zoom :]
 
@@ -188,8 +191,8 @@ def sector_of(yaw: ArrayLike) -> NDArray[np.int8]:
 
 
 def sectors_touched(yaw: ArrayLike) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-    """Return the sector of a yaw, and a second one if the yaw lies within 15° of an edge (else
-    -1).
+    """Return the sector of a yaw [rad], and the second sector if the yaw lies within 15° of its
+    edge, else -1.
     """
     angle = np.asarray(yaw, dtype=np.float64)
     first = sector_of(angle)

@@ -1,8 +1,8 @@
-"""Table of topics: key expression → message and quality of service; keys are built and parsed only
-here.
+"""Zenoh keys of the contract: the topics with their messages and quality of service. Keys are built
+and parsed only here.
 
-A region is cut into chunks of 4, 3 and 3 quadkey digits, a tile into 4, 3, 3 and 4, so that a
-wildcard is a region of any size: `gripmap/v1/map/1200/320/*/*` is a z7 zone.
+A region's quadkey is split into chunks of 4, 3 and 3 digits, a tile's into 4, 3, 3 and 4, so that
+wildcards select areas of different size: `gripmap/v1/map/1200/320/*/*` is a z7 zone.
 """
 
 from __future__ import annotations
@@ -25,15 +25,17 @@ _CHUNKS: Final = (4, 3, 3, 4)
 
 
 class Topic(NamedTuple):
-    """Kind of key.
+    """Kind of key, with its message and quality of service.
 
     Attributes:
-        zoom: of the quadint in the key, None without one.
+        name: first chunk of the key after the root.
+        zoom: zoom of the quadint in the key; None if the key has no quadint.
         named: True if the last chunk is a name (of a vehicle or a service).
         message: payload; None for a liveliness token.
-        priority: Zenoh priority by name.
+        priority: name of the Zenoh priority.
         block: congestion control: block (True) or drop (False).
-        express: sent at once, not held back for a millisecond to share a frame with others.
+        express: True to send at once, False to wait up to a millisecond for other messages in the
+            same frame.
     """
 
     name: str
@@ -74,32 +76,32 @@ def chunks(quadint: int, zoom: int) -> str:
 
 
 def observation_key(region: int, vehicle: str) -> str:
-    """Return the key of a vehicle's observations of a region."""
+    """Return the key under which a vehicle publishes its observations of a region."""
     return f"{ROOT}/obs/{chunks(region, grid.REGION_ZOOM)}/{vehicle}"
 
 
 def state_key(region: int, vehicle: str) -> str:
-    """Return the key of a vehicle's states in a region."""
+    """Return the key under which a vehicle publishes its states in a region."""
     return f"{ROOT}/state/{chunks(region, grid.REGION_ZOOM)}/{vehicle}"
 
 
 def ack_key(vehicle: str) -> str:
-    """Return the key of a vehicle's acknowledgements."""
+    """Return the key of the acknowledgements that a vehicle receives."""
     return f"{ROOT}/ack/{vehicle}"
 
 
 def map_key(tile: int) -> str:
-    """Return the key of a tile of the map."""
+    """Return the key of a map tile."""
     return f"{ROOT}/map/{chunks(tile, grid.TILE_ZOOM)}"
 
 
 def alert_key(tile: int) -> str:
-    """Return the key of a tile's alerts."""
+    """Return the key of the alerts in a tile."""
     return f"{ROOT}/alert/{chunks(tile, grid.TILE_ZOOM)}"
 
 
 def ahead_key(vehicle: str) -> str:
-    """Return the key of a vehicle's view ahead."""
+    """Return the key under which a vehicle publishes the road ahead: warnings and horizon."""
     return f"{ROOT}/ahead/{vehicle}"
 
 
@@ -129,13 +131,13 @@ def shard_key(service: str) -> str:
 
 
 class ServiceToken(NamedTuple):
-    """Announcement that a service serves a region: a liveliness token that exists as long as the
-    service.
+    """Announcement that a service serves a region: a Zenoh liveliness token, which exists as long
+    as the service runs.
 
     Attributes:
         region: key expression, chunks of 4, 3 and 3 digits or `*`.
-        service: its name.
-        start: distinguishes the starts of a service.
+        service: name of the service.
+        start: identifier that differs for each start of the service.
     """
 
     region: str
@@ -144,12 +146,13 @@ class ServiceToken(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Return the token: `gripmap/v1/serves/<region>/<service>/<start>`, with `all` for `*`,
-        which no key may contain."""
+        """Return the key of the token: `gripmap/v1/serves/<region>/<service>/<start>`, with `all`
+        in place of `*`, because a concrete key must not contain `*`.
+        """
         return self.key_under(SERVES)
 
     def key_under(self, root: str) -> str:
-        """Return the token below another root: CLAIMS, or WAITS for a standby."""
+        """Return the key of the token under another root: CLAIMS, or WAITS for a standby service."""
         return f"{root}/{self.region.replace('*', _ALL)}/{self.service}/{self.start}"
 
 
@@ -157,7 +160,7 @@ def parse_served(key: str, root: str = SERVES) -> ServiceToken:
     """Parse the key of a service's token.
 
     Raises:
-        InputError: the key is not that of a service's token.
+        InputError: the key does not belong to a service's token.
     """
     *found, service, start = ["", "", *key.removeprefix(f"{root}/").split("/")]
     region = "/".join(found[2:]).replace(_ALL, "*")
@@ -167,7 +170,9 @@ def parse_served(key: str, root: str = SERVES) -> ServiceToken:
 
 
 class Parsed(NamedTuple):
-    """Parts of a concrete key: topic, quadint and name, None where the topic has none."""
+    """Parts of a concrete key: topic, quadint and name. Quadint or name is None if the topic has
+    none.
+    """
 
     topic: Topic
     quadint: int | None

@@ -7,8 +7,8 @@ Legend
     PRIOR    belief for a road that was never measured: uniform       (32,)
     ℓ        log p(a visit's measurements | μ), up to a constant      (…, 32), nats
 
-A log-likelihood travels as 32 bytes: steps of 1/16 nat below the maximum, floored at 255 steps. A
-flat one (all zeros) means that nothing was learned.
+A log-likelihood is sent as 32 bytes: steps of 1/16 nat below the maximum, at most 255 steps. A flat
+log-likelihood (all zeros) contains no information about μ.
 """
 
 from __future__ import annotations
@@ -31,14 +31,15 @@ FLOOR_STEPS: Final = 255
 
 
 def quantiles(probability: NDArray[np.floating[Any]], q: float) -> FloatArray:
-    """Return the q-quantile of histograms on the grid, linear inside a bin.
+    """Return the q-quantile of histograms on the friction grid, with linear interpolation inside a
+    bin.
 
     Args:
         probability: (…, 32), non-negative; need not be normalised.
-        q: in [0, 1].
+        q: level in [0, 1].
 
     Returns:
-        (…,) values in [LOWER, UPPER].
+        friction μ, (…,), in [LOWER, UPPER].
     """
     p = np.asarray(probability, dtype=np.float64)
     upto = np.cumsum(p, axis=-1)
@@ -52,8 +53,8 @@ def quantiles(probability: NDArray[np.floating[Any]], q: float) -> FloatArray:
 
 
 def encode_log_likelihood(log_likelihood: NDArray[np.floating[Any]]) -> ByteArray:
-    """Return ℓ (…, 32) as bytes below its maximum; -inf becomes the floor. The caller must
-    refuse NaN.
+    """Return log-likelihoods ℓ (…, 32) as bytes: steps below the maximum; -inf becomes 255 steps.
+    The caller must refuse NaN.
     """
     below = np.max(log_likelihood, axis=-1, keepdims=True) - log_likelihood
     steps: ByteArray = np.clip(np.rint(below * STEPS_PER_NAT), 0, FLOOR_STEPS).astype(np.uint8)
@@ -61,7 +62,7 @@ def encode_log_likelihood(log_likelihood: NDArray[np.floating[Any]]) -> ByteArra
 
 
 def decode_log_likelihood(steps: ByteArray) -> FloatArray:
-    """Return bytes (…, 32) as ℓ with maximum 0 (if the sender put it there) and floor -255/16
-    nat.
+    """Return log-likelihoods ℓ (…, 32) [nat] from their bytes. The range is -255/16 to 0; the
+    maximum is 0 if the sender encoded it so.
     """
     return steps.astype(np.float64) / -STEPS_PER_NAT

@@ -28,7 +28,7 @@ _FIXES: Final = {
 
 
 class Format(StrEnum):
-    """Format of an answer."""
+    """Data format of an answer."""
 
     ARROW = "arrow"
     GEOJSON = "geojson"
@@ -44,7 +44,7 @@ Degrees = Annotated[float, Field(ge=-180.0, le=180.0, allow_inf_nan=False)]
 
 
 class MapQuery(BaseModel):
-    """Parsed query; None is 'not given'."""
+    """Parsed map query; a parameter that was not given is None."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -1,7 +1,7 @@
-"""Regions as key expressions, the regions along a route, and the parts that no service serves.
+"""Key expressions of regions, the regions along a route, and the areas that no service serves.
 Pure.
 
-A region expression has three chunks, of 4, 3 and 3 quadkey digits; `*` is all of a chunk.
+A region expression has three chunks, of 4, 3 and 3 quadkey digits; `*` matches any chunk.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ def overlap(one: str, other: str) -> bool:
 
 
 def covers(wide: str, narrow: str) -> bool:
-    """Return True if an expression has all regions of another."""
+    """Return True if the expression `wide` contains all regions of the expression `narrow`."""
     return all(a in (b, "*") for a, b in zip(wide.split("/"), narrow.split("/"), strict=True))
 
 
 def region_of(tile: int) -> str:
-    """Return the region in which a tile lies."""
+    """Return the region expression of the region in which a tile lies."""
     return keys.chunks(int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM)), grid.REGION_ZOOM)
 
 
 def unserved_expressions(asked: MapQuery, served: Collection[str]) -> list[str]:
-    """Return the fewest expressions that cover the unserved part of a question. For a question
-    without a place, that is the area outside every service's region.
+    """Return the fewest region expressions that cover the unserved part of a query. For a query
+    without a place, this is the area outside every service's regions.
 
     Raises:
         InputError: the route is too long.
@@ -75,7 +75,7 @@ def _regions_without(
 
 
 class Rank:
-    """Places in the order in which a route passes them; places off the route come last."""
+    """Sort order of cells and sectors along a route; those that are not on the route come last."""
 
     def __init__(self, route: Sequence[tuple[float, float]]) -> None:
         self._place = {key: place for place, key in enumerate(keys_along(route).tolist())}
@@ -85,7 +85,7 @@ class Rank:
         return self._place.get(cell * grid.SECTORS + sector, len(self._place))
 
     def order(self, cells: IntArray, sectors: IntArray) -> IntArray:
-        """Return the indices (n,) that sort cells and sectors (n,) along the route."""
+        """Return the indices (n,) that sort the given cells and sectors (n,) along the route."""
         ranks = [
             self.of(cell, sector)
             for cell, sector in zip(cells.tolist(), sectors.tolist(), strict=True)
@@ -94,11 +94,11 @@ class Rank:
 
 
 def keys_along(route: Sequence[tuple[float, float]]) -> IntArray:
-    """Return the keys (cell · 4 + sector) that a route of (longitude, latitude) passes, in order,
-    each once.
+    """Return the keys (cell · 4 + sector) that a route of (longitude, latitude) [deg] passes, in
+    order and without repetitions.
 
     Raises:
-        InputError: longer than ROUTE_MOST_M.
+        InputError: the route is longer than ROUTE_MOST_M.
     """
     points = np.array(route)
     scale = np.cos(np.radians(points[:-1, 1].mean()))

@@ -14,8 +14,8 @@ WHEELS: Final = ("fl", "fr", "rl", "rr")
 
 
 def per_wheel(name: str) -> tuple[str, ...]:
-    """Return the four channel names of a quantity that exists per wheel: `per_wheel("omega")` =
-    omega_fl … omega_rr.
+    """Return the four channel names of a quantity that each wheel has: `per_wheel("omega")` returns
+    omega_fl, omega_fr, omega_rl, omega_rr.
     """
     return tuple(f"{name}_{wheel}" for wheel in WHEELS)
 
@@ -52,8 +52,8 @@ CONTEXT: Final = tuple(CONTEXT_UNITS)
 
 
 class C(IntEnum):
-    """Index of a context signal on the last axis of a context block; the flags come first, in
-    the order of FLAGS.
+    """Index of a context signal on the last axis of a context block. The flags come first, in the
+    order of FLAGS.
     """
 
     ABS = CONTEXT.index("abs_active")
@@ -64,8 +64,8 @@ class C(IntEnum):
 
 
 class S(IntEnum):
-    """Index of a channel on the last axis of a block; of a wheel channel, the index of its first
-    wheel (fl).
+    """Index of a channel on the last axis of a block of signals. For a quantity with one channel
+    per wheel, it is the index of the front left wheel (fl).
     """
 
     AX = CHANNELS.index("ax")
@@ -80,7 +80,7 @@ class S(IntEnum):
 
 
 class Health(IntFlag):
-    """Flags that limit an estimate; flags add up, 0 is sound."""
+    """Reasons why an estimate is less reliable, as bit flags; 0 means no such reason."""
 
     OK = 0
     NO_TORQUE = 1  # wheel torque missing: longitudinal force from the accelerometer alone

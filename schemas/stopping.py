@@ -9,10 +9,10 @@ from schemas.thresholds import GRAVITY, REACTION_S
 
 
 def stopping_speed(mu: FloatArray | float, sight_m: float) -> FloatArray:
-    """Return the speed [m/s] from which a vehicle stops within a sight distance [m] on a level
-    road, after the reaction time and with a deceleration of g·mu; 0 without grip.
+    """Return the highest speed [m/s] from which a vehicle can stop within a sight distance [m] on a
+    level road. It reacts after REACTION_S and brakes with g·mu; 0 without grip.
 
-    v·REACTION_S + v²/(2·g·mu) = sight_m, solved for v.
+    The speed v solves v·REACTION_S + v²/(2·g·mu) = sight_m.
     """
     grip = GRAVITY * np.asarray(mu, np.float64)
     during = grip * REACTION_S

@@ -1,5 +1,5 @@
-"""Every table of the contract: name, type, unit and meaning of each column, and the Arrow
-schemas made from them.
+"""All tables of the contract: name, type, unit and meaning of each column, and the Arrow schemas of
+the tables.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU
 
 
 class Field(NamedTuple):
-    """One column.
+    """One column of a table.
 
     Attributes:
-        name, type, unit, meaning: of the column.
-        step: the service stores the value as a multiple of it; None to store it unchanged. It is a
+        name, type, unit, meaning: description of the column.
+        step: the service rounds stored values to multiples of this step; None: no rounding. It is a
             power of two far below the value's uncertainty. Finer digits are noise and would take a
             quarter more bytes.
-        range: smallest and largest value that a report may carry; NaN means 'absent'. None for
+        range: smallest and largest value that a report may contain; NaN means 'absent'. None for
             columns that are not reported.
     """
 
@@ -344,7 +344,7 @@ SIGNAL_LOG_CONTEXT: Final = tuple(
 
 
 def arrow_schema(*fields: Field) -> pa.Schema:
-    """Return the Arrow schema of columns, with unit and meaning in the field metadata."""
+    """Return the Arrow schema of the given columns, with unit and meaning in the field metadata."""
     return pa.schema(
         [pa.field(f.name, f.type, metadata={"unit": f.unit, "meaning": f.meaning}) for f in fields]
     )
@@ -354,7 +354,7 @@ CELL_HOUR_SCHEMA: Final = arrow_schema(*CELL_HOUR)
 
 
 def stored_columns(*fields: Field) -> tuple[Field, ...]:
-    """Return columns as they are stored on disk: times in microseconds."""
+    """Return the columns as they are stored on disk: times in microseconds instead of nanoseconds."""
     return tuple(
         f._replace(type=US, unit="us since 1970, UTC") if f.type == NS else f for f in fields
     )

@@ -1,20 +1,21 @@
-"""Numbers that more than one room must agree on; each is defined only here.
+"""Numbers that several packages must agree on; each is defined only here.
 
 EXCITED_SHARE       share of μ that must be used for a reading of μ to be more than a lower bound
                     (contract)
 UTILISED_WINDOW_S   `mu_utilised` is the largest grip used within this time [s] (contract)
 SLIPPERY_MU         slippery is μ below this: packed snow has .2–.35, wet asphalt .5–.8 (Pacejka
                     2012, ch. 1)
-SURFACES            kinds of road by their μ: above and up to; the interval is judged on each of its
-                    own
-Z_95                95 % quantile of the standard normal: half a 90 % interval in standard
-                    deviations
-GRAVITY             [m/s²], rounded; standard gravity is 9.80665 (ISO 80000-3)
-EARTH_RADIUS_M      [m] of the sphere that Web Mercator tiles are cut from: WGS 84, semi-major axis
-METRES_PER_DEGREE   [m/°] of latitude on that sphere, π/180 · EARTH_RADIUS_M, rounded
-REACTION_S          [s] of a warned driver (Green, Transportation Human Factors 2, 2000: 1.2
-                    to 1.5 s)
-NS                  nanoseconds of a second
+SURFACES            kinds of road by their range of μ: above the first number, up to the second;
+                    intervals are evaluated for each kind separately
+Z_95                95 % quantile of the standard normal distribution: half the width of a 90 %
+                    interval in standard deviations
+GRAVITY             acceleration of gravity [m/s²], rounded; standard is 9.80665 (ISO 80000-3)
+EARTH_RADIUS_M      radius of the Web Mercator sphere [m]: semi-major axis of WGS 84
+METRES_PER_DEGREE   length of a degree of latitude on this sphere [m/°], rounded:
+                    π/180 · EARTH_RADIUS_M
+REACTION_S          reaction time of a warned driver [s] (Green, Transportation Human Factors 2,
+                    2000: 1.2 to 1.5 s)
+NS                  nanoseconds per second
 """
 
 from __future__ import annotations

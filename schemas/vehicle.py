@@ -1,4 +1,6 @@
-"""Vehicle file: nominal parameters, known to a few per cent, as the estimator assumes."""
+"""Vehicle file: nominal parameters of a vehicle. The estimator assumes that they are known to a few
+per cent.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +28,8 @@ Learned = tuple[Annotated[float, Field(allow_inf_nan=False)], Spread]
 
 
 class Calibration(BaseModel):
-    """Device errors learned from a car's own drives: value and standard deviation; None if not
-    learned.
+    """Sensor and wheel errors learned from a car's own drives: value and standard deviation of
+    each; None if not learned.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -158,11 +160,12 @@ class Vehicle(BaseModel):
         return self.wheel_radius if own is None else own
 
     def understeer_per_g(self) -> float | None:
-        """Return the steering [rad per g] beyond L r/v that the file's axles ask for; None where it
-        does not say.
+        """Return the understeer gradient [rad per g]: the steering angle beyond L·r/v (wheelbase ×
+        yaw rate / speed) that the axle stiffnesses in the file imply. Return None if the file does
+        not contain them.
 
-        The axles' slip angles at 1 g differ by load over stiffness: 1/k_f - 1/k_r, k of a wheel
-        over its static load.
+        The slip angles of the axles at 1 g differ by 1/k_f - 1/k_r, where k is the cornering
+        stiffness of a wheel divided by its static load.
         """
         wheelbase = self.cg_to_front_axle + self.cg_to_rear_axle
         per_axle = 0.5 * self.mass * GRAVITY / wheelbase
@@ -177,11 +180,12 @@ class Vehicle(BaseModel):
 
 
 def load_vehicle(path: Path | str) -> Vehicle:
-    """Read a vehicle file (JSON), or return that of a class: "class:compact".
+    """Read a vehicle file (JSON), or return the parameters of a vehicle class for a path such as
+    "class:compact".
 
     Raises:
         InputError: the file cannot be read, a field is missing or out of range, or mass and yaw
-            inertia are not of one vehicle; names the field and the fix.
+            inertia do not fit together; names the field and the fix.
     """
     if str(path).startswith(PREFIX):
         return Vehicle.model_validate(fields_of_class(str(path).removeprefix(PREFIX)))

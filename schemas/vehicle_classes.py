@@ -1,10 +1,11 @@
 """Vehicle files of common classes, for a car whose own parameters are unknown.
 
-Typical values of laden production cars with one or two persons. Stiffness is per wheel, at static
-load, against the angle of its rim: steering, bushes and roll are included, so that the front axle
-is softer than the rear one and every car understeers, by 20 to 35 mrad per g. Measured front axles
-of six cars have 10 to 17 times their load per radian, rear axles 15 to 25 (Volvo S90, VW Golf,
-Ferrari 250LM and others). Sizes follow the makers' data sheets of each class.
+The values are typical of production cars with one or two persons. Stiffness is per wheel, at static
+load, relative to the angle of the rim. It includes the compliance of steering and bushes, and roll.
+Therefore the front axle is softer than the rear axle and every car understeers, by 20 to 35 mrad
+per g. Measured stiffnesses of six cars (Volvo S90, VW Golf, Ferrari 250LM and others) are 10 to 17
+times the load per radian at the front axle and 15 to 25 times at the rear axle. Sizes follow the
+makers' data sheets of each class.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ INERTIA_SHARE: Final = 0.97
 
 
 class Size(NamedTuple):
-    """Sizes of a class: mass [kg], arms of the axles [m], tracks [m], height of the centre of
-    gravity [m], and so on.
+    """Dimensions of a vehicle class: mass [kg], distances of the axles from the centre of gravity
+    [m], track [m], height of the centre of gravity [m], wheel radius [m] and steering ratio.
 
-    `drive_front` is the share of the driving torque at the front axle, None where a class has all
-    kinds.
+    `drive_front` is the share of the driving torque at the front axle; None if the class has front,
+    rear and all-wheel drive.
     """
 
     mass: float
@@ -56,10 +57,10 @@ CLASSES: Final = {
 
 
 def fields_of_class(name: str) -> dict[str, str | float | None]:
-    """Return the fields of the vehicle file of a class.
+    """Return the fields of the vehicle file for a class of vehicles.
 
     Raises:
-        InputError: there is no such class.
+        InputError: there is no class of this name.
     """
     if name not in CLASSES:
         raise InputError(

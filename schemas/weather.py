@@ -1,8 +1,8 @@
-"""Road weather: its rules, and its bytes on the wire. A temperature or precipitation that is not
-known is NaN.
+"""Road weather reports: validation rules, and encoding as bytes. An unknown temperature or
+precipitation is NaN.
 
-One report is of a z10 region from a time on. Everything in it is optional, but not all of it may be
-missing.
+A report applies to a z10 region from a time on. Each value is optional, but at least one must be
+given.
 """
 
 from __future__ import annotations
@@ -29,8 +29,11 @@ PRIOR_SUM_ERROR: Final = 0.01  # single precision and a few digits of text
 
 @dataclass(frozen=True)
 class Report:
-    """Weather of a region from `time` [ns] on: air and road temperature [°C], precipitation [mm/h
-    as water], each NaN where unknown; `prior`: probabilities (32,) of a road there, or None."""
+    """Weather of a region from `time` [ns] on.
+
+    Air and road temperature are in °C and precipitation in mm/h of water, each NaN where unknown.
+    `prior` is a friction distribution (32,) of the region's roads, or None.
+    """
 
     time: int
     air_temperature: float = np.nan
@@ -47,10 +50,11 @@ def encode(report: Report) -> bytes:
 
 
 def decode(payload: bytes, encoding: str = wire.WEATHER_ENCODING) -> Report:
-    """Read a report, protobuf or JSON, and ask the rules.
+    """Read a report from protobuf or JSON, and validate it.
 
     Raises:
-        WireError: no Weather, a value out of range, a prior that is none, or nothing given.
+        WireError: the payload is not a Weather message, a value is out of range, the prior is not a
+            distribution, or no value is given.
     """
     message: Any = wire.parse(payload, encoding, pb.Weather, wire.WEATHER_ENCODING)
     values = {name: getattr(message, name) if message.HasField(name) else np.nan for name in RANGES}

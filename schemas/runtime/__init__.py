@@ -1,2 +1,3 @@
-"""Machinery that both packages use: compiler, records, fast batch decoding, sessions, metrics,
-process set-up, figures."""
+"""Technical modules that both packages use: compilation, records, sessions, metrics, process
+set-up, figures.
+"""

@@ -1,7 +1,8 @@
-"""Frame of both command lines: error handling, negative numbers, version, completion, quiet mode.
+"""Common parts of both command lines: error handling, negative numbers, version, completion, quiet
+mode.
 
-Exit codes: 0 done, 1 done and something failed or was left, 2 misuse or bad input, 3 not plausible
-(edge-agent), 130 ended by Ctrl-C.
+Exit codes: 0 success, 1 finished but something failed or is left to do, 2 misuse or bad input, 3
+not plausible (edge-agent), 130 ended by Ctrl-C.
 """
 
 from __future__ import annotations
@@ -36,18 +37,20 @@ class Command(NamedTuple):
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """Parser whose errors are one line like those of the commands, without the usage."""
+    """Argument parser whose errors are one line, like those of the commands, without the usage
+    text.
+    """
 
     def error(self, message: str) -> NoReturn:
-        """Print the error and the help command, and exit."""
+        """Print the error with a reference to `--help` on one line, and exit."""
         self.exit(BAD_INPUT, f"error: {message}; see {self.prog} --help\n")
 
 
 def parser_of(
     prog: str, description: str, commands: Iterable[Command], *chosen: str | None
 ) -> argparse.ArgumentParser:
-    """Return a parser with all commands by name and the options of the chosen ones; other
-    modules are not imported.
+    """Return a parser that knows all commands by name, and the options of the chosen commands only.
+    Modules of other commands are not imported.
     """
     parser = OneLineParser(prog=prog, description=description)
     parser.add_argument("--version", action=VersionAction)
@@ -115,7 +118,7 @@ class VersionAction(argparse.Action):
 
 
 def version() -> str:
-    """Return the version of the distribution, or of a source tree that was never installed."""
+    """Return the version of the installed distribution, or a note that it is not installed."""
     from importlib import metadata
 
     try:
@@ -125,7 +128,7 @@ def version() -> str:
 
 
 def run_guarded(run: Callable[[], int]) -> int:
-    """Run a command; misuse, Ctrl-C and a closed output pipe end it with at most one line.
+    """Run a command; after misuse, Ctrl-C or a closed output pipe, print at most one line.
 
     Returns:
         the exit code.
@@ -151,7 +154,7 @@ def run_guarded(run: Callable[[], int]) -> int:
 
 
 def out_folder(field: str, path: Path) -> Path:
-    """Return a path to write; check it before anything is computed.
+    """Check that a file can be written at `path`, before anything is computed, and return the path.
 
     Raises:
         InputError: the path is a folder, or its parent folder does not exist.
@@ -169,7 +172,7 @@ def out_folder(field: str, path: Path) -> Path:
 
 @contextmanager
 def report_write_errors(path: Path) -> Iterator[None]:
-    """Turn errors of writing the `--out` file inside this block into input errors.
+    """Convert errors of writing the `--out` file inside this block into input errors.
 
     Raises:
         InputError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Durable files: they survive power loss, and they are either complete or absent."""
+"""Durable writing of files: a file survives power loss, and is either complete or absent."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ _OWN: Final = ".drafts-"
 
 
 def draft_of(path: Path) -> Path:
-    """Return the path of a file's draft; the leading dot hides it from Spark and pyarrow."""
+    """Return the path of a file's draft (temporary file). Its leading dot hides it from Spark and
+    pyarrow.
+    """
     return path.with_name(f".{path.name}{ENDING}")
 
 
@@ -24,11 +26,11 @@ def draft_of(path: Path) -> Path:
 def open_durably(
     path: Path, mode: int | None = None, *, named: bool = True
 ) -> Iterator[BufferedWriter]:
-    """Open a file that appears under its name, complete and durable, when the block ends. If the
-    block fails, nothing changes.
+    """Open a draft file for writing; when the block ends, rename it to `path`, complete and
+    durable. If the block fails, nothing changes.
 
     Args:
-        path: of the file; an existing one is replaced.
+        path: path of the file; an existing file is replaced.
         mode: permissions, which the draft has from its first byte on; the default permissions if
             None.
         named: True to make the name durable too; otherwise the caller syncs the folder.
@@ -56,17 +58,17 @@ def open_durably(
 
 @contextmanager
 def own_drafts(folder: Path) -> Iterator[Path]:
-    """Create a folder within `folder` for drafts that are renamed when they are complete.
+    """Create a temporary folder within `folder` for drafts that are renamed when they are complete.
 
-    Two attempts at one file, on one or two machines, write different drafts. `sweep_drafts` removes
-    the drafts of a killed attempt.
+    Two concurrent attempts to write one file, on one or two machines, write different drafts.
+    `sweep_drafts` removes the drafts of a killed attempt.
     """
     with TemporaryDirectory(prefix=_OWN, dir=folder) as drafts:
         yield Path(drafts)
 
 
 def sweep_drafts(folder: Path) -> None:
-    """Remove the drafts of attempts that died; call it only when no attempt is running."""
+    """Remove the drafts of attempts that were killed; call this only while no attempt is running."""
     for drafts in folder.glob(f"{_OWN}*"):
         shutil.rmtree(drafts, ignore_errors=True)
 
@@ -81,7 +83,9 @@ def sync_directory(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder and its parents so that power loss does not lose them."""
+    """Create a folder and its parents, and sync each parent folder, so that they survive power
+    loss.
+    """
     if not folder.exists():
         make_folder(folder.parent)
         folder.mkdir(exist_ok=True)

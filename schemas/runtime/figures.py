@@ -1,4 +1,6 @@
-"""Figures measured by a campaign, each with its bar: the file `figures.json` and a table."""
+"""Figures measured by a campaign, each with its target: the file `figures.json` and a Markdown
+table.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,9 @@ class Figure:
     """One measured value.
 
     Attributes:
-        bar: limit of the value; a pair for "within"; None if the value is only shown.
-        better: the side of the bar on which the value must lie.
+        name, value, unit: the measurement.
+        bar: target (limit) for the value; a pair for "within"; None if there is no target.
+        better: side of the target on which the value must lie.
     """
 
     name: str
@@ -34,7 +37,7 @@ class Figure:
 
     @property
     def holds(self) -> bool:
-        """True if the bar holds; NaN (not measured) never does."""
+        """True if the value meets its target; False for NaN (not measured)."""
         if self.bar is None:
             return not math.isnan(self.value)
         if isinstance(self.bar, tuple):
@@ -55,7 +58,7 @@ def header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:
 
 
 def _find_versions() -> dict[str, str]:
-    """Return the versions of PACKAGES that are installed."""
+    """Return the versions of those PACKAGES that are installed, by name."""
     found = {}
     for name in PACKAGES:
         with suppress(metadata.PackageNotFoundError):
@@ -64,11 +67,11 @@ def _find_versions() -> dict[str, str]:
 
 
 def commit(source: Path) -> str:
-    """Return the commit of the repository that a source file belongs to; `-dirty` is appended if a
+    """Return the commit of the repository that contains a source file; `-dirty` is appended if a
     tracked file was changed.
 
-    The repository of the working directory may be a different one. An installed copy may lie inside
-    a repository that does not track it; the result is then "unknown".
+    The repository is that of the source file, not that of the working directory. The result is
+    "unknown" if the repository does not track the file, as for an installed copy.
     """
     git = ["git", "-C", str(source.parent)]
     describe = [*git, "describe", "--always", "--abbrev=7", "--exclude=*", "--dirty"]
@@ -91,7 +94,7 @@ def write(path: Path, campaign: str, seeds: Sequence[int], figures: Sequence[Fig
 
 
 def markdown(figures: Sequence[Figure]) -> str:
-    """Return the figures as a Markdown table; a missed bar is marked."""
+    """Return the figures as a Markdown table; a missed target is marked."""
     lines = ["| figure | value | bar | |", "|---|---|---|---|"]
     for name, *rest in map(row, figures):
         lines.append(f"| `{name}` | {' | '.join(rest)} |")
@@ -99,7 +102,7 @@ def markdown(figures: Sequence[Figure]) -> str:
 
 
 def row(figure: Figure) -> list[str]:
-    """Return name, value with unit, bar and verdict of a figure."""
+    """Return four table cells for a figure: name, value with unit, target, and whether it is met."""
     signs = {"less": "≤ ", "more": "≥ "}
     bar = figure.bar
     value = f"{figure.value:.4g} {figure.unit}"

@@ -1,5 +1,5 @@
-"""Commands that install an extra of this distribution, from where it was installed itself: it is
-on no index.
+"""Commands that install optional parts ("extras") of this distribution. The command uses the source
+from which the distribution was installed, because no package index offers it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ NAME = "gripmap"
 
 
 def install_command(extra: str) -> str:
-    """Return a command that installs an extra into this environment."""
+    """Return a shell command that installs an extra into this environment."""
     try:
         text = metadata.distribution(NAME).read_text("direct_url.json")
     except metadata.PackageNotFoundError:

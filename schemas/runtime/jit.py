@@ -1,4 +1,6 @@
-"""Compilation of kernels; the only way to compile one in all packages."""
+"""Compilation of numerical functions ("kernels") with numba; all packages compile them through this
+module.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ from schemas.runtime import progress_messages
 
 
 class _Told(event.Listener):
-    """Listener that reports compilations, because they take time."""
+    """Listener that reports compilations to the user, because they take time."""
 
     def on_start(self, event: event.Event) -> None:
         """Report the first compilation of the process."""
@@ -30,7 +32,7 @@ class _Told(event.Listener):
         progress_messages.set_status(f"compiling {event.data['dispatcher'].__name__}")
 
     def on_end(self, event: event.Event) -> None:
-        """Do nothing."""
+        """Do nothing; the listener interface requires this method."""
 
 
 event.register("numba:compile", _Told())  # type: ignore[no-untyped-call]
@@ -44,41 +46,44 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Compile `function` with numba: cached on disk, no fast-math, IEEE division (x/0 is inf, not
     an exception).
 
-    Without fast-math and threads the result of a row does not depend on the number of rows. Banks
-    of N = 1 and of N = thousands are therefore bit-equal. If the cache's disk is full, a kernel is
-    compiled at each start.
+    Without fast-math and threads, the result for a row does not depend on the number of rows.
+    Therefore a vehicle gets bit-equal results alone and among thousands. If the cache cannot be
+    written, the function is compiled again at each start.
     """
     return _compile(function)
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile `function` into each of its callers; for a few lines of arithmetic in a loop, where a
-    call costs more.
+    """Compile `function` so that its code is copied into each caller. Use this for a few lines of
+    arithmetic inside a loop, where a call would cost more than the arithmetic.
 
-    The optimiser can then vectorise over the four wheels. Pass numbers and tuples to such
-    functions: values of an array must be read again after every write to another array.
+    The optimiser can then vectorise over the four wheels. Pass numbers and tuples rather than
+    arrays: after each write to any array, the compiler must read array elements from memory again.
     """
     return _compile(function, forceinline=True)
 
 
 def nogil(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile `function` and release the interpreter lock while it runs; for long kernels that
-    touch only their arguments."""
+    """Compile `function` so that it releases the interpreter lock (GIL) while it runs. Use this for
+    long computations that access only their arguments.
+    """
     return _compile(function, nogil=True)
 
 
 def refcount_free(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile like `nogil`, without counting references to arrays, which costs two locked additions
-    per array and call.
+    """Compile like `nogil`, but without counting references to arrays. Counting costs two locked
+    additions per array and call.
 
-    Only for functions that neither create nor return arrays, so that the caller owns everything
-    they touch. Functions that they call must be `refcount_free` too.
+    Use this only for functions that neither create nor return arrays, so that the caller owns all
+    arrays. Functions that they call must be `refcount_free` too.
     """
     return _compile(function, nogil=True, references=False)
 
 
 def refcount_free_inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile like `refcount_free` into each caller; an array argument costs seven words."""
+    """Compile like `refcount_free`, and copy the code into each caller as `inlined` does. An array
+    argument is passed as seven machine words.
+    """
     return _compile(function, nogil=True, forceinline=True, references=False)
 
 
@@ -109,10 +114,11 @@ prefetch = cast(Callable[[NDArray[Any], Any, int], None], intrinsic(_prefetch))
 
 
 def entry_point(kernel: Callable[P, R]) -> Callable[P, R]:
-    """Return the machine code of a compiled function that was called before, without numba's
-    argument check (0.3 us).
+    """Return the machine code of a compiled function as a callable without numba's argument check,
+    which costs 0.3 µs per call.
 
-    Every argument must have the same type as in that call. Types are not checked again.
+    The function must have been called before. Every argument must have the same type as in that
+    call, because types are not checked again.
     """
     made = next(iter(kernel.overloads.values()))  # type: ignore[attr-defined]
     return cast(Callable[P, R], made.entry_point)
@@ -139,8 +145,8 @@ class _Cache(FunctionCache):
     """Numba's cache with two fixes: a full disk does not raise, and closures get stable keys."""
 
     def _index_key(self, sig: object, codegen: Any) -> object:  # noqa: ANN401 numba's own types
-        """Identify a closure by the names that it closes over, because numba's pickle of it
-        differs per process.
+        """Return the cache key; for a closure it contains the names of the enclosed objects.
+        Numba's own key for a closure differs in each process.
         """
         cells = self._py_func.__closure__
         if cells is None:
@@ -152,19 +158,19 @@ class _Cache(FunctionCache):
         return sig, codegen.magic_tuple(), (self._py_func.__code__.co_code, names)
 
     def save_overload(self, sig: object, data: object) -> None:
-        """Save the compiled code if the disk allows it."""
+        """Save the compiled code; ignore errors of the disk."""
         with suppress(OSError):
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
 
 @functools.cache
 def kernel_cache(package: str) -> str:
-    """Return the folder of a package's compiled kernels, in the user's cache, named by a digest of
-    the sources.
+    """Return the folder for a package's compiled functions, in the user's cache; a digest of all
+    source files is part of its name.
 
-    Numba's own cache checks only the file of a kernel, not the files of its callees and constants.
-    It would continue with outdated code after a change there. Old folders may be deleted at any
-    time.
+    Numba's own cache checks only the source file of a function, not the files of the functions and
+    constants that it uses. After a change there it would use outdated code. Old folders may be
+    deleted at any time.
     """
     root = Path(__file__).parents[2]
     digest = hashlib.blake2b(digest_size=8)
@@ -176,11 +182,11 @@ def kernel_cache(package: str) -> str:
 
 @functools.cache
 def cache_root() -> Path | None:
-    """Return the folder for compiled kernels: the user's cache, or else a folder of the user among
-    the temporary files.
+    """Return the folder for compiled functions: the user's cache folder, or else a folder of the
+    user among the temporary files.
 
-    None if neither can be written (a service account without a home, a read-only container).
-    Kernels are then compiled at each start.
+    Return None if neither can be written (a service account without a home folder, a read-only
+    container). Functions are then compiled again at each start.
     """
     for folder in _roots():
         with suppress(OSError):

@@ -1,5 +1,5 @@
-"""Lazy public names of a package: each is imported at first use, so that importing the package
-is fast.
+"""Lazy public names of a package: each name is imported at its first use, so that importing the
+package is fast.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from typing import Any
 def lazy_exports(
     package: str, names: Mapping[str, str]
 ) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
-    """Return `__all__`, `__getattr__` and `__dir__` of a package (PEP 562).
+    """Return `__all__`, `__getattr__` and `__dir__` for a package with lazy public names (PEP 562).
 
     Args:
-        package: its name, for the error message.
+        package: name of the package, for the error message.
         names: each public name and the module that defines it.
     """
     face = sorted(names)

@@ -1,8 +1,7 @@
-"""Links of a session: which router it is connected to now, over which transport, and how often that
-changed.
+"""Connections of a Zenoh session: the connected router, the transport, and the number of changes.
 
-Zenoh reports each transport and link that opens or closes. The watch keeps the present state and
-counts, so that its owner learns of a loss when it happens and not from missing answers.
+Zenoh reports each transport and link that opens or closes. A watch keeps the current state and
+counts, so that its owner learns of a lost connection at once and not from missing answers.
 """
 
 from __future__ import annotations
@@ -27,15 +26,15 @@ log = logging.getLogger(__name__)
 
 
 class LinkWatch:
-    """Present links of `session`.
+    """Watch over the current links of `session`.
 
     Attributes:
         epoch: number of times that the session was connected to a router.
-        lost: number of times that it lost one.
+        lost: number of times that the session lost a router.
 
     Args:
-        session: to watch.
-        name: of the session, for the log.
+        session: session to watch.
+        name: name of the session, for the log.
         on_change: called after each change, on a thread of Zenoh.
     """
 
@@ -61,7 +60,7 @@ class LinkWatch:
 
     @property
     def protocols(self) -> list[str]:
-        """Transports of the present links: quic, tls or tcp."""
+        """Transport protocols of the current links: quic, tls or tcp."""
         with self._lock:
             return sorted(self._links.values())
 
@@ -102,7 +101,7 @@ class LinkWatch:
 
 
 def link_metrics(watches: Sequence[LinkWatch]) -> list[Metric]:
-    """Return the links of some sessions as metrics."""
+    """Return metrics about the links of several sessions."""
     found = Counter(protocol for watch in watches for protocol in watch.protocols)
     return [
         Metric("links", "gauge", "links to routers, by transport", _by_protocol(found), "protocol"),
@@ -126,7 +125,7 @@ def _by_protocol(found: Mapping[str, int]) -> dict[str, float]:
 
 
 def router_metrics(session: zenoh.Session) -> list[Metric]:
-    """Return the sessions and links of a router as metrics, read from the router itself."""
+    """Return metrics about the sessions and links of a router, as the router reports them."""
     kinds = Counter(
         str(transport.whatami).rpartition(".")[2].lower() for transport in session.info.transports()
     )

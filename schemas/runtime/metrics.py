@@ -1,7 +1,7 @@
 """Metrics and health over HTTP: OpenMetrics at `/metrics`, health at `/healthz`, on loopback by
 default.
 
-Values are read when they are requested; nothing is counted only for display.
+Values are read when they are requested; no counter exists only for the metrics.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ READ_S: Final = 5.0  # a client whose request is not complete is cut off
 
 
 class Metric(NamedTuple):
-    """Family of values; a counter only grows. `label` names the dimension; "" for a single
-    value.
+    """Metric with one or several values. `label` is the name of the dimension that distinguishes
+    the values; "" for a single value.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Metric(NamedTuple):
 
 
 def gauge(name: str, text: str, value: float) -> Metric:
-    """Return a single value that can rise and fall."""
+    """Return a metric with a single value that can rise and fall."""
     return Metric(name, "gauge", text, {"": value})
 
 
@@ -50,13 +50,13 @@ Troubles = Callable[[], Sequence[str]]
 def serve_metrics(
     host: str, port: int | None, read: Read, troubles: Troubles
 ) -> Iterator[str | None]:
-    """Serve while the block runs; yields the address, or None if `port` is None. Port 0 selects a
-    free port.
+    """Serve metrics and health while the block runs; yield the address, or None if `port` is None.
+    Port 0 selects a free port.
 
     Args:
-        host, port: where to listen.
-        read: returns all current values.
-        troubles: returns one message per problem; an empty list means healthy.
+        host, port: address to listen on.
+        read: function that returns all current values.
+        troubles: function that returns one message per problem; an empty list means healthy.
 
     Raises:
         InputError: the port is in use, or the package for the format is missing.
@@ -149,8 +149,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(404, "text/plain", b"/metrics and /healthz\n")
 
     def _is_own_name(self) -> bool:
-        """Return False on loopback for a foreign host name, by which a web page would read it
-        (DNS rebinding).
+        """Return True if the request's host name is allowed. On loopback, a foreign host name is
+        refused, because a web page could use it to read the metrics (DNS rebinding).
         """
         server = self.server
         try:

@@ -1,12 +1,15 @@
 """Colours of all plots and pages, distinguishable with three kinds of colour blindness and in
 greyscale.
 
-The live page, HTML reports, images and QGIS share them. `FOUR` are the classes of a well known
-grip, `TWO` those of a roughly known one, `LITTLE` is no class. In the order ice, snow, rather
-slippery, wet, rather not, good grip the lightness rises on light ground and falls on dark ground,
-for every kind of sight and on grey paper: the most dangerous class stands out most. `GRIP` runs
-through `FOUR` at the values of `SURFACES`, in steps of equal lightness. Nothing is green, because a
-safe colour would be a promise. `tests/test_palette.py` computes order and distances.
+The live page, HTML reports, images and QGIS use the same colours. `FOUR` are the colours of the
+four classes where friction is well known. `TWO` are the classes where it is roughly known. `LITTLE`
+is the colour where too little is known for a class.
+
+Consider the order ice, snow, rather slippery, wet, rather not slippery, good grip. Along it
+lightness rises on a light background and falls on a dark one, for every kind of colour vision and
+in greyscale. So the most dangerous class stands out most. `GRIP` is a colour scale through `FOUR`
+at the values of `SURFACES`, in steps of equal lightness. No colour is green, because green would
+promise safety. `tests/test_palette.py` checks order and distances.
 """
 
 from __future__ import annotations
@@ -54,7 +57,7 @@ UNKNOWN: Final = "not measured: only lower bounds"
 
 
 class LineStyle(NamedTuple):
-    """Style of a line in all plots; `dash` in matplotlib's notation."""
+    """Style of a line in all plots; `dash` is in matplotlib's notation."""
 
     colour: str
     dash: str = "-"
@@ -77,12 +80,14 @@ OTHER: Final = LineStyle("#777777", ":")  # an estimator from outside
 
 
 def line_of(estimator: str) -> LineStyle:
-    """Return the line style of an estimator by name."""
+    """Return the line style of an estimator, given by name."""
     return ESTIMATORS.get(estimator, OTHER)
 
 
 def shade(value: float, low: float, high: float) -> str:
-    """Return the colour of a value on GRIP between `low` and `high`; the pages compute the same."""
+    """Return the colour of a value on the scale GRIP, which runs from `low` to `high`. The web
+    pages use the same formula.
+    """
     at = min(max((value - low) / (high - low), 0.0), 1.0) * (len(GRIP) - 1)
     k = min(int(at), len(GRIP) - 2)
     first, second = (_to_rgb(GRIP[j]) for j in (k, k + 1))

@@ -1,10 +1,10 @@
-"""Plug-ins of other distributions: entry points by group and name. They never replace a built-in
-name.
+"""Plug-ins from other distributions: Python entry points, found by group and name. A plug-in never
+replaces a built-in name.
 
     [project.entry-points."gripmap.estimators"]
     mine = "my_package.estimators:bank"
 
-group                   object behind a name
+group                   object that the entry point must load
 gripmap.estimators      bank(vehicles) with `advance` as in EstimatorBank
 gripmap.tyre_curves     curve(theta): force over its peak for normalised slips, an array;
                         `--estimator aco-fckf@name`
@@ -34,10 +34,10 @@ def entry_points_of(group: str) -> dict[str, EntryPoint]:
 
 
 def load_entry_point(group: str, name: str) -> Any:  # noqa: ANN401 whatever stands behind it
-    """Import the object behind a name.
+    """Import the object that an entry point refers to.
 
     Raises:
-        InputError: it cannot be imported.
+        InputError: the object cannot be imported.
     """
     try:
         return entry_points_of(group)[name].load()

@@ -1,4 +1,4 @@
-"""Unused ports of this machine, for servers that are started, or started again, later."""
+"""Unused network ports of this machine, for servers that start, or restart, later."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ FIRST: Final = 15_000
 
 
 def free_ports(count: int) -> list[int]:
-    """Return different ports of 127.0.0.1 that nothing listens on.
+    """Return `count` different ports of 127.0.0.1 on which no server listens.
 
-    The system gives the ports from `OUTGOING` on to outgoing connections, so one of these may be
-    taken before its server starts. The ports returned lie below.
+    The ports lie below the range that the system uses for outgoing connections (read from the file
+    `OUTGOING`). A port of that range could be taken before its server starts.
     """
     try:
         last = int(OUTGOING.read_text(encoding="ascii").split()[0])

@@ -1,4 +1,6 @@
-"""Liveliness tokens of services: which service serves which region, once or continuously."""
+"""Liveliness tokens of services, which show which service serves which region: read once or tracked
+continuously.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,8 @@ _ALL: Final = f"{SERVES}/**"
 
 
 def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToken]:
-    """Return the tokens that are active now and visible to this session; or those below another
-    root.
+    """Return the service tokens that are active now and visible to this session. Another `root`
+    selects other kinds of tokens.
     """
     found = set[ServiceToken]()
     for reply in session.liveliness().get(f"{root}/**", timeout=ANSWER_S):
@@ -29,7 +31,7 @@ def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToke
 
 
 class PresenceTracker:
-    """Tokens that are tracked continuously."""
+    """Set of service tokens that is updated continuously."""
 
     def __init__(self) -> None:
         self._guard = Lock()
@@ -45,24 +47,27 @@ class PresenceTracker:
 
     @property
     def lost_tokens(self) -> set[ServiceToken]:
-        """Return the tokens that were active and are not any more."""
+        """Return the tokens that were active and are no longer."""
         with self._guard:
             return set(self._withdrawn)
 
     @property
     def ever_lost(self) -> set[ServiceToken]:
-        """Return the tokens that were lost at any time; they may be active again."""
+        """Return all tokens that were ever lost; they may be active again."""
         with self._guard:
             return set(self._fell)
 
     def refresh(self, session: zenoh.Session) -> set[ServiceToken]:
-        """Query the active tokens. A router's answer may lack a token that it is just sending to
-        the same session's subscription (1 of 60 answers); the subscription then delivers it before
-        the answer ends."""
+        """Query the active tokens, and return them together with the tracked ones.
+
+        A router's answer may lack a token that the router is just sending to the same session's
+        subscription (1 of 60 answers). The subscription then delivers the token before the answer
+        ends.
+        """
         return active_tokens(session) | self.active
 
     def record(self, token: ServiceToken, *, stands: bool) -> None:
-        """Record that a token became active or was lost."""
+        """Record that a token became active (`stands`) or was lost."""
         with self._guard:
             (self._here.add if stands else self._here.discard)(token)
             (self._withdrawn.discard if stands else self._withdrawn.add)(token)
@@ -72,7 +77,9 @@ class PresenceTracker:
 
 @contextmanager
 def track_tokens(session: zenoh.Session) -> Iterator[PresenceTracker]:
-    """Yield a tracker of the tokens, from those active at the beginning of the block on."""
+    """Yield a tracker of the service tokens. It contains the tokens that are active now, and
+    follows changes until the block ends.
+    """
     tokens = PresenceTracker()
 
     def hear(sample: zenoh.Sample) -> None:

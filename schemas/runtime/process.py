@@ -1,4 +1,4 @@
-"""Set-up of a long-lived process: memory limits, and log lines as text or as JSON."""
+"""Set-up of a long-lived process: memory limits, log lines as text or JSON, and fast exit."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LARGE: Final = 4 << 20  # bytes; a turn's own arrays are smaller
 
 
 class LogLine(str):
-    """Log line with its values by name, for the JSON form."""
+    """Log line as text, with its values by name for the JSON form."""
 
     __slots__ = ("values",)
 
@@ -35,17 +35,17 @@ class LogLine(str):
 
 
 def limit_memory(*without: str) -> None:
-    """Prevent libraries from using memory and threads that a long-lived process does not need; call
-    it first.
+    """Prevent libraries from using memory and threads that a long-lived process does not need. Call
+    this before other imports.
 
     Args:
         without: modules that the libraries can do without; importing them is blocked.
 
-    Arrow imports pandas, if installed, to recognise data frames: half a second and 30 MB. The
-    linear algebra library of numpy starts one thread per core, and these threads busy-wait; on our
-    small products this doubles the processor time. The allocator keeps large freed arrays, and
-    small objects stay among them: about 0.1 GB. Arrow's own allocator keeps memory for each thread
-    that ever used it.
+    Four causes are removed. Arrow imports pandas, if installed, to recognise data frames: half a
+    second and 30 MB. The linear algebra library of numpy starts one thread per core, and these
+    threads busy-wait; with our small matrices this doubles the processor time. The memory allocator
+    keeps large freed arrays with small objects between them: about 0.1 GB. Arrow's own allocator
+    keeps memory for each thread that ever used it.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
@@ -55,15 +55,16 @@ def limit_memory(*without: str) -> None:
 
 
 def trim_memory() -> None:
-    """Return free memory to the system, after work that needed much memory for a short time."""
+    """Give unused memory back to the system, after work that needed much memory for a short time."""
     with suppress(AttributeError, OSError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def force_exit(code: int) -> NoReturn:
-    """End the process with an exit code although a thread hangs; call it after closing files.
+    """End the process at once with an exit code, even if a thread hangs. Call this after closing
+    files.
 
-    Threads stop at once. Printed text is flushed.
+    Printed text is flushed. Other threads are stopped without cleanup.
     """
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):  # a full disk, a reader that left, a closed stream
@@ -104,8 +105,9 @@ def print_line(line: str, stream: TextIO) -> None:
 
 
 def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], None]:
-    """Return a function that prints log lines; in JSON each has time, process and `who`, and the
-    first word is the event."""
+    """Return a function that prints log lines. A JSON line contains the time, the process and the
+    values `who`; the first word of the text is the event.
+    """
 
     def text(line: str) -> None:
         print_line(line, stream)
@@ -121,7 +123,7 @@ def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], No
 
 
 def log_as(form: Form, stream: TextIO, **who: object) -> None:
-    """Send warnings of the program and its libraries to `stream` in this form."""
+    """Send warnings of the program and its libraries to `stream`, in the given form (text or JSON)."""
     handler = logging.StreamHandler(stream)
     handler.setFormatter(
         _Formatter(who) if form == "json" else logging.Formatter("%(levelname)s: %(message)s")

@@ -1,8 +1,8 @@
-"""Progress messages of a command: on stderr, never on stdout, and none in quiet mode.
+"""Progress messages of a command: on stderr, never on stdout, and not in quiet mode.
 
-On a terminal a spinner with a clock appears when something takes longer than a second. Elsewhere a
-long operation is reported once as a line. An imported library reports nothing: only the command
-lines call `enable_messages`.
+On a terminal, a spinner with a clock appears when an operation takes longer than a second. Without
+a terminal, a long operation is reported once as a line. Messages are off by default, so an imported
+library prints nothing; only the command lines call `enable_messages`.
 """
 
 from __future__ import annotations
@@ -46,20 +46,20 @@ def enable_messages(*, quiet: bool = False) -> None:
 
 
 def report(line: str) -> None:
-    """Print a line of progress."""
+    """Print a line about the progress, if messages are enabled."""
     if _voice.on:
         print_line(line, sys.stderr)
 
 
 def report_once(line: str) -> None:
-    """Print a message once; on a terminal it becomes the spinner's text."""
+    """Print a message unless the process has printed it before."""
     if line not in _voice.said_once:
         _voice.said_once.add(line)
         report(line)
 
 
 def set_status(words: str) -> None:
-    """Set the current activity, shown by the spinner."""
+    """Set the text about the current activity, which the spinner shows."""
     with _voice.lock:
         _voice.words = words
         if _voice.shown is not None:
@@ -68,7 +68,7 @@ def set_status(words: str) -> None:
 
 @contextmanager
 def show_status(words: str) -> Iterator[None]:
-    """Show a spinner while the block runs, from PATIENCE_S on and only on a terminal."""
+    """Show a spinner while the block runs: only on a terminal, and only after PATIENCE_S."""
     if not (_voice.on and sys.stderr.isatty()) or _voice.shown is not None:
         yield
         return
@@ -83,7 +83,7 @@ def show_status(words: str) -> Iterator[None]:
 
 
 def stop_status() -> None:
-    """Stop the spinner: the command has ended, or asks the user a question."""
+    """Stop the spinner, because the command has ended or asks the user a question."""
     timer = _voice.timer
     _voice.timer = None
     if timer is not None:

@@ -1,13 +1,12 @@
-"""Records of named fields as a NumPy structured array: the state that a compiled kernel carries per
-vehicle.
+"""Records of named fields as a NumPy structured array: the state of each vehicle in compiled code.
 
-The annotations of a class are the fields: float, int, bool, a NumPy number, another such class, or
-Annotated[FloatArray, size, ...] and its counterparts for other numbers. `record_type` returns the
-type and `records` the array. A kernel sees a row as an object with these names.
+The annotations of a class define the fields: float, int, bool, a NumPy number, another such class,
+or Annotated[FloatArray, size, ...] and its counterparts for other numbers. `record_type` returns
+the type and `records` the array. Compiled code sees a row as an object with these names.
 
-Why not a tuple of arrays: each array in it costs 0.1 to 0.3 us per call, and a record array costs
-as much as one of them. The data of one vehicle is contiguous, and sizes are constants, so short
-loops are unrolled.
+A tuple of arrays would be slower: each array in it costs 0.1 to 0.3 µs per call, and a record array
+costs as much as one array. The data of one vehicle are contiguous, and sizes are constants, so
+short loops are unrolled.
 """
 
 from __future__ import annotations
@@ -52,21 +51,21 @@ KINDS: dict[Any, Any] = {
 
 
 class Records(Protocol[R_co]):
-    """Record array as a kernel sees it: rows with the fields of R."""
+    """Type of a record array in compiled code: its rows have the fields of the class R."""
 
     def __getitem__(self, index: int | tuple[int, int], /) -> R_co:
         """Return a row, which is a view into the array."""
         ...
 
     def __setitem__(self, index: int | tuple[int, int], row: object, /) -> None:
-        """Copy another row into this one."""
+        """Copy another row into the row at `index`."""
         ...
 
 
 @cache
 def record_type(kind: type) -> np.dtype[np.void]:
-    """Return the structured type whose fields are the annotations of `kind`, those of its bases
-    first.
+    """Return the structured NumPy type whose fields are the annotations of `kind`; fields of base
+    classes come first.
     """
     fields = []
     for name, hint in get_type_hints(kind, include_extras=True).items():
@@ -82,12 +81,12 @@ def record_type(kind: type) -> np.dtype[np.void]:
 
 
 def records(kind: type, *shape: int) -> RecordArray:
-    """Return an array of rows of `kind`, all zero."""
+    """Return an array of records of the class `kind`, all zero."""
     return np.zeros(shape, record_type(kind))
 
 
 def put_record(row: np.void, value: tuple[Any, ...]) -> None:
-    """Copy the values of a named tuple into a row; its annotations give the fields."""
+    """Copy the values of a named tuple into a row; nested tuples fill nested records."""
     for name, part in zip(row.dtype.names or (), value, strict=True):
         if isinstance(part, tuple):
             put_record(row[name], part)

@@ -1,7 +1,8 @@
-"""Spark session and distribution of tasks over a cluster.
+"""Spark session, and distribution of tasks over a cluster.
 
-A task runs independently, and again if its machine fails. It therefore writes each file under a
-name that depends on the task alone, by renaming a draft that no other attempt uses.
+Tasks run independently, and a task is repeated if its machine fails. A task therefore writes each
+file under a name that depends on the task alone. It writes a draft of its own and renames the
+draft.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ SETTINGS: Final = {
 
 
 def session(*, progress: bool = False) -> Any:  # noqa: ANN401 a package without types
-    """Return the Spark session of this process: of the cluster that spark-submit or Spark's
-    settings name, or of this machine.
+    """Return the Spark session of this process. It uses the cluster that spark-submit or Spark's
+    settings name, or else this machine.
 
     Raises:
         InputError: Spark or Java is missing.
@@ -59,16 +60,16 @@ def spread(
     tasks: Sequence[_Task],
     work: Callable[[_Task], _Outcome],
 ) -> list[_Outcome]:
-    """Run all tasks, each as one Spark task; return outcomes in the order of the tasks.
+    """Run all tasks, each as one Spark task; return their outcomes in the same order.
 
     A failed task is repeated up to `spark.task.maxFailures` times. The output of a failed attempt
     is ignored, so an outcome counts once.
 
     Args:
-        session: of Spark.
-        tasks: picklable.
-        work: processes one task; a function of a module that is installed on all machines, or a
-            partial of one.
+        session: Spark session.
+        tasks: arguments of `work`; picklable.
+        work: function that processes one task; it must belong to a module that is installed on all
+            machines, or be a partial of such a function.
 
     Raises:
         InputError: raised by a task; such a task is not repeated.
@@ -113,5 +114,7 @@ def spread(
 
 
 def _unpack_column(column: Any) -> Iterator[tuple[int, Any]]:  # noqa: ANN401 an array of Arrow's
-    """Yield numbers with their tasks or outcomes."""
+    """Yield pairs from a column of pickled bytes: the number of a task, and the task or its
+    outcome.
+    """
     return (pickle.loads(one) for one in column.to_pylist())

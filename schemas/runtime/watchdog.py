@@ -26,13 +26,14 @@ def notify_alive() -> None:
 
 
 def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
-    """Notify the service manager that a process is ready and waiting, until `notify_alive` is
-    called.
+    """Notify the service manager repeatedly that the process is ready and waiting, until
+    `notify_alive` is called.
 
-    A thread sends the signals, because a waiting process may be busy for long.
+    A thread sends the signals, because a waiting process may be busy for a long time.
 
     Returns:
-        a function to call repeatedly; `most_s` seconds after its last call the signals stop.
+        a function that the process must call repeatedly; the signals stop `most_s` seconds after its
+        last call.
     """
     last = time.monotonic()
     every_s = float(os.environ.get(_WITHIN, _USUAL_US)) * 1e-6 / 4

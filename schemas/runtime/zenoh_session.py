@@ -1,9 +1,9 @@
-"""Zenoh session of the contract: a client of routers, without scouting, gossip and shared memory.
+"""Zenoh session for GripMap: a client of routers, without scouting, gossip and shared memory.
 
-Reasons: scouting finds strangers and costs half a second at start; shared memory drops samples
-silently when a receiver stalls; the lease states how long a silent peer is kept. An endpoint that
-does not answer is given up after `open_timeout`, so that TLS, listed after QUIC, is tried soon
-where UDP is blocked.
+Reasons: scouting finds foreign routers and costs half a second at start. Shared memory drops
+samples silently when a receiver stalls. The lease states how long a silent peer is kept. An
+endpoint that does not answer is abandoned after `open_timeout`. So, where UDP is blocked, TLS
+(listed after QUIC) is tried soon.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ log = logging.getLogger(__name__)
 
 
 def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
-    """Return the Zenoh configuration: the defaults above, the endpoints, then the pass-through
-    section.
+    """Return the Zenoh configuration. Endpoints override the defaults of this module, and the
+    `config` section of the settings overrides both.
 
     Args:
-        settings: of the configuration file.
-        name: of the session; replaces `{name}` in the section, so that one file serves many
-            vehicles with a certificate each.
+        settings: Zenoh section of the configuration file.
+        name: name of the session; replaces `{name}` in the settings, so that one file serves many
+            vehicles, each with its own certificate.
 
     Raises:
-        InputError: Zenoh refuses a setting, a certificate that it names does not exist, or a time
-            limit keeps the session from its second endpoint.
+        InputError: Zenoh refuses a setting, a certificate that it names does not exist, or a
+            connection time limit would prevent the session from trying its second endpoint.
     """
     if len(settings.connect) > 1 and settings.config.get(_TIMEOUT, 0) != 0:
         problem = "with a limit Zenoh tries the first endpoint only"
@@ -97,11 +97,11 @@ def quality_of(topic: keys.Topic) -> dict[str, Any]:
 def open_session(
     settings: ZenohSettings, stop: threading.Event | None = None, name: str = ""
 ) -> zenoh.Session | None:
-    """Open a session; wait for the router until one answers or `stop` is set (then return None).
+    """Open a session; wait until a router answers, or return None when `stop` is set.
 
-    A session that lost its router reconnects by itself. The reason for waiting is logged once.
-    Where nothing answers in time, the next try allows twice as long, so that a slow network is not
-    taken for a blocked one for ever.
+    A session that loses its router reconnects by itself. Each reason for waiting is logged once. If
+    no router answers in time, the next attempt waits twice as long, so that a slow network is not
+    mistaken for a blocked one.
     """
     stop = stop or threading.Event()
     logged = set[str]()

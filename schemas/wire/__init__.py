@@ -1,5 +1,5 @@
-"""The messages of the contract as bytes: batches, acknowledgements, alerts; tiles:
-`schemas.wire.tile`.
+"""Encoding of the contract's messages as bytes: batches, acknowledgements, alerts, and map tiles
+(`schemas.wire.tile`).
 """
 
 from schemas.wire.batches import decode

@@ -1,4 +1,6 @@
-"""Wire format of the road ahead of a vehicle: its warnings, and its horizon as runs of metres."""
+"""Message about the road ahead of a vehicle: warnings, and the horizon as a sequence of road
+segments ("runs").
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ WarningState = Literal["raised", "updated", "ended"]
 
 @dataclass(frozen=True)
 class GripWarning:
-    """Warning of a slippery stretch of road within reach; fields as in the message `Warning`."""
+    """Warning of a slippery stretch of road ahead of the vehicle; fields as in the protobuf message
+    `Warning`.
+    """
 
     id: str
     state: WarningState
@@ -52,7 +56,9 @@ class GripWarning:
 
 
 class Runs(NamedTuple):
-    """Horizon as n runs; a run is a stretch within one cell and sector. See the message `Ahead`."""
+    """Horizon as n runs. A run is a segment of the route within one cell and sector. Fields as in
+    the protobuf message `Ahead`.
+    """
 
     start_m: FloatArray
     end_m: FloatArray
@@ -71,8 +77,8 @@ class Outlook(NamedTuple):
     """The road ahead of one vehicle: the current warnings, and the horizon along its most probable
     route.
 
-    `here` is the friction at the vehicle, from its own measurements and the map: median, 5 % and
-    95 % quantile; NaN if none is known.
+    `here` is the friction at the vehicle, from its own measurements and the map: median, 5 % and 95
+    % quantile; NaN if unknown.
     """
 
     vehicle: str
@@ -100,7 +106,7 @@ def decode_ahead(payload: bytes) -> Outlook:
     """Return the outlook in the bytes of a message.
 
     Raises:
-        WireError: not an Ahead, or columns of different lengths.
+        WireError: the payload is not an Ahead message, or its columns have different lengths.
     """
     message = parse(payload, AHEAD_ENCODING, pb.Ahead, AHEAD_ENCODING)
     whole = ("cell", "sector", "basis")

@@ -1,8 +1,8 @@
-"""Decoder of one batch, and the parts that every decoder shares: heads, checks, and the columns
-that a sender may leave out.
+"""Decoder of one batch of records, and the parts that all decoders share: heads, checks, and
+columns that a sender may leave out.
 
-A column that is not sent is filled: floats with NaN, the cell and the sector from the pose, the
-leaving time with the entering time. The ingest of the fleet service decodes many batches at once.
+Missing columns are filled: floats with NaN, cell and sector from the pose, the leaving time with
+the entering time. The fleet service has its own decoder, which decodes many batches at once.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Heads(NamedTuple):
         )
 
     def take(self, kept: BoolArray) -> Heads:
-        """Return the heads that `kept` selects."""
+        """Return the heads that the mask `kept` (k,) selects."""
         return Heads(
             self.kind,
             list(compress(self.vehicle, kept)),
@@ -90,7 +90,7 @@ class Decoded(NamedTuple):
         sizes: number of records of each batch, (k,).
         columns: every column of the kind's table, all records one after the other, (n,);
             `log_likelihood` is (n, 32).
-        with_likelihood: whether a record came with one, (n,).
+        with_likelihood: mask (n,), True if the record came with a log-likelihood.
         errors: index and error of each message that is not a valid batch.
     """
 
@@ -116,7 +116,7 @@ class PresentColumns(NamedTuple):
     columns: dict[str, BoolArray]
 
     def records(self, name: str) -> BoolArray:
-        """Return True for each record (n,) whose batch contains a column."""
+        """Return a mask of records (n,): True if the record's batch contains the column `name`."""
         return np.repeat(self.columns[name], self.sizes)
 
 
@@ -124,7 +124,8 @@ def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN40
     """Parse a batch with the protobuf library and check that its columns have equal lengths.
 
     Raises:
-        WireError: too large, not the message, no needed column, or columns of unequal length.
+        WireError: the payload is too large or not the expected message, or a required column is
+            missing, or columns have unequal lengths.
     """
     message = parse(payload, encoding, MESSAGES[kind], ENCODING[kind])
     _check_columns(message, kind)
@@ -132,7 +133,7 @@ def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN40
 
 
 def head_of(kind: Kind, payload: bytes, encoding: str) -> Head | None:
-    """Return the head of a batch whose records are invalid; None if the head is unreadable too."""
+    """Return the head of a batch whose records are invalid; None if the head cannot be read either."""
     try:
         found = parse(payload, encoding, MESSAGES[kind], ENCODING[kind])
     except WireError:
@@ -145,8 +146,8 @@ def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
     """Read one batch; the inverse of `encode` for every column that was sent.
 
     Raises:
-        WireError: too large, not the message, no needed column, unequal columns, a number that does
-            not fit.
+        WireError: the payload is too large or not the expected message, a required column is
+            missing, columns have unequal lengths, or a number does not fit its column.
     """
     message = message_of(kind, payload, encoding)
     n = len(getattr(message, NEEDED[kind][0]))
@@ -179,7 +180,9 @@ def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
 
 
 def _read_column(message: Any, name: str, dtype: np.dtype[Any], n: int) -> NDArray[Any]:  # noqa: ANN401
-    """Return a column of a message, integers as int64; if it was not sent, filled."""
+    """Return a column of a message (n,), integers as int64. A column that was not sent is filled
+    with its default.
+    """
     values = getattr(message, name)
     if name == LIKELIHOOD:
         return np.frombuffer(values or bytes(n * mugrid.BINS), np.uint8).reshape(n, mugrid.BINS)
@@ -192,7 +195,7 @@ def _check_columns(message: Any, kind: Kind) -> None:  # noqa: ANN401
     """Check that a message's columns have equal lengths.
 
     Raises:
-        WireError: they have not.
+        WireError: the lengths differ, or the number of records is out of range.
     """
     first = NEEDED[kind][0]
     n = len(getattr(message, first))
@@ -214,8 +217,9 @@ def _check_columns(message: Any, kind: Kind) -> None:  # noqa: ANN401
 
 
 def complete(found: Decoded, sent: PresentColumns) -> Decoded:
-    """Fill the columns that follow from the pose; drop messages without a position, or with a
-    number that does not fit its column.
+    """Fill the columns that follow from the pose. Move two kinds of messages from the valid batches
+    to the errors: messages without a position, and messages with a number that does not fit its
+    column.
     """
     kind = sent.kind
     columns = found.columns
@@ -281,7 +285,9 @@ def _derive_columns(columns: Columns, sent: PresentColumns, unplaced: BoolArray)
 
 
 def _with_regions(found: Decoded, columns: Columns) -> Heads:
-    """Return the heads; a missing region is taken from the first record of the batch."""
+    """Return the heads of the batches. If a head has no region, it is taken from the first record
+    of the batch.
+    """
     heads = found.heads
     region_missing = found.heads.region == 0
     if not region_missing.any():

@@ -1,7 +1,9 @@
-"""Batches, acknowledgements and alerts as bytes. Reading batches: `schemas.wire.batches`.
+"""Encoding of batches, acknowledgements and alerts as bytes. `schemas.wire.batches` decodes
+batches.
 
-A batch travels as protobuf (`application/protobuf;gripmap.v1.ObservationBatch`) or as the JSON
-mapping of the same message (`application/json`), so that a person can publish with one line.
+A batch is sent as protobuf (`application/protobuf;gripmap.v1.ObservationBatch`) or as the JSON
+mapping of the same message (`application/json`), so that a person can publish one from a command
+line.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ MAX_BYTES: Final = 64 * 1024  # fifty records take 8 kB as protobuf, 40 kB as JS
 
 
 class Kind(StrEnum):
-    """Kind of a batch; the value is its chunk in the key."""
+    """Kind of a batch: observations or states; the value is the chunk of the key that names it."""
 
     OBSERVATION = "obs"
     STATE = "state"
@@ -66,7 +68,7 @@ _KIND_OF: Final = {number: kind for kind, number in _PB_KIND.items()}
 
 
 def encoding_of(message: type[Any]) -> str:
-    """Return the Zenoh encoding of a protobuf message."""
+    """Return the name of the Zenoh encoding of a protobuf message type."""
     return f"application/protobuf;{message.DESCRIPTOR.full_name}"
 
 
@@ -79,8 +81,8 @@ WEATHER_ENCODING: Final = encoding_of(pb.Weather)
 
 @cache
 def column_types(kind: Kind) -> dict[str, np.dtype[Any]]:
-    """Name and numpy type of every column of a batch; times are int64 ns, the likelihood is
-    uint8 (n, 32).
+    """Return name and NumPy type of every column of a batch. Times are int64 [ns]; the likelihood
+    is uint8, (n, 32).
     """
     special: dict[Any, type] = {tables.NS: np.int64, tables.LIKELIHOOD: np.uint8}
     return {
@@ -150,10 +152,10 @@ def encode(batch: Batch) -> bytes:
 
 
 def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> Any:  # noqa: ANN401 protobuf messages are untyped
-    """Parse a message from its bytes: protobuf of the `expected` encoding, or JSON.
+    """Parse a message from its bytes: protobuf if `encoding` is the `expected` one, or JSON.
 
     Raises:
-        WireError: too large, another encoding, or not the message.
+        WireError: the payload is too large, has another encoding, or is not the expected message.
     """
     if len(payload) > MAX_BYTES:
         raise WireError("payload", f"{len(payload)} bytes", f"send at most {MAX_BYTES}")
@@ -176,11 +178,14 @@ def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> A
 
 
 class StreamAck(NamedTuple):
-    """Settled batches of one stream: ranges of seq, both ends included, and (seq, row, reason) of
-    the refused ones.
+    """Acknowledged batches of one stream, given by sequence numbers (`seq`).
 
-    `late` are those of the durable that came when the map had gone on; `time` is the service's
-    clock [ns], 0 if untold.
+    Attributes:
+        boot, kind, region: identity of the stream.
+        durable: ranges of batches that are stored safely, both ends included.
+        rejected: sequence number, row and reason of each refused record.
+        late: ranges of durable batches that arrived too late to change the map in order.
+        time: clock of the service [ns]; 0 if not sent.
     """
 
     boot: int
@@ -193,8 +198,8 @@ class StreamAck(NamedTuple):
 
 
 def encode_ack(vehicle: str, streams: list[StreamAck], time: int = 0) -> bytes:
-    """Return the protobuf bytes of an acknowledgement that a service sends at `time` [ns] of its
-    clock.
+    """Return the protobuf bytes of an acknowledgement; `time` is the service's clock at sending
+    [ns].
     """
     message = pb.Ack(vehicle=vehicle, time=time)
     for stream in streams:
@@ -217,7 +222,8 @@ def decode_ack(payload: bytes) -> tuple[str, list[StreamAck]]:
     """Return the vehicle and the streams of an acknowledgement.
 
     Raises:
-        WireError: not an Ack, or of a kind that this version does not know.
+        WireError: the payload is not an Ack message, or has a kind of batch that this version does
+            not know.
     """
     message = parse(payload, ACK_ENCODING, pb.Ack, ACK_ENCODING)
     if any(stream.kind not in _KIND_OF for stream in message.streams):
@@ -238,8 +244,8 @@ def decode_ack(payload: bytes) -> tuple[str, list[StreamAck]]:
 
 @dataclass(frozen=True)
 class Alert:
-    """A cell became slippery (`raised`), or ceased to be, and why; see the message of the same
-    name.
+    """Alert that a cell became slippery (`raised` is True) or is no longer slippery, with the
+    reason; fields as in the protobuf message `Alert`.
     """
 
     cell: int
@@ -265,7 +271,7 @@ def decode_alert(payload: bytes) -> Alert:
     """Return the alert in the bytes of a message.
 
     Raises:
-        WireError: not an Alert.
+        WireError: the payload is not an Alert message.
     """
     return _alert_of_message(parse(payload, ALERT_ENCODING, pb.Alert, ALERT_ENCODING))
 
@@ -281,7 +287,7 @@ def decode_standing(payload: bytes) -> list[Alert]:
     """Return the active alerts in the bytes of a tile's message.
 
     Raises:
-        WireError: no StandingAlerts.
+        WireError: the payload is not a StandingAlerts message, or too large.
     """
     if len(payload) > MAX_STANDING_BYTES:
         raise WireError("payload", f"{len(payload)} bytes", f"send at most {MAX_STANDING_BYTES}")

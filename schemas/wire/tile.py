@@ -1,8 +1,8 @@
-"""Reader for a tile of the map, an Arrow stream from an untrusted sender.
+"""Reader for map tiles: Arrow streams from an untrusted sender.
 
-Arrow trusts its sender: it decompresses data however large the result is, and uses lengths and
-offsets unchecked. Therefore the head of each message is checked before Arrow sees its body, and the
-result is checked in full.
+The Arrow library trusts its input: it decompresses data to any size, and uses lengths and offsets
+without checks. Therefore this module checks the header of each message before Arrow reads the body,
+and validates the result in full.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ _COMPRESSION = 3
 
 
 def decode_tile(payload: bytes) -> pa.Table:
-    """Return the cells of a tile.
+    """Return the cells of a tile as a table.
 
     Raises:
-        WireError: too large, compressed, not of the map's columns, or damaged.
+        WireError: the tile is too large, compressed or damaged, or has other columns than the map.
     """
     if len(payload) > MAX_BYTES:
         raise WireError("tile", f"{len(payload)} bytes", f"send at most {MAX_BYTES}")
