@@ -1,1 +1,1 @@
-"""Signals in: a recorded log; each source gives blocks of samples."""
+"""Input of vehicle signals: live sources and recorded logs, delivered as blocks of samples."""

@@ -1,4 +1,6 @@
-"""Block of samples, as every source of signals (a recorded log, a simulated fleet) delivers it."""
+"""Block of samples, the form in which every source of signals (a recorded log, a live source, a
+simulated fleet) delivers them.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +14,12 @@ from schemas.thresholds import NS
 
 @dataclass(frozen=True)
 class Block:
-    """Samples of N vehicles: t (T, N) [s], the same instants as time (T, N) [ns UTC], signals (T,
-    N, channels).
+    """Samples of N vehicles at T times.
 
-    `context` (T, N, len(CONTEXT)) has the flags of controllers and the state of the surroundings;
-    None if the source has no such signals.
+    `t` (T, N) is the time in seconds [s], `time` (T, N) the same instants in [ns UTC], `signals`
+    (T, N, channels) the readings. `context` (T, N, len(CONTEXT)) has the flags of controllers (ABS,
+    ESC, traction control), the air temperature and the wiper; it is None if the source has no such
+    signals.
     """
 
     t: FloatArray
@@ -26,7 +29,7 @@ class Block:
 
 
 def to_utc_ns(t: FloatArray, start_ns: int) -> IntArray:
-    """Return seconds since the start as ns UTC, rounded to the ns; same shape."""
+    """Return times t [s] since the start as [ns UTC], rounded to 1 ns; same shape as t."""
     whole = t.astype(np.int64)
     time: IntArray = start_ns + whole * NS + np.rint((t - whole) * NS).astype(np.int64)
     return time

@@ -1,5 +1,5 @@
-"""Import of sources into a signal log: select the reader of each file, apply the profile, and write
-Parquet with its provenance.
+"""Import of recordings into a signal log: choose the reader of each file, apply the profile, and
+write Parquet with a record of its origin.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ PROVENANCE = b"gripmap.import"
 
 
 def read_source(path: Path, profile: Profile | None, database: Database | None) -> Recording:
-    """Read a recording of any kind: the signals of the profile, or all signals if there is no
-    profile.
+    """Read a recording of any supported kind.
+
+    Return the signals that the profile needs, or all signals if `profile` is None.
 
     Raises:
-        InputError: the file is unknown, broken, too large for the memory, needs a database, or
-            needs a library that is not installed.
+        InputError: the file is missing, of an unknown kind, broken or too large for the memory, or
+            it needs a database or a library that is not there.
     """
     with bounded_memory(path):
         return _read_source(path, profile, database)
@@ -119,7 +120,9 @@ def _decode_frames(
 
 
 def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Database | None:
-    """Return the CAN database named on the command line, else that of the profile."""
+    """Return the CAN database from `given`, the path on the command line; without it, that of the
+    profile; else None.
+    """
     if given is not None:
         return read_dbc(given)
     if profile is None or profile.dbc is None:
@@ -131,8 +134,8 @@ def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Da
 
 
 def profile_of(log: Path) -> Profile:
-    """Return the profile with which a log was imported; for another log, a profile that uses its
-    columns unchanged.
+    """Return the profile with which a log was imported. For a log that was not imported, return a
+    profile that uses its columns unchanged.
 
     Raises:
         InputError: the file cannot be read.
@@ -148,8 +151,10 @@ def profile_of(log: Path) -> Profile:
 
 
 def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[str]) -> None:
-    """Write the log as Parquet, with column `timestamp` where the date is known, else `t`; the
-    metadata record the processing steps.
+    """Write the merged log as Parquet.
+
+    The time column is `timestamp` if the date is known, else `t`. The file's metadata records the
+    sources, the profile and the processing steps.
     """
     columns: dict[str, Any] = {}
     if merged.start_ns is not None:

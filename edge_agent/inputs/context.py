@@ -1,9 +1,9 @@
-"""Context signals: flags of controllers and state of the surroundings, from the readings of a
-source to the rows of a log.
+"""Context signals: flags of controllers and state of the surroundings, converted from readings of a
+source to rows of a log.
 
-A flag or a temperature is not interpolated. A row has the last reading at or before its time, as
-long as that is not older than HELD_S; a channel that the profile calls `lasting` is sent when it
-changes, and holds until its next reading.
+A flag or a temperature is not interpolated. A row has the last reading at or before its time, if
+that reading is at most HELD_S old. A channel that the profile marks as `lasting` is sent only when
+it changes; its last reading is valid until the next one.
 """
 
 from __future__ import annotations
@@ -31,12 +31,13 @@ def context_values(name: str, values: FloatArray, active: Sequence[float] | None
     """Return the readings of a context signal in the log's unit, same shape.
 
     Args:
-        name: of the signal, one of CONTEXT.
-        values: in its unit; NaN where there is none.
-        active: recorded values at which a flag is on; None: all but 0.
+        name: name of the signal, one of CONTEXT.
+        values: readings in the unit of the signal log; NaN for a missing reading.
+        active: recorded values at which a flag is on; None: all except 0.
 
     Returns:
-        Flags as 0 and 1, the wiper within 0 and 1, temperatures that can be true. NaN stays NaN.
+        Flags as 0 or 1, wiper limited to 0 to 1, temperatures as they are. Impossible temperatures
+        become NaN; NaN stays NaN.
     """
     if name in FLAGS:
         on = values != 0.0 if active is None else np.isin(values, active)
@@ -47,8 +48,10 @@ def context_values(name: str, values: FloatArray, active: Sequence[float] | None
 
 
 def held_readings(name: str, series: Series, t: FloatArray, *, lasting: bool) -> FloatArray:
-    """Return the last reading at or before each time t (T,) [s]; NaN if there is none or it is too
-    old.
+    """Return the last reading at or before each time t (T,) [s]; NaN if there is no such reading or
+    it is too old.
+
+    A reading of a `lasting` channel never becomes too old.
     """
     known = np.isfinite(series.values)
     times = series.t[known]
@@ -61,7 +64,9 @@ def held_readings(name: str, series: Series, t: FloatArray, *, lasting: bool) ->
 
 
 def lasting_signals(profile: Profile) -> set[str]:
-    """Return the full names of the signals that are sent only when they change."""
+    """Return the full names of the signals of `lasting` channels, which are sent only when they
+    change.
+    """
     return {
         name
         for channel in profile.channels.values()
@@ -71,7 +76,7 @@ def lasting_signals(profile: Profile) -> set[str]:
 
 
 def context_signals(profile: Profile) -> set[str]:
-    """Return the full names of the signals from which the context is made."""
+    """Return the full names of the signals from which the context channels are computed."""
     return {
         name
         for channel in CONTEXT
@@ -83,19 +88,20 @@ def context_signals(profile: Profile) -> set[str]:
 def context_block(
     samples: int, vehicles: int, values: Mapping[str, FloatArray | BoolArray | float]
 ) -> FloatArray:
-    """Return a block's context (T, N, len(CONTEXT)) from the values of a source; the rest is
-    unknown.
+    """Return the context (T, N, len(CONTEXT)) of a block from the values of a source.
 
-    For sources without a profile, for example a simulation:
+    Signals without a value are NaN (unknown). For sources without a profile, for example a
+    simulation:
 
         Block(t, time, signals, context_block(*t.shape, {"abs_active": truth.abs, "air_temperature":
         -3.0}))
 
     Args:
-        samples: T.
-        vehicles: N.
-        values: by the names of CONTEXT, each (T, N), (N,) or one number; flags may be boolean; NaN
-            is unknown.
+        samples: number T of samples.
+        vehicles: number N of vehicles.
+        values: values by signal name (from CONTEXT); each has shape (T, N) or (N,), or is one
+            number;
+            flags may be boolean; NaN is unknown.
 
     Raises:
         KeyError: a name is not one of CONTEXT.

@@ -1,9 +1,10 @@
-"""Signals corrected by the calibration of a vehicle: without offsets, with equal wheels, the true
-steering map and a common clock.
+"""Correction of signals by a vehicle's calibration: sensor offsets, wheel radii, steering angle and
+delays between devices.
 
-A quantity that was not learned is assumed to be sound; a learned one is a posterior mean, drawn
-towards sound. Rear steering is not corrected. Neither is a_y: its reading on a straight contains
-crossfall, which the tyres really hold, and no drive separates the two.
+A quantity that was not learned is assumed to be free of error. A learned quantity is a posterior
+mean, so it lies between the measured value and no error. The rear steering angle is not corrected.
+The lateral acceleration a_y is not corrected either: its offset on a straight contains the
+crossfall of the road, for which the tyres provide a real force, and drives cannot separate the two.
 """
 
 from __future__ import annotations
@@ -21,11 +22,12 @@ TURNING = (S.OMEGA, S.OMEGA + 4)
 
 
 class Corrector:
-    """Correction of one vehicle's signals by its calibration; blocks may be cut anywhere.
+    """Correction of one vehicle's signals by its calibration; the input may be split into blocks
+    anywhere.
 
-    Early devices are delayed to match the latest one: of each, the reading nearest to the moment
-    that the latest device describes is used, without interpolation. A row therefore describes a
-    moment up to a tenth of a second before its time.
+    Devices that send early are delayed to match the latest device. For each early device the
+    reading nearest to the time of the latest device's reading is used, without interpolation. A row
+    therefore describes a moment up to a tenth of a second before its time stamp.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -36,8 +38,9 @@ class Corrector:
         self._rows = np.empty((0, len(CHANNELS)))
 
     def advance(self, t: FloatArray, signals: FloatArray) -> FloatArray:
-        """Return the next rows corrected: times t (T,) [s] and signals (T, 18); the same array if
-        there is nothing to correct.
+        """Return the next rows corrected: times t (T,) [s] and signals (T, 18).
+
+        If there is nothing to correct, the result is the same array.
         """
         if self._known is not None:
             signals = _correct_signals(signals, self._known)
@@ -49,7 +52,9 @@ class Corrector:
         )
 
     def _wait_for_latest(self, t: FloatArray, signals: FloatArray) -> FloatArray:
-        """Return signals of one moment per row, with early devices delayed to match the latest."""
+        """Return signals (T, 18) in which each row describes one moment: early devices are delayed
+        to match the latest.
+        """
         times = np.concatenate([self._t, t])
         rows = np.concatenate([self._rows, signals])
         together = signals.copy()
@@ -73,15 +78,15 @@ class Corrector:
 
 
 def correct_log(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> FloatArray:
-    """Return a whole log, times t (T,) [s] and signals (T, 18), corrected by a `Corrector`."""
+    """Return all signals (T, 18) of a log with times t (T,) [s], corrected by a `Corrector`."""
     return Corrector(vehicle).advance(t, signals)
 
 
 def scale_axles(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
-    """Return signals (T, 18) of wheels that all have `wheel_radius`: speed at the rim and force on
-    the road stay.
+    """Return signals (T, 18) converted to wheels that all have the radius `wheel_radius`.
 
-    Return the same array if the vehicle file has no radius per axle.
+    Wheel speed and torque are scaled so that the speed at the rim and the force on the road stay
+    the same. If the vehicle file has no radius per axle, the result is the same array.
     """
     for axle in range(2):
         share = vehicle.axle_radius(axle) / vehicle.wheel_radius
@@ -95,11 +100,11 @@ def scale_axles(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
 
 
 def free_rear_wheels(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
-    """Return signals (T, 18) whose rear wheels turn as freely rolling ones with the same mean do at
-    the yaw rate.
+    """Return signals (T, 18) with the rear wheel speeds that freely rolling wheels would have at
+    the measured yaw rate. The mean of both rear wheels does not change.
 
-    Wheels of a locked axle turn alike, so that each slips by half the track times the yaw rate in
-    every turn. That slip contains no information on the total force of the axle.
+    Wheels of a locked axle turn at the same speed, so in a turn each wheel slips by half the track
+    times the yaw rate. That slip contains no information on the total force of the axle.
     """
     signals = signals.copy()
     half = 0.5 * vehicle.track_rear * signals[..., S.YAW_RATE] / vehicle.wheel_radius
@@ -124,8 +129,8 @@ def _correct_signals(signals: FloatArray, known: Calibration) -> FloatArray:
 
 
 def _device_waits(known: Calibration | None) -> dict[tuple[int, int], float]:
-    """Return the delay [s] to add to the channels of each device to match the latest device, which
-    is left out.
+    """Return the delay [s] that is added to the channels of each device so that all devices match
+    the latest one. The latest device itself is left out.
     """
     if known is None or (known.wheel_lag is None and known.steer_lag is None):
         return {}

@@ -1,4 +1,4 @@
-"""Limit of the memory that reading a file may take, because a small compressed file may hold a
+"""Limit for the memory that reading a file may use, because a small compressed file may expand to a
 large one.
 """
 
@@ -20,11 +20,12 @@ _PAGES: Final = Path("/proc/self/statm")  # address space of this process, in pa
 
 @contextmanager
 def bounded_memory(path: Path, most: int = MOST_BYTES) -> Iterator[None]:
-    """Let this process allocate at most so many bytes more; do nothing where the system does not
-    count them.
+    """Limit the memory that this process allocates within the block to `most` more bytes.
+
+    On a system that does not report the used memory, nothing is limited.
 
     Raises:
-        InputError: the file needs more.
+        InputError: the file needs more memory.
     """
     before = resource.getrlimit(resource.RLIMIT_AS)
     try:
@@ -41,8 +42,8 @@ def bounded_memory(path: Path, most: int = MOST_BYTES) -> Iterator[None]:
 
 
 def limit_memory(most: int) -> None:
-    """Let this process allocate at most so many bytes more; an existing limit stays if it is
-    lower.
+    """Limit the memory of this process to `most` bytes more than now. A lower existing limit stays
+    in force.
     """
     with suppress(FileNotFoundError):
         held = int(_PAGES.read_text().split()[0]) * resource.getpagesize()

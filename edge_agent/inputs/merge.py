@@ -1,10 +1,13 @@
-"""Recordings, each with its own clock, to one signal log by a profile.
+"""Merging of recordings, each with its own clock, into one signal log by a profile.
 
-Clocks: the log's time is that of the source with the wheel speeds; a source with a date is put
-where its date says, and one without begins when the first does. Loggers write local time without
-saying so: dates that do not meet are tried in other time zones, in quarters of an hour. Rows: those
-of the table where all comes from one; else a fixed rate, linear between readings that are near
-enough, and positions only at the row next to their fix.
+Clocks: the log's time is that of the source with the wheel speeds. A source with a date is placed
+by its date; a source without a date begins when the first source does. Some loggers write local
+time without stating it. Therefore, if dates do not overlap, other time zones are tried, in steps of
+a quarter of an hour.
+
+Rows: if all signals come from one table, its rows are used. Otherwise rows have a fixed rate, with
+linear interpolation between readings that are near enough. A position is written only into the row
+nearest to its fix.
 """
 
 from __future__ import annotations
@@ -46,8 +49,10 @@ SMOOTH: Final = 50  # readings to either side over which bursts of arrival are s
 
 @dataclass
 class Merged:
-    """A signal log: t (T,) [s] from 0, columns by name, ns UTC of t = 0 where a source had a date,
-    and the processing steps.
+    """A merged signal log.
+
+    `t` (T,) [s] starts at 0, and `columns` are the channels by name. `start_ns` is the [ns UTC] of
+    t = 0 if a source had a date, else None. `notes` describe the processing steps.
     """
 
     t: FloatArray
@@ -71,14 +76,14 @@ def merge_recordings(
 
     Args:
         recordings: recordings of the sources.
-        profile: the channel of each signal.
-        wheel_radius: of the vehicle file [m]; takes precedence over the profile's.
-        steering_ratio: of the vehicle file; takes precedence over the profile's.
+        profile: maps signals to channels.
+        wheel_radius: radius of the vehicle file [m]; takes precedence over the profile's.
+        steering_ratio: ratio of the vehicle file; takes precedence over the profile's.
         shifts: source name -> seconds to add to its clock.
 
     Raises:
-        InputError: no signal of the profile is there, dates do not meet, or a radius or ratio is
-            missing.
+        InputError: no recording has a signal of the profile, dates do not overlap, or a radius or
+            ratio is missing.
     """
     radius = wheel_radius or profile.wheel_radius
     ratio = steering_ratio or profile.steering_ratio
@@ -131,8 +136,11 @@ def merge_recordings(
 
 
 def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tuple[int, Channel]]:
-    """Return channel -> the recording that has its signals, and how; a receiver fills channels that
-    the profile's signals do not.
+    """Return, for each channel, the index of the recording that has its signals, and its
+    conversion.
+
+    A recording of a position receiver provides the position channels that the profile's signals do
+    not.
     """
     found: dict[str, tuple[int, Channel]] = {}
     for name in (*CHANNELS, GROUND, *CONTEXT):
@@ -156,7 +164,9 @@ def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tup
 def _align_clocks(
     recordings: Sequence[Recording], reference: int, shifts: Mapping[str, float], notes: list[str]
 ) -> tuple[list[float], int | None]:
-    """Return the seconds to add to the times of each recording, and the ns UTC of time 0."""
+    """Return the seconds to add to the times of each recording, and the [ns UTC] of time 0 (None
+    without a date).
+    """
     spans = [_time_span(recording) for recording in recordings]
     base = recordings[reference].start_ns
     dated = next(
@@ -215,10 +225,10 @@ def _spans_overlap(span: tuple[float, float], shift: float, other: tuple[float, 
 def make_channel(
     name: str, channel: Channel, recording: Recording, radius: float | None, ratio: float | None
 ) -> tuple[Series, float]:
-    """Return a channel in SI units on its own times, and the jitter of its time stamps [s].
+    """Return a channel in SI units at its own times, and the jitter of its time stamps [s].
 
     Raises:
-        InputError: a number of the car is not known that its unit needs.
+        InputError: the unit requires the wheel radius or the steering ratio, and it is not known.
     """
     where = f"{name} ({', '.join(channel.signals)})"
     parts = [recording.signals[signal] for signal in channel.signals]
@@ -273,7 +283,9 @@ def make_channel(
 
 
 def _hold_last(series: Series, t: FloatArray) -> FloatArray:
-    """Return the last reading at or before each time."""
+    """Return the last reading at or before each time; before the first reading, return the first
+    one.
+    """
     return series.values[
         np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, len(series.t) - 1)
     ]
@@ -287,12 +299,12 @@ def _describe_rates(series: Series) -> dict[str, object]:
 
 
 def straighten_times(t: FloatArray) -> tuple[FloatArray, float]:
-    """Return the smoothed times of a periodic signal whose stamps come in bursts, and the standard
-    deviation of their error [s].
+    """Return smoothed times of a periodic signal whose time stamps come in bursts, and the standard
+    deviation of the stamps' error [s].
 
-    Arrival wanders about a line through the count of readings, which a running mean over SMOOTH
-    readings to either side follows. Times that are not periodic (off by more than a period), or
-    already even, come back as they are.
+    The time stamps vary around a straight line over the number of readings. A running mean over
+    SMOOTH readings to either side follows slow variations. Times that are not periodic (off by more
+    than a period), or that are already even, are returned unchanged.
     """
     if len(t) < FEWEST:
         return t, 0.0
@@ -308,7 +320,7 @@ def straighten_times(t: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _still_courses(series: dict[str, Series]) -> None:
-    """Set a receiver's course to NaN at walking speed."""
+    """Set the course of a position receiver to NaN at walking speed."""
     if "yaw" in series and GROUND in series and len(series["yaw"].t) == len(series[GROUND].t):
         yaw = series["yaw"]
         speed = series[GROUND].values
@@ -352,13 +364,13 @@ def _build_rows(
 
 
 def _row_rate(dense: Mapping[str, Series]) -> float:
-    """Return the rate of the fastest channel, rounded up to a usual rate."""
+    """Return the row rate [Hz]: the rate of the fastest channel, rounded up to a usual rate."""
     fastest = max(1.0 / max(float(np.median(np.diff(one.t))), 1e-3) for one in dense.values())
     return next((rate for rate in RATES if rate >= 0.95 * fastest), RATES[-1])
 
 
 def sample_at_rows(series: Series, t: FloatArray, *, sparse: bool) -> FloatArray:
-    """Return a series sampled at the times of the rows; NaN if no reading is near enough."""
+    """Return a series sampled at the times of the rows; NaN in rows without a reading near enough."""
     good = np.isfinite(series.values)
     known = series.t[good]
     values = series.values[good]

@@ -1,9 +1,9 @@
-"""A draft profile from the names of signals: the likely channel of each signal, for a person to
+"""Draft of a profile from the names of signals: the likely channel of each signal, for a person to
 check.
 
-Names are split into words at case, digits and signs. A wheel is recognised by its two letters or
-words, in English or German (VL VR HL HR: vorn and hinten, links and rechts). Units come from the
-recording where it has them.
+Names are split into words at changes of case, digits and signs. A wheel is recognised by its two
+letters or words, in English or German (VL VR HL HR: vorn = front and hinten = rear, links = left
+and rechts = right). Units come from the recording if it states them.
 """
 
 from __future__ import annotations
@@ -78,7 +78,9 @@ def split_words(name: str) -> str:
 
 
 def place_of(plain: str) -> str | None:
-    """Return the wheel, fl to rr, that the words of a name denote."""
+    """Return the wheel ("fl", "fr", "rl" or "rr") that the words of a name denote; None if they
+    denote no wheel.
+    """
     tokens = plain.split()
     for wheel, spellings in PLACES.items():
         for spelling in spellings:
@@ -90,11 +92,11 @@ def place_of(plain: str) -> str | None:
 
 
 def draft_profile(signals: Mapping[str, str], name: str) -> Profile:
-    """Return a profile drafted from the names.
+    """Return a draft profile, with channels guessed from the names of the signals.
 
     Args:
         signals: name -> unit as recorded, "" where it is not given.
-        name: of the profile.
+        name: name of the profile.
     """
     channels: dict[str, Channel] = {}
     for signal, unit in signals.items():

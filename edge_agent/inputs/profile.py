@@ -1,10 +1,12 @@
-"""A profile: which signal of a recording is which channel of the signal log, as checked JSON.
+"""A profile, stored as validated JSON: it maps signals of a recording to channels of the signal
+log.
 
-    value of a channel = scale · (sum of its signals, in SI) · sign + offset,     at the time
-                                                                                  stamped − delay_s
+    value of a channel = scale · (sum of its signals, in SI) · sign + offset,
+    at the time (time stamp − delay_s)
 
-A speed at the rim becomes a wheel speed by `wheel_radius`, an angle of the steering wheel a road
-wheel's by `steering_ratio`; the vehicle file's radius and ratio go before those of the profile.
+`wheel_radius` converts a speed at the rim to a wheel speed, and `steering_ratio` an angle of the
+steering wheel to an angle of the road wheel. Radius and ratio of the vehicle file take precedence
+over those of the profile.
 """
 
 from __future__ import annotations
@@ -26,13 +28,13 @@ Text = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class Part(BaseModel):
-    """Base of the parts of a profile: unknown names are refused."""
+    """Base of the parts of a profile; unknown field names are rejected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Sign(Part):
-    """A sign that has a signal of its own: the value is negative where `signal` equals
+    """Separate signal for the sign of a value: the value is negative where `signal` equals
     `negative`.
     """
 
@@ -41,7 +43,7 @@ class Sign(Part):
 
 
 class Channel(Part):
-    """Source of a channel, and its conversion to SI units."""
+    """Source signals of a channel, and their conversion to SI units."""
 
     signal: Annotated[list[Text] | Text, Field(description="name, or names whose values are added")]
     message: Annotated[
@@ -86,17 +88,21 @@ class Channel(Part):
 
     @property
     def signals(self) -> list[str]:
-        """Full names of the signals whose values are added."""
+        """Return the full names of the signals whose values are added."""
         names = [self.signal] if isinstance(self.signal, str) else self.signal
         return [self.full_name(name) for name in names]
 
     @property
     def gates(self) -> dict[str, list[float]]:
-        """Full names of the signals that must be valid, each with its valid values."""
+        """Return the full names of the signals that state the validity of a reading, each with the
+        values that mean "valid".
+        """
         return {self.full_name(name): values for name, values in self.valid.items()}
 
     def full_name(self, name: str) -> str:
-        """Return the name that readers use for a signal of this channel's message."""
+        """Return the name of a signal as readers use it: MESSAGE.SIGNAL if the channel has a CAN
+        message.
+        """
         return name if self.message is None else f"{self.message}.{name}"
 
     def needed_signals(self) -> list[str]:
@@ -109,7 +115,7 @@ class Channel(Part):
 
 
 class Profile(Part):
-    """Profile of one car or recorder: the mapping from its signals to channels."""
+    """Profile of one car or recorder: maps its signals to channels."""
 
     version: Literal[1] = 1
     name: Annotated[str, Field(min_length=1, max_length=64)]
@@ -154,13 +160,13 @@ class Profile(Part):
 
 
 def shipped_profiles() -> list[str]:
-    """Return the names of the profiles in the package."""
+    """Return the names of the profiles that are part of the package."""
     return sorted(path.stem for path in FOLDER.glob("*.json"))
 
 
 def load_profile(name: str) -> tuple[Profile, Path]:
-    """Load a profile by path or by the name of a shipped one; return it with the folder in which
-    its DBC is searched.
+    """Load a profile by path or by the name of a shipped profile; return it with the folder of its
+    CAN database.
 
     Raises:
         InputError: it cannot be read, or a field is missing, unknown or out of range.

@@ -1,6 +1,4 @@
-"""Result of a reader: named series on one clock, and the selection of the signals that a profile
-needs.
-"""
+"""Result of a reader: named series with a common clock, and helpers for readers of foreign files."""
 
 from __future__ import annotations
 
@@ -17,8 +15,8 @@ from schemas.numeric import FloatArray
 
 @dataclass(frozen=True)
 class Series:
-    """One recorded signal: times t (n,) [s] since its recording's start, values (n,), and the
-    unit if it is known.
+    """One recorded signal: times t (n,) [s] since its recording's start, values (n,), and the unit
+    ("" if unknown).
     """
 
     t: FloatArray
@@ -28,12 +26,13 @@ class Series:
 
 @dataclass
 class Recording:
-    """Signals of one source by name, all on one clock.
+    """Signals of one source by name, all with the same clock.
 
     Attributes:
-        name: of the file, for messages.
-        start_ns: ns UTC of t = 0, None where the source has no date.
-        rows: whether all signals share their times, as the columns of a table do.
+        name: name of the file, for messages.
+        signals: the series by name.
+        start_ns: [ns UTC] of t = 0, None if the source has no date.
+        rows: True if all signals have the same times, like the columns of a table.
         notes: remarks of the reader.
     """
 
@@ -46,8 +45,8 @@ class Recording:
 
 @contextmanager
 def foreign_errors(path: Path, kind: str) -> Iterator[None]:
-    """Turn any exception that a library raises on a broken file into an error of one line that
-    names the file.
+    """Convert any exception that a library raises on a broken file into a one-line error that names
+    the file.
 
     Raises:
         InputError: the file cannot be read as `kind`.
@@ -68,10 +67,10 @@ def foreign_errors(path: Path, kind: str) -> Iterator[None]:
 
 
 def import_optional(name: str, extra: str = "inputs") -> Any:  # noqa: ANN401 modules of optional libraries have no common type
-    """Import an optional library.
+    """Import an optional library and return it.
 
     Raises:
-        InputError: it is not installed.
+        InputError: the library is not installed.
     """
     try:
         return importlib.import_module(name)

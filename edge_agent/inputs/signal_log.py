@@ -1,11 +1,11 @@
-"""A recorded drive: a Parquet signal log as blocks of one vehicle.
+"""Reader of a recorded drive: a Parquet signal log, delivered as blocks of one vehicle.
 
-Needed columns: `t` [s] or `timestamp`; ax, ay, yaw_rate; the four omega; delta_fl or delta_fr. Each
-of them must hold at least one reading. The other channels may be missing, and NaN or null is a
-missing reading anywhere. A front wheel whose steering angle has no column takes that of the other;
-rear wheels without a column do not steer. Context signals (`schemas.signals.CONTEXT`) are optional.
-`timestamp` is an Arrow timestamp, or a number: integer ns since 1970 UTC, float s since 1970 UTC.
-Time may stand still (the estimator reports this in `health`) but not go back.
+Required columns: `t` [s] or `timestamp`; ax, ay, yaw_rate; the four omega; delta_fl or delta_fr.
+Each of them must have at least one reading. The other channels may be missing, and NaN or null is a
+missing reading in any column. A front wheel without a steering column gets the angle of the other
+front wheel; rear wheels without a column do not steer. Context signals (`schemas.signals.CONTEXT`)
+are optional. `timestamp` is an Arrow timestamp, or a number: integer [ns] or float [s] since 1970
+UTC. Time may repeat (the estimator reports this in `health`) but not go backwards.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ BLOCK_ROWS: Final = 16_384
 
 @dataclass(frozen=True)
 class SignalLog:
-    """A read log: t (T,) [s] as recorded, signals (T, channels), and the ns UTC of t = 0 where
-    the log knows it.
+    """A signal log in memory: t (T,) [s] as recorded, signals (T, channels), and the [ns UTC] of t
+    = 0 if the log states it, else None.
     """
 
     t: FloatArray
@@ -49,7 +49,9 @@ class SignalLog:
     context: FloatArray | None = None  # (T, len(CONTEXT)), where a column of it is there
 
     def blocks(self, start_ns: int, rows: int = BLOCK_ROWS) -> Iterator[Block]:
-        """Yield the log in order, in blocks of at most `rows` samples; t = 0 is at `start_ns`."""
+        """Yield the log in order, in blocks of at most `rows` samples. `start_ns` is the [ns UTC]
+        of t = 0.
+        """
         for first in range(0, len(self.t), rows):
             t = self.t[first : first + rows, None]
             context = None if self.context is None else self.context[first : first + rows, None]
@@ -62,9 +64,9 @@ def read_log(path: Path) -> SignalLog:
     """Read and check a signal log.
 
     Raises:
-        InputError: not a readable Parquet file, a needed column missing or without a reading, a
-            column that is not numeric, no row, or time that is missing or goes back; names the
-            column (and row) and the fix.
+        InputError: the file is not a readable Parquet file, has no row, lacks a required column, or
+            has a required column without a reading, a column that is not numeric, or time that is
+            missing or goes backwards. The error names the column (and row) and the fix.
     """
     table = _read_table(path)
     if not table.num_rows:
@@ -106,7 +108,7 @@ def _read_table(path: Path) -> pa.Table:
 
 
 def _read_context(table: pa.Table) -> FloatArray | None:
-    """Return the context (T, len(CONTEXT)); None if the log has no column of it."""
+    """Return the context signals (T, len(CONTEXT)); None if the log has no context column."""
     if not set(CONTEXT) & set(table.column_names):
         return None
     context = np.full((table.num_rows, len(CONTEXT)), np.nan)
@@ -117,8 +119,10 @@ def _read_context(table: pa.Table) -> FloatArray | None:
 
 
 def _float_column(table: pa.Table, name: str) -> FloatArray:
-    """Return a column as float64, with NaN for null. It is a copy, because Arrow's array is
-    read-only and numba would compile again for it.
+    """Return a column as float64, with NaN for null.
+
+    The result is a copy, because Arrow's array is read-only and numba would compile a second
+    version for it.
     """
     try:
         values: Any = pc.cast(table[name], pa.float64())
@@ -130,7 +134,7 @@ def _float_column(table: pa.Table, name: str) -> FloatArray:
 
 
 def _read_time(table: pa.Table) -> tuple[FloatArray, int | None]:
-    """Return t [s] and the ns UTC of t = 0; None for a log that has only `t`."""
+    """Return t [s] and the [ns UTC] of t = 0; the latter is None for a log that has only `t`."""
     name = next((name for name in ("t", "timestamp") if name in table.column_names), None)
     if name is None:
         raise InputError(
@@ -151,7 +155,9 @@ def _read_time(table: pa.Table) -> tuple[FloatArray, int | None]:
 
 
 def _seconds_from_first(column: Any) -> tuple[FloatArray, int | None]:  # noqa: ANN401 pyarrow's column types are not generic
-    """Return the seconds since the first sample, and the ns UTC of that sample."""
+    """Return the seconds since the first sample, and the [ns UTC] of that sample (None if its time
+    is not finite).
+    """
     if column.null_count:
         row = int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])
         raise InputError("timestamp", f"row {row} has no time", "give every sample its time")
@@ -193,8 +199,11 @@ def _check_log(table: pa.Table, signals: FloatArray) -> None:
 
 
 def fill_steering(signals: FloatArray, missing: Sequence[bool]) -> None:
-    """Fill the steering angles of wheels (4,) that have no channel (not of those that have one
-    without readings).
+    """Fill the steering angles of wheels without a column, in place; `missing` (4,) is True for
+    these wheels.
+
+    A front wheel gets the angle of the other front wheel, a rear wheel gets zero. Columns without
+    readings are not filled.
     """
     if missing[0]:
         signals[:, S.DELTA] = signals[:, S.DELTA + 1]

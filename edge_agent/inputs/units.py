@@ -1,4 +1,4 @@
-"""Units of recordings, and their factors to the units of the signal log."""
+"""Units of recordings, and their conversion factors to the units of the signal log."""
 
 from __future__ import annotations
 
@@ -99,14 +99,17 @@ def standard_spelling(text: str) -> str:
 
 
 def unit_of_channel(channel: str, text: str) -> str | None:
-    """Return the unit of a channel as stated by the recording; None if it states none that fits."""
+    """Return the unit of a channel as stated by the recording; None if the stated unit does not fit
+    the channel.
+    """
     unit = standard_spelling(text)
     return unit if unit in QUANTITY[channel] else None
 
 
 def to_si(channel: str, unit: str, wheel_radius: float | None) -> float | None:
-    """Factor to the signal log's unit; None where a rim's speed needs a radius that is not
-    known.
+    """Return the factor from a unit to the signal log's unit.
+
+    Return None if a speed at the rim requires a wheel radius that is not known.
     """
     factor = QUANTITY[channel][unit]
     if channel.startswith("omega") and unit in SPEED:

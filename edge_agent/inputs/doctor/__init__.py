@@ -1,3 +1,3 @@
-"""The signal doctor: finds faults in a drive's signals by physics, not by names, and corrects
-them.
+"""The signal doctor: finds faults in a drive's signals by physical relations between them, and
+corrects the faults.
 """

@@ -1,10 +1,10 @@
-"""Correction of a recorded drive by the measurements of the signal doctor: late devices and locked
-axles.
+"""Correction of a recorded drive by the measurements of the signal doctor: delayed devices and
+locked axles.
 
-The doctor reports a clock error that is too large for the filter. If the drive shows how large it
-is, the lag is removed from the log before the estimator reads it. An error of unknown size remains
-a finding, and the log is not published. The filter's own states estimate smaller lags, so that a
-replay of a log without faults stays causal.
+The doctor reports a delay between devices that is too large for the filter. If the drive shows the
+size of the delay, the log is corrected before the estimator reads it. A delay of unknown size
+remains a finding, and the log is not published. Smaller delays are estimated by the filter's own
+states, so that the replay of a log without faults remains causal.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from schemas.vehicle import Vehicle
 
 
 class Adopted(NamedTuple):
-    """A corrected log for the estimator, its vehicle, its diagnosis, and notes on the changes."""
+    """A corrected log, its vehicle, its diagnosis, and notes that describe the changes."""
 
     log: SignalLog
     vehicle: Vehicle
@@ -37,14 +37,14 @@ class Adopted(NamedTuple):
 
 
 def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
-    """Return the log that the estimator processes: corrected by the calibration, then by the
-    doctor's measurements.
+    """Return the log for the estimator: corrected first by the calibration, then by the doctor's
+    measurements.
     """
     return adopt_measured(replace(log, signals=correct_log(log.t, log.signals, vehicle)), vehicle)
 
 
 def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
-    """Examine a log, correct the measured faults, and examine the result."""
+    """Examine a log, correct the measured faults, and examine the corrected log."""
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
     delays = {
         finding.channel: finding.delay_s
@@ -87,11 +87,11 @@ def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
 def align_import(
     merged: Merged, profile: Profile, vehicle: Vehicle, merge_with: Callable[[Profile], Merged]
 ) -> tuple[Merged, Profile]:
-    """Correct the delays of late devices in merged recordings; return the recordings and a profile
-    that contains the delays.
+    """Correct the delays of devices in merged recordings; return the merged recordings and a
+    profile that contains the delays.
 
     The doctor measures the delays. `merge_with` merges the same recordings with a given profile. If
-    no device is late, both are returned unchanged.
+    no device is delayed, both arguments are returned unchanged.
     """
     signals = np.full((len(merged.t), len(CHANNELS)), np.nan)
     for index, name in enumerate(CHANNELS):
@@ -112,8 +112,8 @@ def align_import(
 
 
 def align_devices(t: FloatArray, signals: FloatArray, delays: Mapping[str, float]) -> FloatArray:
-    """Return signals (T, 18) with the readings of late devices moved earlier by `delays` [s], by
-    linear interpolation between samples.
+    """Return signals (T, 18) in which the readings of delayed devices are moved earlier by `delays`
+    [s], with linear interpolation between samples.
     """
     signals = signals.copy()
     for device, seconds in delays.items():
@@ -126,7 +126,9 @@ def align_devices(t: FloatArray, signals: FloatArray, delays: Mapping[str, float
 
 
 def _shift_channel(t: FloatArray, values: FloatArray, seconds: float, *, angle: bool) -> FloatArray:
-    """Return values (T,) moved earlier by `seconds`; missing readings stay missing."""
+    """Return values (T,) moved earlier by `seconds`. Missing readings stay missing; an angle is not
+    interpolated.
+    """
     at = t + seconds
     after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
     share = np.clip((at - t[after - 1]) / (t[after] - t[after - 1]), 0.0, 1.0)

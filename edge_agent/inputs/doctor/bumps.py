@@ -1,10 +1,10 @@
-"""Test that separates front and rear wheels: a bump reaches the rear wheel one wheelbase after the
-front wheel.
+"""Test that identifies the front axle: it meets a bump in the road before the rear axle does.
 
-The difference of the left and right wheel of an axle, minus its mean over some metres, is
-unevenness of the road plus noise. Over the distance driven, the rear axle repeats the signal of the
-front axle after one wheelbase. A correlation peak there, or one wheelbase before, identifies the
-axles; a smooth road has no peak.
+The speed difference between the left and right wheel of an axle, minus its mean over some metres,
+consists of road unevenness and noise. As a function of distance, the rear axle repeats the signal
+of the front axle after one wheelbase. Therefore the correlation of both signals has a peak one
+wheelbase later if the channels are named correctly, and one wheelbase earlier if front and rear are
+exchanged. A smooth road gives no peak.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ CLIPPED: Final = 3.0  # standard deviations beyond which a reading is a pothole 
 
 
 def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
-    """Return 1 if the front channels meet bumps first, -1 if the rear ones do, 0 if the road does
-    not show it.
+    """Return 1 if the front channels meet bumps first, -1 if the rear channels do, 0 if the drive
+    does not show it.
 
     t are times (T,) [s], signals (T, 18).
     """
@@ -57,7 +57,9 @@ def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
 
 
 def _side_unevenness(apart: FloatArray, wheelbase: float) -> FloatArray:
-    """Return the difference of both sides (n,) minus its running mean over some wheelbases."""
+    """Return the speed difference between the sides (n,) minus its running mean over WINDOW
+    wheelbases.
+    """
     width = 2 * round(0.5 * WINDOW * wheelbase / STEP_M) + 1
     if width >= len(apart):
         return np.zeros_like(apart)

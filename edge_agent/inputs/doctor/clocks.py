@@ -1,4 +1,4 @@
-"""Delays of the devices, from the lags between their signals in the turns of a drive."""
+"""Delays of the devices, computed from the lags between their signals in the turns of a drive."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ LARGEST_LAG_S: Final = 0.085  # devices of sound cars lie within .06 s
 
 
 def wheels_speak_late(axle: Fit, seconds: float) -> bool:
-    """Return True if the axle's yaw rate lags in the same direction as `seconds`, the measured lag
-    of the wheels, and by more than half of it.
+    """Return True if the axle's yaw rate lags in the same direction as the measured wheel lag
+    `seconds`, and by more than half of it.
     """
     return (
         axle.is_known
@@ -32,8 +32,8 @@ def wheels_speak_late(axle: Fit, seconds: float) -> bool:
 def measure_clocks(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, diagnosis: Diagnosis
 ) -> None:
-    """Measure the delays of wheels and steering relative to the inertial unit, and report those
-    that are too large.
+    """Measure the delays of wheel speeds and steering relative to the inertial unit, and add a
+    finding for each delay that is too large.
     """
     diagnosis.lags = measure_lags_twice(t, signals, vehicle, diagnosis.fits)
     listed = late_devices(diagnosis)
@@ -45,10 +45,10 @@ def measure_clocks(
 
 
 def late_devices(diagnosis: Diagnosis) -> dict[str, float]:
-    """Return the delay of each device [s], from the lags measured in the turns of a drive.
+    """Return the delay [s] of each device, from the lags measured in the turns of a drive.
 
     If wheels and steering lead the yaw rate by about the same time, the inertial unit is late. If
-    the accelerometer is not late compared with the wheels, only the gyroscope is late.
+    in that case the accelerometer is not late compared with the wheels, only the gyroscope is late.
     """
     wheel, steer = (diagnosis.lags.get(name, 0.0) for name in ("wheel_lag", "steer_lag"))
     if not (abs(wheel) > LARGEST_LAG_S and abs(wheel - steer) < 0.5 * abs(wheel)):

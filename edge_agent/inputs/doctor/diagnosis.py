@@ -1,4 +1,6 @@
-"""Records of the signal doctor: one fault, and everything that is known of a log."""
+"""Records of the signal doctor: one fault (`Finding`), and the complete result for a log
+(`Diagnosis`).
+"""
 
 from __future__ import annotations
 
@@ -11,12 +13,16 @@ from edge_agent.inputs.doctor.scales import SETTLED
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault: its channel, its name, its description, and its correction.
+    """One fault: its channel, its kind, its description, and its correction.
 
     Attributes:
-        scale: factor for the channel; offset: to add after that; delay_s: delay of its time
-        stamps [s].
-        confidence: log odds over the next best explanation, where there is one.
+        channel: channel or device that has the fault.
+        kind: short name of the fault.
+        words: description for a person.
+        scale: factor that corrects the channel.
+        offset: correction that is added after the factor.
+        delay_s: delay of the channel's time stamps [s].
+        confidence: log odds of this explanation against the next best one, where there is one.
     """
 
     channel: str
@@ -30,8 +36,8 @@ class Finding:
 
 @dataclass
 class Diagnosis:
-    """Faults, channels that are in order, channels that nothing was learned of, and the
-    identities' fits.
+    """Result of an examination: faults, channels without fault, channels that the drive says
+    nothing about, and the fits of the physical relations.
     """
 
     findings: list[Finding] = field(default_factory=list)
@@ -51,5 +57,5 @@ class Diagnosis:
 
     @property
     def is_passed(self) -> bool:
-        """True if every channel was found to be in order."""
+        """Return True if every channel was found to be free of faults."""
         return not self.findings and not self.unknown

@@ -1,12 +1,13 @@
-"""A drive prepared for its examination: evenly sampled, smoothed, with the motion computed from the
-wheels alone.
+"""A drive prepared for its examination: evenly sampled, smoothed, and with the motion computed from
+the wheels alone.
 
 Legend
     v    speed of the car from its wheels [m/s]: R times the median of the four, R of the vehicle
          file
-    r    yaw rate [rad/s];  r_w the same from the wheels: (right − left) / track, mean of both axles
-    v_g  speed over ground from fixes [m/s]; course, also from fixes, counter-clockwise from east
-         [rad]
+    r    yaw rate [rad/s]
+    r_w  yaw rate from the wheels [rad/s]: (right − left) / track, mean of both axles
+    v_g  speed over ground from position fixes [m/s]
+    course  direction of travel from position fixes, counter-clockwise from east [rad]
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ CREEP: Final = 0.15  # of the drive's fast speed; slower is standing, whatever t
 
 @dataclass(frozen=True)
 class EvenDrive:
-    """Smoothed signals on even times (n,); NaN where nothing was read. `wheels` (n, 4) are
+    """Smoothed signals at even time steps (n,); NaN where there is no reading. `wheels` (n, 4) are
     speeds at the rim [m/s].
     """
 
@@ -63,13 +64,14 @@ class EvenDrive:
 
     @property
     def v_dot(self) -> FloatArray:
-        """Acceleration from the wheels [m/s²]."""
+        """Return the car's acceleration (n,) computed from the wheel speeds [m/s²]."""
         return np.asarray(np.gradient(self.v, self.t))
 
 
 def smooth_twice(x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
-    """Return a running mean over `seconds`, applied twice, that skips NaN; NaN where half of the
-    window is NaN.
+    """Return x after a running mean over `seconds`, applied twice. The mean skips NaN.
+
+    The result is NaN where x is NaN, or where less than about 40 % of the window is known.
     """
     width = min(max(1, round(seconds * RATE_HZ)), len(x))
     for _ in range(2):
@@ -81,7 +83,9 @@ def smooth_twice(x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
 
 
 def interpolate_near(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray:
-    """Return readings interpolated linearly at other times; NaN if no reading is near enough."""
+    """Return readings interpolated linearly at the times `at`; NaN between readings that are more
+    than JOINED_S apart.
+    """
     good = np.isfinite(x)
     if good.sum() < 2:
         return np.full(len(at), np.nan)
@@ -95,7 +99,9 @@ def interpolate_near(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray
 def over_ground(
     t: FloatArray, latitude: FloatArray, longitude: FloatArray, at: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return speed [m/s] and course [rad] at given times, from fixes FIX_S / 2 before and after."""
+    """Return speed [m/s] and course [rad] at the times `at`, from the positions FIX_S / 2 before
+    and after.
+    """
     north = interpolate_near(t, np.radians(latitude) * EARTH_RADIUS_M, at)
     east = interpolate_near(t, np.radians(longitude) * EARTH_RADIUS_M, at) * np.cos(
         np.radians(np.nanmean(latitude))
@@ -118,10 +124,10 @@ def prepare_drive(
 
     Args:
         t: times (T,) [s].
-        signals: the channels; readings of a wheel far off the median of the four are left out.
-        vehicle: its radius, tracks and wheelbase.
-        ground: the receiver's own speed (T,) [m/s], where it was recorded; it is better than that
-            of the fixes.
+        signals: readings; readings of a wheel far from the median of the four are left out.
+        vehicle: its radius, tracks and wheelbase are used.
+        ground: speed measured by the position receiver (T,) [m/s], if it was recorded; it is more
+            accurate than the speed computed from positions.
     """
     last = min(t[-1], t[0] + LONGEST_S)
     at = np.arange(t[0], last, 1.0 / RATE_HZ)
@@ -185,11 +191,12 @@ def prepare_drive(
 
 
 def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
-    """Return True where a wheel spins or locks, (n,), by comparing the wheels (n, 4), in any unit.
+    """Return an array (n,) that is True where a wheel spins or locks, by comparison of the wheel
+    speeds (n, 4) in any unit.
 
-    Front and rear wheels of a side roll nearly alike, in turns as well; a constant difference is
-    another tyre. A wheel that is off all along is left out: it is a separate fault and would hide
-    the rest of the drive.
+    Front and rear wheel of a side roll nearly alike, in turns too; a constant difference is caused
+    by different tyres. A wheel that differs all the time is left out: it is a separate fault and
+    would make the rest of the drive unusable.
     """
     speed = np.nanmedian(np.where(np.isfinite(wheels), wheels, 0.0), axis=1)
     size = np.maximum(np.abs(speed), CREEP * max(fast, 1e-9))
@@ -211,8 +218,8 @@ def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
 
 
 def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
-    """Return True where the speed of the wheels differs from that over ground, (n,), in any unit:
-    all wheels spin or lock together.
+    """Return an array (n,) that is True where the wheel speed differs from the speed over ground,
+    in any unit: all wheels spin or lock together.
     """
     known = np.isfinite(v) & np.isfinite(v_ground) & (np.abs(v) > 0.3 * fast)
     if known.sum() < 5 * RATE_HZ:
@@ -228,7 +235,9 @@ def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
 
 
 def _nearest_yaw(t: FloatArray, yaw: FloatArray, at: FloatArray) -> FloatArray:
-    """Return the nearest reading of a sparse angle; averaging across ±π would be wrong."""
+    """Return the nearest reading of a sparse angle at each time; averaging across ±π would be
+    wrong.
+    """
     good = np.flatnonzero(np.isfinite(yaw))
     if len(good) < 2:
         return np.full(len(at), np.nan)

@@ -1,9 +1,9 @@
-"""Findings of the signal doctor: one per fault, with its evidence, and the channels that are in
-order.
+"""Findings of the signal doctor: one per fault, with its evidence, and the list of channels without
+fault.
 
-A channel is sound when an identity that was excited enough holds it and no fault explains the drive
-nearly as well; it is unknown if no finding mentions it. Only a log whose channels are all sound has
-passed.
+A channel is free of faults if a physical relation with enough excitation confirms it, and no fault
+explains the drive nearly as well. A channel is unknown if it is neither confirmed nor faulty. A log
+passes only if all its channels are free of faults.
 """
 
 from __future__ import annotations
@@ -71,8 +71,13 @@ CHANNELS_OF: Final = {"ax": "ax", "ay": "ay", "r": "yaw_rate", "delta": "delta",
 def diagnose(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None
 ) -> Diagnosis:
-    """Examine a log: times t (T,) [s], signals (T, 18), and the receiver's speed (T,) [m/s]
-    where it was recorded.
+    """Examine a log and return the diagnosis.
+
+    Args:
+        t: times (T,) [s].
+        signals: readings (T, 18).
+        vehicle: nominal vehicle of the drive.
+        ground: speed measured by the position receiver (T,) [m/s], if it was recorded.
     """
     diagnosis = Diagnosis()
     t, slow = _in_seconds(t, diagnosis)
@@ -154,7 +159,10 @@ def diagnose(
 
 
 def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
-    """Return the times in seconds, and True if the sampling rate is unusable."""
+    """Return the times in seconds, and True if the sampling rate is unusable.
+
+    Times in another unit are converted. Both faults are added to the diagnosis.
+    """
     step = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
     if step > 0.0 and not 1.0 / FASTEST_HZ <= step <= 1.0 / SLOWEST_HZ:
         for unit, factor in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("minutes", 60.0)):
@@ -169,11 +177,11 @@ def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
 
 
 def _find_jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
-    """Find status bits above the number of a wheel speed: readings that jump away from the other
+    """Find status bits in the upper bits of a wheel speed: readings that jump away from the other
     three wheels and back.
 
-    A wheel that spins or locks is off as well, but gets there in steps and by any amount. A bit is
-    whole from one reading to the next, and adds the same each time.
+    A wheel that spins or locks also differs from the others, but gradually and by any amount. A
+    status bit changes completely from one reading to the next, and adds the same amount each time.
     """
     wheels = signals[:, S.OMEGA : S.OMEGA + 4]
     good = np.isfinite(wheels).all(axis=1)
@@ -200,7 +208,7 @@ def _find_jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
 
 
 def _axes_exchanged(drive: EvenDrive) -> bool:
-    """Return True if the axes of the accelerometer are exchanged."""
+    """Return True if the longitudinal and lateral axes of the accelerometer are exchanged."""
 
     def axis_likeness(x: FloatArray, y: FloatArray) -> float:
         good = np.isfinite(x) & np.isfinite(y) & (drive.moving > 0)
@@ -258,8 +266,8 @@ def _find_scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) 
 def _holds_throughout(
     quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenDrive | None
 ) -> bool:
-    """Return True if the drive's parts all have the gains that the faults make: a slide does not
-    keep a gain.
+    """Return True if all parts of the drive have the gain that the fault predicts. A slide does not
+    keep a constant gain.
     """
     fault = verdict.faults[quantity]
     if (
@@ -299,8 +307,8 @@ def _holds_throughout(
 
 
 def _turns_as_steered(verdict: Verdict, found: dict[str, Fit]) -> bool:
-    """Return True if the car turns as it is steered or as its course does: in a spin v·r is not
-    an acceleration.
+    """Return True if the car turns as its steering or its course predicts. In a spin, v·r is not
+    the lateral acceleration.
     """
     for name in ("steering", "turning"):
         gain = 1.0
@@ -319,11 +327,11 @@ def _turns_as_steered(verdict: Verdict, found: dict[str, Fit]) -> bool:
 
 
 def _find_radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Finding]:
-    """Return wheels that turn faster or slower than the others on calm, straight moments; exchanged
-    axles.
+    """Return findings about wheels that turn faster or slower than the others while driving
+    straight and calmly, and about exchanged axles.
 
     In a bend, wheels slip with the force of the tyres, so only moments with hardly any force count.
-    A wheel whose error is not confirmed while the car coasts adds the wheels to `doubts`.
+    If the error of a wheel is not confirmed while the car coasts, the wheels are added to `doubts`.
     """
     findings = []
     tracks = (vehicle.track_front, vehicle.track_front, vehicle.track_rear, vehicle.track_rear)
@@ -364,7 +372,7 @@ def _find_radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Fi
 
 
 def _compare_axles(drive: EvenDrive) -> list[Finding]:
-    """Return findings about exchanged axles: in a turn the front wheels travel further, v_f² = v_r²
+    """Return findings about exchanged axles. In a turn the front wheels travel further: v_f² = v_r²
     + (L r)².
     """
     front = drive.wheels[:, :2].mean(axis=1)
@@ -395,7 +403,9 @@ def _compare_axles(drive: EvenDrive) -> list[Finding]:
 
 
 def _find_offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
-    """Return constant errors that are beyond the largest usual one by SURE standard deviations."""
+    """Return findings about constant errors that exceed the largest usual one by SURE standard
+    deviations.
+    """
     moving = drive.moving > 0
     lateral = found["lateral"]
     axle = found["axle"]

@@ -1,4 +1,4 @@
-"""Findings to corrections: the profile and the vehicle file as they should have been."""
+"""Conversion of findings to corrections of the profile and of the vehicle file."""
 
 from __future__ import annotations
 
@@ -33,16 +33,14 @@ EXCHANGED: Final = {
 
 
 def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
-    """Return the lags [s] by device that are no fault, but too large for the filter."""
+    """Return the lags [s] by device that are too small for a finding, but too large for the filter."""
     if any(finding.kind == "clock" for finding in diagnosis.findings):
         return {}
     return {name: lag for name, lag in late_devices(diagnosis).items() if abs(lag) > FILTER_BEARS_S}
 
 
 def list_corrections(diagnosis: Diagnosis) -> list[Finding]:
-    """Return the findings, and the small lags in the same form: everything that a corrected profile
-    removes.
-    """
+    """Return all corrections for a profile: the findings, and the small lags in the same form."""
     lags = small_lags(diagnosis)
     return [
         *diagnosis.findings,

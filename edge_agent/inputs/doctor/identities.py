@@ -1,12 +1,12 @@
-"""Comparison of quantities that are equal by physics: gain, offset, lag and confidence.
+"""Comparison of pairs of quantities that are equal by physics: gain, offset, lag and confidence.
 
-identity       left        right    checks
-lateral        a_y         v · r    unit and sign of a_y, v, r
-longitudinal   a_x         dv/dt    unit and sign of a_x, v
-steering       δ · v       L · r    unit and sign of δ, v, r (plus a term understeer · v² r)
-axle           r_w         r        which wheel is left, v, r
-ground         v_g         v        unit of v: the wheels' radius
-turning        d course    r        sign and unit of r
+identity left right checks lateral a_y v · r unit and sign of a_y, v, r longitudinal a_x dv/dt unit
+and sign of a_x, v steering δ · v L · r unit and sign of δ, v, r (plus a term understeer · v² r)
+axle r_w r which wheel is left, v, r ground v_g v unit of v: the wheels' radius turning d course r
+sign and unit of r
+
+Symbols: v speed and r_w yaw rate from the wheels, r yaw rate of the gyroscope, δ steering angle, L
+wheelbase, v_g speed over ground (see `drive`).
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ CORRELATED_S: Final = 1.0  # that far apart two moments tell different things
 class Fit:
     """Result of the fit left = gain · right + offset (+ further terms).
 
-    `error` is the standard deviation of ln |gain|, `lag_s` the delay of `left` [s].
+    `error` is the standard deviation of ln |gain|. `lag_s` is the delay of `left` relative to
+    `right` [s]. `excited_s` is the time with enough excitation [s].
     """
 
     gain: float
@@ -60,7 +61,9 @@ class Fit:
 
     @property
     def is_known(self) -> bool:
-        """True if the fit carries information."""
+        """Return True if the drive determines the gain: enough excited time, a small error and a
+        clear correlation.
+        """
         return self.excited_s >= FEWEST_S and self.error < 0.3 and abs(self.correlation) > 0.45
 
 
@@ -68,12 +71,12 @@ NOTHING: Final = Fit(np.nan, np.nan, 0.0, np.inf, 0.0, 0.0, np.inf, np.zeros(0),
 
 
 class Relation(NamedTuple):
-    """Terms of an identity: left = gain · right + offset + Σ k · term, each (n,).
+    """Terms of an identity: left = gain · right + offset + Σ k · term, each an array (n,).
 
     If `per` is given, the offset is multiplied by it and therefore not constant. If `bend` (n,) is
-    given, the left side also has an unknown share of right · bend: at one speed, understeer cannot
-    be separated from a gain of the steering. `loose` are prior standard deviations of the gains of
-    the last further terms, for the same reason.
+    given, the left side also contains an unknown share of right · bend, because at one speed
+    understeer cannot be separated from a gain of the steering. `loose` are prior standard
+    deviations of the gains k of the last terms, which are also hard to separate from the main gain.
     """
 
     left: FloatArray
@@ -137,7 +140,7 @@ IDENTITIES: Final[dict[str, Callable[[EvenDrive], Relation]]] = {
 
 
 def fit_identities(drive: EvenDrive) -> dict[str, Fit]:
-    """Fit every identity to a drive; return the results by name."""
+    """Fit every identity to a drive; return the fits by name."""
     return {
         name: fit_identity(sides(drive), drive.moving, drive.grips, level=name == "ground")
         for name, sides in IDENTITIES.items()
@@ -145,11 +148,11 @@ def fit_identities(drive: EvenDrive) -> dict[str, Fit]:
 
 
 def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) -> Fit:
-    """Fit left = gain · right + offset + Σ k · term, over the moving part, after removal of the
-    lag.
+    """Fit left = gain · right + offset + Σ k · term over the moving part of the drive, after
+    removal of the lag.
 
-    The gain is the geometric mean of both regressions, so that noise on either side does not bias
-    it.
+    The gain is the geometric mean of both regressions (left on right, right on left), so that noise
+    on either side does not bias it.
 
     Args:
         sides: the two sides of the identity.
@@ -240,8 +243,8 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
 def _bend_of(
     x: FloatArray, y: FloatArray, constant: FloatArray, bend: FloatArray, count: float
 ) -> tuple[float, float]:
-    """Return the share of `bend` in the right side, and the standard deviation of ln gain that
-    follows from the uncertainty of this share.
+    """Return (share of `bend` in the right side, standard deviation of ln gain that follows from
+    the uncertainty of this share).
 
     The share is the posterior mean over BENDS. Its cost is the residual of the left side over
     `count` independent moments plus the squared deviation from usual cars.
@@ -263,7 +266,7 @@ def _bend_of(
 def _fit_with_priors(
     table: FloatArray, y: FloatArray, loose: tuple[float, ...], count: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return gains by robust least squares, and their standard deviations.
+    """Return the gains by robust least squares, and their standard deviations.
 
     The gains of the last columns have a prior with mean 0 and the standard deviations `loose`.
     """
@@ -284,7 +287,9 @@ def _fit_with_priors(
 
 
 def _gains_of_parts(x: FloatArray, y: FloatArray, excited: BoolArray) -> tuple[float, ...]:
-    """Return the gain of each of PARTS parts of the excited time, in order of time."""
+    """Return the gain in each of PARTS consecutive parts of the excited time. Parts that are too
+    short are left out.
+    """
     rows = np.flatnonzero(excited)
     found = []
     for part in np.array_split(rows, PARTS):
@@ -302,8 +307,8 @@ def _median_ratio(x: FloatArray, y: FloatArray) -> float:
 
 
 def fit_robustly(table: FloatArray, y: FloatArray) -> FloatArray:
-    """Fit least squares twice, the second time without points that are three robust standard
-    deviations off.
+    """Return the least-squares solution of table · x = y, fitted twice. The second fit leaves out
+    points that are more than three robust standard deviations off.
     """
     solution = np.linalg.lstsq(table, y, rcond=None)[0]
     off = np.abs(y - table @ solution)
@@ -325,10 +330,11 @@ def shift_series(x: FloatArray, seconds: float) -> FloatArray:
 
 
 def lag_of(left: FloatArray, right: FloatArray, moving: FloatArray) -> tuple[float, float]:
-    """Return the delay of `left` relative to `right` [s], from the peak of |correlation|, and its
-    error, infinite if unknown.
+    """Return the delay of `left` relative to `right` [s] and its error [s], from the peak of
+    |correlation|.
 
-    The error grows with the difference between the lags of the two halves of the drive.
+    The error is infinite if the delay is unknown. It grows with the difference between the lags of
+    the two halves of the drive.
     """
     lag, sharp = _correlation_peak(left, right, moving)
     if not sharp:

@@ -1,15 +1,15 @@
-"""Delays of devices relative to the inertial unit, each from two measurements of the yaw rate.
+"""Delays of devices relative to the inertial unit, each from a comparison of two yaw rates.
 
-    wheel_lag   wheels' yaw rate behind the gyro's: mean of both axles, or the axle that follows the
-                gyro best
-    steer_lag   yaw rate of a bicycle model on the measured angle behind the gyro's (Rajamani 2012,
-                section 2.3)
+    wheel_lag   delay of the yaw rate from the wheels against the gyroscope's; from the mean of both
+                axles, or from the axle that agrees best with the gyroscope
+    steer_lag   delay of the yaw rate that a bicycle model computes from the measured steering angle
+                against the gyroscope's (Rajamani 2012, section 2.3)
 
     m (v̇_y + v r) = F_f + F_r,   I ṙ = a F_f − b F_r,   F_f = C_f (δ − (v_y + a r)/v),   F_r = −C_r (v_y − b r)/v
 
-The lag is where the correlation of both sides is largest; the peak is a parabola through three
-samples. A side force builds up behind its slip (LEAD), so that wheels and steering move a little
-before the body turns.
+The lag is the shift with the largest correlation of both sides; a parabola through three samples
+refines the peak. A lateral force builds up a little later than its slip, so wheels and steering
+move slightly before the body turns. LEAD corrects for this.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ LEAD: Final = {"wheel_lag": 0.013, "steer_lag": 0.017}
 def find_lags(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, least: float = LEAST_LIKE
 ) -> dict[str, float]:
-    """Return the lags [s] of a drive by quantity, from t (T,) [s] and signals (T, 18).
+    """Return the lags [s] of a drive by quantity, from times t (T,) [s] and signals (T, 18).
 
     A lag whose correlation is below `least` is left out. Signals are smoothed less than in the
-    doctor's other checks, because after smoothing over half a second the peak of the correlation is
+    doctor's other checks: after smoothing over half a second, the peak of the correlation would be
     too flat for a resolution of milliseconds.
     """
     at = np.arange(t[0], min(t[-1], t[0] + LONGEST_DRIVE_S), 1.0 / RATE_HZ)
@@ -84,7 +84,7 @@ def find_lags(
 
 
 class _Peak(NamedTuple):
-    """Lag [s] at the largest correlation, and that correlation."""
+    """Lag [s] with the largest correlation, and that correlation."""
 
     seconds: float
     likeness: float
@@ -93,7 +93,9 @@ class _Peak(NamedTuple):
 def _find_delay(
     left: FloatArray, right: FloatArray, among: BoolArray, least: float
 ) -> _Peak | None:
-    """Return the delay of `left` relative to `right`; None if the drive does not determine it."""
+    """Return the delay of `left` relative to `right` with its correlation; None if the drive does
+    not determine it.
+    """
     most = round(LONGEST_S * RATE_HZ)
     among = among.copy()
     among[: most + 1] = among[len(among) - most - 1 :] = False
@@ -118,7 +120,9 @@ def _find_delay(
 
 
 def _bicycle_yaw_rate(speed: FloatArray, steering: FloatArray, vehicle: Vehicle) -> FloatArray:
-    """Return the yaw rate of a bicycle model with the measured steering, by the trapezoidal rule."""
+    """Return the yaw rate (n,) [rad/s] of a bicycle model with the measured steering, integrated by
+    the trapezoidal rule.
+    """
     m = vehicle.mass
     inertia = vehicle.yaw_inertia
     a = vehicle.cg_to_front_axle

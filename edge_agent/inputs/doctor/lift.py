@@ -1,9 +1,10 @@
-"""A car on a lift or on rollers: wheels turn and gain speed, and the body feels nothing of it.
+"""Test for a car on a lift or on rollers: wheels turn and change speed, but the body does not
+accelerate.
 
-On a road, wheels that gain .5 m/s² for a second are felt by the accelerometer, in a slide on ice as
-well: tyres without any grip turn, but then all wheels that are not driven show whether the car
-moves. So one axle must stand while the other turns fast, or all wheels must change their speed
-while body and yaw rate rest.
+On a road, an accelerometer measures wheels that gain .5 m/s² for a second, also in a slide on ice:
+driven wheels without any grip may spin, but then the other wheels show whether the car moves.
+Therefore the test requires that one axle stands while the other turns fast, or that all wheels
+change their speed while accelerometers and yaw rate show no motion.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ GAINS_M_S2: Final = 0.4  # root mean square of the wheels' acceleration
 
 
 def is_on_lift(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> bool:
-    """Return True if wheels turn while the car stands; t (T,) [s], signals (T, 18)."""
+    """Return True if wheels turn while the car stands. `t` are times (T,) [s], `signals` readings
+    (T, 18).
+    """
     at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
     if len(at) < LEAST_S * RATE_HZ:
         return False

@@ -1,4 +1,6 @@
-"""Faults of position and heading: latitude and longitude exchanged, a compass angle as yaw."""
+"""Faults of position and heading: exchanged latitude and longitude, or a compass angle in place of
+yaw.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ COMPASS: Final[dict[str, Callable[[FloatArray], FloatArray]]] = {
 
 
 def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
-    """Return the faults of the yaw angle."""
+    """Return the findings about the yaw angle."""
     findings = []
     if np.isfinite(signals[:, S.LATITUDE]).sum() < 10:
         return []
@@ -50,18 +52,18 @@ def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
 
 
 def _total_turn(angle: FloatArray) -> float:
-    """Return the range of an angle (n,) [rad] from its 5 % to its 95 % quantile, unwrapped."""
+    """Return the range of an angle (n,) [rad] after unwrapping, from its 5 % to its 95 % quantile."""
     unwrapped = np.unwrap(angle)
     return float(np.percentile(unwrapped, 95) - np.percentile(unwrapped, 5))
 
 
 def _course_agreement(yaw: FloatArray, course: FloatArray) -> float:
-    """Return the mean cosine of the difference between yaw and course; 1 if they are equal."""
+    """Return the mean cosine of the difference between yaw and course [rad]; 1 if they are equal."""
     return float(np.mean(np.cos(yaw - course)))
 
 
 def has_exchanged_position(t: FloatArray, signals: FloatArray, drive: EvenDrive) -> bool:
-    """Return True if the fixes agree with the wheels only after latitude and longitude are
+    """Return True if the positions agree with the wheels only after latitude and longitude are
     exchanged.
     """
     latitude = signals[:, S.LATITUDE]

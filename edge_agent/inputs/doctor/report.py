@@ -1,4 +1,6 @@
-"""The doctor's findings as lines for a terminal, and as one self-contained page with plots."""
+"""The doctor's findings as text lines for a terminal, and as one self-contained HTML page with
+plots.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ STYLE: Final = (
 
 
 def report_lines(diagnosis: Diagnosis) -> list[str]:
-    """Return the findings, one line each."""
+    """Return the diagnosis as text lines: one per finding, unknown channel, lag and channel without
+    fault.
+    """
     lines = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in diagnosis.findings]
     lines += [
         f"{'unknown':<8} {channel:<10} this drive gives no evidence"
@@ -58,8 +62,8 @@ def report_lines(diagnosis: Diagnosis) -> list[str]:
 
 
 def report_document(diagnosis: Diagnosis) -> dict[str, object]:
-    """Return the findings for a program; scale, offset and delay correct a channel, in this
-    order.
+    """Return the diagnosis as a JSON-compatible document for programs. To correct a channel, apply
+    scale, offset and delay of a finding, in this order.
     """
     return {
         "passed": diagnosis.is_passed,
@@ -129,8 +133,8 @@ def _identity_table(fits: dict[str, Fit]) -> str:
 
 
 def _scatter_plot(name: str, fit: Fit) -> str:
-    """Return a scatter plot of both sides, with the identity itself (grey) and the measured
-    relation (red).
+    """Return an SVG scatter plot of both sides of an identity, with the ideal relation (grey) and
+    the measured relation (red).
     """
     step = max(1, len(fit.right) // POINTS)
     x = fit.right[::step]

@@ -1,16 +1,16 @@
-"""Search for quantities with a wrong unit, sign or clock: the fewest faults that explain all
-identities.
+"""Search for quantities with a wrong unit, sign or clock: the smallest set of faults that explains
+all identities.
 
-Every quantity may be sound or have one of a few faults, each a factor on the recorded value. A
-fault costs FAULT_COST / 2 in log probability, since few columns are wrong (Occam). An identity
-states, in logarithms,
+Every quantity may be free of faults or have one of a few faults. Each fault is a factor on the
+recorded value and costs FAULT_COST / 2 in log probability, because faulty columns are rare (Occam).
+An identity relates the quantities by
 
-    ln |gain| = ln centre + Σ ± ln factor of the quantities in it + error,        sign(gain) = Π
-                                                                                  sign(factor)
+    ln |gain| = ln centre + Σ ± ln factor of its quantities + error
+    sign(gain) = Π sign(factor)
 
-Every set of at most two faulty quantities is tried. A quantity is settled when all explanations
-that disagree on it cost SETTLED more. Clocks are treated in the same way: the lag of an identity is
-the difference of two devices' lags.
+Every set of at most two faulty quantities is tried. A quantity is settled if every explanation with
+another fault of it costs at least SETTLED more than the best one. Clocks are treated in the same
+way: the lag of an identity is the difference between the lags of two devices.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class Member(NamedTuple):
 
 
 class Law(NamedTuple):
-    """Expected gain of an identity without faults, the spread of its logarithm among such cars, and
-    the quantities in it.
+    """Properties of an identity without faults: expected gain, standard deviation of the gain's
+    logarithm between cars, and its quantities.
     """
 
     centre: float
@@ -98,7 +98,7 @@ CLOCK_COST: Final = 4.0  # lags have no table of faults that one could hit by ch
 
 
 def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
-    """Return the possible faults of each quantity."""
+    """Return the possible faults of each quantity for this vehicle, by quantity."""
     g = 1.0 / GRAVITY
     deg = 1.0 / DEG
     ratio = vehicle.steering_ratio or 16.0
@@ -137,20 +137,22 @@ JOINT: Final = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of the search: the fault of each quantity, None if it is sound, and by how much more
-    the best explanation costs that gives this quantity another fault.
+    """Result of the search for faults.
+
+    `faults` has the fault of each quantity, None if there is none. `margins` has, for each
+    quantity, the extra cost of the best explanation that gives this quantity another fault.
     """
 
     faults: dict[str, Mistake | None]
     margins: dict[str, float]
 
     def is_settled(self, quantity: str) -> bool:
-        """Return True if no other explanation of the quantity is plausible."""
+        """Return True if every other explanation of the quantity is implausible."""
         return self.margins[quantity] >= SETTLED
 
 
 def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
-    """Return the smallest set of faults of unit and sign that explains the identities."""
+    """Return the smallest set of unit and sign faults that explains the fitted identities."""
     choices = faults_of(vehicle, found["ground"])
     known = {name: fit for name, fit in found.items() if fit.is_known}
     costs: list[tuple[float, dict[str, Mistake]]] = []
@@ -171,8 +173,8 @@ def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
 
 
 def _are_equivalent(one: Mistake | None, other: Mistake | None) -> bool:
-    """Return True if two faults are equivalent: km/h equals a radius of .28 m, which no drive
-    separates from a wrong radius.
+    """Return True if two faults have the same effect on the signal. For example, km/h equals a
+    radius of .28 m, and no drive can distinguish it from a wrong radius.
     """
     if one is None or other is None:
         return one is other
@@ -214,7 +216,10 @@ def _misfit_of(name: str, fit: Fit, guess: Mapping[str, Mistake]) -> float:
 
 def late_clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
     """Return the smallest set of late devices that explains the lags, as device → (delay of its
-    clock [s], margin); empty if none is late.
+    clock [s], margin).
+
+    The result is empty if no device is late. The margin is the extra cost of the next best
+    explanation.
     """
     known = {
         name: fit

@@ -1,4 +1,6 @@
-"""Evidence of slip and of constancy: how to distinguish a sliding wheel from a faulty sensor."""
+"""Tests that distinguish a sliding wheel from a faulty sensor: evidence of slip, and evidence of
+constant errors.
+"""
 
 from __future__ import annotations
 
@@ -34,8 +36,10 @@ TURNS_LIKE: Final = 0.8
 
 
 def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:
-    """Return True if a wheel leaves the others (n,) by sudden steps of a few sizes, FEWEST_STEPS
-    at least.
+    """Return True if a wheel speed differs from the others by sudden steps of a few fixed sizes, at
+    least FEWEST_STEPS times.
+
+    `above` (n,) is the difference from the other wheels, `off` (n,) is True where it is large.
     """
     enters = np.flatnonzero(~off[:-1] & off[1:])
     if len(enters) < FEWEST_STEPS:
@@ -51,8 +55,10 @@ def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:
 
 
 def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float) -> bool:
-    """Return True if a wheel has nothing to do with the other three (n, 3), which agree: no wheel
-    spins for that long.
+    """Return True if a wheel disagrees with the other three wheels (n, 3) most of the time while
+    they agree with each other.
+
+    No wheel spins for that long, so the signal is not a speed of this wheel.
     """
     agree = np.ptp(rest, axis=1) < 0.1 * np.abs(others) + 0.02 * fast
     moves = np.abs(others) > 0.3 * fast
@@ -64,10 +70,11 @@ def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float
 
 
 def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
-    """Return the axles whose left and right wheels are exchanged, though the other axle's are not:
-    name and wheels.
+    """Return the axles with exchanged left and right wheels, if the other axle is correct: name and
+    wheel indices.
 
-    With both exchanged the axles agree, and the identity of the axles shows it.
+    If both axles are exchanged, they agree with each other, and the identity of the yaw rates shows
+    the fault.
     """
 
     def yaw_likeness(yaw: FloatArray) -> float:
@@ -96,11 +103,12 @@ def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
 
 
 def find_locked_axles(drive: EvenDrive) -> list[str]:
-    """Return the axles whose wheels turn as one, "front" or "rear": a locked differential, or one
-    sensor for both.
+    """Return the axles whose wheels turn at the same speed, "front" or "rear": a locked
+    differential, or one sensor for both wheels.
 
-    The other axle follows the yaw rate. A wheel speed of a locked axle is the mean of both; a
-    filter that takes the difference for slip reads a slide in every tight turn.
+    The other axle must agree with the yaw rate. A wheel speed of a locked axle is the mean of both
+    wheels; a filter that interprets the missing difference as slip would see a slide in every tight
+    turn.
     """
     locked = []
     for name, own, other in (
@@ -124,8 +132,8 @@ def find_locked_axles(drive: EvenDrive) -> list[str]:
 
 
 def find_followed(drive: EvenDrive) -> BoolArray:
-    """Return True where the car follows its steering, (n,): it does not slide there, whatever the
-    road.
+    """Return an array (n,) that is True where the car follows its steering, so that it does not
+    slide on any road.
     """
     fast = np.maximum(np.abs(drive.v), 1.0)
     wanted = drive.wheelbase * drive.r / fast
@@ -136,11 +144,11 @@ def find_followed(drive: EvenDrive) -> BoolArray:
 
 
 def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
-    """Return True if speed over ground over the wheels' is the same while the car gains and loses
-    speed.
+    """Return True if the ratio of speed over ground to wheel speed equals `gain` both while the car
+    gains speed and while it loses speed.
 
-    Wheels that spin turn too fast while they are driven, wheels under brakes too slowly; a wrong
-    radius always is.
+    Spinning wheels turn too fast while they are driven, and braked wheels turn too slowly. A wrong
+    radius has the same effect all the time.
     """
     ratio = smooth_twice(drive.v_ground, 1.0) / np.where(
         drive.v == 0.0, np.nan, smooth_twice(drive.v, 1.0)
@@ -153,8 +161,8 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
 
 
 def spread_of_parts(beside: FloatArray) -> float:
-    """Return the spread over the parts of a drive of quantities that should be constant: a tilt is
-    in all, a slide is not.
+    """Return the standard deviation of a quantity between parts of a drive. A tilt of the sensor is
+    the same in all parts, a slide is not.
     """
     parts = [
         float(np.nanmedian(part))
@@ -165,13 +173,13 @@ def spread_of_parts(beside: FloatArray) -> float:
 
 
 def is_steady(fit: Fit) -> bool:
-    """Return True if the parts of the drive have the gain that all have together."""
+    """Return True if most parts of the drive have the gain of the whole drive."""
     return share_of_parts(fit, fit.gain) >= STEADY_SHARE
 
 
 def share_of_parts(fit: Fit, gain: float, within: float = STEADY) -> float:
-    """Return the share of a drive's parts whose gain is the given one, within `within` in
-    logarithms.
+    """Return the share of a drive's parts whose gain has the sign of `gain` and differs by less
+    than `within` in the logarithm.
     """
     if not fit.parts:
         return 0.0
@@ -182,11 +190,11 @@ def share_of_parts(fit: Fit, gain: float, within: float = STEADY) -> float:
 def measure_lags_twice(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, found: dict[str, Fit]
 ) -> dict[str, float]:
-    """Return the lags [s] that both halves of a drive agree on, of devices whose identity holds all
-    along.
+    """Return the lags [s] on which both halves of a drive agree, for devices whose identity holds
+    throughout the drive.
 
-    A car that slides answers to its steering later or sooner than its model, and not by the same
-    time again.
+    In a slide, a car responds to its steering later or sooner than the model, and by a different
+    time in each slide. Such a lag is therefore left out.
     """
     half = len(t) // 2
     whole = find_lags(t, signals, vehicle)

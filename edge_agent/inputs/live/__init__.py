@@ -1,1 +1,1 @@
-"""Live sources: threads that listen, and rows built from their messages at a fixed rate."""
+"""Live sources: threads that receive messages, and rows built from the messages at a fixed rate."""

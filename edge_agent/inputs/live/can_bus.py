@@ -1,4 +1,6 @@
-"""A CAN bus by python-can; the interface takes only the identifiers that the profile reads."""
+"""Live source for a CAN bus, by python-can; the interface filters for the identifiers that the
+profile needs.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,9 @@ OWN: Final = "gripmap"
 
 
 class Decoder:
-    """Frames to signals, by the database; of a message that the profile puts on another bus,
-    nothing.
+    """Decoder of CAN frames to signals, by a CAN database.
+
+    Messages that the profile assigns to another bus are left out.
     """
 
     def __init__(self, profile: Profile, database: Database, bus: int | None = None) -> None:
@@ -40,7 +43,7 @@ class Decoder:
         }
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the signals in frames (time, (identifier, extended, data))."""
+        """Return the signals, by name, in received frames (time, (identifier, extended, data))."""
         log: Log = {}
         for time, (identifier, extended, data) in heard:
             log.setdefault((0, identifier, extended), Frames()).add(time, data)
@@ -48,13 +51,13 @@ class Decoder:
 
 
 class CanFeed(Feed):
-    """One bus of python-can.
+    """Live source for one bus of python-can.
 
     Args:
-        name: of the source.
-        clock: the host's.
+        name: name of the source.
+        clock: clock of the host.
         decoder: decodes the frames that the profile needs.
-        options: of `can.Bus`: interface, channel and further options of the interface.
+        options: options of `can.Bus`: interface, channel and further options of the interface.
 
     Raises:
         InputError: python-can is not installed.
@@ -88,5 +91,5 @@ class CanFeed(Feed):
                 self.hear(round(message.timestamp * NS), frame)
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the profile's signals in the frames."""
+        """Return the profile's signals, by name, in the received frames."""
         return self._decoder.series(heard)

@@ -1,5 +1,5 @@
-"""Signals of a Kuksa databroker, by gRPC (kuksa.val.v2): paths of the vehicle signal
-specification (COVESA VSS).
+"""Live source for a Kuksa databroker, by gRPC (kuksa.val.v2). Signals are paths of the vehicle
+signal specification (COVESA VSS).
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ NUMBERS: Final = ("bool", "int32", "int64", "uint32", "uint64", "float", "double
 
 
 class DatabrokerFeed(Feed):
-    """The paths of a broker.
+    """Live source for paths of a databroker.
 
     Args:
-        name: of the source.
-        clock: the host's.
+        name: name of the source.
+        clock: clock of the host.
         address: host and port.
-        paths: that the profile reads; those which the broker does not know are left out.
-        lasting: of these, the ones that are sent when they change.
-        files: `ca`, the authority of its certificate, without which no TLS is spoken, and `token`,
-            a JSON web token.
+        paths: paths that the profile needs; paths that the broker does not know are left out.
+        lasting: those of the paths that are sent only when they change.
+        files: `ca`, file of the certificate authority (without it the connection does not use TLS),
+            and `token`, file with a JSON web token.
 
     Raises:
         InputError: grpc is not installed, or a file cannot be read.
@@ -54,8 +54,9 @@ class DatabrokerFeed(Feed):
     def listen(self) -> None:
         """Receive updates until the connection to the broker ends.
 
-        The first answer holds the broker's last values, however old. They are not readings, except
-        for a signal that is sent only on change: there the last value still holds.
+        The first answer contains the broker's last values, which may be old. They do not count as
+        readings, except for a signal that is sent only when it changes: its last value is still
+        valid.
         """
         connection = self._connection
         with connection.open_channel() as channel:
@@ -79,14 +80,14 @@ class DatabrokerFeed(Feed):
                 self._call.cancel()
 
     def close(self) -> None:
-        """Stop listening."""
+        """Stop listening, and cancel the subscription."""
         self.stopping.set()
         if self._call is not None:
             self._call.cancel()
         super().close()
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the values by path."""
+        """Return the received values by path."""
         times: dict[str, list[float]] = {}
         values: dict[str, list[float]] = {}
         for time, (path, value) in heard:
@@ -95,7 +96,7 @@ class DatabrokerFeed(Feed):
         return {path: Series(np.array(times[path]), np.array(values[path])) for path in times}
 
     def _known_paths(self, channel: Any) -> list[str]:  # noqa: ANN401
-        """Return the paths that the broker knows, because it refuses a whole subscription if it
+        """Return the paths that the broker knows. The broker would reject a whole subscription that
         contains an unknown path.
         """
         m = self._messages

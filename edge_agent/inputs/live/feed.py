@@ -1,10 +1,11 @@
-"""A live source: a thread that listens, reopens a lost connection, and hands over the received
+"""Base of a live source: a thread that listens, reopens a lost connection, and stores the received
 messages.
 
-Times are the host's: seconds since its start, by a clock that never steps. A source whose stamps
-are up to BELIEVED_S old when they arrive has the host's date and is believed. Any other has a clock
-of its own: its fastest message within WHILE_S to 2 WHILE_S is taken to have come at once (Cristian,
-Distrib. Comput. 3 (1989): the minimum of the delays).
+Times are the host's: seconds since its start, by a monotonic clock. A source whose time stamps are
+at most BELIEVED_S old on arrival has the same date as the host, and its stamps are used unchanged.
+For any other source, the difference between the two clocks is estimated: the message with the
+smallest delay within the last WHILE_S to 2 WHILE_S is assumed to have arrived without delay
+(Cristian, Distrib. Comput. 3 (1989): the minimum of the delays).
 """
 
 from __future__ import annotations
@@ -37,24 +38,24 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class HostClock:
-    """The host's clock from its start on: the UTC time [ns] of the start, and the reading of a
-    monotonic clock at that moment.
+    """The host's clock since its start: the UTC time [ns] of the start, and the reading of a
+    monotonic clock [s] at that moment.
     """
 
     start_ns: int = field(default_factory=time.time_ns)
     steady_s: float = field(default_factory=time.monotonic)
 
     def now(self) -> float:
-        """Return the seconds since the start."""
+        """Return the seconds since the start of the clock."""
         return time.monotonic() - self.steady_s
 
     def seconds_of(self, stamp_ns: int) -> float:
-        """Return a date in ns UTC as seconds since the start."""
+        """Return a date [ns UTC] as seconds since the start of the clock."""
         return (stamp_ns - self.start_ns) / NS
 
 
 class Stamps:
-    """Puts a source's stamps on the host's clock."""
+    """Conversion of a source's time stamps to the host's clock."""
 
     def __init__(self) -> None:
         self._before = self._lately = float("inf")
@@ -62,12 +63,14 @@ class Stamps:
 
     @property
     def lead(self) -> float:
-        """Seconds to add to its stamps, 0 where they are believed."""
+        """Return the seconds to add to the source's stamps; 0 where the stamps are used unchanged."""
         least = min(self._before, self._lately)
         return 0.0 if -EARLY_S <= least < BELIEVED_S or least == float("inf") else least
 
     def host_time(self, stamp: float, arrival: float) -> float:
-        """Return the host's time of a stamp that arrived now."""
+        """Return the host's time [s] for a time stamp [s] of a message that arrived at `arrival`
+        [s].
+        """
         if arrival - self._turned > WHILE_S:
             self._before = self._lately
             self._lately = float("inf")
@@ -77,13 +80,15 @@ class Stamps:
 
 
 class Feed(ABC):
-    """One live source. `start` once, `take` again and again, `close` once.
+    """Base class of live sources. Call `start` once, `take` repeatedly, and `close` once.
 
     Attributes:
-        name: how it was asked for.
-        heard: messages so far; lost: those known to be missing; broken: those that could not be
-            read.
-        openings, losses: how often the source was opened, and lost.
+        name: the source as given on the command line.
+        heard: number of messages received.
+        lost: number of messages known to be missing.
+        broken: number of messages that could not be read.
+        openings: number of times that the source was opened.
+        losses: number of times that the connection was lost.
     """
 
     def __init__(self, name: str, clock: HostClock) -> None:
@@ -100,13 +105,15 @@ class Feed(ABC):
 
     @abstractmethod
     def listen(self) -> None:
-        """Open the source, count that, and `hear` until `stopping` is set; to return or raise
-        earlier is to lose it.
+        """Open the source, increment `openings`, and call `hear` for each message until `stopping`
+        is set.
+
+        An earlier return or an exception counts as a loss of the source; it is then opened again.
         """
 
     @abstractmethod
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the signals in the received messages."""
+        """Return the signals in the received messages, by name."""
 
     def start(self) -> None:
         """Start the thread that listens to the source."""
@@ -114,19 +121,21 @@ class Feed(ABC):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening; a thread that hangs in a driver is left behind, see `listening`."""
+        """Stop listening. A thread that hangs in a driver is not waited for longer than LEAVE_S;
+        see `listening`.
+        """
         self.stopping.set()
         self._thread.join(LEAVE_S)
 
     @property
     def listening(self) -> bool:
-        """Return True if the thread runs: after `close`, a hanging thread that its library may wait
-        for at exit.
+        """Return True if the thread is still running. After `close` this means that it hangs in a
+        driver, and the driver's library may block the exit of the process.
         """
         return self._thread.is_alive()
 
     def hear(self, stamp_ns: int, what: object) -> None:
-        """Keep a message with the source's own date [ns UTC]."""
+        """Store a message with the source's own time stamp [ns UTC]."""
         self.last = self.clock.now()
         self.heard += 1
         if len(self._waiting) >= MOST_WAITING:
@@ -137,7 +146,7 @@ class Feed(ABC):
         self.newest = max(self.newest, placed)
 
     def unreadable(self, reason: str) -> None:
-        """Count a message that makes no sense; the first of its kind is logged."""
+        """Count an unreadable message. The first one with this reason is logged."""
         self.broken += 1
         self.say(reason)
 
@@ -148,7 +157,7 @@ class Feed(ABC):
 
     @property
     def trouble(self) -> str | None:
-        """Reason why the source delivers nothing; None while it delivers."""
+        """Return the reason why the source delivers nothing; None while it delivers."""
         silent = self.clock.now() - self.last
         return f"{self.name} has sent nothing for {silent:.0f} s" if silent > SILENT_S else None
 
@@ -165,7 +174,7 @@ class Feed(ABC):
             self.stopping.wait(RETRY_S)
 
     def say(self, reason: str) -> None:
-        """Log a reason once."""
+        """Log a reason, but each different reason only once."""
         if reason not in self._reasons and len(self._reasons) < 50:
             self._reasons.add(reason)
             log.warning("%s: %s", self.name, reason)

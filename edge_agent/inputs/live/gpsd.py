@@ -1,4 +1,4 @@
-"""Positions of a running gpsd: its JSON over TCP."""
+"""Live source for positions of a running gpsd, as JSON over TCP."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CONNECT_S: Final = 5.0
 
 
 class GpsdFeed(Feed):
-    """The TPV reports of a gpsd at (host, port)."""
+    """Live source for the position reports (TPV) of a gpsd at the address (host, port)."""
 
     def __init__(self, name: str, clock: HostClock, address: tuple[str, int]) -> None:
         super().__init__(name, clock)
@@ -59,7 +59,7 @@ class GpsdFeed(Feed):
             self.hear(fix.time, fix)
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the signals latitude, longitude, speed and course."""
+        """Return the received positions as the signals latitude, longitude, speed and course."""
         t = np.array([time for time, _ in heard])
         return {
             name: Series(t, np.array([getattr(fix, name) for _, fix in heard]), UNITS[name])

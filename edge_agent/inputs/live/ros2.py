@@ -1,10 +1,11 @@
-"""Topics of ROS 2 over rmw_zenoh, no ROS installed: a subscriber at a Zenoh router, messages
-decoded by rosbags.
+"""Live source for ROS 2 topics by the Zenoh transport of ROS (rmw_zenoh), without a ROS
+installation.
 
-A topic's key is DOMAIN/TOPIC/PACKAGE::msg::dds_::TYPE_/HASH, its payload CDR. The attachment begins
-with a sequence number and the time of publication (int64 each, little endian; rmw_zenoh_cpp,
-design.md), so lost messages are counted. Signals are named as in a bag, /topic.field.field; topics
-of can_msgs/Frame are buses.
+It subscribes at a Zenoh router, and the library rosbags decodes the messages. The key of a topic is
+DOMAIN/TOPIC/PACKAGE::msg::dds_::TYPE_/HASH, and the payload is CDR. The attachment begins with a
+sequence number and the time of publication (int64 each, little endian; rmw_zenoh_cpp, design.md),
+so lost messages can be counted. Signals have the same names as in a bag, /topic.field.field. Topics
+with the type can_msgs/Frame are CAN buses.
 """
 
 from __future__ import annotations
@@ -50,19 +51,20 @@ MOST_PUBLISHERS: Final = 1000  # whose sequence numbers are followed
 
 
 class Ros2Feed(Feed):
-    """Topics of one domain.
+    """Live source for topics of one ROS domain.
 
     Args:
-        name: of the source.
-        clock: the host's.
-        settings: how to reach the router.
+        name: name of the source.
+        clock: clock of the host.
+        settings: Zenoh settings to reach the router.
         domain: ROS_DOMAIN_ID.
-        signals: that the profile reads; each begins with its topic.
-        decoder: of topics of CAN frames, where there is a database.
-        types: a folder of PACKAGE/NAME.msg, for messages that no distribution has.
+        signals: signals that the profile needs; each name begins with its topic.
+        decoder: decoder for topics of CAN frames, if there is a CAN database.
+        buses: topics of CAN frames.
+        types: folder of PACKAGE/NAME.msg files, for message types that no ROS distribution has.
 
     Raises:
-        InputError: rosbags is not installed, no signal names a topic, or a type makes no sense.
+        InputError: rosbags is not installed, no signal names a topic, or a message type is invalid.
     """
 
     def __init__(
@@ -94,7 +96,7 @@ class Ros2Feed(Feed):
         self._after: dict[bytes, int] = {}  # publisher -> the sequence number that is next
 
     def listen(self) -> None:
-        """Receive samples until stopped; Zenoh itself reconnects to a lost router."""
+        """Receive messages until the source is stopped. Zenoh itself reconnects to a lost router."""
         session = open_session(self._settings, self.stopping)
         if session is None:
             return
@@ -111,7 +113,7 @@ class Ros2Feed(Feed):
                 subscriber.undeclare()
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the values by name; frames are decoded with the database."""
+        """Return the received values by signal name. CAN frames are decoded with the database."""
         frames = [(time, what) for time, what in heard if isinstance(what, tuple)]
         found = self._decoder.series(frames) if self._decoder and frames else {}
         times: dict[str, list[float]] = {}
@@ -155,8 +157,8 @@ class Ros2Feed(Feed):
         self.hear(at, {name: float(take(message)) for name, take in self._leaves[topic]})
 
     def _publication_time(self, attachment: bytes) -> int:
-        """Return the time of publication [ns], 0 where it is missing; count the messages lost
-        before it.
+        """Return the time of publication [ns], 0 if it is missing, and count the messages that were
+        lost before this one.
         """
         if len(attachment) < ATTACHMENT.size:
             return 0
@@ -171,10 +173,11 @@ class Ros2Feed(Feed):
 
 
 def type_of(key: str) -> str:
-    """Return the message type in a key: `sensor_msgs::msg::dds_::Imu_` is sensor_msgs/msg/Imu.
+    """Return the message type in a key, for example sensor_msgs/msg/Imu for
+    `sensor_msgs::msg::dds_::Imu_`.
 
     Raises:
-        ValueError: it contains none.
+        ValueError: the key contains no type.
     """
     place, mark, name = key.split("/")[-2].partition(DDS)
     if not mark or not name.endswith("_"):

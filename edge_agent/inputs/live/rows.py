@@ -1,11 +1,12 @@
-"""Rows at a fixed rate from the messages of live sources, with the importer's profile and merging,
-a tenth of a second at a time.
+"""Rows at a fixed rate built from the messages of live sources, with the same profile and merging
+as the importer, a tenth of a second at a time.
 
-A row is made DELAY_S after its time, so that readings on both sides of it have arrived. A source
-that is active but behind (its host is busy) is waited for up to PATIENCE_S. Later messages are
-treated as missing, and counted. The clock makes the rows: where all sources are silent they are
-empty, and the estimator widens. A fix that arrives after its row is moved along its own course to
-the first row that is left.
+A row is built DELAY_S after its time, so that readings before and after it have arrived. If an
+active source is delayed because its host is busy, the row waits for up to PATIENCE_S. Readings that
+arrive later are treated as missing, and counted. The host's clock determines the rows: while all
+sources are silent the rows are empty, and the estimator's uncertainty grows. A position that
+arrives after its row was sent is moved along its own course to the first row that has not been
+sent.
 """
 
 from __future__ import annotations
@@ -43,17 +44,17 @@ UNSTEERED: Final = STEERING[2:]
 
 
 class LiveRows:
-    """Blocks of one vehicle's samples from its sources.
+    """Generator of blocks with one vehicle's samples from its live sources.
 
     Args:
-        feeds: the sources; they are started by `blocks`.
-        profile: which signal is which channel.
-        vehicle: its wheel radius and steering ratio go before the profile's.
-        clock: the host's, the same as that of the feeds.
-        wait: sleeps so many seconds.
+        feeds: the sources; `blocks` starts them.
+        profile: maps signals to channels.
+        vehicle: its wheel radius and steering ratio take precedence over the profile's.
+        clock: clock of the host, the same as that of the feeds.
+        wait: function that sleeps for a number of seconds.
 
     Raises:
-        InputError: the profile reads the steering wheel, and its ratio is not given.
+        InputError: the profile uses the steering wheel angle, and no steering ratio is given.
     """
 
     def __init__(
@@ -111,12 +112,14 @@ class LiveRows:
                 feed.close()
 
     def health_problems(self) -> list[str]:
-        """Return one message per silent source."""
+        """Return one message for each silent source."""
         return [trouble for feed in self.feeds if (trouble := feed.trouble)]
 
     def _may_deliver(self, time: float) -> bool:
-        """Return True if a source may still deliver readings of a time: not a silent source, and
-        not a receiver, whose fixes are rare.
+        """Return True if a source may still deliver readings for a time.
+
+        Silent sources do not count, and neither do position receivers, because their fixes are
+        rare.
         """
         return any(
             feed.heard and feed.newest < time and feed.trouble is None and "course" not in kept
@@ -162,7 +165,7 @@ class LiveRows:
         )
 
     def _recent_recording(self, place: int, feed: Feed, oldest: float) -> Recording:
-        """Return the recent readings of a source."""
+        """Return the recent readings of a source, including those from before the block."""
         kept = self._readings[place]
         fresh_ones = feed.take()
         if "course" not in fresh_ones:
@@ -190,8 +193,8 @@ class LiveRows:
         return Recording(feed.name, dict(kept))
 
     def _place_fixes(self, fixes: dict[str, Series], t: FloatArray, signals: FloatArray) -> None:
-        """Write each fix into the row nearest to its time; if that row has already been sent, move
-        the fix into the first row.
+        """Write each position fix into the row nearest to its time. If that row has already been
+        sent, move the fix to the first row of the block.
         """
         half = 0.5 / self.rate_hz
         speed = fixes.get(GROUND)
@@ -228,14 +231,14 @@ class LiveRows:
                 signals[rows, CHANNELS.index(name)] = values
 
     def _fill_steering(self, signals: FloatArray) -> None:
-        """Fill missing steering as in a log: a front wheel outside the profile steers like the
-        other one, rear wheels do not steer.
+        """Fill missing steering angles as in a log. A front wheel without a channel in the profile
+        gets the angle of the other front wheel, and rear wheels get zero.
         """
         fill_steering(signals, [name not in self._profile.channels for name in STEERING])
 
     def _start_ns(self) -> int:
-        """Return the date of the start [ns UTC], corrected by a receiver's clock; the first fix
-        determines it for good.
+        """Return the date of the start [ns UTC], corrected by a receiver's clock. The first
+        position fix determines the correction permanently.
         """
         if self._date_ns is None and self._used["latitude"] > -math.inf:
             leads = [
@@ -250,7 +253,7 @@ class LiveRows:
 
 
 def _readings_at(series: Series | None, times: FloatArray) -> FloatArray:
-    """Return the readings at exactly these times, NaN where there are none."""
+    """Return the readings at exactly the given times; NaN at times without a reading."""
     found = np.full(len(times), np.nan)
     if series is not None and len(series.t):
         place = np.clip(np.searchsorted(series.t, times), 0, len(series.t) - 1)

@@ -1,12 +1,12 @@
-"""Live sources as written on a command line: `kind:address?option=value`.
+"""Live sources in the notation of the command line: `kind:address?option=value`.
 
 source                                   is
 can:socketcan/can0, can:virtual/bench    a bus of python-can: interface, channel; `bus` is its
                                          number in the profile (else that in the channel's name),
                                          other options are those of the interface
 ros2:tcp/127.0.0.1:7447                  topics of rmw_zenoh at a router, of `domain` (0);
-                                         `frames=/can0` is one of can_msgs/Frame; `messages=FOLDER`
-                                         holds PACKAGE/NAME.msg of your own types
+                                         `frames=/can0` is a topic of can_msgs/Frame;
+                                         `messages=FOLDER` has PACKAGE/NAME.msg of your own types
 vss:127.0.0.1:55555                      a Kuksa databroker; with `ca=FILE` by TLS, with
                                          `token=FILE` authenticated
 gpsd:127.0.0.1:2947                      a gpsd
@@ -39,23 +39,22 @@ VSS_PROFILE: Final = "vss"
 
 
 def is_live(source: str) -> bool:
-    """Return True if a source of `run` is a live one."""
+    """Return True if a source given to `run` is a live source."""
     return source.partition(":")[0] in KINDS
 
 
 def open_sources(
     sources: Sequence[str], profile_name: str | None, dbc: Path | None = None
 ) -> tuple[list[Feed], Profile, HostClock]:
-    """Open the sources; return them with the profile that they are read by and the clock that they
-    share.
+    """Create the live sources; return them with their profile and their common clock.
 
     Args:
-        sources: as named on the command line.
-        profile_name: a file, or the name of a shipped one; a databroker alone needs none.
-        dbc: CAN database; else the profile's.
+        sources: sources in the notation of the command line.
+        profile_name: file or name of a shipped profile; for a databroker alone it is optional.
+        dbc: CAN database; by default the profile's.
 
     Raises:
-        InputError: a source, its profile or its library is missing or makes no sense.
+        InputError: a source, its profile or its library is missing or invalid.
     """
     kinds = [source.partition(":")[0] for source in sources]
     if profile_name is None and "vss" in kinds:
@@ -167,7 +166,7 @@ def _open_ros2(
 
 
 def _parse_option(text: str) -> int | float | bool | str:
-    """Return an option in the type that python-can expects."""
+    """Return the value of an option in the type that python-can expects: bool, int, float or str."""
     if text in ("true", "false"):
         return text == "true"
     for kind in (int, float):

@@ -1,3 +1,3 @@
-"""Readers of foreign recordings: each gives a `Recording`; libraries are imported when they are
-used.
+"""Readers of foreign recordings. Each returns a `Recording`; optional libraries are imported at
+first use.
 """

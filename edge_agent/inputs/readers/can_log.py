@@ -1,8 +1,10 @@
-"""CAN logs (BLF, ASC, candump, TRC, bus-logging MF4) to series, by way of a CAN database.
+"""Reader of CAN logs (BLF, ASC, candump, TRC, bus-logging MF4); a CAN database decodes the frames
+to series.
 
-Times are those of arrival, counted from the log's first frame in whole microseconds, so that one
-drive is one drive in every format. Buses are numbered as python-can does. If several buses carry a
-message, the named bus is used, otherwise the bus with most of the wanted signals.
+Times are those of arrival, counted from the log's first frame in whole microseconds, so that a
+drive has the same times in every format. Buses are numbered as python-can does. If several buses
+carry a message, the bus named in the profile is used; otherwise the bus with the most frames of the
+wanted messages.
 """
 
 from __future__ import annotations
@@ -30,8 +32,8 @@ Key: TypeAlias = tuple[int, int, bool]  # bus, identifier, extended
 
 @dataclass
 class Frames:
-    """Frames of one identifier on one bus: time of arrival [s as logged], and their bytes,
-    filled up to LONGEST.
+    """Frames of one identifier on one bus: times of arrival [s as logged], and data bytes, padded
+    to LONGEST.
     """
 
     times: list[float] = field(default_factory=list)
@@ -45,7 +47,7 @@ class Frames:
         self.data += data[:LONGEST].ljust(LONGEST, b"\0")
 
     def to_columns(self) -> tuple[FloatArray, Bytes]:
-        """Return the times (n,) and bytes (n, LONGEST) of the frames."""
+        """Return the times (n,) and the data bytes (n, LONGEST) of the frames."""
         return np.array(self.times), np.frombuffer(bytes(self.data), np.uint8).reshape(-1, LONGEST)
 
 
@@ -68,11 +70,12 @@ def decode_log(
     """Return the signals `MESSAGE.SIGNAL` of a log.
 
     Args:
-        take: gives the log's frames.
-        name: of the log.
-        database: how to decode it.
-        wanted: full names; names that the database or the log does not have are left out.
-        buses: the bus of a message, where it is known.
+        take: function that returns the log's frames.
+        name: name of the log.
+        database: CAN database that decodes the frames.
+        wanted: full names of signals; names that the database or the log does not have are left
+            out.
+        buses: bus number by message, where it is known.
     """
     messages: dict[str, list[str]] = defaultdict(list)
     for whole in wanted:
@@ -99,14 +102,14 @@ def decode_log(
 
 
 def no_database(path: Path) -> InputError:
-    """Return the error for CAN frames without a database."""
+    """Return the error for a log of CAN frames without a database."""
     return InputError(
         "dbc", f"{path} holds CAN frames", "name their database: --dbc, or dbc in the profile"
     )
 
 
 def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
-    """Return the frames of the wanted identifiers, read by python-can, and the time of the log's
+    """Return the frames with the wanted identifiers, read by python-can, and the time of the log's
     first frame [s].
     """
     log: Log = defaultdict(Frames)
@@ -130,7 +133,7 @@ def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
 
 
 def bus_of(channel: Any) -> int:  # noqa: ANN401 python-can gives a number, a name or None
-    """Return the number of a bus: 1 for can1 and 1, 0 for a name without a number."""
+    """Return the number of a bus: 1 for "can1" and for 1, 0 for a name without a number."""
     if isinstance(channel, int):
         return channel
     digits = "".join(c for c in str(channel or "") if c.isdigit())
@@ -138,8 +141,11 @@ def bus_of(channel: Any) -> int:  # noqa: ANN401 python-can gives a number, a na
 
 
 def _find_messages(log: Log, messages: list[CanMessage], buses: dict[str, int]) -> dict[str, Key]:
-    """Return the key (bus, identifier, extended) of each message in the log; without a given bus,
-    the one with the most frames.
+    """Return, by message name, the key (bus, identifier, extended) under which the log has the
+    message.
+
+    If the bus of a message is not given, the buses are searched in order of their number of frames
+    of all these messages, largest first.
     """
     counts: dict[int, int] = defaultdict(int)
     for message in messages:

@@ -1,5 +1,5 @@
-"""CAN frames in text that python-can does not read: SavvyCAN's GVRET CSV, and PCAN traces
-without their header.
+"""Reader of CAN frames in two text formats that python-can does not read: the GVRET CSV of
+SavvyCAN, and PCAN traces without a header.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _TRACE: Final = re.compile(
 
 
 def is_gvret(path: Path) -> bool:
-    """Return True if a CSV has the header of SavvyCAN's native format."""
+    """Return True if a CSV file has the header of SavvyCAN's native format."""
     with path.open("rb") as file:
         head = file.readline(LONGEST_LINE).decode("utf-8", errors="replace").lower()
     names = [name.strip() for name in head.split(",")]
@@ -31,17 +31,17 @@ def is_gvret(path: Path) -> bool:
 
 
 def is_bare_trace(path: Path) -> bool:
-    """Return True if a PCAN trace does not state its version."""
+    """Return True if a PCAN trace has no header with its version."""
     with path.open("rb") as file:
         head = file.read(65_536).decode("utf-8", errors="replace")
     return "$FILEVERSION" not in head
 
 
 def gvret_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
-    """Return the frames of the wanted identifiers, and the time of the first frame [s].
+    """Return the frames with the wanted identifiers, and the time of the first frame [s].
 
     Raises:
-        InputError: a row is not of this format; names it.
+        InputError: a row has another format; the error names the row.
     """
     log: Log = defaultdict(Frames)
     first = None
@@ -72,8 +72,10 @@ def gvret_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
 
 
 def trace_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
-    """Return the frames of a trace without header, times in milliseconds, and the time of the first
-    [s].
+    """Return the frames with the wanted identifiers from a trace without header, and the time of
+    the first frame [s].
+
+    The trace has times in milliseconds.
 
     Raises:
         InputError: no line is a frame.

@@ -1,10 +1,11 @@
-"""CAN databases, parsed tolerantly, and frames decoded a column at a time.
+"""Tolerant parser of CAN databases (DBC), and decoder of frames, one signal for all frames at a
+time.
 
-Only `BO_` and `SG_` lines are read. Therefore names with blanks, doubled messages and unknown
-attributes, on which strict parsers fail, do no harm. Multiplexed signals are decoded where their
-switch selects them. Bit numbers are those of a DBC. Little endian counts up from the start bit. Big
-endian starts at its most significant bit and counts down within a byte, then continues in the next
-byte.
+Only `BO_` and `SG_` lines are read. Therefore names with blanks, duplicate messages and unknown
+attributes, on which strict parsers fail, cause no error. Multiplexed signals are decoded only in
+frames whose multiplexer value selects them. Bit numbers are those of a DBC. A little-endian signal
+counts up from the start bit. A big-endian signal starts at its most significant bit and counts down
+within a byte, then continues in the next byte.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class Signal:
     switch: int | None = None  # value of the multiplexer at which it is present
 
     def decode(self, data: Bytes) -> FloatArray:
-        """Return the physical values (n,) in frames (n, LONGEST)."""
+        """Return the physical values (n,) of the signal in frames (n, LONGEST)."""
         raw = self._raw_values(data)
         number: NDArray[np.int64] | NDArray[np.uint64] = (
             raw.view(np.int64) if self.size < 64 or self.signed else raw
@@ -86,7 +87,7 @@ class Signal:
 
     @property
     def last_byte(self) -> int:
-        """The last byte that it touches."""
+        """Return the index of the last byte that contains bits of the signal."""
         if self.little:
             return (self.start + self.size - 1) // 8
         return self.start // 8 + max(0, -(-(self.size - self.start % 8 - 1) // 8))
@@ -94,8 +95,8 @@ class Signal:
 
 @dataclass(frozen=True)
 class CanMessage:
-    """A message of a database: identifier with its extended flag taken off, length [byte] and
-    signals by name.
+    """A message of a database: identifier without the extended flag, length [byte], and signals by
+    name.
     """
 
     name: str
@@ -106,7 +107,7 @@ class CanMessage:
     multiplexer: str | None = None
 
     def decode(self, data: Bytes, names: list[str]) -> dict[str, FloatArray]:
-        """Return the physical values by signal; NaN if a multiplexed signal is not in the frame."""
+        """Return the physical values by signal; NaN where a multiplexed signal is not in the frame."""
         found = {name: self.signals[name].decode(data) for name in names}
         switched = [name for name in names if self.signals[name].switch is not None]
         if switched and self.multiplexer is not None:
@@ -123,7 +124,7 @@ def read_dbc(path: Path) -> Database:
     """Return the messages of a database by name.
 
     Raises:
-        InputError: the file cannot be read, is too large, or holds no message with a signal.
+        InputError: the file cannot be read, is too large, or contains no message with a signal.
     """
     try:
         if path.stat().st_size > MOST_BYTES:
@@ -144,8 +145,8 @@ def read_dbc(path: Path) -> Database:
 
 
 def parse_dbc(text: str) -> Database:
-    """Return the messages in a database's text; invalid lines are left out, and the last of two
-    equal names counts.
+    """Return the messages in a database's text, by name. Invalid lines are left out; of two
+    messages with the same name, the last one is used.
     """
     database: Database = {}
     message: CanMessage | None = None
@@ -171,7 +172,9 @@ def parse_dbc(text: str) -> Database:
 
 
 def _parse_signal(found: re.Match[str]) -> tuple[Signal | None, str]:
-    """Return the signal in a line and its multiplexer mark; None if the line is invalid."""
+    """Return the signal in a line and its multiplexer mark. The signal is None if the line is
+    invalid.
+    """
     words = found["label"].split()
     mux = words.pop() if len(words) > 1 and _MULTIPLEXED.fullmatch(words[-1]) else ""
     try:

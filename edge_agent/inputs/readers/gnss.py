@@ -1,8 +1,8 @@
-"""Positions as NMEA 0183 sentences or gpsd's JSON, one a line; lines that are broken are left out
-and counted.
+"""Reader of positions from NMEA 0183 sentences or gpsd's JSON, one per line; broken lines are left
+out and counted.
 
-Of NMEA, RMC is read: time with date, place, speed, course. A sentence whose checksum is wrong
-counts as broken.
+Of the NMEA sentences, RMC is used: time with date, position, speed, course. A sentence with a wrong
+checksum is broken.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ UNITS: Final = {"latitude": "deg", "longitude": "deg", "speed": "m/s", "course":
 
 
 class Fix(NamedTuple):
-    """A position: ns UTC, degrees, speed [m/s], and course [deg clockwise from north]; NaN where
-    not given.
+    """A position fix: time [ns UTC], latitude and longitude [deg], speed [m/s], course [deg
+    clockwise from north]; NaN where not given.
     """
 
     time: int
@@ -38,7 +38,7 @@ class Fix(NamedTuple):
 
 
 def parse_nmea(line: str) -> Fix | None:
-    """Return the fix in an RMC sentence; None for any other line, and if the receiver has no
+    """Return the fix in an RMC sentence; None for any other sentence, or if the receiver has no
     position.
 
     Raises:
@@ -70,10 +70,10 @@ def parse_nmea(line: str) -> Fix | None:
 
 
 def parse_gpsd(line: str) -> Fix | None:
-    """Return the fix in a TPV report; None for any other object, and if the report has no position.
+    """Return the fix in a TPV report; None for any other object, or if the report has no position.
 
     Raises:
-        ValueError: the line is no JSON object, or a field is no number.
+        ValueError: the line is not a JSON object, or a field is not a number.
     """
     report = json.loads(line)
     if not isinstance(report, dict):
@@ -105,10 +105,11 @@ def _check_position(fix: Fix) -> Fix:
 
 
 def read_gnss(path: Path) -> Recording:
-    """Return the signals latitude, longitude, speed and course from a file of sentences or reports.
+    """Return the signals latitude, longitude, speed and course from a file of NMEA sentences or
+    gpsd reports.
 
     Raises:
-        InputError: the file cannot be read, or holds no position with a time.
+        InputError: the file cannot be read, or contains no position with a time.
     """
     fixes: list[Fix] = []
     broken = 0

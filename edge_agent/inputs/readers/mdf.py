@@ -1,8 +1,8 @@
-"""Reader of ASAM MDF 4 files: measured channels, or the frames of a logged bus.
+"""Reader of ASAM MDF 4 files, which contain measured channels or the frames of a logged bus.
 
-The library asammdf decodes the file. It can loop for ever on a block that points to itself or out
-of the file. Therefore `check_blocks` first follows the chains of data groups, channel groups,
-channels and data lists, and visits each address at most once.
+The library asammdf decodes the file. It can loop forever on a block that refers to itself or to an
+address outside the file. Therefore `check_blocks` first follows the chains of data groups, channel
+groups, channels and data lists, and visits each address at most once.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ LINKS: Final = {
 
 
 def check_blocks(path: Path) -> None:
-    """Follow the chains of blocks.
+    """Check the links between the blocks of a file by following all chains.
 
     Raises:
-        InputError: a link leads out of the file or into a circle, or a group counts more records
-            than the file holds.
+        InputError: a link leads out of the file or into a circle, or a group states more records
+            than fit into the file.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -97,7 +97,7 @@ def _linked_blocks(file: BinaryIO, address: int, size: int, path: Path) -> list[
 
 class MdfContent(NamedTuple):
     """Content of a file: either frames and the time of the first one [s since 1970 UTC], or the
-    channels of a measurement.
+    channels of a measurement. The other field is None.
     """
 
     frames: tuple[Log, float] | None
@@ -105,7 +105,8 @@ class MdfContent(NamedTuple):
 
 
 def read_isolated(path: Path, identifiers: set[int] | None, names: set[str] | None) -> MdfContent:
-    """Read a file in a process of its own: asammdf's compiled parts crash on some broken files.
+    """Read a file in a separate process, because asammdf's compiled parts crash on some broken
+    files.
 
     Args:
         path: the file.
@@ -142,12 +143,12 @@ def _read_content(path: Path, identifiers: set[int] | None, names: set[str] | No
 
 
 def has_frames(mdf: Any) -> bool:  # noqa: ANN401
-    """Return True if a bus was logged in the file."""
+    """Return True if the file contains the frames of a logged bus."""
     return any("CAN_DataFrame" in name for name in mdf.channels_db)
 
 
 def mdf_frames(mdf: Any, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
-    """Return the frames of the wanted identifiers, and the start of the log [s since 1970 UTC]."""
+    """Return the frames with the wanted identifiers, and the start of the log [s since 1970 UTC]."""
     log: Log = {}
     first = np.inf
     start = float(mdf.header.start_time.timestamp())
@@ -176,7 +177,7 @@ def mdf_frames(mdf: Any, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
 
 
 def read_mdf(mdf: Any, path: Path, wanted: set[str] | None) -> Recording:  # noqa: ANN401
-    """Return the channels of a measurement by name; all if `wanted` is None.
+    """Return the channels of a measurement by name; all channels if `wanted` is None.
 
     If several channels have the same name, the first one with samples is used.
     """

@@ -1,8 +1,8 @@
-"""Racelogic VBO files, and the same columns saved as CSV: times, places and units as that format
-means them.
+"""Reader of Racelogic VBO files, and of tables with the same columns, with times, positions and
+units of that format.
 
-time        hhmmss.ss UTC of the day        lat, long    minutes, west positive
-velocity    km/h                            heading      degrees, clockwise from north
+time hhmmss.ss UTC of the day lat, long minutes, west positive velocity km/h heading degrees,
+clockwise from north
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ NAMES: Final = {"lat": "latitude", "long": "longitude", "velocity": "speed", "he
 
 
 def is_vbo(path: Path) -> bool:
-    """Return True if a file has the sections of a VBO, whatever its ending."""
+    """Return True if a file has the sections of a VBO file; its suffix does not matter."""
     with path.open("rb") as file:
         head = file.read(65_536).decode("utf-8", errors="replace").lower()
     return "[column names]" in head and ("[header]" in head or head.startswith("file created on"))
 
 
 def has_vbo_columns(names: Sequence[str]) -> bool:
-    """Return True if a table's columns are those of a VBO."""
+    """Return True if a table has the columns of a VBO file."""
     lower = {name.strip().lower() for name in names}
     return {"sats", "time", "lat", "long"} <= lower or {
         "satellites",
@@ -67,7 +67,7 @@ def read_vbo(path: Path) -> Recording:
 def convert_vbo(
     path: Path, columns: Mapping[str, FloatArray], units: Mapping[str, str]
 ) -> Recording:
-    """Return a recording of VBO columns (T,) in that format's units."""
+    """Return a recording of VBO columns (T,), converted from the units of that format."""
     lower = {name.lower(): name for name in columns}
     clock = columns[lower["time"]]
     whole = np.floor(clock / 100.0)

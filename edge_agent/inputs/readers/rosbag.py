@@ -1,8 +1,9 @@
-"""ROS bags (version 2 folders and MCAP files, and version 1) by rosbags, no ROS installed.
+"""Reader of ROS bags (version 2 folders and MCAP files, and version 1) by the library rosbags,
+without a ROS installation.
 
-A signal is called `/topic.field.field`; elements of short arrays `/topic.field[0]`, joints
-`/topic.velocity[NAME]`. Its time is the message's own stamp where it has one, else that of the
-recorder. Topics of can_msgs/Frame are a CAN log.
+A signal is called `/topic.field.field`; elements of short arrays are `/topic.field[0]`, and joints
+`/topic.velocity[NAME]`. Its time is the message's own time stamp if there is one, else that of the
+recorder. Topics with the type can_msgs/Frame are read as a CAN log.
 """
 
 from __future__ import annotations
@@ -28,14 +29,16 @@ Leaf = tuple[str, Callable[[Any], Any]]
 
 
 def is_bag(path: Path) -> bool:
-    """Return True if the path is a bag: by its suffix, or a folder with a bag's metadata."""
+    """Return True if the path is a bag: by its suffix, or because it is a folder with a bag's
+    metadata.
+    """
     return path.suffix in SUFFIXES or (path / "metadata.yaml").is_file()
 
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Any]:
-    """Open a bag and close it at the end of the block; the path of a database file stands for its
-    folder.
+    """Open a bag for a `with` block, and close it at the end. For the path of a database file, its
+    folder is opened.
     """
     highlevel = import_optional("rosbags.highlevel")
     typesys = import_optional("rosbags.typesys")
@@ -54,20 +57,22 @@ def open_bag(path: Path) -> Iterator[Any]:
 
 
 def _close_files(part: Any) -> None:  # noqa: ANN401
-    """Close the files of a reader: a bag that could not be opened leaves its file open."""
+    """Close the files of a reader. The library leaves the file of a bag open if the bag cannot be
+    opened.
+    """
     for held in (part, *getattr(part, "storages", ()), getattr(part, "storage", None)):
         if (file := getattr(held, "bio", None)) is not None:
             file.close()
 
 
 def has_frames(reader: Any) -> bool:  # noqa: ANN401
-    """Return True if a topic of the bag is a CAN log."""
+    """Return True if a topic of the bag contains CAN frames."""
     return any(connection.msgtype == FRAME for connection in reader.connections)
 
 
 def bag_frames(reader: Any, path: Path, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
-    """Return the frames of the wanted identifiers, and the time of the first one [s since 1970
-    UTC]; each topic is a bus.
+    """Return the frames with the wanted identifiers, and the time of the first frame [s since 1970
+    UTC]. Each topic is a bus.
     """
     log: Log = {}
     first = np.inf
@@ -82,7 +87,7 @@ def bag_frames(reader: Any, path: Path, wanted: set[int]) -> tuple[Log, float]: 
 
 
 def read_bag(reader: Any, path: Path, wanted: set[str] | None) -> Recording:  # noqa: ANN401
-    """Return the signals of a bag by name; all if none is requested."""
+    """Return the signals of a bag by name; all signals if `wanted` is None."""
     topics = [
         c
         for c in reader.connections
@@ -111,7 +116,9 @@ def read_bag(reader: Any, path: Path, wanted: set[str] | None) -> Recording:  # 
 
 
 def _read_messages(reader: Any, connections: list[Any]) -> Iterator[tuple[Any, int, int, Any]]:  # noqa: ANN401
-    """Yield connection, time of the recorder [ns], time of the message [ns], and message."""
+    """Yield (connection, time of the recorder [ns], time of the message [ns], message) for each
+    message of the connections.
+    """
     if not connections:
         return
     for connection, stored, raw in reader.messages(connections=connections):
@@ -120,14 +127,14 @@ def _read_messages(reader: Any, connections: list[Any]) -> Iterator[tuple[Any, i
 
 
 def stamp_of(message: Any) -> int:  # noqa: ANN401
-    """Return the message's own time [ns]; 0 if it has none."""
+    """Return the time stamp in the message's header [ns]; 0 if it has none."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     return 0 if stamp is None else int(stamp.sec) * NS + int(stamp.nanosec)
 
 
 def leaves_of(message: Any, prefix: str = "", depth: int = 0) -> Iterator[Leaf]:  # noqa: ANN401
-    """Yield the name of each number in a message and a function that reads it from a message of the
-    same type.
+    """Yield a pair for each number in a message: its name, and a function that reads it from a
+    message of the same type.
     """
     for name in getattr(message, "__dataclass_fields__", {}):
         if name.startswith("__") or any(name.endswith(word) for word in SKIPPED):

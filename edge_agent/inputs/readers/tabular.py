@@ -1,7 +1,8 @@
-"""Tables, CSV and Parquet, one row per sample: every column that is a number becomes a series.
+"""Reader of tables (CSV and Parquet) with one row per sample; every numeric column becomes a
+series.
 
-The time is the column `t` [s], `timestamp`, or one whose name says time; a unit may stand in the
-name, `speed [km/h]`.
+The time column is `t` [s], `timestamp`, or a column with a name such as `time`. A name may contain
+its unit: `speed [km/h]`.
 """
 
 from __future__ import annotations
@@ -44,15 +45,16 @@ _UNIT: Final = re.compile(r"^(?P<name>.*)[\[(](?P<unit>[^\[\](]*)[\])]\s*$")
 
 
 def read_table(path: Path, time: str | None = None, time_unit: str | None = None) -> Recording:
-    """Return the columns of a table.
+    """Return the columns of a table as a recording.
 
     Args:
         path: a CSV or Parquet file.
-        time: name of the column that holds the time; else it is looked for.
-        time_unit: of numbers in it: s, ms, us, ns; else the name or their size tells.
+        time: name of the time column; by default it is found by its name.
+        time_unit: unit of numbers in the time column: s, ms, us, ns; by default it follows from the
+            column's name or from the size of the numbers.
 
     Raises:
-        InputError: the file is broken or empty, has no time, or its time goes back.
+        InputError: the file is broken or empty, has no time column, or its time goes backwards.
     """
     kind = "Parquet" if path.suffix == ".parquet" else "CSV"
     with foreign_errors(path, kind):
@@ -111,8 +113,8 @@ def _read_csv(path: Path) -> pa.Table:
 
 
 def _read_racechrono(path: Path, lines: list[str]) -> pa.Table:
-    """Return the table of RaceChrono's CSV version 3: a preamble, then names, units and sources, a
-    row each.
+    """Return the table in a RaceChrono CSV file of version 3: a preamble, then one row each of
+    names, units and sources, then the data.
 
     Raises:
         InputError: there is no row of names.
@@ -141,7 +143,7 @@ def _read_racechrono(path: Path, lines: list[str]) -> pa.Table:
 
 
 def _make_distinct(names: list[str]) -> list[str]:
-    """Return names of which no two are alike."""
+    """Return the names, with a number appended to each repeated name."""
     return [name if name not in names[:k] else f"{name} {k}" for k, name in enumerate(names)]
 
 
@@ -185,7 +187,9 @@ def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
 
 
 def _parse_seconds(column: Any, name: str, unit: str | None) -> tuple[FloatArray, int | None]:  # noqa: ANN401 Arrow columns are not generic
-    """Return the seconds since the first row, and the ns UTC of that row if the time is a date."""
+    """Return the seconds since the first row, and the [ns UTC] of that row if the time is a date,
+    else None.
+    """
     if pa.types.is_timestamp(column.type):
         ns = pc.cast(pc.cast(column, pa.timestamp("ns", tz=column.type.tz)), pa.int64())
         values = np.asarray(ns.to_numpy(zero_copy_only=False))

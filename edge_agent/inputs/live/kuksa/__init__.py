@@ -1,1 +1,1 @@
-"""Messages of a Kuksa databroker."""
+"""Connection to a Kuksa databroker, and its protocol messages."""

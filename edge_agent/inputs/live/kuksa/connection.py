@@ -1,4 +1,4 @@
-"""Connection to a Kuksa databroker: address, certificate authority, token, and the calls of
+"""Connection to a Kuksa databroker: address, certificate authority, token, and calls of
 kuksa.val.v2.
 """
 
@@ -18,18 +18,18 @@ LOOPBACK: Final = ("127.", "localhost:", "[::1]:", "unix:")
 
 
 class BrokerConnection:
-    """Settings of a connection, and functions that open it.
+    """Settings of a connection, and methods that open it.
 
     Attributes:
-        grpc: the module.
-        messages: the messages of kuksa.val.v2.
-        metadata: sent with each call.
+        grpc: the imported gRPC module.
+        messages: module with the messages of kuksa.val.v2.
+        metadata: metadata sent with each call.
 
     Args:
         option: command-line option or source that names the broker, for errors.
         address: host and port.
-        files: `ca`, the authority of its certificate, without which no TLS is spoken, and `token`,
-            a JSON web token.
+        files: `ca`, file of the certificate authority (without it the connection does not use TLS),
+            and `token`, file with a JSON web token.
 
     Raises:
         InputError: grpc is not installed, a file cannot be read, or a token would be sent without
@@ -58,7 +58,7 @@ class BrokerConnection:
             )
 
     def open_channel(self) -> Any:  # noqa: ANN401 grpc has no types
-        """Return a channel; it connects when it is used."""
+        """Return a gRPC channel, which connects at the first call."""
         if self._authority is None:
             return self.grpc.insecure_channel(self._address)
         return self.grpc.secure_channel(
@@ -66,12 +66,12 @@ class BrokerConnection:
         )
 
     def make_call(self, kind: Any, name: str, answer: Any) -> Any:  # noqa: ANN401
-        """Return a call of the service.
+        """Return a function that calls a method of the broker's service.
 
         Args:
-            kind: function of a channel that makes calls, e.g. unary_unary.
-            name: of the call.
-            answer: class of the answer.
+            kind: method of a gRPC channel that makes calls, e.g. unary_unary.
+            name: name of the service's method.
+            answer: class of the response message.
         """
         return kind(
             f"{SERVICE}{name}",
