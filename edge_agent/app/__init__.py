@@ -1,1 +1,1 @@
-"""Programs behind the commands: live loop, replay of logs, estimators by name, metrics."""
+"""Functions behind the commands: live loop, replay of logs, estimators by name, metrics."""

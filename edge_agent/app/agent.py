@@ -1,7 +1,7 @@
-"""The agent: estimator bank, pipeline and publisher around the live loop.
+"""The agent: connects estimator bank, pipeline and publisher in the live loop.
 
-It corresponds to `fleet_service.app.service`. Signals come from an `AgentSource`. Parts that use the
-vehicles' sessions next to the publisher, such as warnings of the road ahead, are `AgentPart`s.
+It corresponds to `fleet_service.app.service`. Signals come from an `AgentSource`. Additional parts
+that use the vehicles' Zenoh sessions, such as warnings of the road ahead, are `AgentPart`s.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class AgentOptions:
 
 
 class AgentSource(NamedTuple):
-    """Signals of the vehicles.
+    """Source of the vehicles' signals.
 
     Attributes:
         blocks: blocks of samples, in real time or faster.
@@ -83,23 +83,25 @@ class AgentSource(NamedTuple):
 
 
 class AgentPart(Protocol):
-    """A part that uses the vehicles' sessions next to the publisher."""
+    """Interface of an additional part that uses the vehicles' Zenoh sessions."""
 
     def attach_session(self, name: str, session: zenoh.Session) -> None:
         """Use the session of a vehicle, which has been opened."""
 
     def start_part(self) -> None:
-        """Start, before the first block."""
+        """Start the part, before the first block."""
 
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:
-        """Update from the pipeline after a block; `admitted` is True if its records are published."""
+        """Update the part from the pipeline after a block; `admitted` is True if the block's
+        records are published.
+        """
 
     def close_part(self) -> Mapping[str, float]:
-        """Stop, and return counts for the last line of output."""
+        """Stop the part, and return counts for the last line of output."""
 
 
 class Agent:
-    """An agent that drives its vehicles once."""
+    """An agent that processes the signals of its vehicles, once."""
 
     def __init__(
         self, options: AgentOptions, source: AgentSource, parts: Sequence[AgentPart] = ()
@@ -112,8 +114,10 @@ class Agent:
         self._publisher: Publisher | None = None
 
     def drive(self) -> int:
-        """Drive in real time until the source ends, the duration has passed or a signal arrives;
-        then shut down. Print a line of counts and return 0.
+        """Process blocks in real time until the source ends, the duration has passed or a signal
+        (SIGTERM, Ctrl-C) arrives; then shut down.
+
+        Print a line of counts and return 0.
         """
         config = self.options.config
         log_as(config.log, sys.stderr)
@@ -203,7 +207,7 @@ class Agent:
         ]
 
     def _warm_up(self) -> None:
-        """Load or compile the kernels before the clock runs, on a temporary vehicle."""
+        """Load or compile the kernels before the loop starts, by one step with a temporary vehicle."""
         t = np.zeros((1, 1))
         time = np.zeros((1, 1), dtype=np.int64)
         signals = np.full((1, 1, len(CHANNELS)), np.nan)

@@ -1,7 +1,8 @@
-"""Replay of many recorded drives to estimates, several at a time: here, or on Spark.
+"""Estimation of many recorded drives in parallel, on threads of this machine or on Spark.
 
-It uses threads, because the kernels and Parquet release the interpreter lock, and the compiled code
-is loaded once. Both engines run the same function for each drive and write the same bytes.
+Threads are sufficient, because the kernels and Parquet release the interpreter lock; the compiled
+code is loaded only once. Both engines run the same function for each drive and write the same
+bytes.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from schemas.vehicle import load_vehicle
 
 
 class Task(NamedTuple):
-    """Signal log, the vehicle that recorded it, and the file of its estimates."""
+    """Task: a signal log, the vehicle that recorded it, and the file for its estimates."""
 
     log: Path
     vehicle: Path
@@ -40,11 +41,11 @@ class Outcome(NamedTuple):
 
 
 def tasks_of(logs: Sequence[Path], vehicle: Path | None, folder: Path) -> list[Task]:
-    """Return one task per log, with its estimates under the log's name in `folder`; the vehicle
-    file is next to the log unless one is given.
+    """Return one task per log. The estimates get the log's name in `folder`. The vehicle file is
+    next to the log unless `vehicle` is given.
 
     Raises:
-        InputError: two logs have one name, or estimates would replace a log.
+        InputError: two logs have the same name, or estimates would replace a log.
     """
     tasks = [
         Task(log, vehicle or vehicle_file_of(log), folder / f"{log.stem}.parquet") for log in logs
@@ -63,15 +64,16 @@ def tasks_of(logs: Sequence[Path], vehicle: Path | None, folder: Path) -> list[T
 
 
 def vehicle_file_of(log: Path) -> Path:
-    """Return the vehicle file of a log: the same name, ending in .json."""
+    """Return the path of a log's vehicle file: the same name with the suffix .json."""
     return log.with_suffix(".json")
 
 
 def estimate_drives(
     tasks: Sequence[Task], estimator: str, jobs: int, memberships: Memberships | None = None
 ) -> Iterator[Outcome]:
-    """Estimate all drives, `jobs` at a time; yield outcomes as they arrive. A bad drive stops no
-    other.
+    """Estimate all drives, `jobs` at a time, and yield the outcomes as they become available.
+
+    A drive that fails does not stop the others.
 
     Raises:
         InputError: jobs is below 1.
@@ -88,11 +90,11 @@ def estimate_drives(
 def backfill_on_spark(
     tasks: Sequence[Task], estimator: str, memberships: Memberships | None = None
 ) -> Iterator[Outcome]:
-    """Estimate like `estimate_drives`, on the machines of Spark, all of which see the same files;
-    outcomes in the tasks' order.
+    """Estimate all drives on the machines of Spark, which must all see the same files. Yield the
+    outcomes in the order of the tasks.
 
     Raises:
-        InputError: Spark is not available or gave up, or the folder of the estimates cannot be
+        InputError: Spark is not available or failed, or the folder of the estimates cannot be
             created.
     """
     folders = {prepare_path("out", task.out).parent for task in tasks}
@@ -106,8 +108,8 @@ def backfill_on_spark(
 
 
 def estimate_atomically(task: Task, estimator: str, memberships: Memberships | None) -> Outcome:
-    """Estimate one drive and write its file atomically, also if another process estimates the
-    same drive.
+    """Estimate one drive and write its file atomically, even if another process estimates the same
+    drive.
     """
     folder = task.out.parent
     with own_drafts(folder) as drafts:
@@ -119,7 +121,7 @@ def estimate_atomically(task: Task, estimator: str, memberships: Memberships | N
 
 
 def estimate_drive(task: Task, estimator: str, memberships: Memberships | None = None) -> Outcome:
-    """Estimate one drive."""
+    """Estimate one drive and write its estimates to `task.out`; return the outcome."""
     try:
         vehicle = load_vehicle(task.vehicle)
         log, vehicle, *_ = prepare_log(read_log(task.log), vehicle)

@@ -1,7 +1,8 @@
 """Report of a drive: the estimates of one or more estimators as an HTML page or an image.
 
-Speed, sideslip, friction with its 90 % band, grip in use, health and the track share one time axis.
-The HTML page is one file that needs no network; pointing at a plot reads all values of that moment.
+Speed, sideslip, friction with its 90 % interval, grip in use, health and the track share one time
+axis. The HTML page is one file that needs no network. With the pointer on a plot, it shows all
+values at that time.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ class Panel:
     """Plot of one quantity.
 
     Attributes:
-        name, unit: of the quantity.
-        column: of the estimates.
-        scale: from the column's unit to the shown one.
-        band: columns of lower and upper end, or the standard deviation.
-        fixed: ends of the axis; None to fit them.
+        name, unit: name and unit of the quantity.
+        column: column of the estimates.
+        scale: factor from the column's unit to the displayed unit.
+        band: columns of lower and upper end, or the column of the standard deviation.
+        fixed: ends of the axis; None to fit the axis to the values.
     """
 
     name: str
@@ -68,7 +69,7 @@ PANELS: Final = (
 
 @dataclass(frozen=True)
 class RecordedDrive:
-    """RecordedDrive with its estimates by estimator; `title` is shown above."""
+    """Recorded drive with its estimates by estimator; `title` is the headline of the report."""
 
     log: SignalLog
     estimates: Mapping[str, pa.Table]
@@ -76,10 +77,10 @@ class RecordedDrive:
 
 
 def write_report(drive: RecordedDrive, path: Path) -> None:
-    """Write a report in the format of the path's ending.
+    """Write a report in the format given by the path's suffix.
 
     Raises:
-        InputError: the ending is unknown, or a package that it needs is missing.
+        InputError: the suffix is unknown, or a required package is missing.
     """
     if path.suffix == PAGE:
         with open_durably(path) as file:
@@ -95,8 +96,8 @@ def write_report(drive: RecordedDrive, path: Path) -> None:
 def curve_of(
     table: pa.Table, panel: Panel
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return time, value, and both ends of the band of a quantity, (n,) each; NaN where there is
-    none.
+    """Return time, value, lower and upper end of a quantity, (n,) each. The ends are NaN for a
+    quantity without interval.
     """
     t, value = (table[name].to_numpy().astype(np.float64) for name in ("t", panel.column))
     if len(panel.band) == 2:
@@ -112,7 +113,7 @@ def curve_of(
 
 
 def thin_parts(count: int) -> list[slice]:
-    """Return the parts of a curve that are one point each."""
+    """Return slices that divide a curve of `count` samples into at most MOST_POINTS points."""
     step = max(1, math.ceil(count / MOST_POINTS))
     return [slice(k, min(k + step, count)) for k in range(0, count, step)]
 
@@ -164,7 +165,7 @@ def _plot_of(drive: RecordedDrive, panel: Panel) -> dict[str, Any]:
 
 
 def _health_spans(drive: RecordedDrive) -> list[dict[str, Any]]:
-    """Return the spans in which the first estimator reported a limit, by flag."""
+    """Return, by health flag, the time spans in which the first estimator reported the flag."""
     table = next(iter(drive.estimates.values()))
     t = table["t"].to_numpy()
     flags = table["health"].to_numpy()
@@ -179,8 +180,10 @@ def _health_spans(drive: RecordedDrive) -> list[dict[str, Any]]:
 
 
 def _track_of(drive: RecordedDrive) -> dict[str, Any] | None:
-    """Return the places of the drive [m from its middle] with time and the colour of the first
-    estimator's mu.
+    """Return the track of the drive: x and y [m from the mean position], time, and a colour for the
+    mu of the first estimator.
+
+    Return None if the log has fewer than two positions.
     """
     position = drive.log.signals[:, [S.LATITUDE, S.LONGITUDE]].reshape(-1, 2)
     known = np.flatnonzero(np.isfinite(position).all(axis=1))

@@ -1,4 +1,6 @@
-"""Estimates of one vehicle as a file with the columns of the contract, one row per sample."""
+"""File with the estimates of one vehicle: the columns of `schemas.tables.ESTIMATES`, one row per
+sample.
+"""
 
 from __future__ import annotations
 
@@ -35,10 +37,10 @@ WHEEL_COLUMNS = tuple(
 
 
 def prepare_path(field: str, path: Path) -> Path:
-    """Return the path after creating its folder.
+    """Create the folder of a path, and return the path.
 
     Raises:
-        InputError: it is a folder, or its folder cannot be written.
+        InputError: the path is a folder, or its folder cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -59,10 +61,10 @@ def prepare_path(field: str, path: Path) -> Path:
 
 
 def write_table(field: str, path: Path, table: pa.Table) -> None:
-    """Write a table in the format of the path's ending, atomically.
+    """Write a table atomically in the format given by the path's suffix.
 
     Raises:
-        InputError: the path cannot be written, or its ending is not one of ENDINGS.
+        InputError: the path cannot be written, or its suffix is not one of ENDINGS.
     """
     with (
         open_durably(prepare_path(field, path)) as file,
@@ -80,10 +82,10 @@ def _table_writer(path: Path, field: str = "out") -> Any:  # noqa: ANN401 a clas
 
 
 class EstimatesFile:
-    """Writer of estimates block by block; the file appears under its name when it is complete.
+    """Writer of estimates, block by block. The file gets its name only when it is complete.
 
     Raises:
-        InputError: the path cannot be written, or its ending is not one of ENDINGS.
+        InputError: the path cannot be written, or its suffix is not one of ENDINGS.
     """
 
     def __init__(self, path: Path) -> None:
@@ -105,13 +107,13 @@ class EstimatesFile:
         self._opened.__exit__(kind, error, trace)
 
     def write(self, t: FloatArray, estimates: Estimates) -> None:
-        """Add a block: t (T, 1) and the estimates of a bank of one vehicle."""
+        """Add a block: times t (T, 1) and the estimates of a bank with one vehicle."""
         self._writer.write_table(estimates_table(t, estimates))
 
 
 def estimates_table(t: FloatArray, estimates: Estimates) -> pa.Table:
-    """Return estimates (T, 1) as a table of ESTIMATES_SCHEMA; the columns per wheel are null if
-    the bank has one mu.
+    """Return estimates (T, 1) as a table of ESTIMATES_SCHEMA. The columns per wheel are null if the
+    estimator has one friction for all wheels.
     """
     wheels = estimates.mu_wheel
     columns: list[Any] = []

@@ -1,4 +1,6 @@
-"""Estimator banks by name, with the shipped or given memberships, also from other packages."""
+"""Estimator banks by name, with shipped or given memberships; estimators of other packages are
+included.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from schemas.vehicle import Vehicle
 
 
 def known_estimators() -> dict[str, str]:
-    """Return all estimators by name with one line about each, those of other packages too."""
+    """Return all estimators by name, with a one-line description. Estimators of other packages are
+    included.
+    """
     others = {
         name: f"from {point.value}"
         for name, point in plugins.entry_points_of(plugins.ESTIMATORS).items()
@@ -24,16 +28,16 @@ def known_estimators() -> dict[str, str]:
 def bank_of(
     estimator: str, vehicles: Sequence[Vehicle], memberships: Memberships | None = None
 ) -> EstimatorBank:
-    """Return a bank of estimators by name, one per vehicle.
+    """Return a bank of estimators, one per vehicle.
 
     Args:
-        estimator: a key of `known()`; NAME@CURVE for the tyre curve of another package.
+        estimator: a key of `known_estimators()`; NAME@CURVE uses the tyre curve of another package.
         vehicles: nominal vehicles, N of them.
         memberships: fuzzy sets instead of the shipped ones.
 
     Raises:
-        InputError: there is no such estimator, no vehicle, memberships for an estimator that has
-            none, or its tuned ones cannot be read.
+        InputError: the estimator or the tyre curve is unknown, no vehicle is given, memberships are
+            given for an estimator that has none, or the tuned memberships cannot be read.
     """
     estimator, _, own = estimator.partition("@")
     if own and own not in plugins.entry_points_of(plugins.TYRE_CURVES):

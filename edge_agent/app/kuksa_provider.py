@@ -1,8 +1,8 @@
-"""Provider of a Kuksa databroker: writes the friction at the vehicle over kuksa.val.v2.
+"""Provider for a Kuksa databroker: writes the friction at the vehicle over kuksa.val.v2.
 
-`Vehicle.ADAS.ESC.RoadFriction.*` are float percent. `Vehicle.Exterior.RoadSurfaceCondition` (VSS
-pull request 892) is a word. An unknown value is written as a data point without a value, so that no
-old one stays in the broker.
+`Vehicle.ADAS.ESC.RoadFriction.*` are percent, as float. `Vehicle.Exterior.RoadSurfaceCondition`
+(VSS pull request 892) is a word. An unknown value is written as a data point without a value, so
+that no outdated value stays in the broker.
 """
 
 from __future__ import annotations
@@ -31,24 +31,27 @@ log = logging.getLogger(__name__)
 
 
 def surface_condition(signals: Mapping[str, float]) -> str:
-    """Return the value of RoadSurfaceCondition that the friction proves."""
+    """Return the value of RoadSurfaceCondition that follows from the friction: "ICE", "DRY" or
+    "UNKNOWN".
+    """
     if signals.get(f"{BRANCH}.UpperBound", 100.0) < ICE_BELOW:
         return "ICE"
     return "DRY" if signals.get(f"{BRANCH}.LowerBound", 0.0) > DRY_ABOVE else "UNKNOWN"
 
 
 class KuksaProvider:
-    """Writes the signals of one vehicle on a thread; a broker that is away costs nothing else.
+    """Writer of one vehicle's signals, on a separate thread, so that an unavailable broker does not
+    delay the agent.
 
     Attributes:
-        written: values that the broker accepted.
-        refused: values that it did not accept.
+        written: number of values that the broker accepted.
+        refused: number of values that it rejected.
 
     Args:
         text: HOST:PORT, with `?ca=FILE` for TLS and `&token=FILE` for a JSON web token.
 
     Raises:
-        InputError: `text` is no address, grpc is not installed, or a file cannot be read.
+        InputError: `text` is not an address, grpc is not installed, or a file cannot be read.
     """
 
     def __init__(self, text: str) -> None:
@@ -70,13 +73,13 @@ class KuksaProvider:
         self._thread.start()
 
     def write(self, signals: Mapping[str, float], time_ns: int) -> None:
-        """Write signals of VSS [%] soon; values that are still waiting are replaced."""
+        """Queue VSS signals [%] for writing. Values that are still waiting are replaced."""
         with self._changed:
             self._latest = (signals, time_ns)
             self._changed.notify()
 
     def close(self) -> None:
-        """Write what waits, and end."""
+        """Write the waiting signals, and stop the thread."""
         with self._changed:
             self._stopping = True
             self._changed.notify()
@@ -108,7 +111,7 @@ class KuksaProvider:
                 return
 
     def _write_one(self, publish: Any, path: str, value: Any, time_ns: int) -> bool:  # noqa: ANN401
-        """Write a value; return False if the broker is away."""
+        """Write a value; return False if the broker is unavailable."""
         messages = self._connection.messages
         point = messages.Datapoint(value=value)
         point.timestamp.seconds, point.timestamp.nanos = divmod(time_ns, NS)
@@ -132,7 +135,7 @@ class KuksaProvider:
         return True
 
     def _log_problem(self, problem: str) -> None:
-        """Log a problem once, and its end."""
+        """Log a problem when it begins, and its end."""
         if problem and not self._problem:
             log.warning("writing to the databroker fails (%s); trying again", problem)
         elif self._problem and not problem:

@@ -1,4 +1,4 @@
-"""Library functions: estimate a log, and return the result as a table or a plot."""
+"""Functions of the Python library: estimate a log, and return the result as a table or a plot."""
 
 from __future__ import annotations
 
@@ -33,33 +33,42 @@ DEFAULT = "aco-fckf"
 
 def read_log(path: Path | str) -> SignalLog:
     """Return a signal log (Parquet): t (T,) [s] and signals (T, 18) in the order of
-    schemas.signals.CHANNELS, SI units.
+    schemas.signals.CHANNELS, in SI units.
 
     Raises:
-        InputError: it cannot be read, or lacks a required column; names column, row and fix.
+        InputError: the file cannot be read, or lacks a required column. The error names the column,
+            the row and the fix.
     """
     return signal_log.read_log(Path(path))
 
 
 def load_vehicle(path: Path | str) -> Vehicle:
-    """Return a vehicle file (JSON); InputError names the invalid field."""
+    """Return the vehicle in a vehicle file (JSON).
+
+    Raises:
+        InputError: the file cannot be read, or a field is invalid; the error names the field.
+    """
     return load_vehicle_file(Path(path))
 
 
 def load_memberships(path: Path | str) -> Memberships:
-    """Return the fuzzy sets that `edge-agent tune` wrote; InputError names the invalid field."""
+    """Return the fuzzy sets in a file that `edge-agent tune` wrote.
+
+    Raises:
+        InputError: the file cannot be read, or a field is invalid; the error names the field.
+    """
     return tuned_memberships.load_tuned(path).memberships
 
 
 def make_bank(
     estimator: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None
 ) -> EstimatorBank:
-    """Return N estimators, one per vehicle: `bank.advance(t, signals)` with t (T, N) and signals
-    (T, N, 18).
+    """Return a bank of estimators, one per vehicle. Call `bank.advance(t, signals)` with t (T, N)
+    and signals (T, N, 18).
 
     Raises:
-        InputError: there is no such estimator, no vehicle, or memberships for an estimator that has
-            none.
+        InputError: the estimator is unknown, no vehicle is given, or memberships are given for an
+            estimator that has none.
     """
     return bank_of(estimator, vehicles, memberships)
 
@@ -74,8 +83,8 @@ def estimate(
     """Return the estimates of a log, one row per sample, with the columns of
     schemas.tables.ESTIMATES.
 
-    Known device errors of a calibrated vehicle file and the lags that the signal doctor measures
-    are corrected in the signals first, as in `edge-agent replay`.
+    As in `edge-agent replay`, two kinds of error are corrected in the signals first: known sensor
+    errors of a calibrated vehicle file, and delays that the signal doctor measures.
     """
     log, vehicle, *_ = prepare_log(log, vehicle)
     bank = bank_of(estimator, [vehicle], memberships)
@@ -86,10 +95,10 @@ def estimate(
 
 
 def to_table(t: FloatArray, estimates: Estimates, vehicle: int = 0) -> pa.Table:
-    """Return estimates (T, N) of one of the vehicles as a table; t (T, N) or (T,) [s].
+    """Return the estimates (T, N) of one vehicle as a table; t has shape (T, N) or (T,) [s].
 
     Raises:
-        InputError: there is no such vehicle.
+        InputError: there is no vehicle with this index.
     """
     count = estimates.values.shape[1]
     if not 0 <= vehicle < count:
@@ -103,8 +112,8 @@ def to_table(t: FloatArray, estimates: Estimates, vehicle: int = 0) -> pa.Table:
 def plot(
     estimates: dict[str, pa.Table], *, truth: pa.Table | None = None, title: str = ""
 ) -> Figure:
-    """Plot speed and friction with its 90 % band over time, for several estimators by name; `truth`
-    is a simulated log.
+    """Plot speed and friction with its 90 % interval over time, for several estimators by name.
+    `truth` is a simulated log with the true values.
 
     Raises:
         InputError: matplotlib is not installed.
@@ -148,7 +157,7 @@ def plot(
 
 
 def known_estimators() -> Iterator[tuple[str, str]]:
-    """Return names of all estimators, those of other packages too, with one line about each."""
+    """Yield (name, one-line description) of all estimators, including those of other packages."""
     from edge_agent.app.estimator_factory import known_estimators
 
     yield from known_estimators().items()

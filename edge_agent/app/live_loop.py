@@ -1,8 +1,9 @@
-"""Live loop: blocks of samples in real time through the pipeline to the publisher, until it is
-stopped.
+"""Live loop: passes blocks of samples in real time through the pipeline to the publisher, until it
+is stopped.
 
-The clock paces the loop. A block that is finished more than its own length too late counts as
-behind. Nothing is skipped: a loop that fell behind catches up as fast as it can.
+The loop waits so that no block is processed before its time. A block counts as late if it is
+finished more than its own length behind real time. No block is skipped: a loop that fell behind
+catches up as fast as possible.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Progress:
-    """Progress of the loop: seconds of signals, blocks, late blocks, the longest and the last lag
-    [s].
+    """Progress of the loop: duration of the signals [s], number of blocks, number of late blocks,
+    the longest and the last delay [s].
 
     `held` counts records that were not published, because their signals were not verified.
     """
@@ -50,9 +51,9 @@ class LoopOptions(NamedTuple):
     Attributes:
         on_status: receives the progress every STATUS_EVERY_S.
         duration_s: time after which the loop ends [s].
-        clock: monotonic [s].
-        is_admitted: returns True if the records of a block may be published; others are held back
-            and counted.
+        clock: monotonic clock [s].
+        is_admitted: returns True if the records of a block may be published; other records are
+            held back and counted.
         after: called after each block.
     """
 
@@ -71,10 +72,10 @@ def run_live_loop(
     options: LoopOptions,
     progress: Progress | None = None,
 ) -> Progress:
-    """Run until the blocks end, the duration has passed or `stop` is set; then close the open
-    visits.
+    """Run the loop until the blocks end, the duration has passed or `stop` is set; then close the
+    open visits.
 
-    `progress` is updated while it runs, and returned.
+    `progress` is updated during the run, and returned.
     """
     progress = progress or Progress()
     status_at = STATUS_EVERY_S
@@ -109,7 +110,9 @@ def run_live_loop(
 
 
 def _warn_of_flags(pipeline: Pipeline, warned: set[tuple[int, str]]) -> None:
-    """Log each controller flag that carries no weight, once a vehicle; `warned` remembers which."""
+    """Log each controller flag that the pipeline ignores as implausible, once per vehicle. `warned`
+    contains the flags already logged.
+    """
     for vehicle, flag, reason in pipeline.doubted_flags():
         if (vehicle, flag) not in warned:
             warned.add((vehicle, flag))
@@ -131,8 +134,9 @@ def _offer_if_admitted(
 
 
 def final_counts(progress: Progress, publisher: Publisher) -> dict[str, float]:
-    """Return the final counts of records, all kinds together and observations alone, and lags and
-    blocks of the loop."""
+    """Return the final counts: records of all kinds together, observations separately, and blocks
+    and delays of the loop.
+    """
     counts = publisher.counts
     seen = Kind.OBSERVATION
     return {

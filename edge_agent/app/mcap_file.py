@@ -1,5 +1,5 @@
-"""Estimates as MCAP for Foxglove and other viewers: JSON messages with a schema, one per sample
-on one topic.
+"""Writer of estimates in the format MCAP, for Foxglove and other viewers: JSON messages with a
+schema, one per sample, on one topic.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ _JSON: Final = {"double": "number", "int32": "integer"}
 
 
 class McapTableWriter:
-    """Writer of tables of estimates; log times count from the first sample of the drive.
+    """Writer of tables of estimates. Log times count from the first sample of the drive.
 
-    A value that is not a number is left out of its message, because JSON has none.
+    A value that is NaN or null is left out of its message, because JSON cannot represent NaN.
 
     Args:
-        file: opened for writing.
-        schema: of the tables; its column `t` is the time [s].
+        file: file opened for writing.
+        schema: schema of the tables; its column `t` is the time [s].
 
     Raises:
         InputError: the package mcap is missing.

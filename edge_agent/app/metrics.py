@@ -19,7 +19,7 @@ _NAMES: Final = {Kind.OBSERVATION: "observation", Kind.STATE: "state"}
 
 
 def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
-    """Return all current values; records are counted by kind."""
+    """Return all metrics with their current values; records are counted by kind."""
     counts = publisher.counts
     status = publisher.status
     return [
@@ -115,7 +115,7 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
 
 
 def health_problems(publisher: Publisher, progress: Progress) -> list[str]:
-    """Return one message per problem."""
+    """Return one message per health problem of the publisher and the loop."""
     status = publisher.status
     found = [] if status.links else ["no session is open"]
     if status.cut_off:

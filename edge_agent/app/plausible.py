@@ -1,4 +1,6 @@
-"""Plausibility check of a replay's estimates: one summary line, and an exit code of its own."""
+"""Plausibility check of a replay's estimates: it gives a summary line, and the exit code
+IMPLAUSIBLE for implausible estimates.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +27,11 @@ MOST_RESETS_PER_S: Final = 0.2
 
 
 def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
-    """Return the grip in use by the accelerometers, (T,) [1], smoothed over SMOOTHED_S; 0 where
-    they are missing.
+    """Return the grip in use according to the accelerometers (T,) [1], smoothed over SMOOTHED_S; 0
+    where a reading is missing.
 
-    `mu_utilised` would not do, because it looks back a second: on a road that has just become
-    slippery more was used than is available.
+    The estimate `mu_utilised` is not suitable here, because it is the maximum of the last second:
+    on a road that has just become slippery it exceeds the available grip.
     """
     used = np.nan_to_num(np.hypot(signals[:, S.AX], signals[:, S.AY])) / GRAVITY
     step = float(np.median(np.diff(t))) if len(t) > 1 else SMOOTHED_S
@@ -39,7 +41,7 @@ def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
 
 @dataclass
 class Plausibility:
-    """Counters over the blocks of one replay."""
+    """Counters over the blocks of one replay, from which the check is computed."""
 
     radius: float
     first: float = np.inf
@@ -73,12 +75,14 @@ class Plausibility:
 
     @property
     def seconds(self) -> float:
-        """Length of the drive."""
+        """Return the length of the drive [s]."""
         return max(self.last - self.first, 0.0)
 
     @property
     def median_speed_error(self) -> float:
-        """Median of |v_x − wheels| over the wheels' speed; 0 for a car that stood."""
+        """Return the median of |v_x − wheels| over the wheels' speed [1]; 0 for a car that did not
+        move.
+        """
         away = np.concatenate(self.away) if self.away else np.zeros(0)
         return float(np.median(away)) if len(away) else 0.0
 
@@ -93,7 +97,7 @@ class Plausibility:
         return [words for words, bad in found.items() if bad]
 
     def summary_line(self) -> str:
-        """Return the summary line."""
+        """Return the summary of the replay as one line."""
         n = max(self.samples, 1)
         summary = (
             f"{self.samples} samples, {self.seconds:.1f} s; speed {self.median_speed_error:.1%} "

@@ -1,4 +1,4 @@
-"""A publisher for a command: opened from the configuration, closed with its final counts."""
+"""Publisher of a command: opened from the configuration, and closed with its final counts."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def open_publisher(
     estimator: str,
     on_open: Callable[[str, zenoh.Session], None] = lambda *_: None,
 ) -> Publisher:
-    """Return a started publisher on the configured outbox; `on_open` is called with each vehicle's
-    session.
+    """Return a started publisher with the configured outbox. `on_open(name, session)` is called
+    with each vehicle's session.
 
     Raises:
-        InputError: Zenoh refuses its settings, or the outbox is in use or unusable.
+        InputError: Zenoh rejects its settings, or the outbox is in use or unusable.
     """
     from edge_agent.app.estimates_file import prepare_path
     from edge_agent.publish.outbox import Outbox
@@ -58,8 +58,8 @@ def open_publisher(
 def close_publisher(
     publisher: Publisher, progress: Progress, drain_s: float, **more: float
 ) -> None:
-    """Wait for acknowledgements, close, and print counts and extra values as one line of JSON on
-    stdout.
+    """Wait at most `drain_s` seconds for acknowledgements and close the publisher. Print counts and
+    the values `more` as one line of JSON on stdout.
 
     Unsettled records stay in the outbox for the next start.
     """
@@ -75,7 +75,7 @@ def close_publisher(
 
 
 def print_status(progress: Progress, publisher: Publisher, log_line: Callable[[str], None]) -> None:
-    """Print one line of progress."""
+    """Print one line with the progress of the loop and the counts of the publisher."""
     from edge_agent.app.live_loop import final_counts
 
     counts = publisher.counts

@@ -1,4 +1,4 @@
-"""Reasons why a live agent publishes nothing, as sentences for the person who started it."""
+"""Reasons why a live agent publishes nothing, as sentences for the user."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NUMBER: Final = re.compile(r"\d+(\.\d+)?")
 
 
 class PublisherState(Protocol):
-    """Part of a publisher that shows whether its records arrive."""
+    """Interface of a publisher's status: the values that show whether its records arrive."""
 
     @property
     def links(self) -> int:
@@ -37,20 +37,21 @@ class PublisherState(Protocol):
 
     @property
     def unanswered_s(self) -> float:
-        """Return the time for which nothing sent was answered [s]."""
+        """Return the time [s] for which sent batches have been unanswered."""
         ...
 
     @property
     def counts(self) -> Counts:
-        """Return the records by kind and result."""
+        """Return the numbers of records by kind and result."""
         ...
 
 
 class SignalWatch:
-    """Times at which the blocks of a source last had a position, a wheel speed and a turning wheel.
+    """Watch of a source: the times at which its blocks last had a position, a wheel speed and a
+    turning wheel.
 
     Args:
-        clock: monotonic [s].
+        clock: monotonic clock [s].
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -59,13 +60,13 @@ class SignalWatch:
         self._seen: dict[str, float] = {}
 
     def watch_blocks(self, source: Iterator[Block]) -> Iterator[Block]:
-        """Yield the blocks of a source and record their contents."""
+        """Yield the blocks of a source unchanged, and record which signals they contain."""
         for block in source:
             self.add(block)
             yield block
 
     def add(self, block: Block) -> None:
-        """Record the contents of a block."""
+        """Record which signals a block contains."""
         signals = block.signals
         now = self._clock()
         if not self._seen:
@@ -80,21 +81,21 @@ class SignalWatch:
         self._seen.update({name: now for name, here in present.items() if here})
 
     def is_missing(self, name: str) -> bool:
-        """Return True if a required signal has been missing for MISSING_S."""
+        """Return True if the required signal has been missing for at least MISSING_S."""
         return bool(self._seen) and self._clock() - self._seen[name] > MISSING_S
 
 
 def reasons_not_publishing(
     watch: SignalWatch, publisher: PublisherState, endpoints: Sequence[str], troubles: Sequence[str]
 ) -> list[str]:
-    """Return the reasons why nothing is published, the first cause first; empty if records can be
-    published.
+    """Return the reasons why nothing is published, the first cause first. The list is empty if
+    records can be published.
 
     Args:
-        watch: has seen the blocks.
-        publisher: of the records.
-        endpoints: routers that it tries to reach.
-        troubles: of the sources and of the signal doctor.
+        watch: watch that has seen the blocks.
+        publisher: status of the publisher.
+        endpoints: routers that the publisher tries to reach.
+        troubles: problems reported by the sources and by the signal doctor.
     """
     found = list(troubles)
     if watch.is_missing("wheels"):
@@ -129,12 +130,12 @@ def reasons_not_publishing(
 
 
 class ReasonReporter:
-    """Prints the reasons within FIRST_S + EVERY_S, and again whenever they change.
+    """Printer of the reasons: first within FIRST_S + EVERY_S, then whenever they change.
 
     Args:
         find: returns the present reasons.
         say: prints a line.
-        clock: monotonic [s].
+        clock: monotonic clock [s].
     """
 
     def __init__(
@@ -150,7 +151,7 @@ class ReasonReporter:
         self._told: list[str] = []
 
     def print_if_due(self) -> None:
-        """Print the reasons if they are due and differ from those that were printed last."""
+        """Print the reasons if it is time for a check and they differ from those printed last."""
         now = self._clock()
         if self._due is None:
             self._due = now + FIRST_S

@@ -1,10 +1,10 @@
-"""Live trip: verified by the signal doctor, and learned from; the knowledge of the car is stored
-next to the outbox.
+"""Live trip: the signal doctor verifies the signals, and a calibration is learned from them. The
+result is stored next to the outbox.
 
 Nothing is published before the doctor has passed the signals, in this trip or in an earlier one
-with the same vehicle file and profile. A trip is examined in parts of PART_S. Each part that passes
-is learned from; one that shows a fault revokes the approval. Learned values are used from the next
-trip on, because an estimator's vehicle does not change during a trip.
+with the same vehicle file and profile. A trip is examined in parts of PART_S. The calibration is
+learned from each part that passes; a part that shows a fault revokes the approval. Learned values
+are used from the next trip on, because an estimator's vehicle does not change during a trip.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ log = logging.getLogger(__name__)
 
 
 class Known(BaseModel):
-    """Stored knowledge of a car: whether its signals passed, and the estimates of each part of a
-    trip.
+    """Stored knowledge about a car: True if its signals passed the doctor, and the estimates of
+    each part of its trips.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -61,9 +61,9 @@ class Trip:
     """One trip of one car.
 
     Args:
-        vehicle: its file.
-        profile: name of the profile by which its signals are read.
-        path: of the stored knowledge; it need not exist.
+        vehicle: vehicle file of the car.
+        profile: profile that maps its signals.
+        path: file of the stored knowledge; it need not exist.
         trusted: True to publish regardless of the doctor's findings.
     """
 
@@ -87,11 +87,11 @@ class Trip:
         self._looking: Future[None] | None = None
 
     def is_admitted(self) -> bool:
-        """True if the signals are verified."""
+        """Return True if the signals of this trip may be published."""
         return self._trusted or self._known.passed
 
     def health_problems(self) -> list[str]:
-        """Return the reasons why nothing is published, if any."""
+        """Return the reason why nothing is published; an empty list if records are published."""
         if self.is_admitted():
             return []
         return [f"the signal doctor: {', '.join(self._faults) or 'has not passed the signals yet'}"]
@@ -99,10 +99,10 @@ class Trip:
     def corrected_blocks(
         self, source: Generator[Block], ground: Callable[[], FloatArray]
     ) -> Generator[Block]:
-        """Yield the blocks of a source with known device errors corrected; the raw ones are kept
-        for the doctor.
+        """Yield the blocks of a source with known sensor errors corrected. The uncorrected blocks
+        are stored for the doctor.
 
-        `ground` returns the speed over ground (T,) of the last block.
+        `ground` returns the speed over ground (T,) [m/s] of the last block.
         """
         if not self.is_admitted():
             log.info(
@@ -121,7 +121,7 @@ class Trip:
         self._start_examination(final=True)
 
     def close(self) -> None:
-        """Wait shortly for the learning to end."""
+        """Wait at most LEAVE_S for the examination to end."""
         if self._looking is not None:
             try:
                 self._looking.result(LEAVE_S)
@@ -141,7 +141,9 @@ class Trip:
             self._start_examination(final=False)
 
     def _start_examination(self, *, final: bool) -> None:
-        """Examine the part next to the loop; the last examination of a part ends it."""
+        """Start an examination of the current part on another thread. With `final`, the part ends
+        and the next one begins.
+        """
         if not self._blocks:
             return
         if not final and self._looking is not None and not self._looking.done():
@@ -181,7 +183,7 @@ class Trip:
 
 
 def state_path_for(spool: Path, name: str) -> Path:
-    """Return the path of a car's stored knowledge, next to its outbox."""
+    """Return the path of the file with a car's stored knowledge, next to its outbox."""
     return spool.with_name(f"{spool.stem}.{name}.json")
 
 
@@ -191,8 +193,8 @@ def _car_identity(vehicle: Vehicle, profile: Profile) -> str:
 
 
 def _read_state(path: Path, identity: str) -> Known:
-    """Return the stored knowledge of the car; empty if the file is missing, broken, or of
-    another car.
+    """Return the stored knowledge of the car; an empty one if the file is missing, broken, or
+    belongs to another car.
     """
     try:
         known = Known.model_validate_json(path.read_bytes())
@@ -210,7 +212,7 @@ def _read_state(path: Path, identity: str) -> Known:
 
 
 def _write_state(path: Path, known: Known) -> None:
-    """Write the learned values to their file, atomically."""
+    """Write the stored knowledge to its file, atomically."""
     part = path.with_suffix(".part")
     try:
         with part.open("w", encoding="utf-8") as file:

@@ -1,4 +1,6 @@
-"""Files of tuned memberships: the result, its comparison, and the command that reproduces it."""
+"""Files of tuned memberships: the membership functions, their scores, and the command that
+reproduces them.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ Count = Annotated[int, Field(ge=1)]
 
 
 class Record(BaseModel):
-    """Base of the parts of a file: unknown names are refused."""
+    """Base of the parts of a file; unknown field names are rejected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -57,14 +59,14 @@ class Score(Record):
 
 
 class SplitScores(Record):
-    """One row of the table: the drives of the search, and other drives."""
+    """Scores on the drives used in the search, and on held-out drives."""
 
     train: Score
     held_out: Score
 
 
 class Budget(Record):
-    """Limits of the search, and the number of vectors that each search evaluated."""
+    """Limits of the search, and the number of parameter vectors that each search evaluated."""
 
     ants: Count
     iterations: Count
@@ -84,7 +86,7 @@ class Provenance(Record):
 
 
 class Document(Record):
-    """Content of the file."""
+    """Content of a file of tuned memberships."""
 
     estimator: str
     memberships: dict[str, list[Finite]]
@@ -102,7 +104,7 @@ class Document(Record):
 
 @dataclass(frozen=True)
 class Tuned:
-    """File with valid memberships."""
+    """A parsed file: its valid memberships, and its complete document."""
 
     memberships: Memberships
     document: Document
@@ -133,7 +135,12 @@ def parse_tuned(text: str | bytes, where: str) -> Tuned:
 
 
 def load_tuned(path: Path | str) -> Tuned:
-    """Read a tuned file; InputError names the invalid field, or the file if it cannot be read."""
+    """Read a file of tuned memberships.
+
+    Raises:
+        InputError: a field is invalid, or the file cannot be read; the error names the field or the
+            file.
+    """
     try:
         text = Path(path).read_bytes()
     except OSError as error:
@@ -146,17 +153,17 @@ def load_tuned(path: Path | str) -> Tuned:
 
 
 def shipped_memberships(estimator: str) -> Memberships:
-    """Return the memberships that come with the package for an estimator.
+    """Return the memberships that the package contains for an estimator.
 
     Raises:
-        InputError: there are none for that estimator.
+        InputError: the package has no memberships for that estimator.
     """
     return load_tuned(FOLDER / f"{estimator}.json").memberships
 
 
 def search_results(estimator: str) -> dict[str, list[Memberships]]:
-    """Return the results of every search behind the shipped file, by search; empty if the file
-    does not have them.
+    """Return the results of all searches behind the shipped file, by kind of search; empty if the
+    file does not contain them.
     """
     document = load_tuned(FOLDER / f"{estimator}.json").document
     return {
@@ -166,7 +173,9 @@ def search_results(estimator: str) -> dict[str, list[Memberships]]:
 
 
 def save_tuned(path: Path, document: Document) -> None:
-    """Write a document after parsing it, so that no file is written that `load_tuned` would refuse."""
+    """Write a document after a check by parsing, so that `load_tuned` accepts every file that is
+    written.
+    """
     text = json.dumps(document.model_dump(), indent=1, ensure_ascii=False) + "\n"
     parse_tuned(text, f"tuned file {path}")
     try:

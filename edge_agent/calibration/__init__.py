@@ -1,3 +1,3 @@
-"""A vehicle learned from its own drives: what its devices and tyres are off by, with standard
-deviations.
+"""Calibration of a vehicle learned from its own drives: systematic errors of its sensors and tyre
+data, with standard deviations.
 """

@@ -1,9 +1,9 @@
-"""Judgement of a calibration on drives that it was not learned from.
+"""Validation of a calibration on drives from which it was not learned.
 
-A calibration is a set of groups (radii, steering, inertial unit, clocks, torque). Each group is
-kept only if a car with it predicts held-out drives at least as well as one without: the predictive
-log-likelihood of the estimator's own innovations does not fall, and the model is not contradicted
-for longer.
+A calibration has several groups of quantities (radii, steering, inertial unit, clocks, torque). A
+group is kept only if the vehicle with this group predicts held-out drives at least as well as
+without it. Two conditions decide: the predictive log-likelihood of the estimator's own innovations
+does not decrease, and the time in the state `CONTRADICTION` does not increase.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ Drive: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 class Prediction(NamedTuple):
-    """Predictive score of a car on one drive."""
+    """Predictive score of a vehicle with a certain calibration on one drive."""
 
     log_likelihood: float  # of the innovations [nat/s]
     contradicted: float  # share of the time
 
 
 class HeldOut(NamedTuple):
-    """Result of learning: the calibration to write, the groups left out of it, and the prediction
-    scores without and with it.
+    """Result of learning: the calibration to write, the groups left out of it, and the mean
+    predictions without (`before`) and with it (`after`).
     """
 
     calibration: Calibration
@@ -58,11 +58,12 @@ Judge: TypeAlias = Callable[[Vehicle, Drive], Prediction]
 
 
 def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> HeldOut:
-    """Learn a calibration from all drives, and keep only the parts that also help on drives that
-    were held out.
+    """Learn a calibration from all drives, and keep only the groups that also improve the
+    prediction of held-out drives.
 
     Raises:
-        InputError: no drive is excited enough, or one drive is too short to hold a part out.
+        InputError: no drive has enough excitation, or a single drive is too short to hold a part
+            out.
     """
     whole = learn_calibration(drives, vehicle)
     folds = split_folds(drives)
@@ -111,8 +112,8 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
 
 
 def split_folds(drives: Sequence[Drive]) -> list[tuple[list[Drive], Drive]]:
-    """Return pairs of drives to learn from and the drive to judge by; a single drive is cut in
-    two.
+    """Return pairs (drives to learn from, drive to validate on). A single drive is cut into two
+    halves.
     """
     if len(drives) == 1:
         t, signals = drives[0]
@@ -131,15 +132,15 @@ def split_folds(drives: Sequence[Drive]) -> list[tuple[list[Drive], Drive]]:
 
 
 def restrict_groups(calibration: Calibration, groups: Sequence[str]) -> Calibration:
-    """Return the calibration with the quantities of some groups alone."""
+    """Return the calibration with only the quantities of the given groups."""
     names = {name for group in groups for name in GROUPS[group]}
     update = {name: None for every in GROUPS.values() for name in every if name not in names}
     return calibration.model_copy(update=update)
 
 
 def is_worse(tried: Sequence[Prediction], best: Sequence[Prediction]) -> bool:
-    """Return True if predictions are worse on the mean of the drives, or one drive is
-    contradicted for longer.
+    """Return True if the predictions `tried` are worse than `best`: a lower mean log-likelihood, or
+    one drive with a longer contradiction.
     """
     lost = _mean_prediction(best).log_likelihood - _mean_prediction(tried).log_likelihood
     longer = max(new.contradicted - old.contradicted for new, old in zip(tried, best, strict=True))

@@ -1,31 +1,34 @@
-"""Errors of one car's devices from its own drives, each a mean over the drives with its standard
-deviation.
+"""Systematic errors of one car's sensors, learned from its own drives: for each quantity the mean
+over the drives with its standard deviation.
 
     quantity          from
-    radius_fl … rr    turning of each wheel against the mean of the four on calm moments, less what
-                      yaw and slip explain
+    radius_fl … rr    speed of each wheel against the mean of the four in calm moments, minus the
+                      difference that yaw and slip explain
     ax, ay            median of a_x − dv/dt and of a_y − v·r, the latter on straights
-    yaw_rate          intercept of the wheels' yaw rate over the gyro's
+    yaw_rate          intercept of the wheels' yaw rate over the gyroscope's
     steer_offset, steer_gain, understeer    δ = gain · L r/v + understeer · v r + offset, all three
-                                            at once
-    force_gain        torque over radius, over mass times acceleration: torque gain and mass, where
-                      torque is recorded
+                                            in one regression
+    force_gain        torque over radius, divided by mass times acceleration: errors of torque gain
+                      and mass, if torque is recorded
     wheel_lag, steer_lag    delay relative to the inertial unit: lags.py
 
-At one speed gain and understeer are the same; only a prior that the whole fleet shares separates
-them there. The regression of a drive therefore has the prior SOUND with standard deviation USUAL,
-and its standard deviations show the remaining uncertainty.
+Symbols: v speed, r yaw rate, δ steering angle, L wheelbase.
 
-Wheels under force slip. The driven axle therefore turns faster, and the dragged one slower; a
-radius is corrected for that by the file's stiffness, its driven axle, and the usual losses to air
-and rolling resistance.
+At a single speed, gain and understeer have the same effect; only a prior common to all cars
+separates them. Therefore the regression of a drive has a prior with mean SOUND and standard
+deviation USUAL, and its standard deviations include the remaining uncertainty.
 
-A drive without enough excitation for a quantity leaves it out. The standard deviation has two
-parts. One is the median deviation among drives over the root of their number; it is not less than
-FLOOR, as few drives may agree by chance. The other is BIAS, the error that all drives share
-(crossfall of 2.5 %, a bent steering map, load). Both were set on 40 simulated rough cars with other
-seeds than those of the figures. A quantity with little excitation is shrunk towards its usual value
-(USUAL): value and standard deviation are those of the posterior.
+Wheels slip under force. The driven axle therefore turns faster, and the other one slower. The radii
+are corrected for this with the stiffness and the driven axle of the vehicle file, and with usual
+air and rolling resistance.
+
+A quantity that a drive does not excite enough is left out for that drive. The standard deviation
+has two parts. The first is the median deviation between drives divided by the square root of their
+number; it is at least FLOOR, because few drives may agree by chance. The second is BIAS, the error
+common to all drives (crossfall of 2.5 %, a nonlinear steering ratio, load). Both were set on 40
+simulated cars with large errors, with other seeds than those of the published figures. The result
+is the posterior with the prior USUAL: a quantity with little excitation is therefore moved towards
+its usual value.
 """
 
 from __future__ import annotations
@@ -110,10 +113,11 @@ states.
 def learn_calibration(
     drives: Sequence[tuple[FloatArray, FloatArray]], vehicle: Vehicle
 ) -> Calibration:
-    """Return the calibration of a vehicle, learned from its drives, (t (T,), signals (T, 18)) each.
+    """Return the calibration of a vehicle learned from its drives, each a pair (t (T,), signals (T,
+    18)).
 
     Raises:
-        InputError: none of them is excited enough.
+        InputError: no drive has enough excitation.
     """
     estimates = [one_drive(t, signals, vehicle) for t, signals in drives]
     calibration = weigh_estimates(estimates, vehicle)
@@ -127,7 +131,9 @@ def learn_calibration(
 
 
 def weigh_estimates(drives: Sequence[DriveEstimates], vehicle: Vehicle) -> Calibration | None:
-    """Return the means over several drives with standard deviations; None if no drive was excited."""
+    """Return a calibration with means and standard deviations over several drives; None if no drive
+    has an estimate.
+    """
     estimates: dict[str, list[float]] = {}
     for drive in drives:
         for name, value in drive.items():
@@ -146,8 +152,8 @@ def weigh_estimates(drives: Sequence[DriveEstimates], vehicle: Vehicle) -> Calib
 
 
 def surer_values(one: Calibration | None, other: Calibration | None) -> Calibration | None:
-    """Return, of each quantity, the value with the smaller standard deviation of two
-    calibrations of a car.
+    """Combine two calibrations of a car: for each quantity, return the value with the smaller
+    standard deviation.
     """
     if one is None or other is None:
         return one or other
@@ -163,11 +169,11 @@ def surer_values(one: Calibration | None, other: Calibration | None) -> Calibrat
 def _posterior_of(
     kind: str, values: FloatArray, bias: float, unknown: float
 ) -> tuple[float, float]:
-    """Return the posterior mean and standard deviation of a quantity from the estimates of drives
-    (n,).
+    """Return the posterior (mean, standard deviation) of a quantity from the estimates of several
+    drives (n,).
 
-    `unknown` is the standard deviation after the best drive; if it is given, the estimates have
-    already been shrunk towards the usual value.
+    `unknown` is the standard deviation stated by the best drive. If it is not 0, the estimates were
+    already moved towards the usual value.
     """
     sound = SOUND.get(kind, 0.0)
     centre = float(np.median(values))
@@ -183,8 +189,9 @@ def _posterior_of(
 
 
 def one_drive(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> DriveEstimates:
-    """Return estimates of one drive, t (T,) [s] and signals (T, 18), by quantity; quantities
-    without enough excitation are left out.
+    """Return the estimates of one drive by quantity, from times t (T,) [s] and signals (T, 18).
+
+    Quantities without enough excitation are left out.
     """
     return _estimate_quantities(prepare_drive(t, signals, vehicle), vehicle) | find_lags(
         t, signals, vehicle
@@ -211,8 +218,8 @@ def _estimate_quantities(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
 
 
 def trace_steering(drive: EvenDrive) -> DriveEstimates:
-    """Return offset, gain and understeer of the steering with their standard deviations, from
-    the way that it makes.
+    """Return offset, gain and understeer of the steering with their standard deviations, from a
+    comparison of steering angle and path curvature.
     """
     fast = np.maximum(drive.v, STEERED_M_S)
     across = drive.v * drive.r
@@ -243,8 +250,8 @@ def trace_steering(drive: EvenDrive) -> DriveEstimates:
 
 
 def _estimate_radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
-    """Return the relative excess of each wheel's speed over the mean of the four, corrected for yaw
-    and slip.
+    """Return, for each wheel, how much faster it turns than the mean of the four (relative),
+    corrected for yaw and slip.
     """
     calm = (
         (drive.moving > 0) & (np.abs(drive.v_dot) < CALM) & (np.abs(drive.v * drive.r) < STRAIGHT)
@@ -262,10 +269,12 @@ def _estimate_radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
 
 
 def _force_gain(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
-    """Compare torque with the force that moves the file's mass, measured by the wheels because an
-    accelerometer pitches with the body.
+    """Return the ratio of the measured wheel torque to the torque that accelerates the mass of the
+    vehicle file.
 
-    Slope, air and rolling are fitted as separate terms, because they do not vary with acceleration.
+    The acceleration comes from the wheel speeds, because an accelerometer pitches with the body.
+    Slope, air and rolling resistance are one constant term of the fit, because they do not vary
+    with acceleration.
     """
     rows = (drive.moving > 0) & np.isfinite(drive.torque) & np.isfinite(drive.v_dot)
     if np.sum(rows & (np.abs(drive.v_dot) > PULLED)) < LEAST_S * RATE_HZ:
@@ -276,11 +285,11 @@ def _force_gain(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
 
 
 def _wheel_slips(drive: EvenDrive, vehicle: Vehicle, rows: BoolArray) -> FloatArray:
-    """Return the slip of the wheels against the mean of the four, (n, 4): the slip from the driving
-    force minus the slip that turns the other wheels.
+    """Return the slips of the wheels minus their mean (n, 4), from the driving force of each axle
+    and its rolling resistance.
 
-    The accelerometer feels the force of the tyres minus that of the air, on slopes too; its offset
-    is the difference of its reading from dv/dt.
+    The accelerometer measures the force of the tyres minus that of the air, also on slopes. Its
+    offset is estimated by the difference between its reading and dv/dt.
     """
     if vehicle.drive_split_front is None:
         return np.zeros((int(rows.sum()), 4))

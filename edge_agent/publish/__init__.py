@@ -1,1 +1,1 @@
-"""Publication: observations → batches → outbox on disk → Zenoh; acknowledgements."""
+"""Publication of observations: batches, an outbox on disk, sending by Zenoh, and acknowledgements."""

@@ -1,5 +1,5 @@
-"""Acknowledgements of the services: they settle batches in the outbox, and they show how far the
-vehicle's clock is behind.
+"""Processing of acknowledgements from fleet services: they settle batches in the outbox, and show
+how far the vehicle's clock is behind.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Counts:
-    """Records by kind and by result."""
+    """Numbers of records by kind and by result."""
 
     offered: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
     published: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
@@ -42,7 +42,7 @@ class AckSettlement:
     """Queue of received acknowledgements, applied to an outbox by the sending thread.
 
     Attributes:
-        clock_behind_s: lag of the vehicle's clock behind the last service that answered [s].
+        clock_behind_s: delay of the vehicle's clock relative to the last service that answered [s].
     """
 
     def __init__(
@@ -55,12 +55,12 @@ class AckSettlement:
         self.clock_behind_s = 0.0
 
     def receive_ack(self, vehicle: str, payload: bytes) -> None:
-        """Queue an acknowledgement; called on a thread of Zenoh."""
+        """Queue an acknowledgement. This method is called on a thread of Zenoh."""
         self._acks.put((vehicle, payload))
 
     def settle_received(self) -> None:
-        """Apply all queued acknowledgements. Unreadable ones and those of other vehicles are counted
-        and ignored.
+        """Apply all queued acknowledgements. An unreadable acknowledgement, or one for another
+        vehicle, is ignored and counted.
         """
         while not self._acks.empty():
             vehicle, payload = self._acks.get()
@@ -96,8 +96,10 @@ class AckSettlement:
                 )
 
     def _compare_clocks(self, reported: int) -> None:
-        """Compare our clock with that of a service [ns], 0 if unknown; an acknowledgement is
-        about a second old.
+        """Compare the vehicle's clock with the time [ns UTC] that a service reported; 0 means
+        unknown.
+
+        An acknowledgement is about a second old on arrival.
         """
         if not reported:
             return

@@ -1,7 +1,7 @@
-"""Batching: records become columns per (vehicle, kind, region) until a batch is due. Pure; time is
-an argument.
+"""Batching: records are collected per (vehicle, kind, region) until a batch is due. The module is
+pure; time is an argument.
 
-A batch is due when it is full, when its oldest record has waited long enough, or at once when a
+A batch is due when it is full, when its oldest record has waited long enough, or immediately when a
 record is urgent.
 """
 
@@ -27,7 +27,7 @@ UNNUMBERED: Final = 0  # the outbox numbers a batch when it takes it in
 
 @dataclass(frozen=True)
 class Draft:
-    """Batch without a number; `encode(seq, first_held)` returns its payload."""
+    """Batch without a sequence number; `encode(seq, first_held)` returns its payload."""
 
     vehicle: str
     kind: Kind
@@ -51,8 +51,8 @@ class _Group:
 
 
 class Batcher:
-    """Collects records of the named vehicles; at most `rows` per batch, waiting at most
-    `flush_s`.
+    """Collector of the records of the named vehicles. A batch has at most `rows` records and waits
+    at most `flush_s` seconds.
     """
 
     def __init__(
@@ -71,8 +71,10 @@ class Batcher:
         return sum(group.rows for group in self._groups.values())
 
     def add(self, records: RecordBlock, now: float) -> None:
-        """Add records; rows of one vehicle and region keep their order. IndexError for an
-        unknown vehicle.
+        """Add records. Records of one vehicle and region keep their order.
+
+        Raises:
+            IndexError: a record belongs to an unknown vehicle.
         """
         if not len(records.vehicle):
             return
@@ -93,7 +95,7 @@ class Batcher:
             group.urgent |= bool(records.urgent[chosen].any())
 
     def take_due(self, now: float, *, everything: bool = False) -> list[Draft]:
-        """Remove and return the batches that are due."""
+        """Remove the batches that are due (or all, with `everything`), and return them."""
         drafts: list[Draft] = []
         for place, group in list(self._groups.items()):
             whole = everything or group.urgent or now - group.since >= self._flush_s
@@ -128,8 +130,9 @@ class Batcher:
 
 
 def _batch_ranges(time: IntArray, ready: int, rows: int) -> Iterator[tuple[int, int]]:
-    """Yield the first and last position of each batch, limited in rows and in time span (a replayed
-    drive can be long)."""
+    """Yield the range [first, last) of each batch, limited in rows and in time span, because a
+    replayed drive may be long.
+    """
     first = 0
     for at in range(1, ready + 1):
         if at == ready or at - first == rows or abs(int(time[at]) - int(time[first])) > SPAN_NS:
@@ -142,5 +145,5 @@ def _slice_columns(columns: Columns, first: int, last: int) -> Columns:
 
 
 def _encode_batch(batch: Batch, seq: int, first_held: int) -> bytes:
-    """Return the payload of a batch with the number from the outbox."""
+    """Return the payload of a batch with the sequence number that the outbox assigned."""
     return encode(replace(batch, seq=seq, first_held=first_held))

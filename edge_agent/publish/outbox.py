@@ -1,14 +1,16 @@
-"""Outbox: batches on disk until they are acknowledged, so that no report is lost or counted twice.
+"""Outbox: stores batches on disk until they are acknowledged, so that no report is lost or counted
+twice.
 
-A batch is committed here before it is sent and is removed only when the service has settled it. It
-is identified by its stream (vehicle, boot, kind, region) and its `seq`, dense from 1 in each
-stream. `boot` is random per start, so a restarted agent opens new streams and never reuses a name.
-Batches of an earlier start are sent again under their old name.
+A batch is committed here before it is sent, and is removed only after the service has settled it.
+It is identified by its stream (vehicle, boot, kind, region) and its sequence number `seq`, which
+counts from 1 without gaps in each stream. `boot` is a random number per start. Therefore a
+restarted agent opens new streams and never reuses an identifier. Batches of an earlier start are
+sent again under their old identifier.
 
-The size is bounded: when the payloads exceed the capacity, the oldest states are dropped first,
+The size is limited: when the payloads exceed the capacity, the oldest states are dropped first,
 then the oldest observations, and both are counted. SQLite runs in WAL mode with a sync per commit.
-The exclusive lock of the database file is held while the outbox is open, so that one file never
-serves two agents. Time is an argument, in monotonic seconds.
+The outbox keeps the exclusive lock of the database file while it is open, so that two agents never
+use the same file. Time is an argument, in monotonic seconds.
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)  # an old state is worth least, 
 
 
 class Stream(NamedTuple):
-    """Numbering scope of `seq`: one vehicle, one start, one kind of record, one region (z10
+    """Scope of the sequence numbers: one vehicle, one start, one kind of record, one region (z10
     quadint).
     """
 
@@ -56,7 +58,9 @@ class Stream(NamedTuple):
 
 @dataclass(frozen=True)
 class StoredBatch:
-    """Unsettled batch on disk; send `fresh` ones now, others when `due_batches` returns them."""
+    """Unsettled batch on disk. Send a `fresh` one immediately, any other when `due_batches` returns
+    it.
+    """
 
     key: int
     stream: Stream
@@ -81,7 +85,9 @@ class OutboxCounts:
 
 @dataclass(slots=True)
 class _Entry:
-    """State of a batch without its payload; it is in flight while `due` has a time."""
+    """State of a batch without its payload. While the batch is in flight, `due` is the time of its
+    next resend.
+    """
 
     stream: Stream
     seq: int
@@ -93,7 +99,9 @@ class _Entry:
 
 @dataclass
 class _Sequence:
-    """Sequence numbers of one stream: the next free number, and the numbers of held batches."""
+    """Sequence numbers of one stream: the next free number, and the numbers of batches in the
+    outbox.
+    """
 
     stream: Stream
     next: int = 1
@@ -101,8 +109,10 @@ class _Sequence:
     held: dict[int, int] = field(default_factory=dict)
 
     def first_held(self) -> int:
-        """Return the lowest seq still held, or the next one if none is; settled seqs are skipped
-        once.
+        """Return the lowest seq that is still in the outbox, or the next free seq if the outbox has
+        no batch of the stream.
+
+        The search continues where the last one ended, so each settled seq is skipped only once.
         """
         while self.first < self.next and self.first not in self.held:
             self.first += 1
@@ -110,8 +120,11 @@ class _Sequence:
 
 
 class Outbox:
-    """Unsettled batches of one agent process. Raises InputError if the file belongs to another
-    agent or is no outbox."""
+    """Store of the unsettled batches of one agent process.
+
+    Raises:
+        InputError: the file belongs to another agent or is not an outbox.
+    """
 
     def __init__(
         self,
@@ -154,9 +167,11 @@ class Outbox:
         self._evict_oldest()
 
     def recover_file(self) -> None:
-        """Continue in a new file with the readable content of the current, damaged one.
+        """Continue in a new file with the readable content of the damaged file. After an error the
+        call may be repeated.
 
-        Raises sqlite3.Error or OSError if the disk refuses; the call may then be repeated.
+        Raises:
+            sqlite3.Error, OSError: the disk does not accept the write.
         """
         self._database.close()
         before = sum(entry.records for entry in self._entries.values())
@@ -212,11 +227,13 @@ class Outbox:
 
     @property
     def batches(self) -> int:
-        """Number of held batches."""
+        """Return the number of batches in the outbox."""
         return len(self._entries)
 
     def count_records(self, vehicles: Collection[str], kind: Kind | None = None) -> int:
-        """Return the number of records in held batches of some vehicles, of one kind or of all."""
+        """Return the number of records in the outbox that belong to the given vehicles, of one kind
+        or of all kinds.
+        """
         held = list(self._entries.values())
         return sum(
             e.records
@@ -225,8 +242,8 @@ class Outbox:
         )
 
     def count_stranded(self, vehicles: Collection[str]) -> int:
-        """Return the number of records that are not sent because they belong to none of these
-        vehicles, for example after a change of name.
+        """Return the number of records that are not sent because they belong to other vehicles than
+        these, for example after a change of name.
         """
         return sum(
             e.records for e in list(self._entries.values()) if e.stream.vehicle not in vehicles
@@ -234,21 +251,24 @@ class Outbox:
 
     @property
     def bytes(self) -> int:
-        """Size of all held payloads [bytes]."""
+        """Return the size of all stored payloads [bytes]."""
         return self._bytes
 
     def unanswered_s(self, now: float) -> float:
-        """Return for how long sent batches have been without an answer [s], in the region that has
-        waited longest; 0 if none waits.
+        """Return the time [s] for which sent batches have been unanswered, in the region with the
+        longest wait; 0 if no batch waits.
         """
         since = (pacer.unanswered_since for pacer in list(self._pacers.values()))
         return max((now - one for one in since if one is not None), default=0.0)
 
     def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
-        """Number the drafts and commit them in one transaction; nothing changes if the commit
-        fails.
+        """Number the drafts and commit them in one transaction; if the commit fails, nothing
+        changes.
 
-        Raises sqlite3.Error if the disk refuses.
+        Return the stored batches.
+
+        Raises:
+            sqlite3.Error: the disk does not accept the write.
         """
         ahead: dict[Stream, int] = {}
         with self._database:
@@ -301,7 +321,9 @@ class Outbox:
         return self._random.uniform(1 - JITTER, 1 + JITTER)
 
     def reset_in_flight(self, vehicle: str, now: float) -> None:
-        """Treat all batches in flight of a vehicle as lost, because it has just reconnected."""
+        """Treat all batches in flight of a vehicle as lost, because the vehicle has just
+        reconnected.
+        """
         for (name, _), pacer in self._pacers.items():
             if name == vehicle:
                 pacer.record_reconnect(now)
@@ -313,7 +335,9 @@ class Outbox:
                 self._pacer_of(entry).queue_batch(key)
 
     def _evict_oldest(self) -> None:
-        """Keep within the capacity: drop the oldest state first, then the oldest observation."""
+        """Drop batches until the capacity is respected: first the oldest states, then the oldest
+        observations.
+        """
         for kind in EVICTION_ORDER:
             while self._bytes > self.capacity_bytes and self._oldest[kind]:
                 key = self._oldest[kind].popleft()
@@ -326,8 +350,10 @@ class Outbox:
         )
 
     def delete_settled(self) -> None:
-        """Delete settled batches from the disk now, without waiting for the next `store`. Raises
-        sqlite3.Error.
+        """Delete settled batches from the disk now, instead of with the next `store`.
+
+        Raises:
+            sqlite3.Error: the disk does not accept the change.
         """
         if self._deletable:
             with self._database:
@@ -335,11 +361,12 @@ class Outbox:
             self._deletable.clear()
 
     def settle_ranges(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> int:
-        """Remove the batches of inclusive seq ranges; return the number of records. Unknown seqs
-        are ignored.
+        """Remove the batches in inclusive ranges of seq; return the number of their records.
+        Unknown numbers are ignored.
 
         The rows are deleted with the next `store` or `delete_settled`, so that an acknowledgement
-        costs no sync. A batch that a crash restores is sent again, and the service recognises it.
+        requires no sync. A batch that a crash restores is sent again, and the service recognises
+        it.
         """
         sequence = self._streams.get(stream)
         if sequence is None:
@@ -355,10 +382,13 @@ class Outbox:
     def due_batches(
         self, now: float, limit: int, vehicles: Collection[str] | None = None
     ) -> list[StoredBatch]:
-        """Return at most `limit` batches to send now, oldest first, of these vehicles or of all;
-        `pacing` decides how many.
+        """Return at most `limit` batches to send now, oldest first, of the given vehicles or of all
+        vehicles.
 
-        Raises sqlite3.Error if the disk refuses.
+        The module `pacing` decides how many batches of a vehicle and region are sent.
+
+        Raises:
+            sqlite3.Error: the disk cannot be read.
         """
         while self._later and self._later[0][0] <= now:
             at, key = heapq.heappop(self._later)
@@ -383,21 +413,27 @@ class Outbox:
         return [batch for key in sorted(keys) if (batch := self._read_batch(key)) is not None]
 
     def _is_passed_over(self, entry: _Entry) -> bool:
-        """Return True if PASSED_OVER later batches of the stream were settled and this one, the
-        oldest, was not.
+        """Return True if this batch is the oldest of its stream in the outbox, and PASSED_OVER
+        later batches of the stream were settled.
         """
         sequence = self._streams[entry.stream]
         later = sequence.next - entry.seq - len(sequence.held)
         return later >= PASSED_OVER and sequence.first_held() == entry.seq
 
     def held_batches(self) -> list[StoredBatch]:
-        """Return all held batches, oldest first. Raises sqlite3.Error."""
+        """Return all batches in the outbox, oldest first.
+
+        Raises:
+            sqlite3.Error: the disk cannot be read.
+        """
         return [
             batch for key in list(self._entries) if (batch := self._read_batch(key)) is not None
         ]
 
     def _read_batch(self, key: int) -> StoredBatch | None:
-        """Return a batch with its payload; None, and count it, if damage removed its row."""
+        """Return a batch with its payload. If its row is missing or damaged, count the loss and
+        return None.
+        """
         entry = self._entries[key]
         query = f"SELECT {spool_file.NAME}, payload, checksum FROM batch WHERE id = ?"
         row = self._database.execute(query, (key,)).fetchone()
@@ -411,7 +447,11 @@ class Outbox:
         return StoredBatch(key, entry.stream, entry.seq, entry.records, row[6])
 
     def close(self) -> None:
-        """Release the file. Raises sqlite3.Error if the disk refuses the last deletions."""
+        """Delete the settled batches and release the file.
+
+        Raises:
+            sqlite3.Error: the disk does not accept the last deletions.
+        """
         try:
             self.delete_settled()
         finally:
@@ -419,7 +459,9 @@ class Outbox:
 
 
 def _keys_within(held: dict[int, int], first: int, last: int) -> list[int]:
-    """Return the keys of held seqs in [first, last], without iterating over a hostile range."""
+    """Return the keys of the batches with seq in [first, last]. A very large (hostile) range is not
+    iterated.
+    """
     if last - first < len(held):
         return [held[seq] for seq in range(first, last + 1) if seq in held]
     return [key for seq, key in held.items() if first <= seq <= last]

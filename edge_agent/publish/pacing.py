@@ -1,12 +1,14 @@
 """Pacing of one vehicle's batches for one region, so that unanswered batches do not flood the
-network. Pure.
+network. The module is pure.
 
-Open, while acknowledgements arrive: fresh batches are sent at once. Of waiting batches, as many are
-in flight as a window allows. The window grows with each settled batch and is halved when one is not
-answered in time (slow start and congestion avoidance, Jacobson 1988: loss indicates overload).
-Silent, when nothing was answered for SILENT_S: fresh batches stay on disk, and a single one is sent
-as a probe at intervals that double up to LONGEST_PROBE_S. The first acknowledgement opens the route
-again. Time is monotonic seconds.
+State "open", while acknowledgements arrive: fresh batches are sent immediately. Of waiting batches,
+as many are in flight as a window allows. The window grows with each settled batch and is halved
+when a batch is not answered in time (slow start and congestion avoidance, Jacobson 1988: loss
+indicates overload).
+
+State "silent", after SILENT_S without an answer: fresh batches stay on disk, and single batches are
+sent as probes at intervals that double up to LONGEST_PROBE_S. The first acknowledgement returns to
+the open state. Time is monotonic [s].
 """
 
 from __future__ import annotations
@@ -29,11 +31,11 @@ HALVED_S: Final = 2.0  # all that is lost at once is one sign
 
 
 class Pacer:
-    """Pacing of one vehicle towards the service of one region.
+    """Pacing of one vehicle's batches towards the service of one region.
 
     Attributes:
-        flying: batches in flight, neither answered nor given up.
-        silent: True if nothing answers.
+        flying: number of batches in flight: sent, not answered and not timed out.
+        silent: True in the state "silent", while the service does not answer.
     """
 
     __slots__ = (
@@ -69,16 +71,18 @@ class Pacer:
 
     @property
     def is_idle(self) -> bool:
-        """True if nothing is in flight and nothing waits."""
+        """Return True if no batch is in flight and no batch waits."""
         return not self.flying and not self._waiting
 
     @property
     def unanswered_since(self) -> float | None:
-        """Return since when sent batches are unanswered; None if none are."""
+        """Return the time since which sent batches are unanswered; None if no batch waits for an
+        answer.
+        """
         return self._unanswered_since
 
     def queue_batch(self, key: int) -> None:
-        """Queue a batch; lower keys are older and are sent first."""
+        """Queue a batch by its key; lower keys are older and are sent first."""
         heapq.heappush(self._waiting, key)
 
     def record_sent(self, now: float) -> None:
@@ -94,7 +98,7 @@ class Pacer:
         self._window = min(grown, LARGEST_WINDOW)
 
     def record_answer(self) -> None:
-        """Record that any acknowledgement arrived."""
+        """Record that an acknowledgement arrived, for any batch. It ends the silent state."""
         self._answered = True
         if self.silent:
             self.silent = False
@@ -103,7 +107,9 @@ class Pacer:
             self._stale = self.flying
 
     def record_timeout(self, now: float, jitter: float) -> None:
-        """Record that a batch in flight was not answered in time."""
+        """Record that a batch in flight was not answered in time; halve the window or enter the
+        silent state.
+        """
         self.flying -= 1
         if self.silent:
             return
@@ -122,8 +128,8 @@ class Pacer:
             self._sure = self._window
 
     def record_reconnect(self, now: float) -> None:
-        """Record that a router is available again: batches in flight are lost, and a silent
-        route is probed at once.
+        """Record that a router is available again: batches in flight are lost, and in the silent
+        state a probe is sent immediately.
         """
         self.flying = 0
         self._unanswered_since = None
@@ -131,7 +137,7 @@ class Pacer:
         self._probe_s = FIRST_PROBE_S
 
     def take_due(self, now: float, jitter: float, most: int, held: Container[int]) -> list[int]:
-        """Return the keys of at most `most` batches to send now, oldest first; keys that are not
+        """Return the keys of at most `most` batches to send now, oldest first. Keys that are not in
         `held` are dropped.
         """
         if self._answered:
@@ -148,8 +154,10 @@ class Pacer:
         return out
 
     def _take_probe(self, now: float, jitter: float, held: Container[int]) -> list[int]:
-        """Return the oldest or the newest batch in turn, so that an unreadable one does not
-        block the route.
+        """Return the key of one batch as a probe, alternately the oldest and the newest, so that an
+        unreadable batch does not block the route.
+
+        The list is empty if no probe is due.
         """
         if now < self._probe_at:
             return []

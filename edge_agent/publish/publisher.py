@@ -1,9 +1,9 @@
-"""Publisher: the thread between the estimation loop and the network: batch, store, send, settle,
-resend.
+"""Publisher: a thread between the estimation loop and the network that batches, stores, sends,
+settles and resends records.
 
 The loop only calls `offer`, which never blocks. Only the sender thread uses disk and network. Every
 batch is on disk before it is sent, and stays there until the service has settled it. A second
-thread opens the sessions and waits for the routers as long as necessary.
+thread opens the Zenoh sessions and waits for the routers as long as necessary.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ log = logging.getLogger(__name__)
 
 
 class Publisher:
-    """Publishes records of the named vehicles; column `vehicle` of the records is an index into
-    `names`.
+    """Publisher of the records of the named vehicles; column `vehicle` of the records is an index
+    into `names`.
 
-    `on_open` is called with each vehicle's session when it is open, for other publications and
-    subscriptions.
+    `on_open(name, session)` is called when the session of a vehicle is open. Other parts use it to
+    publish and subscribe on the same session.
     """
 
     def __init__(
@@ -78,14 +78,14 @@ class Publisher:
         self._sender = threading.Thread(target=self._send_loop, name="sender", daemon=True)
 
     def start(self) -> None:
-        """Start to open sessions and to send."""
+        """Start the threads that open the sessions and send."""
         self._links.start()
         self._sender.start()
 
     @property
     def is_broken(self) -> bool:
-        """True if the sending thread has died: records are accepted, and dropped when there is
-        no room.
+        """Return True if the sender thread has died. Records are then still accepted, and dropped
+        when the queue is full.
         """
         return (
             self._sender.ident is not None
@@ -98,7 +98,9 @@ class Publisher:
         return self.status.count_unsettled(kind)
 
     def offer(self, *blocks: RecordBlock) -> None:
-        """Queue records; never blocks. Records that do not fit are dropped and counted."""
+        """Queue records without blocking. Records that do not fit into the queue are dropped and
+        counted.
+        """
         for records in blocks:
             if not len(records.vehicle):
                 continue
@@ -109,8 +111,10 @@ class Publisher:
                 self.counts.dropped[records.kind] += len(records.vehicle)
 
     def close(self, within_s: float) -> bool:
-        """Flush, wait at most `within_s` for acknowledgements, stop; False if something hung and
-        was abandoned.
+        """Send the remaining records, wait at most `within_s` seconds for acknowledgements, and
+        stop.
+
+        Return False if a thread did not stop in time and was abandoned.
         """
         self._deadline = self._clock() + within_s
         self._closing.set()
@@ -156,7 +160,9 @@ class Publisher:
         self._resend_due()
 
     def _recover_outbox(self) -> None:
-        """Save the readable content of an outbox that was damaged during use, and continue."""
+        """Recover the readable content of an outbox that was damaged during use, and continue with
+        it.
+        """
         try:
             self._outbox.recover_file()
         except (sqlite3.Error, OSError) as error:
@@ -184,8 +190,8 @@ class Publisher:
             log.exception("%d records that cannot be sent are dropped", len(records.vehicle))
 
     def _store_and_send(self) -> None:
-        """Commit waiting records, then send them. A disk that refuses is tried again in the next
-        round.
+        """Commit the waiting records to the outbox, then send them. If the disk refuses, the next
+        round tries again.
         """
         if not self._waiting:
             return
@@ -214,7 +220,7 @@ class Publisher:
                 self._links.put_batch(batch)
 
     def _drop_unwritable(self) -> None:
-        """Drop only the drafts that protobuf refuses."""
+        """Drop the drafts that protobuf cannot encode, and keep the others."""
         waiting = self._waiting
         self._waiting = []
         for draft in waiting:

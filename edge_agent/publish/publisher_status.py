@@ -1,4 +1,4 @@
-"""Status of a publisher for metrics, health and log lines: its sessions, its outbox, and the
+"""Status of a publisher for metrics, health checks and log lines: its sessions, its outbox, and the
 acknowledgements.
 """
 
@@ -14,7 +14,7 @@ from schemas.wire import Kind
 
 
 class PublisherStatus:
-    """Figures that are read from the parts of a publisher, on any thread."""
+    """Status figures of a publisher, which may be read on any thread."""
 
     def __init__(
         self,
@@ -34,57 +34,63 @@ class PublisherStatus:
 
     @property
     def links(self) -> int:
-        """Number of open sessions."""
+        """Return the number of open sessions."""
         return self._sessions.session_count
 
     @property
     def link_watches(self) -> list[LinkWatch]:
-        """The state of each session's link."""
+        """Return the watch of each session's link to its router."""
         return self._sessions.link_watches
 
     @property
     def cut_off(self) -> bool:
-        """True if an open session has no router."""
+        """Return True if an open session has no router."""
         return self._sessions.is_cut_off
 
     @property
     def clock_behind_s(self) -> float:
-        """Lag of the vehicle's clock behind the service's [s]."""
+        """Return the delay of the vehicle's clock relative to the service's [s]."""
         return self._settlement.clock_behind_s
 
     @property
     def unanswered_s(self) -> float:
-        """Time [s] for which sent batches have been without an answer."""
+        """Return the time [s] for which sent batches have been unanswered."""
         return self._outbox.unanswered_s(self._clock())
 
     @property
     def stranded_records(self) -> int:
-        """Records in the outbox under names of other vehicles: of a former name."""
+        """Return the number of records in the outbox under other vehicle names, for example after a
+        change of name.
+        """
         return self._outbox.count_stranded(self._names)
 
     @property
     def fill_share(self) -> float:
-        """Used share of the outbox."""
+        """Return the used share of the outbox capacity [1]."""
         return self._outbox.bytes / self._outbox.capacity_bytes
 
     @property
     def unanswered_records(self) -> int:
-        """Records of batches that were given up, because only later ones were answered."""
+        """Return the number of records in batches that were given up, because the service answered
+        only later batches.
+        """
         return self._outbox.counts.unanswered
 
     @property
     def damage_counts(self) -> tuple[int, int]:
-        """Number of times that the outbox was found damaged, and records known to be lost by it."""
+        """Return (number of times that the outbox was found damaged, number of records known to be
+        lost by this).
+        """
         return self._outbox.counts.damages, self._outbox.counts.damaged
 
     @property
     def dropped_records(self) -> int:
-        """Records dropped for lack of room, in the queue or in the outbox."""
+        """Return the number of records dropped for lack of space, in the queue or in the outbox."""
         return sum(self.counts.dropped.values()) + sum(self._outbox.counts.evicted.values())
 
     def count_unsettled(self, kind: Kind | None = None) -> int:
-        """Return the number of unsettled records: in the outbox, also of an earlier start, or not
-        yet stored in it.
+        """Return the number of unsettled records: those in the outbox, also of an earlier start,
+        and those not yet stored.
         """
         counts = self.counts
         kinds = Kind if kind is None else (kind,)

@@ -1,9 +1,9 @@
-"""Recovery of rows from a damaged SQLite file, page by page without its tree. Pure: bytes in, rows
-out.
+"""Recovery of rows from a damaged SQLite file. Pages are read one by one, without the b-tree. The
+module is pure: bytes in, rows out.
 
-After "Database File Format" of sqlite.org, sections 1.6 (b-tree pages), 2.1 (records) and 4.1
-(write-ahead log). A recovered row may be torn, deleted or older than another copy. The caller must
-verify it, so batches have a checksum.
+Source: "Database File Format" of sqlite.org, sections 1.6 (b-tree pages), 2.1 (records) and 4.1
+(write-ahead log). A recovered row may be incomplete, deleted or older than another copy. Therefore
+the caller must verify it; batches have a checksum for this purpose.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ Value = int | str | bytes | None
 
 
 def recover_rows(database: bytes, log: bytes) -> Iterator[tuple[int, list[Value]]]:
-    """Yield row id and columns of every intact cell; the cells of the write-ahead log first,
-    from its end on.
+    """Yield (row id, columns) of every intact cell. The cells of the write-ahead log come first,
+    newest page first.
     """
     pages = {at // PAGE + 1: database[at : at + PAGE] for at in range(0, len(database), PAGE)}
     newer = [

@@ -1,5 +1,5 @@
-"""Zenoh sessions of all vehicles of a publisher, opened in a thread of their own, and which of them
-has a router.
+"""Zenoh sessions of all vehicles of a publisher, opened on a separate thread, and their connections
+to a router.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from schemas.runtime.link_watch import LinkWatch
 
 
 class SessionLinks:
-    """One session per name. `on_open(name, session)` is called when a session is open, and
-    `on_ack(name, payload)` for each acknowledgement.
+    """Set of Zenoh sessions, one per vehicle name.
+
+    `on_open(name, session)` is called when a session is open, and `on_ack(name, payload)` for each
+    acknowledgement.
     """
 
     def __init__(
@@ -39,42 +41,43 @@ class SessionLinks:
         self._opener = threading.Thread(target=self._open_all, name="connector", daemon=True)
 
     def start(self) -> None:
-        """Start to open the sessions; each waits for a router as long as necessary."""
+        """Start to open the sessions. Each one waits for a router as long as necessary."""
         self._opener.start()
 
     def close(self) -> None:
-        """Close all sessions, once the event `stop` is set."""
+        """Close all sessions. Set the event `stop` before this call."""
         self._opener.join()
         for link in self._links.values():
             link.close()
 
     @property
     def session_count(self) -> int:
-        """Number of open sessions."""
+        """Return the number of open sessions."""
         return len(self._links)
 
     @property
     def link_watches(self) -> list[LinkWatch]:
-        """The state of each session's link."""
+        """Return the watch of each session's link to its router."""
         return [link.watch for link in list(self._links.values())]
 
     @property
     def is_cut_off(self) -> bool:
-        """True if an open session had no router at the last `update_connections`."""
+        """Return True if an open session had no router at the last `update_connections`."""
         return not all(list(self._connected.values()))
 
     @property
     def connected_names(self) -> set[str]:
-        """Names whose session had a router at the last `update_connections`."""
+        """Return the names whose session had a router at the last `update_connections`."""
         return {name for name, connected in self._connected.items() if connected}
 
     def put_batch(self, batch: StoredBatch) -> bool:
-        """Send a batch on its vehicle's session; False if the session refuses."""
+        """Send a batch on its vehicle's session; return False if the session does not accept it."""
         return self._links[batch.stream.vehicle].put(batch)
 
     def update_connections(self) -> list[str]:
-        """Update `connected`, and return the names whose link was replaced by a new one. Batches in
-        flight on the former link are lost, so the caller must send them again.
+        """Update the connection states, and return the names whose link was replaced by a new one.
+
+        Batches in flight on the former link are lost, so the caller must send them again.
         """
         replaced = []
         for name, link in list(self._links.items()):

@@ -1,8 +1,8 @@
-"""SQLite file of an outbox: opened exclusively; a damaged one is set aside, and its readable
-batches are saved.
+"""SQLite file of an outbox: opened exclusively. A damaged file is renamed, and its readable batches
+are copied to a new file.
 
-A batch has a checksum of its name and its bytes, because SQLite does not detect changed bits in
-them.
+Each batch has a checksum of its identifier and payload, because SQLite does not detect changed bits
+in them.
 """
 
 from __future__ import annotations
@@ -49,21 +49,22 @@ Row = tuple[object, ...]
 
 
 def batch_checksum(name: Row, payload: bytes) -> int:
-    """Return the CRC-32 of a batch's name (the columns NAME) and bytes."""
+    """Return the CRC-32 of a batch's identifier (the columns NAME) and payload."""
     return zlib.crc32(payload, zlib.crc32(repr(name).encode()))
 
 
 def is_damage(error: sqlite3.Error) -> bool:
-    """Return True if an error means a damaged file, and not a full or slow disk."""
+    """Return True if an error indicates a damaged file. A full or slow disk is no damage."""
     return getattr(error, "sqlite_errorcode", 0) & 0xFF in _CORRUPT
 
 
 def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
-    """Return the file, checked and locked for this process, and the path to which a damaged one was
-    set aside.
+    """Open the file, checked and locked for this process; return it and the path of a damaged file
+    that was set aside, or None.
 
     Raises:
-        InputError: the file belongs to another agent or is no outbox, or the path cannot be used.
+        InputError: the file belongs to another agent or is not an outbox, or the path cannot be
+            used.
     """
     try:
         make_folder(path.parent)
@@ -90,9 +91,11 @@ def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
 
 
 def recover_file(path: Path) -> tuple[sqlite3.Connection, Path]:
-    """Return a new file with the readable content of a damaged one, which is set aside.
+    """Return a new file with the readable content of a damaged file, and the path to which the
+    damaged file was renamed.
 
-    Raises sqlite3.Error or OSError if the disk refuses.
+    Raises:
+        sqlite3.Error, OSError: the disk does not accept the write.
     """
     aside = next(
         p
@@ -143,8 +146,8 @@ def _open_database(path: Path) -> sqlite3.Connection:
 
 
 def _is_outbox(path: Path) -> bool:
-    """Return True if a file was an outbox: it begins like SQLite except for a few bytes, or is
-    completely erased.
+    """Return True if a damaged file was an outbox: its first bytes resemble those of SQLite, or are
+    all zero.
     """
     with path.open("rb") as file:
         begin = file.read(len(_MAGIC))
@@ -152,8 +155,8 @@ def _is_outbox(path: Path) -> bool:
 
 
 def _readable_batches(path: Path) -> list[Row]:
-    """Return the batches of a damaged file by age, each once, with a correct checksum or from
-    before checksums.
+    """Return the batches of a damaged file, oldest first, each once. A batch must have a correct
+    checksum, or none because it was written by an old version.
     """
     log_file = path.with_name(f"{path.name}-wal")
     found: dict[int, Row] = {}

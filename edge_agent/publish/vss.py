@@ -1,9 +1,9 @@
-"""Friction at the car as signals of the Vehicle Signal Specification (COVESA VSS 4 and later).
+"""Friction at the vehicle as signals of the Vehicle Signal Specification (COVESA VSS 4 and later).
 
 `Vehicle.ADAS.ESC.RoadFriction.{MostProbable,LowerBound,UpperBound}` are percent of a peak adhesion
-of 1: 50 %, 5 % and 95 % quantiles, clipped at 100 as the standard requires. Unknown values are
-absent, never a default. MostProbable is also absent if less than EXCITED_SHARE of the grip was used
-within UTILISED_WINDOW_S, because mu is then mostly prior.
+of 1: 50 %, 5 % and 95 % quantiles, limited to 100 as the standard requires. Unknown values are left
+out, never replaced by a default. MostProbable is also left out if less than EXCITED_SHARE of the
+grip was used within UTILISED_WINDOW_S, because the estimate then depends mostly on the prior.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _TOPIC: Final = keys.TOPICS["vss"]
 def road_friction(
     mu: float, mu_lower: float, mu_upper: float, mu_utilised: float
 ) -> dict[str, float]:
-    """Return the known signals [%]; {} if none is known.
+    """Return the known signals [%]; {} if no signal is known.
 
     Args:
         mu, mu_lower, mu_upper: 50 %, 5 % and 95 % quantiles; NaN where unknown.
-        mu_utilised: largest grip used in the last second, any wheel.
+        mu_utilised: largest grip used by any wheel in the last second.
     """
     signals = {
         "MostProbable": mu if mu_utilised >= EXCITED_SHARE * mu else math.nan,
@@ -50,24 +50,24 @@ def road_friction(
 
 
 class SignalProvider(Protocol):
-    """Receiver of the signals of a vehicle."""
+    """Interface of a receiver for the signals of a vehicle."""
 
     def write(self, signals: Mapping[str, float], time_ns: int) -> None:
-        """Take signals [%] and their time [ns UTC]; do not wait."""
+        """Accept signals [%] and their time [ns UTC] without waiting."""
 
     def close(self) -> None:
-        """Pass on what waits, and end."""
+        """Deliver the waiting signals, and stop."""
 
 
 class RoadFrictionOutput:
-    """Reports the friction of vehicles by name: a line of JSON each, and the same on its own Zenoh
-    key.
+    """Output of the friction of named vehicles: one JSON line per vehicle on the terminal, and the
+    same on the vehicle's Zenoh key.
 
     Args:
         names: row k of the reported values is vehicle k.
-        say: called with a line.
+        say: function that prints a line.
         rate_hz: reports per second.
-        provider: gets the same signals, if there is one.
+        provider: receives the same signals, if given.
     """
 
     def __init__(
@@ -85,13 +85,15 @@ class RoadFrictionOutput:
         self._due = 0
 
     def attach(self, name: str, session: zenoh.Session) -> None:
-        """Use a vehicle's session, which is open now."""
+        """Use a vehicle's session, which has been opened."""
         self.publishers[name] = session.declare_publisher(
             keys.vss_key(name), encoding=ENCODING, **quality_of(_TOPIC)
         )
 
     def report_grip(self, grip: Grip | None) -> None:
-        """Report the current belief. Never waits: a message that finds no room is dropped."""
+        """Report the current friction. The call never waits: a message for which there is no space
+        is dropped.
+        """
         if grip is None or int(grip.time.max()) < self._due:
             return
         now = int(grip.time.max())
@@ -112,6 +114,6 @@ class RoadFrictionOutput:
                 publisher.put(line.encode())
 
     def close(self) -> None:
-        """Let the provider finish."""
+        """Close the provider, if there is one."""
         if self._provider is not None:
             self._provider.close()

@@ -1,5 +1,5 @@
-"""Zenoh session of one vehicle: sends its batches, receives its acknowledgements, declares its
-liveliness token.
+"""Zenoh session of one vehicle: it sends batches, receives acknowledgements, and declares the
+vehicle's liveliness token.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ _QUALITY: Final = {
 
 
 class Link:
-    """Open `session` of one vehicle; `on_ack(vehicle, payload)` is called on a thread of Zenoh."""
+    """Link of one vehicle on an open `session`; `on_ack(vehicle, payload)` is called on a thread of
+    Zenoh.
+    """
 
     def __init__(
         self,
@@ -62,21 +64,23 @@ class Link:
         on_ack: Callable[[str, bytes], None],
         stop: threading.Event,
     ) -> Link | None:
-        """Wait for a router and open the session; None if `stop` was set before."""
+        """Wait for a router, open the session and return the link; return None if `stop` was set
+        before.
+        """
         session = open_session(settings, stop, vehicle)
         return None if session is None else Link(session, vehicle, on_ack)
 
     @property
     def is_connected(self) -> bool:
-        """True if a router is connected now."""
+        """Return True if a router is connected now."""
         return self.watch.is_connected
 
     def put(self, batch: StoredBatch) -> bool:
-        """Send a batch; False if the session refuses. Only the acknowledgement proves that it
-        arrived.
+        """Send a batch; return False if the session does not accept it. Only the acknowledgement
+        proves that the batch arrived.
 
-        Waits until GAP_S after the last message of its kind, because a router drops messages that
-        follow too soon.
+        The call waits until GAP_S after the last message of its kind, because a router drops
+        messages that follow too closely.
         """
         stream = batch.stream
         early = self._free_at[stream.kind] - self._clock()
@@ -92,5 +96,5 @@ class Link:
         return True
 
     def close(self) -> None:
-        """Close the session; an open one would hang the interpreter at exit."""
+        """Close the session. An open session would block the exit of the interpreter."""
         self.session.close()
