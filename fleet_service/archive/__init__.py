@@ -1,1 +1,3 @@
-"""The archive: durable segments (the log), keys of the pseudonyms, and reading all rows."""
+"""The archive: all admitted reports as durable Parquet files, and the keys that turn vehicle names
+into pseudonyms.
+"""

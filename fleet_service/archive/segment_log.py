@@ -1,8 +1,8 @@
-"""The log: rows that wait for the disk. The order is the guarantee: rows, fsynced segment, then
-settled.
+"""Segment log: queue of admitted rows that are written to disk as segments. A batch is acknowledged
+only after its rows are in a segment that is synced to disk.
 
-A thread of its own writes segments, so that messages are processed meanwhile. Only batches returned
-by `end` are settled.
+A separate thread writes segments, so that messages can be processed meanwhile. Only batches that
+`end` returns may be acknowledged.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Upload = Callable[[Sequence[Path]], None]
 
 
 class _Load(Generic[Batch]):
-    """Rows that are written together, by kind, and their batches."""
+    """Rows that are written together, by kind, and the batches to which they belong."""
 
     def __init__(self) -> None:
         self.waiting: dict[Kind, list[Rows]] = {kind: [] for kind in Kind}
@@ -33,7 +33,7 @@ class _Load(Generic[Batch]):
 
     @property
     def rows(self) -> int:
-        """Return the number of rows that are not written yet."""
+        """Return the number of rows that have not been written yet."""
         return sum(len(part["row"]) for waiting in list(self.waiting.values()) for part in waiting)
 
     def take(self, other: _Load[Batch]) -> None:
@@ -43,7 +43,9 @@ class _Load(Generic[Batch]):
         self.batches += other.batches
 
     def write(self, writer: Writer, upload: Upload | None) -> None:
-        """Write each kind that is not written yet, then make all of it durable, by `upload` too."""
+        """Write one segment per kind that has waiting rows, then make all segments durable, on disk
+        and with `upload`.
+        """
         for kind, waiting in self.waiting.items():
             if waiting:
                 rows = {
@@ -57,14 +59,15 @@ class _Load(Generic[Batch]):
 
 
 class SegmentLog(Generic[Batch]):
-    """Log of one run of one service, for one thread; another thread does the disk's work.
+    """Segment log of one run of one service. Only one thread may use it; an internal thread writes
+    to disk.
 
     Args:
-        root: of the archive.
+        root: folder of the archive.
         shard: name of the service.
-        upload: makes segments durable in a second place; with one, a batch is settled when it is in
-            both places.
-        epoch: smallest epoch, from the lease.
+        upload: function that makes segments durable in a second place; if given, a batch is durable
+            only when it is in both places.
+        epoch: smallest allowed epoch, from the lease.
     """
 
     def __init__(
@@ -80,24 +83,24 @@ class SegmentLog(Generic[Batch]):
 
     @property
     def newest(self) -> Cut:
-        """Return the last written segment."""
+        """Return the position of the last written segment."""
         return self._writer.newest
 
     @property
     def hangs_s(self) -> float:
-        """Return the time [s] since the current write began; 0 without one."""
+        """Return the time [s] since the current write began; 0 if no write is running."""
         return (
             0.0 if self._written is None or self._written.done() else time.monotonic() - self._begun
         )
 
     @property
     def rows(self) -> int:
-        """Return the number of waiting rows."""
+        """Return the number of rows that are not durable yet."""
         return self._next.rows + self._load.rows
 
     @property
     def unsettled(self) -> int:
-        """Return the number of waiting batches."""
+        """Return the number of batches that are not durable yet."""
         return len(self._next.batches) + len(self._load.batches)
 
     @property
@@ -111,8 +114,9 @@ class SegmentLog(Generic[Batch]):
         self._next.batches += batches
 
     def begin(self) -> None:
-        """Start writing waiting rows and rows that failed before; do nothing while a write is not
-        collected by `end`."""
+        """Start writing the waiting rows, including rows whose write failed before. Do nothing if
+        the result of the previous write has not been collected with `end`.
+        """
         if self._written is None:
             self._load.take(self._next)
             self._next = _Load()
@@ -120,11 +124,12 @@ class SegmentLog(Generic[Batch]):
             self._written = self._thread.submit(self._load.write, self._writer, self._upload)
 
     def end(self) -> list[Batch]:
-        """Wait for the current write; return the batches that it made durable, each once.
+        """Wait for the current write; return the batches that it made durable. Each batch is
+        returned once.
 
         Raises:
-            OSError: the disk is full or broken, or the copy is not reached; rows that are not
-                durable wait for the next write.
+            OSError: the disk is full or broken, or the second place cannot be reached; rows that
+                are not durable wait for the next write.
         """
         if self._written is None:
             return []
@@ -136,10 +141,11 @@ class SegmentLog(Generic[Batch]):
         return durable
 
     def flush(self) -> list[Batch]:
-        """Write all waiting rows; return the batches that became durable, each once.
+        """Write all waiting rows and wait; return the batches that became durable. Each batch is
+        returned once.
 
         Raises:
-            OSError: as for `end`.
+            OSError: the same as for `end`.
         """
         durable = self.end()
         self._next.batches[:0] = durable  # they are reported with the rest, which may fail

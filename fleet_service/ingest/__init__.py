@@ -1,1 +1,3 @@
-"""Input of messages: queue, rate limits, validation, dedup, acknowledgements; weather."""
+"""Input of messages: queue, rate limits, validation, removal of duplicates, acknowledgements, and
+weather.
+"""

@@ -1,4 +1,6 @@
-"""Acknowledgements: settled sequence numbers, collected per vehicle and stream, as messages."""
+"""Acknowledgements: sequence numbers of durable or rejected batches, collected per vehicle and
+stream, and sent as messages.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ AckedStream = tuple[int, Kind, int]  # boot, kind, region
 
 
 class Acks:
-    """Due acknowledgements, by stream."""
+    """Acknowledgements that have not been sent yet, by stream."""
 
     def __init__(self) -> None:
         self._durable: dict[SequenceTracker, list[int]] = defaultdict(list)
@@ -28,14 +30,14 @@ class Acks:
         )
 
     def record_durable(self, batches: Iterable[BatchId]) -> None:
-        """Record that batches are on disk."""
+        """Record that batches are durable on disk."""
         durable = self._durable
         for stream, seq in batches:
             durable[stream].append(seq)
 
     def record_late(self, batches: Iterable[BatchId]) -> None:
-        """Record that batches arrived after the map had moved on; sent with those of them that
-        are durable.
+        """Record that batches arrived too late to change the map in order. This is sent together
+        with their acknowledgement as durable.
         """
         for stream, seq in batches:
             self._late[stream].add(seq)
@@ -47,8 +49,8 @@ class Acks:
         )
 
     def messages(self, time: int = 0) -> list[tuple[str, bytes]]:
-        """Return vehicle and `Ack` bytes of everything collected, with the service's `time`
-        [ns]; reset.
+        """Return (vehicle, bytes of an `Ack` message) for everything collected, and reset the
+        collection. `time` is the service's clock [ns], which is part of the message.
         """
         settled: dict[str, dict[AckedStream, list[int]]] = {
             vehicle: {} for vehicle in self._rejected
@@ -91,14 +93,16 @@ def _split_stream(
     rejected: tuple[tuple[int, int, str], ...],
     late: tuple[tuple[int, int], ...],
 ) -> Iterator[StreamAck]:
-    """Yield the due acknowledgements of a stream in pieces."""
+    """Yield the acknowledgements of a stream in pieces of at most ITEMS_PER_STREAM items."""
     for at in range(0, max(len(durable), len(rejected), len(late)), ITEMS_PER_STREAM):
         some = slice(at, at + ITEMS_PER_STREAM)
         yield StreamAck(*stream, durable[some], rejected[some], late[some])
 
 
 def consecutive_ranges(numbers: Iterable[int]) -> tuple[tuple[int, int], ...]:
-    """Return runs of consecutive numbers, both ends included; numbers may repeat."""
+    """Return the ranges of consecutive numbers, both ends included; numbers may be repeated and
+    unsorted.
+    """
     ordered = sorted(set(numbers))
     if ordered and ordered[-1] - ordered[0] == len(ordered) - 1:  # as most often
         return ((ordered[0], ordered[-1]),)

@@ -1,11 +1,11 @@
-"""Decode many payloads into one set of columns. Python code runs per message and per column, never
-per record.
+"""Decoder that turns many messages into one set of columns. Python code runs per message and per
+column, never per record.
 
 A compiled scanner (`protobuf_scan`) finds the fields in the bytes of all messages. Then the values
 of all messages are read column by column. A message that the scanner does not understand, for
 example JSON, is decoded by the protobuf library and encoded again in the plain form. So there is
-one path from bytes to columns. An error in one message is reported for that
-message and does not affect the others.
+one path from bytes to columns. An error in one message is reported for that message and does not
+affect the others.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from schemas.wire.batches import (
 
 
 def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
-    """Read batches of one kind from payloads and their encodings."""
+    """Decode batches of one kind, given as pairs of payload and encoding."""
     errors: list[tuple[int, WireError]] = []
     usual = {ENCODING[kind], *PLAIN}
     plain = [
@@ -74,7 +74,7 @@ def _scan_messages(
 
 
 def _reencode_message(kind: Kind, payload: bytes, encoding: str) -> bytes:
-    """Return a message as our own encoder writes it.
+    """Return a message in the plain form that our own encoder writes.
 
     Raises:
         WireError: the payload is not a message of this kind.
@@ -98,7 +98,7 @@ class _Fields(NamedTuple):
         return self.walked.sizes
 
     def present_columns(self) -> PresentColumns:
-        """Return the presence of each column in each message."""
+        """Return, for each column, which messages contain it."""
         given = self.walked.counts > 0
         return PresentColumns(
             self.kind,
@@ -107,7 +107,9 @@ class _Fields(NamedTuple):
         )
 
     def heads(self) -> Heads:
-        """Return the heads; a missing `first_held` is the lowest sequence number."""
+        """Return the heads of the messages; a missing `first_held` is replaced with 1, the lowest
+        sequence number.
+        """
         data = self.data.tobytes()
         texts = {
             name: [
@@ -123,8 +125,9 @@ class _Fields(NamedTuple):
         return Heads(self.kind, texts["vehicle"], boot, region, seq, first_held, texts["estimator"])
 
     def columns(self) -> tuple[IntArray, Columns, BoolArray]:
-        """Return sizes, columns (missing values filled, integers widened), and which records
-        have a likelihood.
+        """Return three items: the number of records of each message (k,), the columns (missing
+        values filled, integers widened to 64 bits), and a mask of the records that have a
+        likelihood (n,).
         """
         out: Columns = {}
         n = int(self.sizes.sum())

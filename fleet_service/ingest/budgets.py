@@ -1,7 +1,9 @@
-"""Budgets of one vehicle besides its bytes: new places, and streams. Pure except for the counts.
+"""Limits per vehicle in addition to the byte rate: number of new cells and number of streams. Pure
+except for the counts.
 
-A row beyond its vehicle's budget is archived and acknowledged like any other, but does not
-reach the map. So nothing is lost, nothing is sent again, and no car fills the memory.
+A row beyond its vehicle's limit is archived and acknowledged like any other, but does not reach the
+map. So no data are lost and nothing is sent again, but a single car cannot fill the service's
+memory.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ WEEK_HOURS: Final = 168.0
 
 
 class Bucket:
-    """Budgets by vehicle: an amount at once, and an amount per hour."""
+    """Token buckets, one per vehicle: an amount that may be used at once, and an amount per hour
+    that is refilled.
+    """
 
     def __init__(self, at_once: float, per_hour: float) -> None:
         self._at_once = at_once
@@ -36,7 +40,7 @@ class Bucket:
         self._left: dict[int, tuple[float, float]] = {}
 
     def take(self, vehicle: int, wanted: int, now: float) -> int:
-        """Take up to `wanted` from a vehicle's budget; return the amount taken. now [s]."""
+        """Take up to `wanted` from a vehicle's budget at time `now` [s]; return the amount taken."""
         left, since = self._left.get(vehicle, (self._at_once, now))
         left = min(self._at_once, left + max(now - since, 0.0) * self._rate)
         given = min(wanted, int(left))
@@ -47,15 +51,16 @@ class Bucket:
 
 
 class NewCells:
-    """Budgets of cells without earlier visits."""
+    """Limit on the number of cells that a vehicle may visit as the first vehicle."""
 
     def __init__(self, at_once: float = NEW_CELLS_AT_ONCE) -> None:
         self._budgets = Bucket(at_once, NEW_CELLS_PER_HOUR)
         self._week = Bucket(NEW_CELLS_PER_WEEK, NEW_CELLS_PER_WEEK / WEEK_HOURS)
 
     def beyond(self, vehicle: IntArray, cell: IntArray, now: float) -> BoolArray:
-        """Return rows (n,) in new cells beyond their vehicle's budget; the others are charged.
-        now [s].
+        """Return a mask of rows (n,), all in cells without earlier visits: True if the row is
+        beyond its vehicle's budget. The other rows are charged to the budget. `now` is the time
+        [s].
         """
         out = np.zeros(len(vehicle), bool)
         order = np.lexsort((cell, vehicle))

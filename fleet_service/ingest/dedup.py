@@ -1,9 +1,9 @@
-"""Record of accepted batches: a watermark and the seqs above it, per (vehicle, boot, kind, region).
-Pure.
+"""Record of accepted batches, which detects duplicates: per stream (vehicle, boot, kind, region) a
+watermark and the set of accepted sequence numbers above it. Pure.
 
-It is bounded by accepted data: every seq above a watermark is a batch in the archive, there are at
-most MAX_GAPS of them, and a stream whose newest record is older than the service accepts is
-dropped.
+The record's size is bounded by accepted data. Every number above a watermark is a batch in the
+archive, a stream has at most MAX_GAPS such numbers, and a stream is dropped when its newest record
+is older than the service accepts.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ class SequenceTracker:
     """Accepted batches of one stream.
 
     Attributes:
-        key: its name.
+        key: name of the stream.
         vehicle: enrolled name of the sender; empty until it sends.
-        boot: as sent; 0 until it sends.
-        witness: number of the vehicle in the map, in every month; 0 until it sends.
-        low: every seq up to here is settled, or will never arrive.
-        seen: the accepted ones above.
-        newest: newest time of an accepted record, by which a batch is too old [ns].
+        boot: start of the vehicle as sent; 0 until it sends.
+        witness: permanent number of the vehicle in the map; 0 until it sends.
+        low: watermark: every sequence number up to here is settled, or will never arrive.
+        seen: accepted sequence numbers above the watermark.
+        newest: newest time of an accepted record [ns]; it decides when the stream is dropped.
     """
 
     __slots__ = ("boot", "key", "low", "newest", "seen", "vehicle", "witness")
@@ -53,12 +53,13 @@ class SequenceTracker:
         self.seen: set[int] | frozenset[int] = _NONE
 
     def accepted(self, seq: int) -> bool:
-        """Return True if this seq was accepted before."""
+        """Return True if the batch with this sequence number was accepted before."""
         return seq <= self.low or seq in self.seen
 
     def accept(self, seq: int, time: int = 0) -> bool:
-        """Record a seq and the newest time of its records [ns]; False (and no record) if too many
-        are missing before it."""
+        """Record a sequence number and the newest time of its records [ns]. Return False, without
+        recording, if too many numbers are missing before it.
+        """
         if seq == self.low + 1:
             self.low = seq
             self._close()
@@ -73,7 +74,7 @@ class SequenceTracker:
         return True
 
     def add(self, seqs: list[int]) -> None:
-        """Record ascending accepted seqs."""
+        """Record accepted sequence numbers, given in ascending order."""
         if (
             seqs[0] == self.low + 1 and seqs[-1] - seqs[0] == len(seqs) - 1
         ):  # as most often: a run that goes on
@@ -83,7 +84,7 @@ class SequenceTracker:
                 self.accept(seq)
 
     def raise_to(self, first_held: int) -> None:
-        """Raise the watermark: seqs below `first_held` never arrive."""
+        """Raise the watermark: sequence numbers below `first_held` will never arrive."""
         if first_held - 1 > self.low:
             if isinstance(self.seen, set):
                 if first_held - self.low > len(self.seen):
@@ -132,8 +133,8 @@ class SequenceTrackers:
         return max((stream.newest for stream in self._streams.values()), default=0)
 
     def accepted(self, kind: Kind, names: IntArray) -> BoolArray:
-        """Return True for batches that were accepted; `names` is (n, 4) of vehicle, boot, region
-        and seq.
+        """Return a mask (n,): True for batches that were accepted before. `names` is (n, 4):
+        vehicle, boot, region and sequence number.
         """
         get = self._streams.get
         found = (get((vehicle, boot, kind, region)) for vehicle, boot, region, _ in names.tolist())
@@ -146,8 +147,8 @@ class SequenceTrackers:
         )
 
     def columns(self) -> tuple[dict[str, IntArray], IntArray]:
-        """Return all streams as columns (n,); `above` is how many seqs of the second value
-        belong to each.
+        """Return all streams as columns (n,), and the sequence numbers above all watermarks in one
+        array. The column `above` is the number of items of this array that belong to each stream.
         """
         streams = list(self._streams.values())
         above = [sorted(stream.seen) for stream in streams]
@@ -167,7 +168,7 @@ class SequenceTrackers:
 
     @staticmethod
     def of(columns: Mapping[str, IntArray], above: IntArray) -> SequenceTrackers:
-        """Restore the streams from the result of `columns`."""
+        """Return the streams that the result of `columns` describes."""
         out = SequenceTrackers()
         at = 0
         seqs = above.tolist()
@@ -184,8 +185,8 @@ class SequenceTrackers:
         return out
 
     def forget(self, before: int) -> None:
-        """Drop streams without a batch from `before` [ns] on; a repeated batch would be refused
-        as too old.
+        """Drop streams whose newest record is older than `before` [ns]. No duplicate can be
+        accepted afterwards, because a repeated batch would be refused as too old.
         """
         for key in [key for key, stream in self._streams.items() if stream.newest < before]:
             del self._streams[key]
@@ -200,7 +201,9 @@ class SequenceTrackers:
         first_held: IntArray,
         time: IntArray,
     ) -> None:
-        """Record archived rows (n,) of one kind, in any order; `time` [ns] of each record."""
+        """Record rows of one kind from the archive, (n,), in any order; `time` [ns] is the time of
+        each record.
+        """
         if not len(seq):
             return
         group, first = group_rows(vehicle, boot, region)

@@ -1,5 +1,5 @@
-"""Grouping of rows by stream in one pass, because a restart processes tens of millions.
-Compiled, pure.
+"""Grouping of rows by stream in one pass. It must be fast, because a restart processes tens of
+millions of rows. Compiled, pure.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ Int32Array = NDArray[np.int32]
 
 @compiled
 def group_rows(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntArray]:
-    """Return the group of each row (n,), in order of first appearance, and the first row of each
-    group (k,).
+    """Return the group of each row, (n,), and the first row of each group, (k,). A group is the set
+    of rows with the same (a, b, c); groups are numbered in order of first appearance.
     """
     places = 2 * len(a) + 1
     table = np.full(places, -1, np.int32)
@@ -44,7 +44,7 @@ def group_rows(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntAr
 
 @compiled
 def largest_of(values: IntArray, group: Int32Array, groups: int) -> IntArray:
-    """Return the largest value of each group, (groups,); every group has one."""
+    """Return the largest value of each group, (groups,); every group must have a value."""
     out = np.full(groups, np.iinfo(np.int64).min, np.int64)
     for i in range(len(values)):
         if values[i] > out[group[i]]:

@@ -1,8 +1,8 @@
 """Inbox: a bounded queue behind the Zenoh subscribers, and the path from bytes to accepted rows.
 
 The subscriber's callback only copies bytes into the queue. If the queue is full, the message is
-dropped and counted. It is not acknowledged, so its sender keeps it and sends it again: this is the
-back-pressure.
+dropped and counted. It is not acknowledged, so its sender keeps it and sends it again. Senders are
+slowed down in this way (back-pressure).
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ KNOWN_NS: Final = (
 
 
 class Message(NamedTuple):
-    """One sample of a subscriber."""
+    """One message that a Zenoh subscriber received."""
 
     kind: Kind
     key: str
@@ -68,12 +68,12 @@ class Message(NamedTuple):
 
 
 class Inbox:
-    """Bounded queue.
+    """Bounded queue of received messages.
 
     Args:
         capacity: maximum number of messages. Threads that call `put` at the same instant may exceed
             it by one each, because the check takes no lock.
-        counts: where drops are counted, under `overload`.
+        counts: counters; dropped messages are counted under `overload`.
         limits: rate limits per vehicle.
     """
 
@@ -102,7 +102,7 @@ class Inbox:
         return take
 
     def put(self, message: Message) -> None:
-        """Enqueue, or drop and count."""
+        """Add a message to the queue; if the queue is full, drop the message and count it."""
         if self._queue.qsize() >= self._capacity or self._bytes >= QUEUE_BYTES:
             self._counts["overload"] += 1
             return
@@ -111,8 +111,9 @@ class Inbox:
         self._queue.put(message)
 
     def drain(self, wait_s: float) -> list[Message]:
-        """Return waiting messages, as many as a step takes; wait up to `wait_s` for the first, then
-        a moment for more."""
+        """Return waiting messages, at most as many as one processing step handles. Wait up to
+        `wait_s` [s] for the first message, then a moment for more.
+        """
         out: list[Message] = []
         size = 0
         try:
@@ -143,13 +144,14 @@ class AcceptedBatches(NamedTuple):
 
 
 class BatchIntake:
-    """Decodes, validates, counts and settles refusals. Python code runs per message, not per row.
+    """Intake of batches: decodes and validates messages, detects duplicates, and refuses invalid
+    batches. Python code runs per message, not per row.
 
     Args:
-        streams: accepted batches, which are updated.
-        pseudonyms: of the vehicles.
-        counts: refusals by rule, under `refused.RULE`, and duplicates.
-        acks: receives refusals and batches that are durable already.
+        streams: accepted batches per stream; updated.
+        pseudonyms: pseudonyms of the vehicles.
+        counts: counters of refusals, under `refused.RULE`, and of duplicates.
+        acks: collects refusals, and acknowledgements of duplicates that are already durable.
     """
 
     def __init__(
@@ -171,7 +173,7 @@ class BatchIntake:
         self.times: dict[str, int] = {}  # newest that each vehicle told in the last call [ns]
 
     def accept(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, AcceptedBatches]:
-        """Return the rows of valid, new batches, by kind."""
+        """Return the rows of valid, new batches, by kind; all other batches are refused or counted."""
         self.times.clear()
         self._now = clock.now / NS
         if abs(clock.now - self._forgot) > FORGET_NS:
@@ -184,7 +186,7 @@ class BatchIntake:
         return out
 
     def witness_of(self, name: str) -> int:
-        """Return the number of a sender in the map.
+        """Return the permanent number of a sender in the map.
 
         Raises:
             OSError: the key can neither be read nor written.
@@ -241,11 +243,11 @@ class BatchIntake:
         return self._rows(kind, new, found, clock) if new else AcceptedBatches([], {})
 
     def _forget(self, clock: Clock) -> None:
-        """Drop streams that are too old to matter, and names of days of which almost nothing
-        arrives any more.
+        """Drop streams that are too old to matter, and cached stream names of days from which
+        hardly any data arrive now.
 
-        Active streams keep their memory: allocated again, they would lie between other objects, and
-        the process would grow by some megabytes each time.
+        Active streams are kept in place. If they were allocated again, they would be scattered
+        between other objects, and the process would grow by some megabytes each time.
         """
         self._forgot = clock.now
         self._streams.forget(min(clock.horizon, self._streams.newest - KNOWN_NS))
@@ -260,8 +262,8 @@ class BatchIntake:
                 del known[name]
 
     def _is_erased(self, owners: Sequence[Parsed], time: IntArray) -> BoolArray:
-        """Return True for batches (n,) in a time span that is erased for all vehicles or for their
-        vehicle.
+        """Return a mask of batches (n,): True if the batch's time is in a span that was erased for
+        all vehicles, or for this vehicle.
         """
         out = erasures.in_spans(self._erased.months, time)
         if self._erased.vehicles:
@@ -279,7 +281,9 @@ class BatchIntake:
             self.times[name] = max(self.times.get(name, 0), measured)
 
     def _new(self, kind: Kind, heads: Heads, time: IntArray, good: BoolArray) -> dict[BatchId, int]:
-        """Return valid batches that were not accepted before, each once, with their positions."""
+        """Return the valid batches that were not accepted before, each once, with their positions
+        in `heads`.
+        """
         out: dict[BatchId, int] = {}
         numbers = (heads.boot, heads.region, time // DAY_NS, heads.seq, heads.first_held)
         batches = zip(
@@ -310,9 +314,10 @@ class BatchIntake:
     def _look_up(
         self, kind: Kind, name: tuple[str, int, int, int], time: int
     ) -> SequenceTracker | None:
-        """Return the stream of a (vehicle, boot, region, day); None without a key, or if the
-        vehicle opens too many. The vehicle then keeps its batch until the disk works again, or the
-        hour is over."""
+        """Return the stream of a (vehicle, boot, region, day). Return None if a key cannot be read,
+        or if the vehicle opens too many streams. The vehicle then keeps its batch until the disk
+        works again, or until the next hour.
+        """
         vehicle, boot, region, _ = name
         try:
             pseudonym = pseudonym_number(self._pseudonyms.of(vehicle, time))
@@ -383,8 +388,9 @@ class BatchIntake:
     def _refuse_unusable(
         self, kind: Kind, owner: Parsed, message: Message, error: InputError
     ) -> None:
-        """Refuse a batch whose records cannot be used: with a rejection if its head can be read,
-        because it would be sent for ever otherwise; else it is only counted."""
+        """Refuse a batch whose records cannot be used. If its head can be read, send a rejection,
+        because otherwise the vehicle would send the batch for ever. If not, only count the refusal.
+        """
         head = head_of(kind, message.payload, message.encoding)
         named = (
             head is not None and head.vehicle == owner.name and head.region in (0, owner.quadint)
@@ -410,15 +416,15 @@ class BatchIntake:
 
 
 def _newest_times(time: IntArray, sizes: IntArray) -> IntArray:
-    """Return the newest time of each batch (k,), as the archive stores it, so that a restart
-    finds the same.
+    """Return the newest time of each batch (k,) [ns], rounded as in the archive, so that a restart
+    computes the same times.
     """
     newest = np.maximum.reduceat(time, np.cumsum(sizes) - sizes)
     return np.asarray(newest // US_STEP * US_STEP)
 
 
 def _select_batches(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, IntArray]:
-    """Return rows, heads and sizes of the batches at these ascending positions."""
+    """Return rows, heads and sizes of the batches at the positions `indices` (ascending)."""
     rows: Rows = {**found.columns, "with_likelihood": found.with_likelihood}
     if len(indices) == len(found.sizes):
         return rows, found.heads, found.sizes
@@ -435,7 +441,7 @@ def _select_batches(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, In
 def _with_identity(
     kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: IntArray, clock: Clock
 ) -> Rows:
-    """Return rows with the identity of their batches, for the archive."""
+    """Return the rows with columns for the identity of their batches, as the archive stores them."""
     numbers = np.array([stream.key[0] for stream, _ in batches], np.int64)
     identity = {
         "vehicle": pseudonym_texts(numbers),

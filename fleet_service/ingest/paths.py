@@ -1,16 +1,16 @@
-"""Plausible path of each vehicle: check that it can have been at all the places that it reports.
-Pure.
+"""Plausibility of each vehicle's path: check that the vehicle can have been at all the places that
+it reports. Pure.
 
-A vehicle's path is a list of at most ANCHORS (time, place), over all its batches, boots and
-regions. A report must be reachable from the anchor before it, and must leave time to reach the
-anchor after it, at FASTEST. Positions leap when they return after a tunnel or a ferry. All leaps of
-a vehicle take from one budget of LEAP_M, which fills again slowly, so that a vehicle cannot leap
-with every row.
+A vehicle's path is a list of at most ANCHORS pairs (time, place), over all its batches, boots and
+regions. A report is plausible if the vehicle could drive from the previous anchor to it, and from
+it to the next anchor, at the speed FASTEST. Positions jump when satellite reception returns after a
+tunnel or a ferry. Therefore a vehicle has a budget of LEAP_M for jumps. It refills slowly, so that
+a vehicle cannot jump with every row.
 
-Reports may come in any order, for example a backlog between live reports. When a path is full, one
-anchor is dropped; old anchors are then farther apart than new ones. A later report into such a gap
-must be near the straight way between its ends, because the vehicle's own way in between is no
-longer known.
+Reports may come in any order, for example old reports between live ones. When a path is full, one
+anchor is dropped, so old anchors are farther apart than new ones. A later report about such a gap
+must be near the straight line between the anchors, because the vehicle's actual path in between is
+no longer known.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _START: Final = 64  # vehicles for which there is room at first
 
 
 class VehiclePaths:
-    """Paths of the vehicles since the service started."""
+    """Recent path of each vehicle since the start of the service."""
 
     def __init__(self) -> None:
         self._rows: dict[int, int] = {}  # row in the arrays, by vehicle
@@ -54,10 +54,10 @@ class VehiclePaths:
     def find_implausible(
         self, vehicle: IntArray, time: IntArray, latitude: FloatArray, longitude: FloatArray
     ) -> BoolArray:
-        """Return the rows (n,) at which their vehicle cannot have been; time [ns], places [deg].
-        Others extend paths.
+        """Return a mask of rows (n,): True if the vehicle cannot have been there. `time` is in ns,
+        places in degrees. Plausible rows extend the paths.
 
-        The rows of a vehicle must lie next to each other, in the order of their arrival.
+        The rows of a vehicle must be adjacent, in the order of their arrival.
         """
         names, inverse = np.unique(vehicle, return_inverse=True)
         if len(self._rows) + len(names) > max(VEHICLES, len(names)):
@@ -96,8 +96,8 @@ Paths = tuple[IntArray, Float32Array, BoolArray, IntArray, FloatArray]
 
 @compiled
 def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: Paths) -> BoolArray:
-    """Compute `VehiclePaths.find_implausible`; `row` (n,) is the vehicle's row in the paths,
-    which are updated.
+    """Compute `VehiclePaths.find_implausible` in compiled code, and update the paths; `row` (n,) is
+    the number of the vehicle's path.
     """
     anchors, places, is_gap, count, leap = paths
     out = np.zeros(len(row), np.bool_)
@@ -154,8 +154,9 @@ def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: P
 
 @compiled
 def _least_needed(anchors: IntArray) -> int:
-    """Return the inner anchor (of (ANCHORS,) times) whose gap is the smallest compared with its
-    age.
+    """Return the index of the anchor that can be dropped with the least loss, given the times
+    (ANCHORS,) [ns]. It is the inner anchor with the smallest gap between its neighbours, relative
+    to its age.
     """
     newest = anchors[-1]
     best = 1
@@ -170,15 +171,15 @@ def _least_needed(anchors: IntArray) -> int:
 
 @compiled
 def _excess_distance(apart: int, there: Float32Array, here: FloatArray) -> float:
-    """Return the distance between two places (2,) [deg] beyond what FASTEST covers in the time
-    between them [ns].
+    """Return the distance [m] between two places (2,) [deg] that exceeds what FASTEST covers in the
+    time `apart` [ns].
     """
     return max(_distance_m(there, here) - FASTEST * apart / NS, 0.0)
 
 
 @compiled
 def _distance_m(there: Float32Array, here: FloatArray | Float32Array) -> float:
-    """Return the distance between two places (2,) [deg], the short way around the date line."""
+    """Return the distance [m] between two places (2,) [deg], the shorter way around the earth."""
     north = here[0] - there[0]
     east = (here[1] - there[1] + 180.0) % 360.0 - 180.0
     return float(np.hypot(north, east * np.cos(np.radians(here[0])))) * METRES_PER_DEGREE

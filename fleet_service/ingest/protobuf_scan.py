@@ -1,10 +1,10 @@
-"""Scanner that finds the fields in the bytes of many protobuf batches, compiled and without an
-object per message.
+"""Scanner that finds the fields in the bytes of many protobuf batches. It is compiled and creates
+no object per message.
 
-The protobuf library stays the authority. The scanner understands only messages as our own encoder,
-or any plain encoder of the .proto, writes them: each field once, columns packed, numbers in range,
-plain ASCII names, columns of equal length. It marks all others as not understood, and
-`batch_decoder` lets the library decode and encode them. Source: protobuf's encoding reference
+The protobuf library remains the reference. The scanner accepts only messages as our own encoder, or
+any plain encoder of the .proto file, writes them: each field once, columns packed, numbers in
+range, plain ASCII names, columns of equal length. It marks all other messages as not understood,
+and `batch_decoder` lets the library decode and encode them. Source: protobuf's encoding reference
 (tags, varints, packed fields).
 """
 
@@ -45,12 +45,12 @@ class ScannedFields(NamedTuple):
     """Positions of the fields of k messages in their bytes.
 
     Attributes:
-        understood: True if the other attributes are valid for a message, (k,).
-        numbers: NUMBERS of each message, (k, 4).
-        texts: begin and end of TEXTS, (k, 2, 2).
+        understood: mask (k,), True if the other attributes are valid for the message.
+        numbers: values of the fields NUMBERS of each message, (k, 4).
+        texts: begin and end of the fields TEXTS, (k, 2, 2).
         begins: begin of each column, (k, columns).
-        counts: elements of each column, (k, columns); bytes for the likelihood.
-        sizes: records of each message, (k,).
+        counts: number of elements of each column, (k, columns); bytes for the likelihood.
+        sizes: number of records of each message, (k,).
     """
 
     understood: BoolArray
@@ -62,8 +62,9 @@ class ScannedFields(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Layout of a kind of message as arrays: role of each field number; width, elements per record
-    and need of each column."""
+    """Fields of a kind of message, as arrays: the role of each field number; for each column the
+    width [bytes], the number of elements per record, and True if it is required.
+    """
 
     roles: IntArray
     widths: IntArray
@@ -72,7 +73,7 @@ class _Layout(NamedTuple):
 
 
 class _Scan(NamedTuple):
-    """Input and output of a scan: all bytes, the layout, whether names must be ASCII, the
+    """Input and output of a scan: all bytes, the layout, whether names must be ASCII, and the
     result.
     """
 
@@ -98,14 +99,14 @@ def _make_layout(kind: Kind) -> _Layout:
 
 
 def walk_fields(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> ScannedFields:
-    """Scan messages that follow each other in `data`.
+    """Scan messages that are concatenated in `data`; return the positions of their fields.
 
     Args:
-        kind: of the messages.
-        data: all bytes.
-        ends: end of each message, (k,).
-        strict: True to leave names that are not ASCII to the library; False if the library wrote
-            the bytes.
+        kind: kind of the messages.
+        data: bytes of all messages.
+        ends: end of each message in `data`, (k,).
+        strict: True to mark messages with non-ASCII names as not understood, so that the library
+            checks them; False if the library itself wrote the bytes.
     """
     layout = _make_layout(kind)
     k = len(ends)
@@ -126,8 +127,9 @@ def walk_fields(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True
 def gather_values(
     data: ByteArray, walked: ScannedFields, column: int, kind: Kind, into: NDArray[Any]
 ) -> None:
-    """Copy a column of all messages, one after the other, into an array (n, …) that is filled with
-    the default value."""
+    """Copy the values of one column from all messages into the array `into` (n, …). Where a message
+    lacks the column, the values of `into` stay unchanged.
+    """
     width = int(_make_layout(kind).widths[column])
     each = int(_make_layout(kind).per_record[column])
     begins = walked.begins[:, column]
@@ -146,7 +148,9 @@ def gather_values(
 
 @refcount_free
 def _read_varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
-    """Return a number and its end; the end is -1 if it is not a number of at most 64 bits."""
+    """Return a variable-length integer and the position after it. The position is -1 if the bytes
+    are not an integer of at most 64 bits.
+    """
     value = 0
     shift = 0
     while at < end and shift < 64:
@@ -163,7 +167,7 @@ def _read_varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
 
 @refcount_free
 def _scan_fields(scan: _Scan, ends: IntArray, first: int) -> None:
-    """Fill the result for all messages; `first` is the column whose length is the number of
+    """Fill the result for all messages; `first` is the column whose length gives the number of
     records.
     """
     data = scan.data
@@ -200,8 +204,8 @@ def _scan_fields(scan: _Scan, ends: IntArray, first: int) -> None:
 
 @refcount_free
 def _scan_field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
-    """Record one field of message k; return its end, or -1 if it is not as our encoder writes
-    it.
+    """Record one field of message `k`; return the position after it, or -1 if the field does not
+    have the form that our encoder writes.
     """
     data = scan.data
     out = scan.out

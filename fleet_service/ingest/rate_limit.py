@@ -1,9 +1,9 @@
 """Rate limit: a token bucket of bytes per vehicle, applied before a message is parsed.
 
 A bucket fills at a constant rate and holds a burst, so that a vehicle can catch up after an outage.
-Messages beyond it are dropped, counted and not acknowledged: the sender keeps them and sends them
-again. This is not a rejection. The name is the last chunk of the key; routers with an access list
-guarantee that it is the sender's.
+Messages beyond the limit are dropped, counted and not acknowledged: the sender keeps them and sends
+them again. This is not a rejection. The vehicle's name is the last chunk of the key; routers with
+an access list guarantee that it is the sender's own name.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _OTHERS: Final = ""
 
 
 class RateLimiter:
-    """Buckets of one service.
+    """Token buckets of one service, one per vehicle.
 
     Args:
-        rate: [bytes/s] of a vehicle in the long run.
-        burst: [bytes] that it may send at once.
-        known: enrolled names; None for any.
-        counts: takes `limited` and `refused.unknown`.
-        clock: [s].
+        rate: long-term rate of a vehicle [bytes/s].
+        burst: amount that a vehicle may send at once [bytes].
+        known: enrolled names; None to accept any name.
+        counts: counters; `limited` and `refused.unknown` are used.
+        clock: function that returns the time [s].
     """
 
     def __init__(
@@ -51,8 +51,8 @@ class RateLimiter:
         self._swept = -float("inf")
 
     def allows(self, key: str, size: int, encoding: str = "") -> bool:
-        """Return True if a message of `size` bytes on `key` may be processed; otherwise count
-        it.
+        """Return True if a message of `size` bytes on `key` may be processed; otherwise count it as
+        limited or refused.
         """
         name = key.rpartition("/")[2]
         if self._known is not None and name not in self._known:
@@ -76,7 +76,9 @@ class RateLimiter:
         return len(self._buckets)
 
     def _forget(self, now: float) -> bool:
-        """Drop full buckets, but not at every message; return True if there is room now."""
+        """Drop full buckets, at most once per refill time; return True if there is room for another
+        bucket now.
+        """
         rate = self._rate
         burst = self._burst
         if now - self._swept >= burst / rate:

@@ -1,12 +1,12 @@
 """Validation of batches. Pure: time and batches are arguments.
 
-Three checks in this order, cheap ones first:
-    identity   is the key the sender's own, and has the batch the same place and name?           per message
-    novelty    was this (vehicle, boot, kind, region, seq) accepted before?                      per message
-    rows       is every value finite, in range, at its place and in its time?                    all rows at once
+Three checks are made in this order, cheap ones first:
+    identity   does the key belong to the sender, and do batch and key agree?      per message
+    novelty    was this (vehicle, boot, kind, region, seq) accepted before?        per message
+    rows       is every value finite, in range, in its region and in time?         all rows at once
 
-One bad row refuses its batch, with row and reason; the refusal settles it. Rules are tables: the
-reason that a sender reads is the text of the rule.
+One invalid row refuses its batch, with row number and reason, and the batch need not be sent again.
+Rules are tables; the reason that a sender reads is the text of the rule.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ _TOPIC: Final = {Kind.OBSERVATION: "obs", Kind.STATE: "state"}
 
 
 class Range(NamedTuple):
-    """A column must lie in [least, most]; NaN, which is neither below nor above, means 'absent'
-    where `optional`.
+    """Rule: a column must lie in [least, most]. If `optional`, NaN is allowed too and means
+    'absent'.
     """
 
     column: str
@@ -61,7 +61,7 @@ RANGES: Final = {
 
 
 class Clock(NamedTuple):
-    """The service's time and how far a record may be from it, all in ns."""
+    """The service's clock, and how far the time of a record may be from it, all in ns."""
 
     now: int
     ahead: int
@@ -71,12 +71,12 @@ class Clock(NamedTuple):
 
     @property
     def horizon(self) -> int:
-        """Oldest accepted time; streams before it are dropped."""
+        """Oldest accepted time [ns]; streams without newer records are dropped."""
         return (self.now if self.least is None else min(self.least, self.now)) - self.oldest
 
 
 class Refusal(NamedTuple):
-    """Reason for a refusal: the rule (for counting), the row, and the text for the sender."""
+    """Reason for a refusal: the rule (for counting), the row number, and the text for the sender."""
 
     rule: str
     row: int
@@ -86,19 +86,19 @@ class Refusal(NamedTuple):
 def check_heads(
     kind: Kind, owners: Sequence[keys.Parsed], heads: Heads, time: IntArray, clock: Clock
 ) -> tuple[IntArray, tuple[Refusal, ...]]:
-    """Check that batches belong to their keys' owners and regions, have valid sequence numbers, and
-    are in time.
+    """Check the heads of batches: owner and region must agree with the key, sequence numbers must
+    be valid, and times must be acceptable.
 
     Args:
-        kind: of the batches.
-        owners: owner of each batch's key, (k,).
-        heads: of the batches.
-        time: of each one's first record [ns], (k,).
+        kind: kind of the batches.
+        owners: vehicle and region from each batch's key, (k,).
+        heads: heads of the batches.
+        time: time of each batch's first record [ns], (k,).
         clock: service time and bounds.
 
     Returns:
-        (k,) index of the first broken rule into the second value, -1 for a valid one; and the
-        rules.
+        index of the first broken rule of each batch, (k,), -1 for a valid batch; and the rules to
+        which the indices refer.
     """
     topic = _TOPIC[kind]
     held = heads.first_held
@@ -143,7 +143,9 @@ _HEAD_RULES: Final = (
 
 
 def _first_broken(broken: Sequence[NDArray[np.bool_]]) -> IntArray:
-    """Return the index of the first broken rule of each, -1 for none."""
+    """Return the index of the first broken rule for each item (n,), -1 if all rules hold. Each
+    element of `broken` is the mask of one rule.
+    """
     out = np.full(len(broken[0]), -1)
     for index in reversed(range(len(broken))):
         if broken[index].any():
@@ -172,13 +174,14 @@ def check_rows(
     """Return the first broken rule of every row.
 
     Args:
-        kind: of the columns.
-        columns: those of `wire.Batch`, (n,).
-        region: (n,) region of each row's batch.
+        kind: kind of the batches.
+        columns: columns of `wire.Batch`, (n,).
+        region: region of each row's batch, (n,).
         clock: service time and bounds.
 
     Returns:
-        (n,) index into the second value, -1 for a valid row; and the rules.
+        index of the first broken rule of each row, (n,), -1 for a valid row; and the rules to which
+        the indices refer.
     """
     broken, rules = _broken_ranges(kind, columns)
     extra = (
@@ -208,8 +211,8 @@ TOO_LONG: Final = Refusal(
 
 
 def too_long(time: IntArray, sizes: IntArray) -> NDArray[np.bool_]:
-    """Return True for batches (k,) that span more than MAX_SPAN_NS, from the times of all rows (n,)
-    [ns] and the number of rows of each batch (k,).
+    """Return a mask of batches (k,): True if the batch spans more than MAX_SPAN_NS. `time` (n,)
+    [ns] contains the times of all rows, `sizes` (k,) the number of rows of each batch.
     """
     if not len(time):
         return np.zeros(len(sizes), bool)
@@ -238,8 +241,8 @@ def _broken_ranges(kind: Kind, columns: Columns) -> tuple[list[NDArray[np.bool_]
 
 
 def _cell_of(columns: Columns) -> IntArray:
-    """Return the cell of the pose; an invalid cell if the pose is not finite (another rule
-    refuses it).
+    """Return the cell of the pose (position). For a pose that is not finite the cell is arbitrary,
+    because another rule refuses the row.
     """
     return grid.cell_of(
         *(np.nan_to_num(np.clip(columns[n], -180.0, 180.0)) for n in ("latitude", "longitude"))

@@ -1,14 +1,15 @@
-"""Input of road weather: from Zenoh and from a Parquet file; checked, archived, and then used by
-the map.
+"""Input of road weather from Zenoh and from a Parquet file. Reports are checked and archived, and
+then used by the map.
 
     weather/NAME-TIME.parquet     reports as received, with the time from which the map used them
 
-Each file is written when reports arrive. `join_daily_files` joins the files of a day, so that a
-start and a past map read as many files as there are days. A report that is read twice, because of a
-power loss in between, is identical and changes nothing.
+A file is written whenever reports arrive. `join_daily_files` joins the files of a day, so that a
+restart, or the computation of a past map, reads only one file per day. After a power loss a report
+may be stored twice; the copies are identical and change nothing.
 
-A report acts on observations of which none was fused yet (`acts_from`). It is durable before it
-acts, so that a replay of the archive finds the same weather and gives the same map.
+A report takes effect at a time (`acts_from`) from which no observation has been fused yet, and it
+is durable before that. Therefore a replay of the archive finds the same weather and gives the same
+map.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ COLUMNS: Final = ("region", "time", *weather.RANGES, "prior")
 
 
 class WeatherMessage(NamedTuple):
-    """One sample on a weather key."""
+    """One message that was received on a weather key."""
 
     key: str
     payload: bytes
@@ -54,13 +55,13 @@ class WeatherMessage(NamedTuple):
 
 
 class WeatherInbox:
-    """Input of reports for one fusion.
+    """Input of weather reports for one fusion.
 
     Args:
-        root: of the archive.
-        name: of the service, part of the file names.
-        fusion: that uses them.
-        counts: refusals are counted here, under `refused.weather`.
+        root: folder of the archive.
+        name: name of the service, part of the file names.
+        fusion: fusion that uses the reports.
+        counts: counters; refusals are counted under `refused.weather`.
     """
 
     def __init__(self, root: Path, name: str, fusion: Fusion, counts: Counter[str]) -> None:
@@ -72,14 +73,14 @@ class WeatherInbox:
         self._last = 0
 
     def enqueue(self, message: WeatherMessage) -> None:
-        """Queue a sample for the next `take`; thread-safe."""
+        """Queue a message for the next `take`; thread-safe."""
         if len(message.payload) > MOST_BYTES:
             self._counts["refused.weather"] += 1
         else:
             self._waiting.append(message)
 
     def take(self, now: int) -> Reports | None:
-        """Archive received reports; return them for the map, None if there are none."""
+        """Archive the received reports; return them for the map, or None if there are none."""
         found: list[tuple[int, Report]] = []
         while self._waiting:
             message = self._waiting.popleft()
@@ -90,8 +91,8 @@ class WeatherInbox:
         return self._archive_reports(found, now) if found else None
 
     def begin(self, path: Path, known: Reports, now: int) -> Reports | None:
-        """Archive the reports of a file that may still affect the map and are not `known`; return
-        them.
+        """Archive those reports of a file that may still affect the map and are not in `known`;
+        return them, or None if there are none.
 
         Raises:
             InputError: the file cannot be read, or a row breaks a rule.
@@ -156,13 +157,14 @@ def archived_reports(
     known: Collection[str] = (),
     damaged: Damaged = skip_damaged,
 ) -> Reports:
-    """Return every report that a map used, in order of receipt up to a time [ns], from files whose
-    names are not `known`.
+    """Return every report that a map used, in order of receipt, up to the time `received_until`
+    [ns]. Files whose names are in `known` are skipped.
 
-    `damaged` is called with a damaged file: the roads of its reports age without weather.
+    `damaged` is called with each damaged file. Its reports are missing, so the roads of its regions
+    age as without weather.
 
     Raises:
-        InputError: a file is of a newer major version.
+        InputError: a file has a newer major version.
         OSError: the archive cannot be read.
     """
     for _ in range(_TURNS):
@@ -190,10 +192,10 @@ def weather_files(root: Path) -> list[Path]:
 
 
 def join_daily_files(root: Path, damaged: Damaged = skip_damaged) -> int:
-    """Join the reports of each day into its newest file; return the number of removed files.
+    """Join the reports of each day into one file; return the number of files saved.
 
     Raises:
-        InputError: a file is of a newer major version.
+        InputError: a file has a newer major version.
         OSError: a file cannot be read or written; nothing is lost.
     """
     days: dict[int, list[Path]] = {}
@@ -217,7 +219,9 @@ def join_daily_files(root: Path, damaged: Damaged = skip_damaged) -> int:
 
 
 def retire_files(root: Path, until_day: int) -> int:
-    """Remove files whose reports acted only up to a day since 1970; return their number."""
+    """Remove files whose reports took effect only up to the day `until_day` (days since 1970);
+    return the number of removed files.
+    """
     removed = 0
     for path in weather_files(root):
         table = load(path, tables.WEATHER_ARCHIVE, ["acts_from"])
@@ -231,15 +235,15 @@ def retire_files(root: Path, until_day: int) -> int:
 
 
 def _written_day(path: Path) -> int:
-    """Return the days since 1970 of a file's writing."""
+    """Return the day on which a file was written (days since 1970)."""
     return int(path.stem[-_DIGITS:]) // DAY_NS
 
 
 def read_file(path: Path) -> list[tuple[int, Report]]:
     """Return region and report of every row of a Parquet file.
 
-    It has the columns `region` (z10 quadint, or quadkey of 10 digits), `time` (timestamp, or ns),
-    and any of the others. Null or NaN is unknown.
+    The file has the columns `region` (z10 quadint, or quadkey of 10 digits), `time` (timestamp, or
+    ns), and any of the weather columns. Null or NaN means unknown.
 
     Raises:
         InputError: names the row, the column and the fix.

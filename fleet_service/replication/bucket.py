@@ -1,8 +1,8 @@
-"""Object storage by obstore: S3 and compatible, GCS, Azure. Every request ends, and no error shows
-a credential.
+"""Object storage through the library obstore: S3 and compatible, GCS, Azure. Every request has a
+time limit, and no error message contains a credential.
 
-An object is either complete or absent, and durable when its put has returned. A put that timed out
-may have succeeded.
+An object is either complete or absent, and it is durable when its upload has returned. An upload
+that timed out may still have succeeded.
 """
 
 from __future__ import annotations
@@ -31,17 +31,18 @@ _TEXT: Final = 160  # characters of an error; what the server says as XML may na
 
 
 class CopyError(OSError):
-    """The bucket does not accept or return an object; the request may be repeated."""
+    """Error of the bucket: it does not accept or return an object. The request may be repeated."""
 
 
 class ObjectBucket:
-    """Objects below a URL.
+    """Bucket: access to the objects below a URL.
 
     Args:
         url: for example s3://bucket/folder; file:///folder is for trials on one machine.
-        options: of obstore, in addition to the environment: endpoint, region, access_key_id …
-        timeout_s: of one request in total.
-        retries: of a failed request.
+        options: options of obstore, in addition to the environment: endpoint, region, access_key_id
+            …
+        timeout_s: total time limit of one request.
+        retries: number of times that a failed request is repeated.
 
     Raises:
         InputError: obstore is not installed, or does not accept the URL or an option.
@@ -95,21 +96,22 @@ class ObjectBucket:
             ) from error
 
     def put(self, name: str, content: bytes | Path) -> None:
-        """Put an object; replace an existing one.
+        """Upload an object; an existing one is replaced.
 
         Raises:
-            CopyError: it is unknown whether the put succeeded.
-            FileNotFoundError: the file to upload does not exist any more.
+            CopyError: it is unknown whether the upload succeeded.
+            FileNotFoundError: the file to upload no longer exists.
         """
         with self._as_copy_errors(name):
             self._do.put(self._store, name, content)
 
     def put_new(self, name: str, content: bytes) -> None:
-        """Put an object that must be new or hold these very bytes already, because a put that timed
-        out had succeeded.
+        """Upload an object whose name must be new. An existing object with the same content is
+        accepted, because an earlier upload may have timed out although it succeeded.
 
         Raises:
-            CopyError: as for `put`, or the object has other content.
+            CopyError: it is unknown whether the upload succeeded, or the existing object has other
+                content.
         """
         with self._as_copy_errors(name):
             try:
@@ -121,10 +123,11 @@ class ObjectBucket:
                     ) from None
 
     def create(self, name: str, content: bytes) -> bool:
-        """Create an object; return True if the existing object is this one.
+        """Create an object if its name is new. Return True if it was created, or exists with the
+        same content.
 
         Raises:
-            CopyError: as for `put`.
+            CopyError: it is unknown whether the upload succeeded.
         """
         with self._as_copy_errors(name):
             try:
@@ -137,7 +140,7 @@ class ObjectBucket:
         """Return the names of the objects in a folder and its subfolders.
 
         Raises:
-            CopyError: they cannot be listed.
+            CopyError: the objects cannot be listed.
         """
         with self._as_copy_errors(f"the list of {folder}"):
             return [
@@ -145,10 +148,10 @@ class ObjectBucket:
             ]
 
     def get(self, name: str) -> bytes | None:
-        """Return an object; None if it does not exist.
+        """Return the content of an object; None if it does not exist.
 
         Raises:
-            CopyError: it cannot be read.
+            CopyError: the object cannot be read.
         """
         with self._as_copy_errors(name):
             try:
@@ -160,7 +163,7 @@ class ObjectBucket:
         """Yield the content of an object in pieces.
 
         Raises:
-            CopyError: as for `get`, or it does not exist.
+            CopyError: the object cannot be read or does not exist.
         """
         with self._as_copy_errors(name):
             for part in self._do.get(self._store, name).stream():
@@ -170,7 +173,7 @@ class ObjectBucket:
         """Return names and sizes [bytes] of all objects.
 
         Raises:
-            CopyError: they cannot be listed.
+            CopyError: the objects cannot be listed.
         """
         with self._as_copy_errors("the list of objects"):
             return {
@@ -181,7 +184,7 @@ class ObjectBucket:
         """Delete an object if it exists.
 
         Raises:
-            CopyError: it may still exist.
+            CopyError: the object may still exist.
         """
         with self._as_copy_errors(name):
             try:
@@ -204,7 +207,8 @@ class ObjectBucket:
 
 
 def error_summary(error: BaseException) -> str:
-    """Return the first words of an error, without headers, response body and duration, so that the
-    same problem gives the same line."""
+    """Return the beginning of an error's message, without headers, response body and duration, so
+    that the same problem always gives the same line.
+    """
     line = (str(error).splitlines() or [type(error).__name__])[0]
     return _TOOK.sub("", line.partition("<")[0]).strip()[:_TEXT]

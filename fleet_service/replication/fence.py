@@ -1,13 +1,15 @@
-"""Terms: successive owners of an archive's copy, and the files of former owners that count.
+"""Fence of an archive's bucket copy: it excludes files that a former owner uploads too late. A term
+is the time during which one service owns the copy.
 
-    fence/NUMBER-TURN       in the bucket, {"epoch", "names"}: the highest counts
-    ARCHIVE/term            the epoch of the service that has the folder
+    fence/NUMBER-TURN       in the bucket, {"epoch", "names"}: the highest is valid
+    ARCHIVE/term            the epoch of the service that owns the folder
 
-An object counts if it has the term's epoch or a later one, if the fence lists it, or if its name
-has no epoch. The list is made after no former owner can acknowledge any more, and before anything
-is acknowledged in the new term. A service that was frozen and wakes may upload more. Such objects
-have an older epoch and are not on the list. They were never acknowledged, their senders send them
-again, and they do not count for any later reader of the bucket.
+An object is valid in three cases: it has the epoch of the current term or a later one, the fence
+lists it, or its name contains no epoch. The owner writes the list when no former owner can
+acknowledge any more, and before it acknowledges anything itself. A former owner that was frozen may
+wake up and upload more objects. They have an older epoch and are not on the list, so all later
+readers of the bucket ignore them. No data are lost: these objects were never acknowledged, so the
+vehicles send their content again.
 """
 
 from __future__ import annotations
@@ -25,27 +27,31 @@ FOLDER: Final = "fence"
 
 
 class Term(NamedTuple):
-    """Ownership of the copy by one service: its number, and the epoch in its file names."""
+    """Ownership of the copy by one service: the lease number, and the epoch in the service's file
+    names.
+    """
 
     number: int
     epoch: int
 
 
 class Fence(NamedTuple):
-    """Objects that count: all from `epoch` on, and these names of former terms."""
+    """Valid objects of a bucket: all objects from `epoch` on, and the objects of former terms with
+    these names.
+    """
 
     epoch: int
     names: frozenset[str]
 
     def counts_object(self, name: str) -> bool:
-        """Return True if an object counts."""
+        """Return True if an object is valid."""
         epoch = layout.term_of(name)
         return epoch is None or epoch >= self.epoch or name in self.names
 
 
 def put_fence(bucket: ObjectBucket, number: int, turn: int, fence: Fence) -> None:
-    """Write the fence; each turn has a name of its own, so that a delayed upload never replaces a
-    later one.
+    """Write the fence. Each turn (renewal of the lease) has a name of its own, so that a delayed
+    upload never replaces a later one.
 
     Raises:
         CopyError: it is unknown whether the upload succeeded.
@@ -55,10 +61,11 @@ def put_fence(bucket: ObjectBucket, number: int, turn: int, fence: Fence) -> Non
 
 
 def fence_of(bucket: ObjectBucket) -> Fence:
-    """Return the fence of the last owner; without one, everything counts.
+    """Return the fence of the last owner; if there is none, return a fence for which all objects
+    are valid.
 
     Raises:
-        CopyError: it cannot be read.
+        CopyError: the fence cannot be read.
     """
     names = bucket.list_names(FOLDER)
     content = bucket.get(max(names)) if names else None
@@ -72,5 +79,5 @@ def fence_of(bucket: ObjectBucket) -> Fence:
 
 
 def largest_epoch(names: Iterable[str]) -> int:
-    """Return the largest epoch in names, or 0."""
+    """Return the largest epoch in the given file names, or 0."""
     return max((layout.term_of(name) or 0 for name in names), default=0)

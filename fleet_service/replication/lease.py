@@ -1,43 +1,51 @@
-"""Lease of an archive's bucket copy. It needs only a bucket with conditional create.
+"""Lease of an archive's bucket copy: at most one service owns the copy. The lease needs only a
+bucket with conditional create.
 
     lease/NUMBER.json       {"holder", "service", "epoch", "turn", "released", "before", "to",
-                            "lease_s"}: the highest number holds
+                            "lease_s"}: the highest number is the current holder
     ARCHIVE/holder.json     identity of this folder, kept over restarts
 
-A service takes over by creating the next number, which only one can do. It renews by writing its
-own number again with the next turn, and then checking that no higher number exists. Clocks are not
-compared.
+A service takes over by creating the next number; the bucket lets only one service do so. The holder
+renews by writing its own object again with the next turn, and then checking that no higher number
+exists. The clocks of different machines are never compared.
 
-Why nothing acknowledged is lost. Let A hold, and let B create the next number at T. A acknowledges
-only what is in the bucket already, and only within `lease_s / 2` after it *began* a valid renewal.
-A valid renewal saw no higher number, so it began before T. B takes over when it has seen the same
-turn for `lease_s` (or for HINT of it, when A's token fell): then A's last renewal began before B
-saw it first, and A's time was over before T. If the turn has changed after T, a renewal landed in
-between, and B waits for `lease_s` more: twice the time in which A acknowledges, so that A's clock
-may be slower. A turn is written at most once, even if the write failed: it may take effect late,
-and a later renewal with the same content would look like none. So the bucket must not repeat a
-request either (`retries=0`). Only then B lists the bucket: everything that A acknowledged is there. An
-acknowledgement that A's network delivers later is still true. If A was frozen and uploads after the
-listing, its files have an older epoch and are not in B's fence (`archive.terms`): they do not
-count, and A acknowledged none of them. A deletes only after it uploaded the replacement and saw no
-higher number, so B finds the replacement.
+**No acknowledged data are lost.** Let A be the holder, and let B create the next number at time T.
 
-Why nothing is doubled. The files that count are one set, which B reads completely before it admits
-anything. A batch that A archived and did not acknowledge is known to B and acknowledged again. Rows
-of A outside this set are sent again and admitted once. A's folder is synchronised with the bucket
-before A serves again.
+- A acknowledges only data that are already in the bucket, and only within `lease_s / 2` after it
+  *began* a valid renewal. A valid renewal found no higher number, so it began before T.
+- B takes over when it has seen the same turn for `lease_s` (or for HINT of it, if A's token is
+  gone). Then A's last renewal began before B saw this turn first, and A's right to acknowledge
+  ended before T.
+- If the turn has changed after T, a renewal succeeded in between. B then waits for another
+  `lease_s`, which is twice the time in which A may acknowledge, so A's clock may be slower than
+  B's.
+- A turn is written at most once, even if the write failed. A failed write may take effect late, and
+  a later renewal with the same content could not be distinguished from it. Therefore the bucket
+  client must not repeat requests (`retries=0`).
+- Only after this does B list the bucket, so it finds everything that A has acknowledged. An
+  acknowledgement that A's network delivers later is still correct.
+- If A was frozen and uploads files after the listing, they have an older epoch and are not in B's
+  fence (see `fence`). They are ignored, and A has acknowledged none of them.
+- A deletes a file only after it has uploaded the replacement and found no higher number, so B finds
+  the replacement.
 
-All of this needs one `lease_s` on all machines, so it is in the object. A service with another
-value does not start next to a live holder. Fields that this version does not know are ignored; an
-older version's record has no `lease_s`. A damaged object is one whose holder is unknown: a live
-holder writes it again with its next turn.
+**No data count twice.** The valid files are one set, and B reads it completely before it accepts
+new data. B therefore knows a batch that A archived without acknowledging, and acknowledges it
+again. Rows of A outside this set are sent again and accepted once. A's folder is synchronised with
+the bucket before A serves again.
 
-A machine that was suspended finds its lease expired (`elapsed_seconds`).
+The proof requires the same `lease_s` on all machines, so the value is stored in the object. A
+service with another value does not start while a holder is alive. Unknown fields are ignored; the
+record of an older version has no `lease_s`. A damaged object means that the holder is unknown; a
+live holder writes the object again with its next turn.
 
-Not covered: a machine whose elapsed-time clock runs at less than 5/6 of another one's speed (half
-of it where no token falls), or stops while it is migrated between hosts, and a bucket without
-read-after-write consistency. `tests/faults/protocol_model.py` checks all states of a model, and
-`tests/faults/lease_histories.py` judges histories of this module in virtual time.
+A machine that was suspended finds that its lease has expired (`elapsed_seconds`).
+
+**Not covered:** a machine whose elapsed-time clock runs at less than 5/6 of another machine's speed
+(1/2 of it if the holder's token stays active, so that HINT does not apply), a clock that stops
+while the machine is migrated between hosts, and a bucket without read-after-write consistency.
+`tests/faults/protocol_model.py` checks all states of a model. `tests/faults/lease_histories.py`
+checks histories of this module in virtual time.
 """
 
 from __future__ import annotations
@@ -77,13 +85,13 @@ class LeaseRecord(NamedTuple):
     """Lease as stored in the bucket.
 
     Attributes:
-        number, epoch: of the term.
-        holder, service: the folder, and the name of the service on it.
+        number, epoch: number of the lease, and epoch in the holder's file names.
+        holder, service: identity of the holder's folder, and name of the service that runs on it.
         turn: grows with each renewal.
-        released: True if the holder released it.
-        before: names of the services that held it earlier.
-        to: the service for which it was released; others leave it alone for one lease time.
-        lease_s: of the holder; 0 in a record of an older version.
+        released: True if the holder released the lease.
+        before: names of the services that held the lease earlier.
+        to: service for which the lease was released; other services wait for one lease time.
+        lease_s: lease time of the holder [s]; 0 in a record of an older version.
     """
 
     number: int
@@ -98,21 +106,19 @@ class LeaseRecord(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return the object's name."""
+        """Return the name of the lease object in the bucket."""
         return f"{FOLDER}/{self.number:010d}.json"
 
     @property
     def content(self) -> bytes:
-        """Return the object's content."""
+        """Return the content of the lease object as JSON."""
         return json.dumps(
             {name: value for name, value in self._asdict().items() if name != "number"}
         ).encode()
 
 
 class Standby(NamedTuple):
-    """Questions of a waiting service: whether it is reachable, and whether the holder's token is
-    active.
-    """
+    """Functions that a waiting (standby) service provides to the lease."""
 
     may: Callable[[], bool]  # whether it would be heard if it took over now
     stands: Callable[[str], bool]  # whether a service's token stands
@@ -121,21 +127,22 @@ class Standby(NamedTuple):
 
 
 class Lease:
-    """Lease of one archive's copy; `wait` for it, `start_renewal` it, `release` it.
+    """Lease of one archive's copy: `wait` for it, then call `start_renewal`, and finally `release`.
 
     Args:
-        holder: identity of this folder, see `holder_of`; this process has it locked, so no other
-            start of it runs.
-        bucket: of the copy; it repeats no request.
-        service: its name.
-        lease_s: time after which a lease that is not renewed may be taken.
+        holder: identity of this folder, see `holder_of`. This process has locked the folder, so no
+            other process uses this identity.
+        bucket: bucket of the copy; it must not repeat requests.
+        service: name of the service.
+        lease_s: time [s] after which a lease that is not renewed may be taken over.
 
     Attributes:
-        lost: True if another service has it.
-        service: its name.
-        serves: returns True if the service works; one that reaches no router must be replaced.
-        succeeds: True if another folder had it before: this folder may hold files that do not
-            count.
+        lost: True if another service has taken over.
+        service: name of the service.
+        serves: function that returns True if the service works; a service that reaches no router
+            must be replaced.
+        succeeds: True if another folder had the lease before; this folder may then contain files
+            that are not valid.
     """
 
     def __init__(self, holder: str, bucket: ObjectBucket, service: str, lease_s: float) -> None:
@@ -160,13 +167,13 @@ class Lease:
 
     @property
     def former_holders(self) -> tuple[str, ...]:
-        """Return the names of the services that held it earlier."""
+        """Return the names of the services that held the lease earlier."""
         return () if self._mine is None else self._mine.before
 
     @property
     def left_s(self) -> float:
-        """Return the time [s] for which the content of the bucket may be acknowledged without a
-        renewal; 0 or less if it may not.
+        """Return the time [s] for which the service may acknowledge data in the bucket without
+        another renewal; 0 or less if it may not.
         """
         return (
             0.0
@@ -176,12 +183,12 @@ class Lease:
 
     @property
     def may_acknowledge(self) -> bool:
-        """Return True if the content of the bucket may be acknowledged now."""
+        """Return True if the service may acknowledge data in the bucket now."""
         return self.left_s > 0.0
 
     def assert_not_superseded(self) -> None:
-        """Check that no other service has taken over. A later successor then finds everything
-        uploaded until now.
+        """Check that no other service has taken over. If the check passes, every later holder will
+        find all data that were uploaded before it.
 
         Raises:
             CopyError: another service has taken over, or the bucket does not answer.
@@ -198,17 +205,19 @@ class Lease:
         epoch: Callable[[], int],
         standby: Standby | None,
     ) -> bool:
-        """Wait until this service has the lease; False if stopped.
+        """Wait until this service has the lease; return False if `stop` is set first.
 
         Args:
-            stop: ends the wait.
-            say: called with a line when the reason for waiting changes.
-            epoch: the largest known epoch.
-            standby: None for a service that is no standby and does not wait for a live holder.
+            stop: event that ends the wait.
+            say: called with a line of text when the reason for waiting changes.
+            epoch: function that returns the largest known epoch.
+            standby: functions of a standby service. None for a service that is no standby and does
+                not wait for a live holder.
 
         Raises:
-            InputError: a live service has it, and this one is no standby or has another `lease_s`.
-            CopyError: the bucket cannot be reached, and this one is no standby.
+            InputError: a live service has the lease, and this service is no standby or has another
+                `lease_s`.
+            CopyError: the bucket cannot be reached, and this service is no standby.
         """
         seen: LeaseRecord | None = None
         since = time.monotonic()
@@ -260,14 +269,15 @@ class Lease:
         return False
 
     def start_renewal(self) -> None:
-        """Renew it from now on in a thread while `serves` is true; otherwise it expires, and
-        another service takes it."""
+        """Start a thread that renews the lease while `serves` returns True. Otherwise the lease
+        expires, and another service takes over.
+        """
         self._thread = threading.Thread(target=self._renew_until_stopped, name="lease", daemon=True)
         self._thread.start()
 
     def release(self, to: str = "") -> None:
-        """Release it if it is still held, for a named service or for any; nothing is
-        acknowledged afterwards.
+        """Release the lease if this service still has it, for the service named `to` or for any.
+        This service must not acknowledge anything afterwards.
         """
         self._stop.set()
         if self._thread is not None:
@@ -283,7 +293,9 @@ class Lease:
                 log.warning("the lease was not released and expires by itself: %s", error)
 
     def make_new_lease(self) -> Lease:
-        """Return a new lease to wait for, after this one was lost."""
+        """Return a new lease object with which the service can wait again after this lease was
+        lost.
+        """
         return Lease(self._holder, self._bucket, self.service, self._lease_s)
 
     def renew(self) -> None:
@@ -330,7 +342,7 @@ class Lease:
     def _create_next(
         self, found: LeaseRecord | None, known: Callable[[], int], stop: threading.Event
     ) -> bool:
-        """Create the next number; False if another service was faster."""
+        """Create the lease object with the next number; return False if another service was faster."""
         number = 1 if found is None else found.number + 1
         epoch = max(int(time.time()), known() + 1, 0 if found is None else found.epoch + 1)
         before = () if found is None else tuple(dict.fromkeys((*found.before, found.service)))
@@ -357,13 +369,15 @@ class Lease:
 
 
 def elapsed_seconds() -> float:
-    """Return elapsed seconds, including suspended time where the system counts it (Linux)."""
+    """Return elapsed time [s] of a monotonic clock. On Linux it includes time in which the machine
+    was suspended.
+    """
     return time.monotonic() if _BOOTTIME is None else time.clock_gettime(_BOOTTIME)
 
 
 def holder_of(root: Path, url: str) -> tuple[str, bool]:
-    """Return the identity of a folder, and True if it existed before; a copied or moved folder gets
-    a new one.
+    """Return the identity of a folder, and True if the folder was used with this bucket before. A
+    copied or moved folder gets a new identity.
 
     Raises:
         OSError: the folder cannot be read or written.
@@ -384,8 +398,8 @@ def holder_of(root: Path, url: str) -> tuple[str, bool]:
 
 
 def forget_holder(root: Path) -> None:
-    """Remove the identity of a folder that is written without a lease: it holds data that no bucket
-    has, so it must not be synchronised with a bucket.
+    """Remove the identity of a folder that is written without a lease. Such a folder contains data
+    that no bucket has, so it must not be synchronised with a bucket.
 
     Raises:
         OSError: the identity cannot be removed.
@@ -395,8 +409,8 @@ def forget_holder(root: Path) -> None:
 
 
 def _check_settings(found: LeaseRecord, lease_s: float) -> None:
-    """Raise InputError if the live holder uses another lease time: it would acknowledge after a
-    take-over.
+    """Raise InputError if the live holder uses another lease time, because it could then
+    acknowledge after a take-over.
     """
     if found.lease_s not in (0.0, lease_s):
         problem = (
@@ -408,7 +422,9 @@ def _check_settings(found: LeaseRecord, lease_s: float) -> None:
 
 
 def _parse_record(name: str, content: bytes) -> LeaseRecord | None:
-    """Return the record of an object; None if it is damaged. Unknown fields are ignored."""
+    """Return the lease record from the content of an object; None if it is damaged. Unknown fields
+    are ignored.
+    """
     try:
         record: dict[str, Any] = json.loads(content)
         found = LeaseRecord(
@@ -433,8 +449,8 @@ def _parse_record(name: str, content: bytes) -> LeaseRecord | None:
 
 
 def _unknown_holder(name: str, content: bytes, previous: LeaseRecord | None) -> LeaseRecord:
-    """Return a record for a damaged object: held by nobody known, and changed whenever the
-    object changes.
+    """Return a record that stands for a damaged lease object: its holder is unknown, and its turn
+    changes whenever the content of the object changes.
     """
     log.warning("the lease object %s is damaged", name)
     turn = int.from_bytes(blake2b(content, digest_size=6).digest(), "big")

@@ -1,5 +1,5 @@
-"""Exclusive ownership of a running service: the folder by a lock, and the bucket copy, if any,
-by a lease.
+"""Exclusive ownership of an archive by a running service: of the folder by a file lock, and of the
+bucket copy, if any, by a lease.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ REQUESTS: Final = 4  # of a lease that fit into its time
 
 
 class Ownership:
-    """Exclusive ownership of an archive folder and its bucket copy; call `close`.
+    """Exclusive ownership of an archive folder and its bucket copy; call `close` at the end.
 
     Attributes:
         copy: bucket copy of the archive; None without one.
-        lease: of the copy; None if no other service must be excluded.
-        to: standby to hand over to; "" for none.
-        leaves: True once everything is ready for the hand-over.
+        lease: lease of the copy; None if no other service must be excluded.
+        to: name of the standby that takes over when this service stops; "" for none.
+        leaves: True once everything is ready for this hand-over.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Ownership:
 
     @property
     def may_acknowledge(self) -> bool:
-        """Return True if the next service will know everything that is durable now."""
+        """Return True if the next owner of the archive will find all data that are durable now."""
         return self.lease is None or self.lease.may_acknowledge
 
     @property
@@ -68,21 +68,21 @@ class Ownership:
 
     @property
     def all_holders(self) -> tuple[str, ...]:
-        """Return the names of this and earlier holders; empty without a lease."""
+        """Return the names of this and all earlier holders of the lease; empty without a lease."""
         return () if self.lease is None else (*self.lease.former_holders, self.lease.service)
 
     def mark_lost(self) -> None:
-        """Record that another service has taken over, as its tokens show."""
+        """Record that another service has taken over, because its tokens have appeared."""
         if self.lease is not None:
             self.lease.lost = True
 
     def release(self) -> None:
-        """Release the lease; nothing is acknowledged afterwards."""
+        """Release the lease, if any; nothing may be acknowledged afterwards."""
         if self.lease is not None:
             self.lease.release(self.to if self.leaves else "")
 
     def close(self) -> None:
-        """Release lease and lock."""
+        """Release the lease and the lock."""
         self.release()
         if self.copy is not None:
             self.copy.close()
@@ -90,10 +90,10 @@ class Ownership:
 
 
 def open_exclusive(config: ServiceConfig, root: Path) -> Ownership:
-    """Open an archive without a lease.
+    """Lock an archive that is used without a lease, and synchronise it with its copy, if any.
 
     Raises:
-        InputError: another service holds it, or its copy cannot be used.
+        InputError: another service has the archive, or its copy cannot be used.
         OSError: the folder cannot be read or written.
     """
     lock_file = lock_archive(root)
@@ -117,19 +117,20 @@ def acquire_archive(
     say: Callable[[str], None],
     signs: Signs | None = None,
 ) -> Ownership | None:
-    """Open an archive with the lease of its copy, if it has one; None if stopped.
+    """Lock an archive and wait for the lease of its copy, if it has a copy. Return None if `stop`
+    is set.
 
     Args:
         config: settings.
-        root: of the archive.
-        stop: ends the wait.
-        say: called with a line whenever the reason for waiting changes.
-        signs: of a standby: whether it would be reachable, whether a service's token is active, and
-            a function called at each check.
+        root: folder of the archive.
+        stop: event that ends the wait.
+        say: called with a line of text whenever the reason for waiting changes.
+        signs: functions of a standby service: whether it is reachable, whether a service's token is
+            active, and one that is called at each check. None if this service is no standby.
 
     Raises:
-        InputError: another service holds folder or copy, or the copy cannot be used with these
-            settings.
+        InputError: another service has the folder or the copy, or the copy cannot be used with
+            these settings.
         OSError: the folder cannot be read or written.
     """
     url = config.archive.second
@@ -217,8 +218,9 @@ def _sync_folder(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> bool:
-    """Synchronise the folder with the copy; False if stopped, or if another service has the lease.
-    A standby retries while the bucket is away."""
+    """Synchronise the folder with the copy. Return False if `stop` is set, or if another service
+    has the lease. A standby retries while the bucket cannot be reached.
+    """
     logged = ""
     while not stop.is_set():
         try:
@@ -241,12 +243,16 @@ def _sync_folder(
 
 
 class _BusyError(Exception):
-    """Another process works in the folder."""
+    """Error: another process is working in the folder."""
 
 
 def _wait_for_compaction(root: Path) -> BinaryIO:
-    """Wait until no compaction of the folder's former service is running: it may have read rows
-    that do not count any more."""
+    """Lock the compacted files of the folder. A compaction of the folder's former service may still
+    be running, and may have read rows that are no longer valid.
+
+    Raises:
+        _BusyError: such a compaction is running; try again later.
+    """
     try:
         return compaction.lock_compacted(root)
     except InputError as error:

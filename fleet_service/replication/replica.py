@@ -1,10 +1,11 @@
 """Bucket replica of an archive: the same files under the same names.
 
-Files that an acknowledgement depends on (segments, keys, vehicle identities) are uploaded before it
-(`upload_segments`). All others follow (`sync`): uploads first, then deletions, so that at any
-instant the copy holds every row at least once, like the folder. A start (`sync_without_lease`) downloads what
-only the bucket has (everything onto an empty disk), and uploads what only the folder has. Only
-objects recorded in the journal are deleted.
+Files on which an acknowledgement depends (segments, keys, vehicle identities) are uploaded before
+the acknowledgement (`upload_segments`). All other files follow later (`sync`). Uploads come first
+and deletions last, so that the copy contains every row at least once at any time. At start
+(`sync_without_lease`), files that only the bucket has are downloaded (all files, if the disk is
+empty), and files that only the folder has are uploaded. Only objects recorded in the upload journal
+are ever deleted.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class BucketReplica:
         OSError: the journal cannot be read or written.
 
     Attributes:
-        failures: requests of `upload_segments` that failed.
+        failures: number of failed requests of `upload_segments`.
     """
 
     def __init__(self, root: Path, url: str, options: Mapping[str, str]) -> None:
@@ -92,32 +93,32 @@ class BucketReplica:
         self._turn = 0
 
     def close(self) -> None:
-        """Close the copy and leave the bucket unchanged."""
+        """Close the replica; the bucket is not changed."""
         self._pool.shutdown(cancel_futures=True)
         self._copied.close()
 
     def attach_lease(self, may: Callable[[], bool], alone: Callable[[], None]) -> None:
-        """Work under a lease from now on.
+        """Write to the bucket only under a lease from now on.
 
         Args:
-            may: returns True if the lease is certainly held.
-            alone: checks in the bucket that no later lease exists; CopyError if one exists or the
-                check fails.
+            may: function that returns True if this service certainly has the lease.
+            alone: function that checks in the bucket that no later lease exists. It raises
+                CopyError if one exists or the check fails.
         """
         self._may = may
         self._alone = alone
 
     @property
     def away_s(self) -> float:
-        """Return for how long the bucket has not accepted data that an acknowledgement needs
-        [s]; 0 if it does.
+        """Return the time [s] for which the bucket has not accepted data on which an
+        acknowledgement depends; 0 if it accepts them.
         """
         since = self._since
         return 0.0 if since is None else time.monotonic() - since
 
     @property
     def trouble(self) -> str | None:
-        """Return a message for the operator; None if there is no problem."""
+        """Return a message to the operator about failing uploads; None if there is no problem."""
         if self._since is None:
             return None
         waits = f"nothing is acknowledged for {self.away_s:.0f} s"
@@ -125,7 +126,7 @@ class BucketReplica:
 
     def sync_without_lease(self, service: str) -> int:
         """Synchronise folder and bucket in both directions; return the number of downloaded files.
-        Nothing else may use the archive.
+        No other process may use the archive meanwhile.
 
         Raises:
             InputError: the bucket cannot be reached, or belongs to another service.
@@ -145,14 +146,14 @@ class BucketReplica:
     def sync_under_lease(
         self, service: str | None, term: Term | None = None, *, succeeds: bool = False
     ) -> int:
-        """Synchronise like `sync_without_lease`, under a lease's `term`: later uploads of a former holder do not
-        count.
+        """Synchronise like `sync_without_lease`, but under the `term` of a lease: files that a
+        former holder uploads later are ignored.
 
         Args:
-            service: its name; None for a standby, which follows the owner of the bucket.
-            term: of the lease; None without one.
-            succeeds: True if another machine had the lease before: data that only this folder has
-                was never acknowledged and is removed.
+            service: name of the service; None for a standby, which follows the owner of the bucket.
+            term: term of the lease; None without a lease.
+            succeeds: True if another machine had the lease before. Data that only this folder has
+                were then never acknowledged and are removed.
 
         Raises:
             InputError: the bucket belongs to another service.
@@ -172,7 +173,7 @@ class BucketReplica:
         return got
 
     def largest_epoch(self) -> int:
-        """Return the largest epoch in a name of the folder or the bucket, or 0.
+        """Return the largest epoch in the file names of folder and bucket, or 0.
 
         Raises:
             CopyError: the bucket cannot be listed.
@@ -180,17 +181,19 @@ class BucketReplica:
         return max(largest_epoch(self._slow.list_sizes()), largest_epoch(self._list_files(FOLDERS)))
 
     def prefetch(self) -> None:
-        """Download for a standby, in advance, the files that a later `sync_under_lease` needs, while another
-        service owns the bucket.
+        """Download files in advance, for a standby: those that a later `sync_under_lease` will
+        need. Another service still owns the bucket.
 
         Raises:
-            CopyError, OSError: the download is incomplete; compaction may remove files meanwhile.
+            CopyError, OSError: the download is incomplete, because the owner's compaction may
+                remove files meanwhile.
         """
         self._download_missing(self._select_counted(self._slow.list_sizes()))
 
     def _raise_fence(self, term: Term) -> None:
-        """Write a fence for this term: later objects count only if they have its epoch. Remove
-        objects that do not count."""
+        """Write a fence for this term: objects that appear later are valid only with the epoch of
+        the term. Delete objects that are not valid.
+        """
         names = [
             name
             for name in self._list_files(FOLDERS)
@@ -221,16 +224,16 @@ class BucketReplica:
         return self._download_missing(there)
 
     def _select_counted(self, there: Mapping[str, int]) -> dict[str, int]:
-        """Return names and sizes of the objects that count."""
+        """Return names and sizes of the valid objects according to the fence."""
         fence = fence_of(self._slow)
         return {name: size for name, size in there.items() if fence.counts_object(name)}
 
     def upload_segments(self, segments: Iterable[Path]) -> None:
-        """Upload written segments and the keys; all are in the bucket when this returns.
+        """Upload written segments and the keys; all of them are in the bucket when this returns.
 
         Raises:
-            CopyError: some are not; the next call continues and uploads nothing twice. After a
-                failure there is a pause, which grows with each further failure.
+            CopyError: some files are not in the bucket; the next call continues and uploads no file
+                twice. After a failure there is a pause, which grows with each further failure.
         """
         if time.monotonic() < self._not_before:
             raise CopyError(f"the upload fails and is tried again: {self._error}")
@@ -263,7 +266,7 @@ class BucketReplica:
         """Upload new and rewritten files, then delete removed ones; return the number of changed
         objects.
 
-        Only `upload_segments` uploads the log.
+        Segments of the inbox are excluded; only `upload_segments` uploads them.
 
         Raises:
             CopyError: the work is incomplete; the next call continues.
@@ -328,7 +331,7 @@ class BucketReplica:
             self._following.release()
 
     def _upload_if_present(self, name: str) -> bool:
-        """Upload a file; False if it was removed meanwhile."""
+        """Upload a file; return False if the file has been removed meanwhile."""
         try:
             self._upload_file(self._root / name, self._slow)
         except FileNotFoundError:
@@ -351,8 +354,10 @@ class BucketReplica:
         self._copied.add(name, stamp)
 
     def _upload_new(self, name: str, content: bytes, bucket: ObjectBucket) -> None:
-        """Upload a file that must be new. A key that a former service uploaded after it lost its
-        lease belongs to rows that do not count, and is replaced."""
+        """Upload a file whose name must be new. The exception is a key that a former service
+        uploaded after it had lost its lease: it belongs to rows that are not valid, and is
+        replaced.
+        """
         if self._alone is None or name.startswith(LOG) or bucket.create(name, content):
             bucket.put_new(name, content)
         else:
@@ -379,7 +384,9 @@ class BucketReplica:
             )
 
     def _download_missing(self, there: Mapping[str, int]) -> int:
-        """Download what only the bucket has, and record which files of the folder it lacks."""
+        """Download the files that only the bucket has; return their number. Also remove files that
+        the bucket lacks from the journal.
+        """
         local = self._list_files(FOLDERS)
         for name in self._copied.copy_stamps():
             if name not in there or (name in local and local[name].size != there[name]):
@@ -419,7 +426,9 @@ class BucketReplica:
         return self._root / f"{name}{BAD}"
 
     def _list_files(self, folders: Iterable[str]) -> dict[str, Stamp]:
-        """Return names and stamps of the files that are copied, in the order of the folders."""
+        """Return names and stamps (size and time) of the files that belong into the copy, in the
+        order of the folders.
+        """
         found: dict[str, Stamp] = {}
         paths = (path for one in folders for path in sorted((self._root / one).rglob("*")))
         for path in paths:
@@ -432,7 +441,7 @@ class BucketReplica:
 
 
 def _is_copied(name: str) -> bool:
-    """Return True if a file of this name is copied; drafts and files set aside are not."""
+    """Return True if a file of this name belongs into the copy; drafts and damaged files do not."""
     folder, *rest = name.split("/")
     hidden = any(part.startswith(".") for part in rest)
     return (
@@ -446,7 +455,7 @@ def _is_copied(name: str) -> bool:
 
 def open_replica(config: ServiceConfig, root: Path) -> BucketReplica | None:
     """Open the bucket replica named in the configuration and synchronise it with the folder `root`;
-    return None if the configuration names none.
+    return None if the configuration names no replica.
 
     Raises:
         InputError, OSError: as for `BucketReplica` and its `sync_without_lease`.

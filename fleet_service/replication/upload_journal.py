@@ -1,11 +1,11 @@
-"""Journal of uploads: the files of an archive that are in its copy, with size and time at the
-upload.
+"""Journal of uploads: records which files of an archive are in its bucket copy, with their size and
+time at the upload.
 
     ARCHIVE/copied      {"copy": URL}, then a line for each put, [name, bytes, time], and for each
                         delete, [name]
 
-A line that is lost costs a put, or brings a file back that is then removed again; it never removes
-one.
+A lost line is harmless: a file is uploaded once more, or a deleted file comes back and is deleted
+again. A lost line never deletes a file.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ NAME: Final = "copied"
 
 
 class Stamp(NamedTuple):
-    """Identifies a version of a file: size, and time of the last write [ns]."""
+    """Version of a file, identified by size [bytes] and time of the last write [ns]."""
 
     size: int
     time: int
@@ -33,21 +33,22 @@ def stamp_of(path: Path) -> Stamp:
     """Return the stamp of a file.
 
     Raises:
-        FileNotFoundError: it does not exist any more.
+        FileNotFoundError: the file no longer exists.
     """
     found = path.stat()
     return Stamp(found.st_size, found.st_mtime_ns)
 
 
 class UploadJournal:
-    """Journal of one archive and one copy; the journal of another copy is ignored.
+    """Upload journal of one archive and one copy; an existing journal about another copy is
+    ignored.
 
     Args:
-        root: of the archive.
-        url: of the copy.
+        root: folder of the archive.
+        url: URL of the copy.
 
     Raises:
-        OSError: it can neither be read nor written.
+        OSError: the journal can neither be read nor written.
     """
 
     def __init__(self, root: Path, url: str) -> None:
@@ -68,12 +69,14 @@ class UploadJournal:
         self._file = path.open("ab", buffering=0)
 
     def copy_stamps(self) -> dict[str, Stamp]:
-        """Return the names in the copy, each with its stamp at the upload; a snapshot."""
+        """Return the names of the files in the copy, each with its stamp at the upload. The result
+        does not change with later uploads.
+        """
         with self._guard:
             return dict(self._stamps)
 
     def find_stamp(self, name: str) -> Stamp | None:
-        """Return the stamp at a file's upload; None if it was not uploaded."""
+        """Return the stamp that a file had at its upload; None if it was not uploaded."""
         return self._stamps.get(name)
 
     def add(self, name: str, stamp: Stamp) -> None:

@@ -1,1 +1,1 @@
-"""Copies of an archive for others: extracts as tables, and a mirror."""
+"""Export from an archive: extracts as tables, and a mirror of its files."""

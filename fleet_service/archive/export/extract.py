@@ -1,5 +1,5 @@
-"""Export of parts of the archive as GeoParquet, GeoJSON or CSV, selected by the ending of the
-name.
+"""Export of parts of the archive as GeoParquet, GeoJSON or CSV; the ending of the file name selects
+the format.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ Box = tuple[float, float, float, float]
 
 
 class Extract(NamedTuple):
-    """Selection: from, to [ns], the second excluded; west, south, east, north [deg]."""
+    """Selected part of the archive: start (included) and end (excluded) of the time range [ns], and
+    a box of west, south, east, north [deg] or None for everywhere.
+    """
 
     since: int
     until: int
@@ -41,7 +43,7 @@ class Extract(NamedTuple):
 
 
 def read_observations(root: Path, part: Extract) -> pa.Table:
-    """Return rows of observations, inbox included, as points."""
+    """Return the selected observations as points; rows that are not compacted yet are included."""
     where = [_time_filter("leave_time", part)]
     if part.bbox is not None:
         west, south, east, north = part.bbox
@@ -58,7 +60,7 @@ def read_observations(root: Path, part: Extract) -> pa.Table:
 
 
 def snapshot_time(root: Path, part: Extract) -> int:
-    """Return the time of the last snapshot of the map before `until` [ns]."""
+    """Return the time [ns] of the last map snapshot before the end of the time range."""
     return snapshots.time_of(_find_snapshot(root, part))
 
 
@@ -74,12 +76,14 @@ def _find_snapshot(root: Path, part: Extract) -> Path:
 
 
 def with_vehicles(table: pa.Table, vehicles: int) -> pa.Table:
-    """Return cells with at least so many vehicles."""
+    """Return the rows of cells that at least `vehicles` vehicles have visited."""
     return table.filter(pc.greater_equal(table["vehicles"], pa.scalar(vehicles, pa.int32())))
 
 
 def map_then(root: Path, part: Extract) -> pa.Table:
-    """Return the last snapshot of the map before `until`."""
+    """Return the last map snapshot before the end of the time range, limited to the box, with cell
+    polygons.
+    """
     path = _find_snapshot(root, part)
     table = load(path, tables.MAP_ARCHIVE)
     if table is None:
@@ -91,8 +95,8 @@ def map_then(root: Path, part: Extract) -> pa.Table:
 
 
 def mask_unmeasured(table: pa.Table, names: Sequence[str], known: BoolArray) -> pa.Table:
-    """Return a table with nulls in the columns `names` where nothing was measured, so that no
-    bound gets a colour.
+    """Return the table with nulls in the columns `names` where `known` (n,) is False. There no
+    value was measured, and a mere lower bound must not be shown with a colour.
     """
     for name in names:
         column = table[name]
@@ -104,7 +108,7 @@ def mask_unmeasured(table: pa.Table, names: Sequence[str], known: BoolArray) -> 
 
 
 def cell_hours(root: Path, part: Extract) -> pa.Table:
-    """Return parts of the roll-up with the polygons of their cells."""
+    """Return the selected hourly statistics per cell (roll-up), with cell polygons."""
     where = [_time_filter("hour", part)]
     days = layout.day_folders(
         root, rollup.TABLE, part.since // layout.DAY_NS, part.until // layout.DAY_NS
@@ -128,22 +132,22 @@ WHAT: Final[dict[str, Callable[[Path, Extract], pa.Table]]] = {
 
 
 def _time_filter(column: str, part: Extract) -> ValueRange:
-    """Return the filter for rows from the first time on and before the second."""
+    """Return a filter for rows within the time range: start included, end excluded."""
     return ValueRange(
         column, -(-part.since // tables.US_STEP), -(-part.until // tables.US_STEP) - 1
     )
 
 
 def _cells_in_box(table: pa.Table, bbox: Box | None) -> pa.Table:
-    """Return the cells that touch a box."""
+    """Return the rows whose cells touch the box."""
     if bbox is None:
         return table
     return table.filter(pa.array(grid.touches(bbox, grid.bounds(table["cell"].to_numpy()))))
 
 
 def write(table: pa.Table, path: Path) -> None:
-    """Write a GeoParquet table in the format of the name's ending; CSV omits binary and nested
-    columns.
+    """Write a GeoParquet table in the format that the ending of the file name selects. CSV omits
+    binary and nested columns.
 
     Raises:
         InputError: the ending is unknown, or the file cannot be written.
@@ -187,7 +191,9 @@ def iso_text(us: int) -> str:
 
 
 def _json_values(table: pa.Table, name: str) -> list[Any]:
-    """Return values for JSON: times as ISO 8601 text, no NaN, no digits beyond single precision."""
+    """Return a column as values for JSON: times as ISO 8601 text, null for NaN, floats rounded to
+    single precision.
+    """
     column = table[name]
     if pa.types.is_timestamp(column.type):
         us = column.cast(tables.US, safe=False).cast(pa.int64()).to_pylist()

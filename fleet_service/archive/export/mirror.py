@@ -1,5 +1,5 @@
-"""Mirror of compacted files, snapshots and roll-ups on another file system: a folder, S3, GCS,
-HDFS.
+"""Mirror of an archive's compacted files, snapshots and roll-ups on another file system: a folder,
+S3, GCS or HDFS.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ _CHUNK: Final = 1 << 22
 
 
 def copy_new_files(root: Path, uri: str, again: Collection[Path] = ()) -> int:
-    """Copy new and rewritten files; return their number.
+    """Copy files that are new or have another size to the mirror at `uri`; return the number of
+    copied files.
 
-    Files that were retired here stay in the mirror. A file appears under its name when it is
-    complete. Files in `again` are copied whatever their size.
+    Files that were removed from the archive stay in the mirror. A file appears under its name only
+    when it is complete. Files in `again` are copied even if their size is unchanged.
 
     Raises:
         InputError: the destination cannot be used.

@@ -1,1 +1,1 @@
-"""File format of an archive: names, versions, segments, reading, snapshots."""
+"""File format of an archive: file names, versions, segments, snapshots, and reading."""

@@ -21,14 +21,16 @@ ROW_GROUP: Final = 128 * 1024  # rows: 5 MB, which is what a query reads at the 
 
 @dataclass(frozen=True)
 class Encoding:
-    """Encoding of a table; DuckDB, pandas, polars and every Spark in use read plain encodings and
-    zstd.
+    """Parquet encoding of a table. Only plain encodings and zstd are used, which DuckDB, pandas,
+    polars and every common Spark version can read.
 
     Attributes:
-        dictionary: columns with repeated values; elsewhere dictionaries cost size and time.
+        dictionary: columns with repeated values, stored with a dictionary; for other columns
+            dictionaries cost size and time.
         delta: integer columns stored as differences.
         index: True to write statistics and page indices for readers of few rows.
-        level: of zstd; 9 saves 2 % over 3 and takes eight times the time.
+        level: compression level of zstd; level 9 saves 2 % compared with 3 and takes eight times
+            the time.
     """
 
     dictionary: tuple[str, ...] = ()
@@ -74,8 +76,8 @@ def write_table(
 
     Args:
         table: the rows.
-        path: of the file; an existing one is replaced.
-        encoding: of the columns.
+        path: path of the file; an existing file is replaced.
+        encoding: encoding of the columns.
         footer: key-value pairs for the footer, in addition to version and digest.
         named: True to make the name durable too; otherwise the caller syncs the folder.
 
@@ -109,7 +111,7 @@ def put_in_place(
     encoding: Encoding,
     footer: Mapping[str, str] | None = None,
 ) -> None:
-    """Write a file below `root`, with its folders; replace an old one.
+    """Write a Parquet file below `root` and create its folders; an existing file is replaced.
 
     Raises:
         OSError: the disk is full or read-only.
@@ -120,7 +122,7 @@ def put_in_place(
 
 
 def sync_tree(root: Path, folders: Iterable[Path]) -> None:
-    """Make new files in `folders`, and those folders themselves, durable."""
+    """Make new files in `folders`, and these folders themselves, durable (fsync up to `root`)."""
     above = {
         parent
         for folder in folders
@@ -132,11 +134,11 @@ def sync_tree(root: Path, folders: Iterable[Path]) -> None:
 
 
 def lock_archive(root: Path) -> BinaryIO:
-    """Lock the archive for this process; the lock is released when the file is closed or the
-    process ends.
+    """Lock the archive for this process; the lock is released when the returned file is closed or
+    the process ends.
 
     Raises:
-        InputError: another service holds it, or the folder cannot be created.
+        InputError: another service has the lock, or the folder cannot be created.
     """
     try:
         root.mkdir(parents=True, exist_ok=True)
@@ -148,7 +150,7 @@ def lock_archive(root: Path) -> BinaryIO:
 
 
 def is_served(root: Path) -> bool:
-    """Return True if a service runs on an archive."""
+    """Return True if a service is running on an archive."""
     try:
         lock_archive(root).close()
     except InputError:
@@ -157,11 +159,11 @@ def is_served(root: Path) -> bool:
 
 
 def lock_file(path: Path, problem: str, fix: str) -> BinaryIO:
-    """Lock a file for as long as the handle is open.
+    """Lock a file for as long as the returned handle is open.
 
     Raises:
-        InputError: another process holds it (with `problem` and `fix`), or the file cannot be
-            created.
+        InputError: another process has the lock (the error states `problem` and `fix`), or the file
+            cannot be created.
     """
     try:
         file = path.open("ab")

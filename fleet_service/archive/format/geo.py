@@ -1,8 +1,8 @@
-"""GeoParquet 1.1 with pyarrow alone: WKB geometries, a bounding box per row, and the `geo` key of
-the footer.
+"""GeoParquet 1.1 written with pyarrow alone: geometries as well-known binary (WKB), a bounding box
+per row, and the `geo` key of the footer.
 
-Source: GeoParquet specification 1.1.0 (OGC), and the OGC simple features' well-known binary.
-Axis order is longitude, latitude; a file without `crs` is OGC:CRS84 by the specification.
+Source: GeoParquet specification 1.1.0 (OGC), and the OGC simple features' well-known binary. Axis
+order is longitude, latitude; a file without `crs` is OGC:CRS84 by the specification.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ Pieces = Sequence[Sequence[int]]
 
 
 def with_cells(table: pa.Table) -> pa.Table:
-    """Return a table with a column `cell` as a GeoParquet table with the cells' polygons.
+    """Return a table with a column `cell` as a GeoParquet table with the polygons of the cells.
 
-    If it also has a column `sector`, a row's polygon is the quarter of the cell that belongs to
-    that heading sector (grid.outline), so that no polygon covers another.
+    If the table also has a column `sector`, a row's polygon is the quarter of the cell that belongs
+    to this heading sector (`grid.outline`), so that polygons do not overlap.
     """
     x, y = _cell_outlines(table, table["cell"].to_numpy())
     return _add_geo_metadata(
@@ -44,10 +44,11 @@ def with_cells(table: pa.Table) -> pa.Table:
 
 
 def with_stretches(table: pa.Table, cells: Pieces) -> pa.Table:
-    """Return a GeoParquet table with one multi-polygon per row, for rows of several cells each.
+    """Return a GeoParquet table with one multi-polygon per row, for rows that consist of several
+    cells.
 
-    `cells` has the cells of each row. If the table has a column `sector`, each polygon is the
-    quarter of the cell that belongs to that heading sector.
+    `cells` contains the cells of each row. If the table has a column `sector`, each polygon is the
+    quarter of the cell that belongs to this heading sector.
     """
     count = np.array([len(own) for own in cells], np.int64)
     first = np.concatenate([[0], np.cumsum(count)])
@@ -68,7 +69,9 @@ def with_stretches(table: pa.Table, cells: Pieces) -> pa.Table:
 
 
 def with_points(table: pa.Table, longitude: FloatArray, latitude: FloatArray) -> pa.Table:
-    """Return a table with points [deg], (n,) each, as a GeoParquet table."""
+    """Return a table with one point per row as a GeoParquet table; longitude and latitude are (n,)
+    [deg].
+    """
     wkb = np.zeros(len(longitude), _POINT)
     wkb["order"], wkb["type"] = _LITTLE_ENDIAN, _TYPE_POINT
     wkb["xy"] = np.stack([longitude, latitude], axis=1)
@@ -93,8 +96,8 @@ def geojson_shapes(table: pa.Table) -> Iterator[dict[str, Any]]:
 
 
 def _read_rings(wkb: bytes, count: int, begin: int) -> list[Any]:
-    """Return the rings of `count` polygons with one ring and equally many corners, from a byte
-    on.
+    """Return the rings of `count` polygons from WKB bytes, starting at byte `begin`. Each polygon
+    must have one ring, and all must have the same number of corners.
     """
     corners = struct.unpack_from("<I", wkb, begin + _RING.itemsize - 4)[0] if count else 0
     rings: list[Any] = np.frombuffer(wkb, _ring_dtype(corners), count, begin)["xy"][
@@ -110,9 +113,10 @@ def _ring_dtype(corners: int) -> np.dtype[Any]:
 def _cell_outlines(
     table: pa.Table, cells: IntArray, count: IntArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the corners (n, k) of cells, or of their quarters if the table has a column `sector`.
+    """Return longitudes and latitudes of the corners of cells, (n, k) each. If the table has a
+    column `sector`, the corners are those of the quarters of cells.
 
-    `count` is the number of cells per row.
+    `count` is the number of cells per row; None means one.
     """
     if "sector" not in table.schema.names:
         return grid.outline(cells)
@@ -127,7 +131,7 @@ def _bounding_sides(
 
 
 def _wkb_polygons(x: FloatArray, y: FloatArray) -> np.ndarray[Any, Any]:
-    """Return polygons of the corners x, y (n, k), each as a closed ring."""
+    """Return WKB polygons from the corners x, y (n, k), each as a closed ring."""
     wkb = np.zeros(len(x), _ring_dtype(x.shape[1] + 1))
     wkb["order"], wkb["type"], wkb["rings"], wkb["points"] = (
         _LITTLE_ENDIAN,

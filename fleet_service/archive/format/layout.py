@@ -1,17 +1,17 @@
-"""Layout of an archive: names are built and parsed only here.
+"""Folders and file names of an archive; names are built and parsed only here.
 
-    inbox/…                                                     the log, see `segments`
+    inbox/…                                                     new rows, see `segments`
     observations/date=2026-01-31/zone=q1202310/NAME.parquet     compacted, sorted by cell and time
     states/date=…/zone=…/NAME.parquet                           compacted
-    checkpoints/…                                               start of a restart, see
+    checkpoints/…                                               state for a fast restart, see
                                                                 `replay.checkpoints`
     requests/…                                                  see `erasure_requests`
-    drafts/                                                     files being written; nothing there
-                                                                counts
+    drafts/                                                     unfinished files, ignored by readers
 
-The date is that of the measurement (UTC). NAME is that of the newest segment whose rows the file
-holds. If services succeed each other by a lease, the epoch of the compacting service follows SHARD:
-two services that compact at once, because one was frozen, never write the same name.
+The date is that of the measurement (UTC). NAME is the name of the newest segment from which the
+file contains rows. If several services own the archive in turn (by a lease), the epoch of the
+compacting service follows SHARD. Two services may compact at once, because one of them was frozen;
+the epoch ensures that they never write the same name.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ _DAY: Final = re.compile(
 
 
 class Cut(NamedTuple):
-    """Position in the log: everything up to this segment. Names only increase, independent of
-    the clock.
+    """Position in the sequence of segments: everything up to and including this segment. Names only
+    increase, independent of the clock.
     """
 
     epoch: int
@@ -67,14 +67,14 @@ class Cut(NamedTuple):
 
 
 class Partition(NamedTuple):
-    """Folder of compacted rows: days since 1970 and z7 zone."""
+    """Folder of compacted rows: day (days since 1970) and z7 zone."""
 
     day: int
     zone: int
 
     def folder(self, root: Path, table: str) -> Path:
-        """Return the partition's folder. The letter before the zone keeps readers from parsing it
-        as a number.
+        """Return the partition's folder. A letter precedes the zone, so that readers do not parse
+        it as a number.
         """
         zone = f"zone=q{grid.quadkey(self.zone, grid.ZONE_ZOOM)}"
         return root / table / f"date={date_of(self.day)}" / zone
@@ -85,7 +85,8 @@ MARKS: Final = ("inbox", "observations", "states", "keys", "rollup", "map")
 
 
 def require_archive(root: Path) -> None:
-    """Raise unless a folder is an archive, because compaction would write into it.
+    """Raise unless a folder is an archive. This check prevents compaction from writing into other
+    folders.
 
     Raises:
         InputError: it is not a folder, or no service created it.
@@ -103,7 +104,7 @@ def require_archive(root: Path) -> None:
 
 
 def partitions_of(time: IntArray, cell: IntArray) -> tuple[IntArray, IntArray]:
-    """Return day and zone of rows, (n,) each."""
+    """Return day and zone of rows, two arrays (n,), from their times [ns] and cells."""
     return time // DAY_NS, grid.zone_of(cell)
 
 
@@ -113,7 +114,7 @@ def date_of(day: int) -> date:
 
 
 def day_of(folder: Path) -> int:
-    """Return the days since 1970 of a folder `date=…`."""
+    """Return the day (days since 1970) of a folder named `date=…`."""
     return (date.fromisoformat(folder.name.removeprefix("date=")) - _EPOCH).days
 
 
@@ -127,7 +128,9 @@ def partition_of(path: Path) -> Partition:
 def compacted_files(
     root: Path, kind: Kind, since_day: int | None = None, until_day: int | None = None
 ) -> Iterator[Path]:
-    """Yield the compacted files of a kind by date, zone and age; both days are included."""
+    """Yield the compacted files of a kind, sorted by date, zone and age. The first and the last day
+    are included.
+    """
     for folder in day_folders(root, TABLES[kind], since_day, until_day):
         yield from sorted(folder.glob("zone=*/*.parquet"))
 
@@ -135,7 +138,7 @@ def compacted_files(
 def day_folders(
     root: Path, table: str, since_day: int | None = None, until_day: int | None = None
 ) -> list[Path]:
-    """Return the folders of a table's days in order."""
+    """Return the folders of a table's days in order of time; both limits are included."""
     found = sorted(path for path in (root / table).glob("date=*") if _DAY.fullmatch(path.name))
     return [
         folder
@@ -146,29 +149,32 @@ def day_folders(
 
 
 def segment_name(prefix: str, number: int) -> str:
-    """Return the name of a segment; `prefix` is SHARD-EPOCH."""
+    """Return the file name of a segment; `prefix` has the form SHARD-EPOCH."""
     return f"{prefix}-{number:08d}.parquet"
 
 
 def with_term(name: str, term: int) -> str:
-    """Return the first part of a file's name with the writer's term instead of a former one, so
-    that it replaces no other file; 0 without terms."""
+    """Return the first part of a file name with the term (lease epoch) of the writing service. An
+    earlier term in the name is replaced, so that the new file replaces no other file. Without terms
+    (0), return the name unchanged.
+    """
     return f"{_TERM.sub('', name)}.{term:010d}" if term else name
 
 
 def compacted_name(name: str, term: int) -> str:
-    """Return the name of a compacted file from its newest segment and the term of the compacting
-    service; 0 without terms."""
+    """Return the name of a compacted file, made from the name of its newest segment and the term
+    (lease epoch) of the compacting service; 0 without terms.
+    """
     shard, epoch, number = name.rsplit("-", 2)
     return f"{with_term(shard, term)}-{epoch}-{number}"
 
 
 def term_of(name: str) -> int | None:
-    """Return the epoch of the service that made an object of an archive's copy; None if its name
-    has none.
+    """Return the term (lease epoch) of the service that created an object of an archive's copy;
+    None if its name contains none.
 
     Segments, checkpoints, weather and vehicle identities have the epoch of their service; compacted
-    files and their roll-ups that of the compacting service.
+    files and their roll-ups have the epoch of the compacting service.
     """
     folder, _, rest = name.partition("/")
     if folder == CHECKPOINTS:
@@ -178,9 +184,7 @@ def term_of(name: str) -> int | None:
 
 
 def age_key(name: str) -> tuple[int, int, str]:
-    """Return a sort key that orders segments, or files with their rows, from old to new: epoch,
-    number, shard.
-    """
+    """Return a key that sorts segments or compacted files from old to new: epoch, number, shard."""
     shard, epoch, number = Path(name).stem.rsplit("-", 2)
     return int(epoch), int(number), shard
 
@@ -193,10 +197,10 @@ def read_epoch(root: Path) -> int:
 
 
 def write_epoch(root: Path, epoch: int) -> None:
-    """Write this epoch into the names of files compacted from now on.
+    """Store the epoch that the names of compacted files contain from now on.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     with open_durably(root / EPOCH_FILE) as file:
         file.write(f"{epoch}\n".encode())

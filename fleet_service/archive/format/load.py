@@ -1,8 +1,9 @@
-"""Reading of one file of the archive, verified, with the columns that this version knows.
+"""Reading and verification of one file of the archive.
 
-A missing column is null, and an unknown one is ignored. A file is damaged if a checksum, a digest
-or a text is wrong. The service that writes the archive, and its compaction, set a damaged file
-aside. Readers skip it with a warning and change nothing.
+The result has the columns that this version knows: a missing column is null, and an unknown column
+is ignored. A file is damaged if a checksum, a digest or a text is wrong. The service that writes
+the archive, and its compaction, rename a damaged file so that it is not read again. Readers skip it
+with a warning and change nothing.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ Damaged = Callable[[Path, str], None]
 
 
 def skip_damaged(path: Path, problem: str) -> None:
-    """Leave a damaged file in place and log a warning; for readers."""
+    """Log a warning about a damaged file and leave it in place; for readers."""
     log.warning("%s is damaged and is ignored: %s", path, problem)
 
 
@@ -72,12 +73,16 @@ def set_aside(path: Path, problem: str) -> None:
 
 
 def count_set_aside(root: Path) -> int:
-    """Return the number of damaged files of an archive; this scans all of it."""
+    """Return the number of damaged files that were set aside in an archive. This scans the whole
+    archive.
+    """
     return sum(1 for _ in root.rglob(f"*{BAD}"))
 
 
 class Content(NamedTuple):
-    """Rows of a file with its own columns, its version and its key-value pairs."""
+    """Complete content of a file: rows with all columns of the file, its format version, and the
+    key-value pairs of its footer.
+    """
 
     table: pa.Table
     version: Version
@@ -96,17 +101,17 @@ def load(
     """Return the rows of one file; None if it is damaged.
 
     Args:
-        path: of the file.
+        path: path of the file.
         schema: the columns that this version knows.
         columns: columns to return; None for all known ones.
-        where: filter on returned columns; row groups without a match are skipped.
+        where: filter on returned columns; row groups without a matching row are skipped.
         whole: True to verify every column, not only the returned ones.
         damaged: called with a damaged file.
 
     Raises:
-        FileNotFoundError: it does not exist any more.
-        InputError: it is of a newer major version.
-        OSError: the system cannot read.
+        FileNotFoundError: the file no longer exists.
+        InputError: the file has a newer major version.
+        OSError: the file cannot be read.
     """
     known = schema if columns is None else pa.schema([schema.field(name) for name in columns])
 
@@ -131,14 +136,14 @@ def load_groups(
     take: Callable[[pa.Table], None],
     damaged: Damaged = skip_damaged,
 ) -> bool:
-    """Read a file like `load`, passing the rows to `take` one row group at a time.
+    """Read a file like `load`, but pass the rows to `take` one row group at a time.
 
-    A complete file takes several times the memory of its rows while it is read. Of a row group
-    without a match only the columns of `where` are read. The result is False if the file is
-    damaged; discard the rows taken from it.
+    This saves memory: reading a complete file takes several times the memory of its rows. In a row
+    group without a match, only the columns of `where` are read. The result is False if the file is
+    damaged; the caller must then discard the rows taken from it.
 
     Raises:
-        as `load`.
+        the same errors as `load`.
     """
     known = pa.schema([schema.field(name) for name in columns])
 
@@ -170,7 +175,9 @@ def _read_batches(file: pq.ParquetFile, group: int, names: list[str]) -> Iterato
 
 
 def _read_row_groups(file: pq.ParquetFile, names: list[str] | None, where: Where) -> pa.Table:
-    """Return the row groups that may match, one after the other, filtered."""
+    """Return the rows that match the filter; read only row groups that may contain such rows, one
+    after the other.
+    """
     own = file.schema_arrow
     known = [one for one in where if one.column in own.names]
     parts = [
@@ -185,10 +192,11 @@ def _read_row_groups(file: pq.ParquetFile, names: list[str] | None, where: Where
 
 
 def read_content(path: Path, damaged: Damaged = skip_damaged) -> Content | None:
-    """Return everything in a file, unknown columns included; None if it is damaged.
+    """Return the complete content of a file, including unknown columns; None if the file is
+    damaged.
 
     Raises:
-        as `load`.
+        the same errors as `load`.
     """
     return _read_verified(path, lambda file: file.read(), damaged)
 
@@ -222,7 +230,8 @@ def _read_verified(
 
 
 def conform_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
-    """Return the columns of `schema`: null if the table has none, cast if the type differs.
+    """Return the table with the columns of `schema`: null where the table has no such column, cast
+    where the type differs.
 
     Raises:
         InputError: a value does not fit the type, or a required column is missing.

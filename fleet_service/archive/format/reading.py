@@ -1,10 +1,10 @@
-"""Reading of an archive: every row once, from the inbox or a compacted file, also during a
-compaction.
+"""Reading of an archive so that every row is read exactly once, from the inbox or from a compacted
+file, even during a compaction.
 
-The inbox is read first and completely; if a compaction deletes segments meanwhile, the reader
+The inbox is read first and completely. If a compaction deletes segments meanwhile, the reader
 starts again. Then the compacted files are listed once. Rows of a segment are skipped if a listed
-file holds them. A file that appears later is not read, because its rows were read from the inbox.
-The order of these steps is what makes the result correct.
+file contains them. A file that appears later is not read, because its rows were already read from
+the inbox. The result is correct only with this order of steps.
 """
 
 from __future__ import annotations
@@ -34,12 +34,17 @@ _TURNS: Final = 100  # a reader that is overtaken by so many compactions has ano
 
 
 class Wanted(NamedTuple):
-    """Selection of rows: columns (None for all), filter, days of measurement (both included),
-    position in the log.
+    """Selection of rows.
 
-    It may yield more than was written after the position: the rest of a compacted file. It yields
-    nothing of the inbox written after `until`, and only compacted files of zones that touch a box
-    [deg].
+    Attributes:
+        columns: columns to read; None for all.
+        where: filter on rows.
+        days: first and last day of measurement, both included.
+        after: read only files that were written after this position. A compacted file is read as a
+            whole, so it may contain older rows too.
+        until: read no segment of the inbox that was written after this position.
+        box: read only compacted files of zones that touch this box (west, south, east, north
+            [deg]).
     """
 
     columns: Sequence[str] | None = None
@@ -50,8 +55,8 @@ class Wanted(NamedTuple):
     box: tuple[float, float, float, float] | None = None
 
     def newer(self, path: Path) -> bool:
-        """Return True if a file was written after the position `after`: a segment, or a compacted
-        file, whose name contains its newest segment.
+        """Return True if a file was written after the position `after`. The file is a segment, or a
+        compacted file, whose name contains its newest segment.
         """
         return self.after is None or layout.age_key(path.name)[:2] > self.after
 
@@ -64,19 +69,19 @@ def read_tables(
     days: tuple[int | None, int | None] = (None, None),
     damaged: Damaged = skip_damaged,
 ) -> Iterator[pa.Table]:
-    """Yield tables that together hold every row once; damaged files are skipped.
+    """Yield tables that together contain every row once; damaged files are skipped.
 
     Args:
-        root: of the archive.
+        root: folder of the archive.
         kind: observations or states.
-        columns: None for all.
+        columns: columns to read; None for all.
         where: filter; row groups without a match are skipped.
-        days: first and last day of measurement; may yield more.
-        damaged: called with a damaged file.
+        days: first and last day of measurement; rows of other days may be included too.
+        damaged: called with each damaged file.
 
     Raises:
-        InputError: a file is of a newer major version.
-        OSError: the system cannot read.
+        InputError: a file has a newer major version.
+        OSError: a file cannot be read.
     """
     yield from read_wanted(root, kind, Wanted(columns, where, days), damaged)
 
@@ -84,7 +89,7 @@ def read_tables(
 def read_wanted(
     root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged
 ) -> Iterator[pa.Table]:
-    """Yield tables like `read_tables`, for a selection."""
+    """Yield tables like `read_tables`, for a selection `wanted`."""
     listing = Listing(root, kind, wanted, damaged)
     yield from listing.inbox()
     for path in listing.files:
@@ -94,11 +99,11 @@ def read_wanted(
 
 
 class Listing:
-    """Rows of an archive at one moment: the inbox, and the list of compacted files, which are read
-    later.
+    """State of an archive at one moment: the rows of the inbox, and a list of compacted files,
+    which are read later.
 
     Args:
-        as of `read_tables`.
+        the same as for `read_tables` and `read_wanted`.
     """
 
     def __init__(
@@ -116,7 +121,7 @@ class Listing:
         self.files = [path for path in files_near(files, wanted.box) if wanted.newer(path)]
 
     def inbox(self) -> Iterator[pa.Table]:
-        """Yield the rows that no compacted file holds; call it once."""
+        """Yield the inbox rows that no compacted file contains; call this only once."""
         fresh = self._fresh
         self._fresh = []
         for path, table in fresh:
@@ -125,7 +130,9 @@ class Listing:
             )
 
     def load_groups(self, path: Path, where: Where, take: Callable[[pa.Table], None]) -> bool:
-        """Read a file like `load`, one row group at a time; if False, discard the rows taken."""
+        """Read a file like `load`, but pass the rows to `take` one row group at a time. Return
+        False if the file is damaged or missing; the caller must then discard the rows taken.
+        """
         both = [*(self._wanted.where or ()), *where]
         try:
             return load_groups(path, self._schema, self._names, both, take, self._damaged)
@@ -133,8 +140,8 @@ class Listing:
             return False
 
     def load(self, path: Path, where: Where | None = None) -> pa.Table | None:
-        """Return the rows of one file that also match this filter; None if it is damaged, or its
-        day was retired.
+        """Return the rows of one file that match the selection and the filter `where`. Return None
+        if the file is damaged, or its day has been removed.
         """
         both = [*(self._wanted.where or ()), *(where or ())]
         try:
@@ -144,7 +151,7 @@ class Listing:
 
 
 def files_near(files: Sequence[Path], box: tuple[float, float, float, float] | None) -> list[Path]:
-    """Return the compacted files of zones that touch a box [deg], or all."""
+    """Return the compacted files of zones that touch a box [deg]; all files if the box is None."""
     if box is None or not files:
         return list(files)
     zone = np.array([layout.partition_of(path).zone for path in files])
@@ -175,9 +182,11 @@ def _read_inbox(
 
 
 def compacted_partitions(files: Iterable[Path], names: set[str]) -> dict[str, set[Partition]]:
-    """Return, by segment name, the partitions into which its rows are already compacted.
+    """Return, for each segment name, the partitions whose rows of this segment are already
+    compacted.
 
-    A file is named by its newest segment, so older files need not be opened.
+    A file is named after its newest segment. Therefore files older than all segments need not be
+    opened.
     """
     done: dict[str, set[Partition]] = {}
     if not names:
@@ -191,7 +200,7 @@ def compacted_partitions(files: Iterable[Path], names: set[str]) -> dict[str, se
 
 
 def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Table:
-    """Return the rows that lie in none of the partitions."""
+    """Return the rows that are in none of the partitions `done`."""
     if not done or not table.num_rows:
         return table
     day, zone = layout.partitions_of(
@@ -204,11 +213,11 @@ def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Tabl
 
 
 def sources_of(path: Path) -> set[str]:
-    """Return the segments whose rows of its partition a compacted file holds; empty if it is
-    missing or damaged.
+    """Return the names of the segments from which a compacted file contains rows; empty if the file
+    is missing or damaged.
 
     Raises:
-        InputError: it is of a newer major version.
+        InputError: the file has a newer major version.
     """
     try:
         footer = pq.read_metadata(path)

@@ -1,5 +1,5 @@
-"""The README of every archive: folders, and every column with unit and meaning, from the
-contract.
+"""The README file of an archive: folders, and every column with unit and meaning, generated from
+the contract.
 """
 
 from __future__ import annotations
@@ -79,11 +79,11 @@ def _escape_cell(value: str) -> str:
 
 
 def write_if_outdated(root: Path) -> None:
-    """Write the page into an archive if it is missing or outdated. A foreign page of that name
-    stays.
+    """Write the README into an archive if it is missing or outdated. A README that GripMap did not
+    write stays unchanged.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     path = root / NAME
     page = page_text().encode()

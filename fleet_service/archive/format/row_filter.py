@@ -1,8 +1,8 @@
-"""Row filter by the range of a column, which can be evaluated on a file's statistics before any row
-is read.
+"""Row filter: a range of values per column. It can be evaluated on a file's statistics before any
+row is read.
 
-Ranges are used instead of Arrow's expressions. Those import pandas (40 MB per process), and their
-scan holds several complete row groups in memory.
+Ranges are used instead of Arrow's expressions for two reasons. Expressions import pandas (40 MB per
+process), and their scan holds several complete row groups in memory.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ Bound = int | float | str | None
 
 
 class ValueRange(NamedTuple):
-    """Rows whose value lies from `least` to `most`, both included; None for no limit. Times are
-    whole microseconds. A row without a value is not selected."""
+    """Filter for rows whose value lies from `least` to `most`, both included; None means no limit.
+    Times are in whole microseconds. A row without a value does not match.
+    """
 
     column: str
     least: Bound = None
@@ -30,7 +31,7 @@ Where = Sequence[ValueRange]
 
 
 def filter_table(table: pa.Table, where: Where) -> pa.Table:
-    """Return the selected rows of a table, with all columns."""
+    """Return the rows of a table that match all ranges, with all columns."""
     for column, least, most in where:
         values = table[column]
         if pa.types.is_timestamp(values.type):
@@ -44,7 +45,9 @@ def filter_table(table: pa.Table, where: Where) -> pa.Table:
 
 
 def matching_row_groups(footer: pq.FileMetaData, where: Where) -> list[int]:
-    """Return the row groups of a file that may hold selected rows, by their statistics."""
+    """Return the indices of the row groups that may contain matching rows, judged by their
+    statistics.
+    """
     places = {footer.schema.column(at).path: at for at in range(footer.num_columns)}
     known = [(places[one.column], one) for one in where if one.column in places]
     return [

@@ -1,10 +1,10 @@
-"""Segments: admitted rows as Parquet files of the log, and reading them.
+"""Segments: admitted rows as Parquet files in the archive's inbox, written and read here.
 
     inbox/SHARD-EPOCH-SEQ.parquet          observations
     inbox/states/SHARD-EPOCH-SEQ.parquet   states
 
-EPOCH grows with every start of the service and SEQ with every segment, so that a name is never used
-twice.
+EPOCH increases with every start of the service and SEQ with every segment, so that a name is never
+used twice.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ Rows = dict[str, NDArray[Any]]
 
 
 def segment_folder(root: Path, kind: Kind) -> Path:
-    """Return the folder of a kind's segments."""
+    """Return the folder for segments of a kind (observations or states)."""
     return root / _FOLDERS[kind]
 
 
 def list_segments(root: Path, kind: Kind) -> list[Path]:
-    """Return the segments of a kind, oldest first within a shard."""
+    """Return the segments of a kind, sorted from old to new by epoch and number."""
     return sorted(
         segment_folder(root, kind).glob("*.parquet"), key=lambda path: layout.age_key(path.name)
     )
@@ -52,9 +52,9 @@ class Writer:
     """Writer of the segments of one run of one service.
 
     Args:
-        root: of the archive.
+        root: folder of the archive.
         shard: name of the service.
-        epoch: smallest epoch, from the lease.
+        epoch: smallest allowed epoch, from the lease.
     """
 
     def __init__(self, root: Path, shard: str, epoch: int = 0) -> None:
@@ -87,16 +87,17 @@ class Writer:
 
     @property
     def newest(self) -> layout.Cut:
-        """Return the last written segment."""
+        """Return the position of the last written segment."""
         return layout.Cut(self._epoch, self._seq)
 
     def write(self, kind: Kind, rows: Rows) -> Path:
-        """Write one segment from columns (n,); it is durable after `sync`.
+        """Write one segment from columns (n,); return its path. The segment is durable only after
+        `sync`.
 
-        `log_likelihood` is (n, 32); `with_likelihood` (n,) is true for rows that have one.
+        `log_likelihood` is (n, 32); `with_likelihood` (n,) is true for rows that have a likelihood.
 
         Raises:
-            OSError: it could not be written; no draft is left.
+            OSError: the file could not be written; no draft is left.
         """
         self._seq += 1
         path = segment_folder(self._root, kind) / layout.segment_name(
@@ -107,7 +108,8 @@ class Writer:
         return path
 
     def sync(self) -> None:
-        """Make the names of the written segments durable. After a failure only this is repeated.
+        """Make the names of the written segments durable. After a failure of this call, repeat only
+        this call.
 
         Raises:
             OSError: a folder cannot be synced.
@@ -118,8 +120,8 @@ class Writer:
 
 
 def round_to_steps(rows: Rows) -> Rows:
-    """Return rows with floats at multiples of their column's step and times in microseconds, so
-    that the fusion uses exactly the values that are stored.
+    """Return rows with floats rounded to multiples of their column's step and times rounded down to
+    microseconds. The fusion then uses exactly the values that are stored.
     """
     out = {
         name: np.rint(c / _STEPS[name]) * _STEPS[name] if name in _STEPS else c
@@ -136,7 +138,7 @@ def to_nanoseconds(times: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
 
 
 def table_of(kind: Kind, rows: Rows) -> pa.Table:
-    """Return columns as an Arrow table of the archive's schema."""
+    """Return columns as an Arrow table with the archive's schema for this kind."""
     return pa.Table.from_arrays(
         [_make_column(f, rows) for f in SCHEMAS[kind]], schema=SCHEMAS[kind]
     )
@@ -158,15 +160,15 @@ def _make_column(f: pa.Field[Any], rows: Rows) -> pa.Array[Any]:
 
 
 def is_value(mu: Float32Array, used: Float32Array) -> BoolArray:
-    """Return True for rows (n,) that give a value of mu and not only a bound: their vehicles used
-    EXCITED_SHARE of it. The result for NaN is False.
+    """Return a mask of rows (n,): True if the row gives a value of μ and not only a lower bound,
+    because the vehicle used at least the share EXCITED_SHARE of it. The result for NaN is False.
     """
     return np.asarray(used.astype(np.float64) >= (EXCITED_SHARE - NEARLY) * mu.astype(np.float64))
 
 
 def rows_of(table: pa.Table) -> Rows:
-    """Return the columns of a table as `Writer.write` takes them; times are int64, and null
-    becomes the default.
+    """Return the columns of a table in the form that `Writer.write` takes. Times are int64 [ns],
+    and null becomes the column's default.
     """
     rows: Rows = {}
     for f in table.schema:
@@ -182,7 +184,9 @@ def rows_of(table: pa.Table) -> Rows:
 
 
 def _without_null(f: pa.Field[Any], column: pa.Array[Any]) -> pa.Array[Any]:
-    """Return a column without null: columns of older versions get the default; floats get NaN."""
+    """Return a column without nulls, which occur in files of older versions. Floats get NaN, other
+    types the column's default.
+    """
     if not column.null_count or pa.types.is_floating(f.type):
         return column
     filled: pa.Array[Any] = column.fill_null(
@@ -192,7 +196,9 @@ def _without_null(f: pa.Field[Any], column: pa.Array[Any]) -> pa.Array[Any]:
 
 
 def _read_likelihoods(column: pa.Array[Any]) -> NDArray[np.uint8]:
-    """Return fixed-size binary as (n, 32); rows without one are flat."""
+    """Return a column of log-likelihoods as an array (n, 32); rows without a likelihood are flat
+    (zeros).
+    """
     filled: pa.Array[Any] = column.fill_null(bytes(mugrid.BINS))
     data = np.frombuffer((filled.buffers()[1] or pa.py_buffer(b"")).to_pybytes(), np.uint8).reshape(
         -1, mugrid.BINS

@@ -1,7 +1,6 @@
 """Snapshots of the public map: one GeoParquet file per hour.
 
-map/date=2026-01-31/20260131T070000Z.parquet      cells that are public, their polygons, sorted by
-                                                  cell
+map/date=2026-01-31/20260131T070000Z.parquet public cells with their polygons, sorted by cell
 """
 
 from __future__ import annotations
@@ -23,10 +22,11 @@ _NAME: Final = "%Y%m%dT%H%M%SZ"
 
 
 def write_snapshot(root: Path, table: pa.Table, now: int) -> Path:
-    """Store the map of a moment [ns]; `table` has the schema of the map.
+    """Store the map at the time `now` [ns]; `table` has the schema of the map. Return the path of
+    the file.
 
     Raises:
-        OSError: it could not be written; no draft is left.
+        OSError: the file could not be written; no draft is left.
     """
     path = path_of(root, now)
     time = pa.array(np.full(table.num_rows, now // tables.US_STEP)).cast(tables.US)
@@ -39,18 +39,18 @@ def write_snapshot(root: Path, table: pa.Table, now: int) -> Path:
 
 
 def path_of(root: Path, now: int) -> Path:
-    """Return the path of the map of a moment [ns]."""
+    """Return the path of the snapshot for the time `now` [ns]."""
     moment = datetime.fromtimestamp(now // NS, UTC)
     return root / TABLE / f"date={moment:%Y-%m-%d}" / f"{moment:{_NAME}}.parquet"
 
 
 def time_of(path: Path) -> int:
-    """Return the time [ns] of a snapshot."""
+    """Return the time [ns] of a snapshot from its file name."""
     return int(datetime.strptime(path.stem, _NAME).replace(tzinfo=UTC).timestamp()) * NS
 
 
 def newest_snapshot(root: Path, until: int) -> Path | None:
-    """Return the last snapshot taken up to a moment [ns]."""
+    """Return the path of the last snapshot taken at `until` [ns] or before; None if there is none."""
     for folder in reversed(layout.day_folders(root, TABLE, until_day=until // layout.DAY_NS)):
         for path in sorted(folder.glob("*.parquet"), reverse=True):
             if time_of(path) <= until:

@@ -1,4 +1,4 @@
-"""Format version of a file and digest of its columns, both in the footer.
+"""Format version of an archive file and digest of its columns, both in the Parquet footer.
 
 | version | change |
 |---|---|
@@ -9,8 +9,8 @@
 
 A minor version adds columns: older readers ignore them, newer readers read null. A major version
 changes the meaning of a column: older readers refuse the file. The digest is computed in the same
-way in all versions, so that damage differs from another version. Parquet's page checksums cover the
-values, but not the names and types of the columns.
+way in all versions, so that a damaged file is not mistaken for one of another version. Parquet's
+page checksums cover the values, but not the names and types of the columns.
 """
 
 from __future__ import annotations
@@ -56,12 +56,12 @@ FIRST: Final = frozenset(
 
 
 class DamagedError(Exception):
-    """The content of the file differs from the content that was written."""
+    """Error for a file whose content differs from the content that was written."""
 
 
 def make_footer(schema: pa.Schema, entries: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return key-value pairs for the footer of a file: `entries`, a version if they have none,
-    and the digest.
+    """Return key-value pairs for the footer of a file: `entries`, the digest, and the current
+    version unless `entries` contains one.
     """
     own = {KEY: str(VERSION), **(entries or {})}
     own = {key: value for key, value in own.items() if key != DIGEST}
@@ -69,8 +69,8 @@ def make_footer(schema: pa.Schema, entries: Mapping[str, str] | None = None) -> 
 
 
 def entries_of(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
-    """Return this project's key-value pairs of a file; undecodable ones are damage, which the
-    digest shows.
+    """Return this project's key-value pairs from a file's footer. Bytes that cannot be decoded are
+    replaced; the digest then detects the damage.
     """
     return {
         key.decode(errors="replace"): value.decode(errors="replace")
@@ -80,16 +80,18 @@ def entries_of(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
 
 
 def is_newer(entries: Mapping[str, str]) -> bool:
-    """Return True if a file states a newer major version; a quick check, `check_version` decides."""
+    """Return True if a file states a newer major version. This is only a quick check;
+    `check_version` decides.
+    """
     return entries.get(KEY, "0").partition(".")[0] > str(VERSION.major)
 
 
 def check_version(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
-    """Return the version of a file with these columns and key-value pairs.
+    """Return the version of a file, given its columns and key-value pairs.
 
     Raises:
-        DamagedError: its columns or its key-value pairs are not those that were written.
-        InputError: it is of a newer major version, or states no valid version.
+        DamagedError: the columns or the key-value pairs are not those that were written.
+        InputError: the file has a newer major version, or states no valid version.
     """
     if KEY not in entries and DIGEST not in entries:
         if schema_digest(schema, {}) not in FIRST:
@@ -115,7 +117,7 @@ def parse_version(text: str) -> Version:
     """Return a version from its text.
 
     Raises:
-        InputError: it is not two numbers.
+        InputError: the text is not of the form MAJOR.MINOR.
     """
     if re.fullmatch(r"[0-9]{1,6}\.[0-9]{1,6}", text) is None:
         raise InputError(
@@ -128,7 +130,7 @@ def parse_version(text: str) -> Version:
 
 
 def schema_digest(schema: pa.Schema, entries: Mapping[str, str]) -> str:
-    """Return the hash (16 hexadecimal digits) of names and types of columns, and of key-value
+    """Return a hash (16 hexadecimal digits) over names and types of the columns, and over key-value
     pairs.
     """
     state = _hash_columns(tuple(schema.names), tuple(schema.types)).copy()
@@ -144,8 +146,8 @@ def _hash_columns(names: tuple[str, ...], types: tuple[pa.DataType, ...]) -> bla
 
 
 def _type_name(kind: pa.DataType) -> str:
-    """Return the name of a type; that of a list's values differs between versions of Arrow and
-    is omitted.
+    """Return the name of a type. The name of a list's item differs between versions of Arrow and is
+    omitted.
     """
     if pa.types.is_list(kind):
         return f"list<{_type_name(kind.value_type)}>"

@@ -1,1 +1,1 @@
-"""Vehicle identities of an archive: pseudonyms, numbers, erasure."""
+"""Vehicle identities in an archive: pseudonyms, permanent numbers, and erasure."""

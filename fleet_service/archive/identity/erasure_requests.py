@@ -1,10 +1,11 @@
-"""Requests of the archive's owner to the running service, as files. Only the service may erase.
+"""Erasure requests from the archive's owner to the running service, as files. Only the service may
+erase data.
 
     requests/NAME.json           the request: a month, and a vehicle or none
-    requests/NAME.answer.json    the result, or the reason of refusal; the request is removed then
+    requests/NAME.answer.json    the result, or the reason of refusal; replaces the request
 
-Write access to the archive is the right to make a request. A request survives a restart of the
-service: the next service finds it.
+Anyone with write access to the archive may make a request. A request survives a restart of the
+service.
 """
 
 from __future__ import annotations
@@ -29,17 +30,17 @@ _KEPT_S: Final = 86_400.0  # an answer that nobody takes
 
 @dataclass(frozen=True)
 class Erasure:
-    """Request to forget a month's key, or one vehicle's rows of that month."""
+    """Request to destroy a month's key, or to remove one vehicle's rows of that month."""
 
     month: str
     vehicle: str | None = None
 
 
 def write_request(root: Path, wanted: Erasure) -> Path:
-    """Write a request; return its file.
+    """Write a request; return the path of its file.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     folder = root / FOLDER
     folder.mkdir(mode=0o700, exist_ok=True)
@@ -56,7 +57,7 @@ def write_request(root: Path, wanted: Erasure) -> Path:
 
 
 def answer_to(question: Path) -> dict[str, Any] | None:
-    """Return the answer to a request and remove it; None if there is none yet.
+    """Return the answer to a request and remove it; None if the service has not answered yet.
 
     Raises:
         InputError: the request was refused.
@@ -73,7 +74,7 @@ def answer_to(question: Path) -> dict[str, Any] | None:
 
 
 def open_requests(root: Path) -> list[Path]:
-    """Return the requests without an answer, oldest first; remove answers that were not
+    """Return the requests without an answer, oldest first. Also remove answers that nobody has
     collected for a day.
     """
     for path in (root / FOLDER).glob(f"*{_ANSWER}"):
@@ -88,7 +89,7 @@ def read_request(question: Path) -> Erasure:
     """Return the content of a request.
 
     Raises:
-        InputError: it is not valid.
+        InputError: the request is not valid.
     """
     try:
         record = json.loads(question.read_bytes())

@@ -1,13 +1,14 @@
-"""Forgotten months, and forgotten vehicles of a month: their measurements are not accepted again.
+"""Records of erased months, and of erased vehicles of a month. Their measurements are not accepted
+again.
 
     keys/2026-01.UNTIL.erased             empty; measurements of that month before UNTIL [ns]
     keys/2026-01.PSEUDONYM.UNTIL.erased   the same for the vehicle with this pseudonym; removed with
                                           the month's key
 
-Without the month's key nobody can tell which batches were received, so a repeated batch would count
-twice. If the rows of a vehicle were removed, nothing proves either that they were received. UNTIL
-is the end of the month. In the current month it is the newest measurement in the archive, so no
-clock is needed.
+Without the month's key, the service cannot recognise batches that it has already received, so a
+repeated batch would count twice. The same holds for a vehicle whose rows were removed. UNTIL is the
+end of the month. In the current month, UNTIL is the time of the newest measurement in the archive,
+so no clock is needed.
 """
 
 from __future__ import annotations
@@ -32,14 +33,14 @@ _EPOCH: Final = date(1970, 1, 1)
 
 
 class Span(NamedTuple):
-    """Times [ns] from `begin` to before `until`."""
+    """Time range [ns]: `begin` is included, `until` is excluded."""
 
     begin: int
     until: int
 
 
 def first_day(month: str) -> date:
-    """Return the first day of a month (2026-01).
+    """Return the first day of a month given as text (2026-01).
 
     Raises:
         InputError: the text is not a month.
@@ -51,10 +52,10 @@ def first_day(month: str) -> date:
 
 
 def span_of(month: str) -> Span:
-    """Return the span of a month.
+    """Return the time range of a month given as text (2026-01).
 
     Raises:
-        InputError: as for `first_day`.
+        InputError: the text is not a month.
     """
     first = first_day(month)
     following = (first.replace(day=28) + timedelta(days=4)).replace(day=1)
@@ -62,8 +63,9 @@ def span_of(month: str) -> Span:
 
 
 def record_erasure(folder: Path, month: str, newest: int, pseudonym: str | None = None) -> None:
-    """Refuse from now on measurements of a month, or of one vehicle in it, up to `newest` [ns], the
-    newest in the archive. The record is durable when this returns.
+    """Record that measurements of a month, or of one vehicle in it, are refused from now on. The
+    refusal covers times up to `newest` [ns], the newest measurement in the archive. The record is
+    durable when this returns.
 
     Raises:
         OSError: the disk is full or broken.
@@ -86,14 +88,14 @@ def record_erasure(folder: Path, month: str, newest: int, pseudonym: str | None 
 
 
 class ErasedData(NamedTuple):
-    """Erased data: spans for all vehicles, and the end [ns] per pseudonym number."""
+    """Erased data: time ranges that apply to all vehicles, and the end [ns] per pseudonym number."""
 
     months: list[Span]
     vehicles: dict[int, int]
 
 
 def read_erasures(folder: Path) -> ErasedData:
-    """Return the erased data recorded in the folder of the keys."""
+    """Return the erased data recorded in the key folder."""
     months = list[Span]()
     vehicles = dict[int, int]()
     for path in sorted(folder.glob("*.erased")):
@@ -112,7 +114,7 @@ def read_erasures(folder: Path) -> ErasedData:
 
 
 def in_spans(spans: Sequence[Span], time: IntArray) -> BoolArray:
-    """Return True for times (n,) [ns] in one of the spans."""
+    """Return a mask of times (n,) [ns]: True if the time lies in one of the ranges."""
     out = np.zeros(len(time), bool)
     for begin, until in spans:
         out |= (time >= begin) & (time < until)

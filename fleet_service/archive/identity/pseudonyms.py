@@ -1,8 +1,9 @@
-"""Pseudonyms: keyed hashes of vehicle names and of their starts, with one key per month.
+"""Pseudonyms: keyed hashes of vehicle names, and of the identifiers of vehicle starts, with one key
+per month.
 
-Destroying a month's key makes its rows anonymous. The number of a start differs per month too,
-because a start that lasts over midnight would otherwise link the pseudonyms of two months. The
-month is that of a batch's first record, so a repeated batch has the same pseudonym.
+Destroying a month's key makes its rows anonymous. The hash of a start differs per month too;
+otherwise a start that lasts over midnight would link the pseudonyms of two months. The key is that
+of the month of a batch's first record, so that a repeated batch has the same pseudonym.
 """
 
 from __future__ import annotations
@@ -28,20 +29,20 @@ _DAY_NS: Final = 86_400_000_000_000
 
 @lru_cache(1 << 16)
 def pseudonym_number(pseudonym: str) -> int:
-    """Return a pseudonym as a signed 64-bit number."""
+    """Return a pseudonym (hexadecimal text) as a signed 64-bit number."""
     return int.from_bytes(bytes.fromhex(pseudonym), signed=True)
 
 
 def pseudonym_texts(numbers: IntArray) -> NDArray[np.bytes_]:
-    """Return the pseudonyms (n,) of numbers; the inverse of `pseudonym_number`."""
+    """Return the pseudonyms (n,) as text from their numbers; the inverse of `pseudonym_number`."""
     return np.frombuffer(numbers.astype(">i8").tobytes().hex().encode(), f"S{2 * _DIGEST_BYTES}")
 
 
 class Pseudonyms:
-    """Mapping from names to pseudonyms.
+    """Mapping from vehicle names to pseudonyms.
 
     Args:
-        folder: of the keys, one file of mode 600 per month; a missing key is created.
+        folder: folder of the keys, one file of mode 600 per month; a missing key is created.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -64,10 +65,10 @@ class Pseudonyms:
         return pseudonym
 
     def boot(self, vehicle: str, boot: int, time: int) -> int:
-        """Return the number (63 bits) of a vehicle's start at a time [ns].
+        """Return the pseudonymous number (63 bits) of a vehicle's start at a time [ns].
 
         Raises:
-            OSError: as for `of`.
+            OSError: a key can neither be read nor written.
         """
         text = f"{vehicle}/{boot}".encode()
         digest = blake2b(text, key=self._key(self.month(time)), digest_size=_DIGEST_BYTES).digest()
@@ -90,10 +91,10 @@ class Pseudonyms:
 
 
 def load_or_create_key(path: Path) -> bytes:
-    """Return a key from a file of mode 600; create it if it does not exist.
+    """Return a key from a file of mode 600; create the file if it does not exist.
 
     Raises:
-        OSError: it can neither be read nor written, or is damaged.
+        OSError: the file can neither be read nor written, or is damaged.
     """
     if not path.exists():
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -107,11 +108,12 @@ def load_or_create_key(path: Path) -> bytes:
 
 
 def _read_key(path: Path) -> bytes:
-    """Return a verified key; keys of a former version have no digest.
+    """Return a key after verification; keys of an earlier version have no digest and are not
+    verified.
 
     Raises:
-        OSError: it is damaged; other pseudonyms would result, and every batch would be accepted
-            again.
+        OSError: the key is damaged. With a wrong key all pseudonyms would differ, and every batch
+            would be accepted again.
     """
     data = path.read_bytes()
     key = data[:KEY_BYTES]

@@ -1,15 +1,16 @@
-"""Vehicle numbers of the map: one number per vehicle for ever, while the archive has one pseudonym
-per month.
+"""Permanent vehicle numbers for the map: one number per vehicle for ever, although the vehicle's
+pseudonym in the archive changes each month.
 
-    keys/witness.key            of the service: a vehicle's number is the keyed hash of its name
+    keys/witness.key            secret key: a vehicle's number is the keyed hash of its name
     keys/2026-01.witnesses      number of each pseudonym of the month; removed with the month's key
-    keys/2026-01.TERM.witnesses the same, of a service that succeeds others: each writes a file of
-    its own
+    keys/2026-01.TERM.witnesses the same for a service that owns the archive by a lease; each
+                                service writes a file of its own
 
-One car must not become two witnesses because a month ended, or because it claims so. The second
-file is for restarts and replays, which see pseudonyms. A lost or damaged line makes one vehicle two
-there, and has no other effect. A service therefore checks the lines when it starts, counts damaged
-ones and removes them. The vehicle's next batch writes its line again.
+A car must not count as two independent sources because a month has ended, or because it claims to
+be another car. The files per month serve restarts and replays, which know only pseudonyms. If a
+line is lost or damaged, a replay counts the vehicle as two; there is no other effect. A service
+therefore checks the lines at start, counts damaged lines and removes them. The vehicle's next batch
+writes its line again.
 """
 
 from __future__ import annotations
@@ -38,10 +39,10 @@ _MONTH: Final = re.compile(r"(\d{4}-\d{2})(\.\d{10})?")
 
 
 class VehicleIds:
-    """Numbers of vehicles.
+    """Permanent numbers of vehicles.
 
     Args:
-        folder: of the keys.
+        folder: folder of the keys.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -52,8 +53,8 @@ class VehicleIds:
         self._unsynced: set[Path] = set()
 
     def id_of(self, vehicle: str, month: str, pseudonym: int) -> int:
-        """Return the number of a vehicle, which has this pseudonym in this month (2026-01); durable
-        after `sync`.
+        """Return the permanent number of a vehicle and record it for the vehicle's pseudonym in
+        this month (2026-01). The record is durable after `sync`.
 
         Raises:
             OSError: the key can neither be read nor written, or the line cannot be written.
@@ -75,7 +76,7 @@ class VehicleIds:
         return number
 
     def number_of(self, vehicle: str) -> int:
-        """Return the number of a vehicle.
+        """Return the permanent number of a vehicle.
 
         Raises:
             OSError: the key can neither be read nor written.
@@ -87,7 +88,8 @@ class VehicleIds:
         )
 
     def sync(self) -> None:
-        """Sync new lines to disk, before any record of their vehicles is acknowledged.
+        """Sync new lines to disk. The service calls this before it acknowledges any record of these
+        vehicles.
 
         Raises:
             OSError: the disk is full or broken; the next call tries again.
@@ -101,7 +103,9 @@ class VehicleIds:
 
 
 def read_numbers(folder: Path) -> dict[int, int]:
-    """Return the numbers by pseudonym of all months, without damaged lines."""
+    """Return a mapping from pseudonym to permanent number for all months; damaged lines are
+    skipped.
+    """
     return {
         pseudonym: number
         for path in _month_files(folder)
@@ -110,7 +114,8 @@ def read_numbers(folder: Path) -> dict[int, int]:
 
 
 def remove_damaged_lines(folder: Path) -> int:
-    """Remove damaged lines, and text that is no line, if the disk allows it; return their number.
+    """Remove damaged lines and other text from the files, if the disk allows it; return the number
+    of damaged lines.
 
     Raises:
         OSError: a file cannot be read.
@@ -127,7 +132,7 @@ def remove_damaged_lines(folder: Path) -> int:
 
 
 def _month_files(folder: Path) -> list[Path]:
-    """Return the files of all months."""
+    """Return the files with the numbers of all months."""
     return [path for path in sorted(folder.glob(f"*{ENDING}")) if _MONTH.fullmatch(path.stem)]
 
 
@@ -140,8 +145,8 @@ def _undamaged_lines(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def numbers_of(known: Mapping[int, int], pseudonyms: IntArray) -> IntArray:
-    """Return the numbers of pseudonyms (n,) by the result of `read_numbers`; an unknown pseudonym is its
-    own number.
+    """Return the permanent numbers of pseudonyms (n,), according to the result of `read_numbers`.
+    An unknown pseudonym is returned unchanged.
     """
     if not known or not len(pseudonyms):
         return pseudonyms
@@ -150,7 +155,7 @@ def numbers_of(known: Mapping[int, int], pseudonyms: IntArray) -> IntArray:
 
 
 def forget_vehicles(folder: Path, month: str, pseudonym: int | None = None) -> None:
-    """Remove one vehicle's line of a month, or all of them."""
+    """Remove one vehicle's line of a month; if `pseudonym` is None, remove all lines of the month."""
     for path in _month_files(folder):
         if path.name.partition(".")[0] != month:
             continue

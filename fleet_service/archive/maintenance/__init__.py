@@ -1,3 +1,1 @@
-"""Work on the files of an archive: compaction, retention, roll-up, Iceberg tables, reserved disk
-space.
-"""
+"""Maintenance of an archive: compaction, retention, roll-up, Iceberg tables, reserved disk space."""

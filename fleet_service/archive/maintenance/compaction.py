@@ -1,8 +1,9 @@
-"""Compaction: rows of the inbox, sorted by cell and time, become one file per date and zone.
+"""Compaction: rows of the inbox are sorted by cell and time and moved to one file per date and
+zone.
 
-A round takes the oldest segments and only adds:
+A round takes the oldest segments. It adds files before it deletes segments:
 
-    1. all files of the round are written and synced as drafts, each with its sources in the footer
+    1. all files of the round are written and synced as drafts; the footer of each names its sources
     2. they are renamed into place, and their folders synced
     3. the segments are deleted
 
@@ -42,10 +43,10 @@ class CompactionResult(NamedTuple):
 
 
 def lock_compacted(root: Path) -> BinaryIO:
-    """Lock the compacted files for this process until the handle is closed.
+    """Lock the compacted files for this process until the returned handle is closed.
 
     Raises:
-        InputError: another process adds to them or rewrites them.
+        InputError: another process has the lock, because it adds or rewrites compacted files.
     """
     return lock_file(
         root / "compaction.lock",
@@ -56,10 +57,10 @@ def lock_compacted(root: Path) -> BinaryIO:
 
 @contextmanager
 def hold_compaction_lock(root: Path) -> Iterator[None]:
-    """Lock the compacted files while the block runs.
+    """Lock the compacted files while the block runs, and remove drafts of interrupted runs.
 
     Raises:
-        InputError: the folder is no archive, or another process has the lock.
+        InputError: the folder is not an archive, or another process has the lock.
     """
     layout.require_archive(root)
     with lock_compacted(root):
@@ -74,11 +75,11 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
     """Move all rows of the inbox into the compacted files.
 
     Args:
-        root: of the archive; a service may run on it.
-        round_rows: rows in memory at once.
+        root: folder of the archive; a service may be running on it.
+        round_rows: approximate number of rows in memory at once.
 
     Raises:
-        InputError: another process compacts it.
+        InputError: another process is compacting the archive.
         OSError: a file cannot be read or written; nothing is lost.
     """
     total = CompactionResult(0, 0, 0)
@@ -110,8 +111,8 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
 
 
 class _Rest(NamedTuple):
-    """Segments that wait, oldest first, and the partitions to which an earlier run moved some of
-    their rows.
+    """Segments that are not compacted yet, oldest first, and for each the partitions to which an
+    earlier, interrupted run already moved rows.
     """
 
     root: Path
@@ -122,7 +123,9 @@ class _Rest(NamedTuple):
 
 
 def _compact_round(rest: _Rest, most: int) -> CompactionResult:
-    """Move the next segments: about `most` rows, or at least one segment."""
+    """Move the rows of the next segments into compacted files: about `most` rows, but at least one
+    segment.
+    """
     sources: list[Path] = []
     tables: list[pa.Table] = []
     newest = VERSION
@@ -152,10 +155,10 @@ def _compact_round(rest: _Rest, most: int) -> CompactionResult:
 
 
 def join_versions(tables: list[pa.Table], known: pa.Schema) -> pa.Table:
-    """Join rows of segments of several versions.
+    """Join tables from segments of several format versions.
 
-    The result has the known columns, null where a segment has none. Columns that only a newer
-    version knows follow, so that a downgrade loses nothing.
+    The result has the known columns, null where a segment does not have the column. Columns that
+    only a newer version knows follow, so that a downgrade loses no data.
     """
     others = [pa.schema([f for f in table.schema if f.name not in known.names]) for table in tables]
     schema = pa.schema([*known, *pa.unify_schemas(others, promote_options="permissive")])
@@ -180,8 +183,8 @@ def _place_files(
 
 
 def consecutive_runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
-    """Return names of segments, in order of age, as runs of consecutive numbers: SHARD-EPOCH,
-    first, last.
+    """Return segment names, given in order of age, as runs of consecutive numbers: (SHARD-EPOCH,
+    first, last).
     """
     out: list[tuple[str, int, int]] = []
     for name in names:
@@ -195,7 +198,7 @@ def consecutive_runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
 
 
 def split_by_partition(table: pa.Table, kind: Kind) -> Iterator[tuple[layout.Partition, pa.Table]]:
-    """Yield the rows of each date and zone, sorted by cell and time."""
+    """Yield the rows of each partition (date and zone), sorted by cell and time."""
     if not table.num_rows:
         return
     table = table.combine_chunks()

@@ -1,5 +1,5 @@
-"""Reserve on the archive's disk: retention and compaction use it to make room when the disk is
-full.
+"""Reserved space on the archive's disk. When the disk is full, the space is released, so that
+retention and compaction can run and make room.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _LEAST_FREE: Final = 4 * SIZE
 
 
 def allocate(root: Path) -> None:
-    """Allocate the reserve if there is plenty of room."""
+    """Allocate the reserved space if the disk has plenty of free space."""
     path = root / NAME
     with suppress(OSError):
         if not path.exists() and shutil.disk_usage(root).free > _LEAST_FREE:
@@ -25,7 +25,7 @@ def allocate(root: Path) -> None:
 
 
 def release(root: Path) -> bool:
-    """Release the reserve if the disk is full; return True if it was released."""
+    """Release the reserved space if the disk is full; return True if it was released."""
     path = root / NAME
     if not path.exists() or shutil.disk_usage(root).free > SIZE:
         return False

@@ -1,7 +1,9 @@
-"""Iceberg tables of the compacted files: registered without copying; the inbox is never registered.
+"""Apache Iceberg tables of the compacted files. Files are registered without copying; the inbox is
+never registered.
 
-There is one registrar per table. Before retention and erasure remove or rewrite files, these files
-leave the tables (`unregister`), because a table that names a missing file cannot be read.
+Only one process may register files of a table. Before retention or erasure removes or rewrites
+files, these files are removed from the tables (`unregister`), because a table that refers to a
+missing file cannot be read.
 """
 
 from __future__ import annotations
@@ -37,12 +39,12 @@ PROPERTIES: Final = {
 
 
 class Place(NamedTuple):
-    """Registration of an archive.
+    """Iceberg registration of an archive.
 
     Attributes:
         catalog: a name in pyiceberg's configuration, or the URI of an SQL catalogue
             (`sqlite:////var/lib/tables.db`).
-        namespace: of the tables `observations` and `states`.
+        namespace: namespace of the tables `observations` and `states`.
         at: URL at which readers of the tables find the archive's folder, its mirror or its copy.
     """
 
@@ -52,8 +54,8 @@ class Place(NamedTuple):
 
 
 class RegistrationResult(NamedTuple):
-    """Result: files added to the tables, files removed from them, and rows of the archive in
-    them.
+    """Result of a registration: number of files added to the tables, number of files removed from
+    them, and number of the archive's rows that they now contain.
     """
 
     added: int
@@ -62,9 +64,10 @@ class RegistrationResult(NamedTuple):
 
 
 def register(root: Path, place: Place) -> RegistrationResult:
-    """Register the compacted files of an archive in the tables; a repeated call changes nothing.
+    """Register the compacted files of an archive in the Iceberg tables; a repeated call changes
+    nothing.
 
-    Files of other archives in the same tables stay.
+    Files of other archives in the same tables stay registered.
 
     Raises:
         InputError: pyiceberg is not installed, the catalogue refuses, or a file cannot be read at
@@ -84,7 +87,7 @@ def register(root: Path, place: Place) -> RegistrationResult:
 
 
 def unregister(root: Path, paths: Sequence[Path]) -> None:
-    """Remove files from the tables before they are removed or rewritten on disk.
+    """Remove files from the Iceberg tables, before they are removed or rewritten on disk.
 
     Raises:
         InputError: the archive is registered and pyiceberg is not installed, or the catalogue
@@ -107,11 +110,11 @@ def unregister(root: Path, paths: Sequence[Path]) -> None:
 
 
 def place_of(root: Path) -> Place | None:
-    """Return the registration of an archive, if it has one.
+    """Return the Iceberg registration of an archive; None if it has none.
 
     Raises:
-        InputError: the record cannot be read; it must not be ignored, because tables may name
-            files.
+        InputError: the record cannot be read. It must not be ignored, because tables may refer to
+            files of the archive.
     """
     path = root / RECORD
     try:
@@ -125,8 +128,8 @@ def place_of(root: Path) -> Place | None:
 
 
 def _record_registration(root: Path, place: Place) -> None:
-    """Record the registration before it happens, so that no registered file is removed
-    unnoticed.
+    """Record the registration before it happens. Otherwise a crash could leave a registered file
+    without a record, and the file could be removed without `unregister`.
     """
     path = root / RECORD
     try:
@@ -164,7 +167,7 @@ def _open_catalog(place: Place) -> Catalog:
 
 
 def _open_table(catalog: Catalog, place: Place, kind: Kind) -> Table:
-    """Return the table of a kind with all columns known today."""
+    """Return the Iceberg table of a kind; create it or add missing columns if necessary."""
     from pyiceberg.transforms import DayTransform
 
     name = (place.namespace, layout.TABLES[kind])
@@ -187,7 +190,7 @@ def _plain_schema(schema: pa.Schema) -> pa.Schema:
 
 
 def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> RegistrationResult:
-    """Remove missing and changed files from a table and add new ones, in one commit."""
+    """Update a table in one commit: remove missing and changed files, and add new files."""
     there = {_file_url(root, place, path): path for path in layout.compacted_files(root, kind)}
     mine = {
         name: file
@@ -209,7 +212,7 @@ def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registrat
 
 
 def _commit_files(table: Table, removed: list[Any], added: list[str]) -> None:
-    """Change a table atomically."""
+    """Remove files from a table and add others, as one atomic change."""
     if not removed and not added:
         return
     with table.transaction() as change:
@@ -222,7 +225,7 @@ def _commit_files(table: Table, removed: list[Any], added: list[str]) -> None:
 
 
 def _files_by_name(table: Table) -> dict[str, Any]:
-    """Return the files that a table names, by name."""
+    """Return the files of a table, by URL."""
     return {task.file.file_path: task.file for task in table.scan().plan_files()}
 
 
@@ -236,7 +239,7 @@ def _file_url(root: Path, place: Place, path: Path) -> str:
 
 @contextmanager
 def _one_line_errors(place: Place) -> Iterator[None]:
-    """Turn errors of the catalogue into one line."""
+    """Convert any error of the catalogue into an InputError with a message of one line."""
     try:
         yield
     except InputError:

@@ -1,7 +1,7 @@
-"""Removal of data: raw rows after a number of days (their roll-ups stay), and all rows of one
-vehicle.
+"""Removal of data: raw rows after a number of days (their hourly statistics stay), and all rows of
+one vehicle.
 
-Only these two operations remove a compacted file or replace it with a new one.
+Only these two operations remove or rewrite a compacted file.
 """
 
 from __future__ import annotations
@@ -42,17 +42,20 @@ _KEYS: Final = "keys"
 
 
 class RetirementResult(NamedTuple):
-    """Result: days whose raw rows were removed, and files."""
+    """Result of `retire_rows`: number of days whose raw rows were removed, and number of removed
+    files.
+    """
 
     days: int
     files: int
 
 
 def retire_rows(root: Path, raw_days: int, today: date) -> RetirementResult:
-    """Remove rows measured more than `raw_days` before `today`, after their roll-ups are safe.
+    """Remove rows that were measured more than `raw_days` before `today`. Their hourly statistics
+    are completed first.
 
     Raises:
-        InputError: too few days, or another process compacts the archive.
+        InputError: `raw_days` is too small, or another process is compacting the archive.
         OSError: a file cannot be read, written or removed.
     """
     files = 0
@@ -72,10 +75,10 @@ def retire_rows(root: Path, raw_days: int, today: date) -> RetirementResult:
 
 
 def due_folders(root: Path, raw_days: int, today: date) -> list[Path]:
-    """Return the folders of days whose raw rows `retire_rows` removes.
+    """Return the day folders whose raw rows `retire_rows` would remove.
 
     Raises:
-        InputError: too few days.
+        InputError: `raw_days` is too small.
     """
     last = _last_to_go(raw_days, today)
     return [day for kind in Kind for day in layout.day_folders(root, TABLES[kind], until_day=last)]
@@ -92,10 +95,11 @@ def _last_to_go(raw_days: int, today: date) -> int:
 
 
 def forget_period(root: Path, month: str) -> None:
-    """Destroy the key of a month (2026-01): its pseudonyms cannot be attributed any more.
+    """Destroy the key of a month (2026-01), so that its pseudonyms can no longer be attributed to
+    vehicles.
 
     Raises:
-        InputError: there is no such key, or a service runs on the archive.
+        InputError: there is no such key, or a service is running on the archive.
         OSError: a file cannot be read or written.
     """
     with lock_archive(root):
@@ -107,9 +111,11 @@ def forget_period(root: Path, month: str) -> None:
 
 
 def destroy_key(root: Path, month: str, newest: int) -> None:
-    """Destroy the key like `forget_period`, for a caller that holds the archive and has no data of
-    the month in memory. Measurements of the month up to `newest` [ns], the newest in the archive,
-    are not accepted again.
+    """Destroy the key like `forget_period`. The caller must have locked the archive and must not
+    have data of the month in memory.
+
+    Measurements of the month up to `newest` [ns], the newest in the archive, are not accepted
+    again.
 
     Raises:
         InputError: there is no such key.
@@ -125,8 +131,9 @@ def destroy_key(root: Path, month: str, newest: int) -> None:
 def _newest_first_time(
     root: Path, days: tuple[int, int | None], where: Where = (), until: float = math.inf
 ) -> int:
-    """Return the newest first time of a record of these days [ns], -1 if there is none; one not
-    before `until` is enough."""
+    """Return the start time [ns] of the record of these days that starts last; -1 if there is no
+    record. The search stops early at a time of `until` or later.
+    """
     newest = -1
     for kind, name in layout.FIRST_TIME.items():
         for table in reading.read_tables(
@@ -139,7 +146,9 @@ def _newest_first_time(
 
 
 class ErasureResult(NamedTuple):
-    """Result of forgetting a vehicle: rows removed, files rewritten or removed."""
+    """Result of `forget_vehicle`: number of removed rows, and the files that were rewritten or
+    removed. `kept` is the reason why the archive's copy still contains the rows, or None.
+    """
 
     rows: int
     files: tuple[Path, ...]
@@ -147,15 +156,15 @@ class ErasureResult(NamedTuple):
 
 
 def forget_vehicle(root: Path, vehicle: str, month: str) -> ErasureResult:
-    """Remove the rows of one vehicle in one month, and everything derived that could reveal them.
+    """Remove the rows of one vehicle in one month, and all derived data that could reveal them.
 
-    That is lines of few vehicles in the month's snapshots, files set aside, and checkpoints.
-    Roll-ups are computed again. Its measurements of that month up to the newest removed row are not
-    accepted again.
+    Derived data are: lines with few vehicles in the month's snapshots, damaged files that were set
+    aside, and checkpoints. Hourly statistics are computed again. Measurements of the vehicle in
+    that month, up to the newest removed row, are not accepted again.
 
     Raises:
-        InputError: the month's key does not exist, or a service runs on the archive (it has more in
-            memory).
+        InputError: the month's key does not exist, or a service is running on the archive (it has
+            further data in memory).
         OSError: a file cannot be read or written.
     """
     with lock_archive(root):
@@ -167,11 +176,12 @@ def forget_vehicle(root: Path, vehicle: str, month: str) -> ErasureResult:
 
 @contextmanager
 def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]:
-    """Do the file part of `forget_vehicle` while a service may write to the log; of new rows it
-    removes only those that exist at the begin. Nothing is compacted before the block ends.
+    """Remove a vehicle's data from the files, as `forget_vehicle` does, while a service may write
+    new rows. Only rows that exist at the beginning are removed. No compaction can run before the
+    block ends.
 
     Raises:
-        as `forget_vehicle`, except for a running service.
+        the same errors as `forget_vehicle`, except for a running service.
     """
     key_of(root, month)
     compact(root)
@@ -212,10 +222,10 @@ def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]
 
 
 def forget_witness(root: Path, vehicle: str, month: str) -> None:
-    """Remove the line with the number by which the map knew a vehicle in a month.
+    """Remove the line with the permanent number by which the map knew a vehicle in a month.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     vehicle_ids.forget_vehicles(
         root / _KEYS, month, pseudonym_number(_pseudonym_of(root, vehicle, month))
@@ -227,8 +237,8 @@ def _pseudonym_of(root: Path, vehicle: str, month: str) -> str:
 
 
 def _thin_snapshot(root: Path, path: Path, cells: set[int]) -> bool:
-    """Remove lines of these cells with fewer than ANONYMOUS vehicles from a snapshot, and round the
-    times of the others to hours; return True if there were any.
+    """Remove the lines of these cells with fewer than ANONYMOUS vehicles from a snapshot, and round
+    the times in their other lines to hours. Return True if the snapshot was changed.
     """
     found = read_content(path, _refuse_damaged)
     if found is None:
@@ -265,10 +275,11 @@ def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
 
 
 def drop_checkpoints(root: Path) -> None:
-    """Remove all checkpoints because their sources change; a service then replays the log.
+    """Remove all checkpoints, because the data from which they were made change. A restarted
+    service then replays the stored rows.
 
     Raises:
-        OSError: one cannot be removed.
+        OSError: a checkpoint cannot be removed.
     """
     if (root / layout.CHECKPOINTS).exists():
         shutil.rmtree(root / layout.CHECKPOINTS)
@@ -276,13 +287,13 @@ def drop_checkpoints(root: Path) -> None:
 
 
 def _may_hold_vehicle(kind: Kind, path: Path, pseudonym: str) -> bool:
-    """Return True if a file may hold rows of a vehicle."""
+    """Return True if a file may contain rows of a vehicle."""
     found = load(path, SCHEMAS[kind], ["vehicle"], damaged=_refuse_damaged)
     return found is not None and pseudonym in pc.unique(found["vehicle"]).to_pylist()
 
 
 def _remove_vehicle(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[int]:
-    """Remove the rows of a vehicle from a file; return their cells."""
+    """Remove the rows of a vehicle from a file; return the cells of the removed rows."""
     found = read_content(path, _refuse_damaged)
     if found is None or pseudonym not in pc.unique(found.table["vehicle"]).to_pylist():
         return []
@@ -300,7 +311,7 @@ def _remove_vehicle(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[
 
 
 def _refuse_damaged(path: Path, problem: str) -> None:
-    """Raise for a damaged file, because it may hold rows to be forgotten."""
+    """Raise an error for a damaged file, because it may contain rows that must be erased."""
     raise InputError(
         "archive",
         f"{path} is damaged ({problem})",
@@ -309,10 +320,10 @@ def _refuse_damaged(path: Path, problem: str) -> None:
 
 
 def key_of(root: Path, month: str) -> Path:
-    """Return the key file of a month.
+    """Return the path of a month's key file.
 
     Raises:
-        InputError: it does not exist.
+        InputError: the file does not exist.
     """
     erasures.first_day(month)
     path = root / _KEYS / f"{month}.key"
@@ -326,7 +337,8 @@ def key_of(root: Path, month: str) -> Path:
 
 
 def _days_of_month(month: str) -> tuple[int, int]:
-    """Return the days of a month and the one after it: a batch has the pseudonym of its first
-    record and may end a day later."""
+    """Return the first day of a month, and the day after its last day. Rows of that day may belong
+    to the month too, because a batch has the pseudonym of its first record and may end a day later.
+    """
     begin, until = erasures.span_of(month)
     return begin // layout.DAY_NS, until // layout.DAY_NS

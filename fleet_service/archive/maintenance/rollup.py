@@ -1,13 +1,13 @@
-"""Roll-up: additive statistics per cell, sector and hour, which stay when their source rows are
-retired.
+"""Roll-up: additive statistics per cell, sector and hour. They stay when the rows from which they
+were computed are removed.
 
     rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet
 
 There is one file (a part) per compacted file, with the same name. An hour's statistics are the sum
-over all parts, so a missing part can be computed at any time, and again when its rows were
-rewritten.
+over all parts. Therefore a missing part can be computed at any time, and a part is computed again
+when its rows are rewritten.
 
-Legend of the merging (columns of `tables.CELL_HOUR`)
+How parts are merged (columns of `tables.CELL_HOUR`)
     sums, counts     add
     mu_min, mu_max   minimum, maximum
     vehicle_bits     or; V vehicles set about 64·(1 - exp(-V/64)) of 64 bits, so V ≈ -64·ln(share of
@@ -46,18 +46,18 @@ _BITS: Final = 64
 
 
 def part_of(path: Path, below: Path | None = None) -> Path:
-    """Return the path of the part of a compacted file of observations; below another folder on
-    request.
+    """Return the path of the roll-up part that belongs to a compacted file of observations. With
+    `below`, the path is below that folder instead of the archive.
     """
     root = path.parents[3] if below is None else below
     return root / TABLE / path.parents[1].name / path.parent.name / path.name
 
 
 def complete_parts(root: Path, until_day: int | None = None) -> int:
-    """Compute missing parts; return their number.
+    """Compute missing roll-up parts; return their number.
 
     Raises:
-        OSError: one cannot be read or written.
+        OSError: a file cannot be read or written.
     """
     missing = [
         path
@@ -70,10 +70,10 @@ def complete_parts(root: Path, until_day: int | None = None) -> int:
 
 
 def make_part(root: Path, path: Path) -> None:
-    """Compute the part of one compacted file; replace an existing one.
+    """Compute and write the roll-up part of one compacted file; an existing part is replaced.
 
     Raises:
-        OSError: it cannot be read or written.
+        OSError: a file cannot be read or written.
     """
     table = compute_part(path, set_aside)
     if table is not None:
@@ -81,17 +81,18 @@ def make_part(root: Path, path: Path) -> None:
 
 
 def compute_part(path: Path, damaged: Damaged) -> pa.Table | None:
-    """Return the part of one compacted file; None if it is damaged (then `damaged` is called).
+    """Return the roll-up part of one compacted file as a table. Return None if the file is damaged,
+    after calling `damaged`.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     table = load(path, tables.OBSERVATION_ARCHIVE, _COLUMNS, damaged=damaged)
     return None if table is None else roll_up(table)
 
 
 def roll_up(table: pa.Table) -> pa.Table:
-    """Return rows of observations as statistics per cell, sector and hour, sorted by them."""
+    """Return statistics of observations per cell, sector and hour, sorted in this order."""
     rows = segments.rows_of(table)
     hour = rows["leave_time"] // HOUR_NS
     order = np.lexsort((hour, rows["sector"], rows["cell"]))
