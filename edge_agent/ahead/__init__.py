@@ -1,1 +1,3 @@
-"""The map in front of the car: horizon, warnings, safe speed, and the map as a prior."""
+"""The map in front of the car: horizon, warnings, safe speed, and the map as a prior of the
+friction estimate.
+"""

@@ -1,4 +1,4 @@
-"""Decoding and validation of received tiles and alerts."""
+"""Decoding and validation of map tiles and alerts received from a fleet service."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _BASIS: Final = {name: number for number, name in enumerate(BASES)}
 
 
 def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells]:
-    """Return tile and cells of a message about the map.
+    """Return the tile (z14 quadint) and the cells in a message about the map.
 
     Raises:
-        WireError: it is not a valid message of a service; it is ignored completely.
+        WireError: the message is invalid; ignore it completely.
     """
     tile = _tile_of_key(key, "map")
     if len(payload) > MOST_TILE_BYTES:
@@ -78,10 +78,10 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
 
 
 def decode_alert_message(key: str, payload: bytes, now: int) -> Alert:
-    """Return a published alert.
+    """Return the alert in a published message.
 
     Raises:
-        WireError: it is not a valid message of a service.
+        WireError: the message is invalid.
     """
     if len(payload) > wire.MAX_BYTES:
         raise WireError("alert", f"has {len(payload)} bytes", f"send at most {wire.MAX_BYTES}")
@@ -89,10 +89,10 @@ def decode_alert_message(key: str, payload: bytes, now: int) -> Alert:
 
 
 def decode_standing_alerts(key: str, payload: bytes, now: int) -> tuple[int, list[Alert]]:
-    """Return a tile and its standing alerts.
+    """Return a tile (z14 quadint) and its active alerts.
 
     Raises:
-        WireError: it is not a valid message of a service.
+        WireError: the message is invalid.
     """
     tile = _tile_of_key(key, "alert")
     return tile, [_check_alert(alert, tile, now) for alert in wire.decode_standing(payload)]

@@ -1,6 +1,6 @@
-"""Horizon: knowledge of each metre ahead, and the safe speed there. Pure.
+"""Horizon: what the map knows about each metre ahead, and the safe speed there. The module is pure.
 
-A metre without knowledge stays unknown: it limits no speed and causes no warning.
+A metre that the map does not know limits no speed and causes no warning.
 """
 
 from __future__ import annotations
@@ -34,18 +34,20 @@ LEAST_VEHICLES: Final = 2  # as for an alert: one bad sensor warns nobody
 
 
 class Horizon(NamedTuple):
-    """Knowledge of one path ahead, each (M,); NaN where unknown.
+    """Knowledge of the map about one path ahead, for each of M metres; NaN where unknown.
 
     Attributes:
-        path: the metres.
-        key: the place, NONE where nothing is known.
-        mu: median; NaN also where only lower bounds are known. mu_lower, mu_upper: 5 and 95 %.
+        path: the path with its M metres.
+        key: map cell and sector of each metre (cell·4 + sector), NONE where nothing is known.
+        mu: median; NaN also where only lower bounds are known.
+        mu_lower, mu_upper: 5 % and 95 % quantiles.
         p_slippery: P(mu < 0.4).
-        age_s: since the last observation.
-        basis: local_map.UNKNOWN, BOUND, MEASURED, BORROWED.
-        slippery: True if it justifies a warning.
-        alerted: True if an alert stands.
-        safe_speed: [m/s]; NaN where unknown, because an unknown road does not allow any speed.
+        age_s: time since the last observation [s].
+        basis: local_map.UNKNOWN, BOUND, MEASURED or BORROWED.
+        slippery: True if the metre justifies a warning.
+        alerted: True if an alert is active there.
+        safe_speed: [m/s]; NaN where unknown, because nothing is known about the safe speed of an
+            unknown road.
     """
 
     path: Path
@@ -68,7 +70,7 @@ def horizon_length(speed: float) -> float:
 
 
 def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
-    """Return the horizon along a path, now [ns]."""
+    """Return the horizon along a path at the time `now` [ns UTC]."""
     places, inverse = np.unique(path.places, return_inverse=True)
     found = known.look_up(places, now)
     inverse = inverse.reshape(path.places.shape)
@@ -109,7 +111,9 @@ def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
 
 
 def justifies_warning(found: PlaceBelief) -> BoolArray:
-    """Return True for places (n,) that are slippery and certain enough for a warning."""
+    """Return an array (n,) that is True where a place is slippery with enough certainty for a
+    warning.
+    """
     firm = (
         (found.basis == MEASURED)
         & (found.p_slippery >= WARN_ABOVE)
@@ -119,12 +123,12 @@ def justifies_warning(found: PlaceBelief) -> BoolArray:
 
 
 def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
-    """Return the speed [m/s] at each metre (M,) that allows bends and stopping within SIGHT_M with
-    the lower end of grip.
+    """Return the safe speed [m/s] at each metre (M,): it allows the bends, and stopping within
+    SIGHT_M, at the lower end of the friction interval.
 
-    Before a slower place it falls with a comfortable deceleration, or with the grip that cornering
-    leaves. Where nothing is measured (NaN) there is no advice (NaN), except before a slower place,
-    with no more braking than an unknown road allows.
+    Before a slower place the speed decreases with a comfortable deceleration, or with the grip that
+    cornering leaves. Where nothing is measured (NaN in `mu_lower`) the result is NaN, except before
+    a slower place; there the braking is at most that of an unknown road.
     """
     measured = np.isfinite(mu_lower)
     bend = np.abs(np.nan_to_num(curvature))
@@ -147,11 +151,11 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
 
 
 def braking_from(horizon: Horizon) -> FloatArray:
-    """Return half the square of the speed that can be braked away from the car to each metre, (M,)
-    [m^2/s^2].
+    """Return the braking energy per mass up to each metre (M,) [m^2/s^2]: half the square of the
+    speed that can be removed by braking between the car and that metre.
 
-    It uses the lower end of grip, at most comfortably; an unknown road allows what must be expected
-    of any road.
+    The braking uses the lower end of the friction interval, and is at most comfortable. An unknown
+    road is assumed to have UNKNOWN_LOWER.
     """
     lower = np.where(np.isfinite(horizon.mu_lower), horizon.mu_lower, UNKNOWN_LOWER)
     return np.asarray(np.cumsum(np.minimum(GRAVITY * lower, COMFORT)))

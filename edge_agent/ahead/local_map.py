@@ -1,9 +1,9 @@
-"""Local copy of the map around one car, with ages: bounded, and fading to unknown. Pure; time is an
-argument.
+"""Local copy of the map around one car, limited in size; old knowledge fades to unknown. The module
+is pure; time is an argument.
 
-A cell's belief is built from the values of a tile: the share of μ below lower, median and upper
-end, and P(slippery). It then fades as in the map: the road may have changed since, and is unknown
-in that case.
+The belief (probabilities of friction) of a cell is reconstructed from the values in a tile: lower
+end, median and upper end of μ, and P(slippery). It then fades as in the fleet's map: with time, the
+probability grows that the road has changed, and a changed road is unknown.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SLIPPERY_BINS: Final[FloatArray] = np.clip(
 
 
 class ReceivedCells(NamedTuple):
-    """Received cells, (n,); belief (n, 32) on the friction grid."""
+    """Received cells (n,); `belief` (n, 32) are probabilities on the friction grid."""
 
     key: IntArray
     belief: FloatArray
@@ -47,7 +47,9 @@ class ReceivedCells(NamedTuple):
 
 
 class PlaceBelief(NamedTuple):
-    """Knowledge of places, each (n,); NaN and UNKNOWN where there is none."""
+    """Knowledge about places (a place is a map cell with a sector of heading), (n,) each; NaN and
+    UNKNOWN where nothing is known.
+    """
 
     key: IntArray
     mu: FloatArray
@@ -66,7 +68,8 @@ def belief_of(
     """Return probabilities on the friction grid (n, 32) from the values of n cells; `mu` may be
     NaN.
 
-    The distribution function is linear between the known values.
+    `lower`, `mu` and `upper` are the 5 %, 50 % and 95 % quantiles, `slippery` is P(slippery). The
+    distribution function is linear between these values.
     """
     n = len(lower)
     measured = np.isfinite(mu)
@@ -94,8 +97,8 @@ NOTHING: Final = ReceivedCells(
 
 
 class LocalMap:
-    """Cache of one car: received tiles, the latest with up to MOST_CELLS cells, and standing
-    alerts.
+    """Map cache of one car: the tiles received last, with up to MOST_CELLS cells in total, and
+    active alerts.
     """
 
     def __init__(self, most_cells: int = MOST_CELLS) -> None:
@@ -107,16 +110,16 @@ class LocalMap:
 
     @property
     def cells(self) -> int:
-        """Number of held cells."""
+        """Return the number of cells in the cache."""
         return sum(len(cells.key) for cells in self._tiles.values())
 
     @property
     def alerts(self) -> list[Alert]:
-        """Return the standing alerts known to the car."""
+        """Return the active alerts known to the car."""
         return [alert for alert, _ in self._alerts.values()]
 
     def store_cells(self, tile: int, cells: ReceivedCells, now: int) -> None:
-        """Store received cells of a tile; they replace older knowledge only."""
+        """Store the received cells of a tile. They replace stored cells only if they are newer."""
         before = self._tiles.pop(tile, NOTHING)
         both = _concatenate_cells([_select_cells(before, now - before.heard < HELD_S * NS), cells])
         latest_first = np.lexsort((both.heard, both.key))[::-1]
@@ -127,7 +130,9 @@ class LocalMap:
             self._tiles.popitem(last=False)
 
     def store_alert(self, alert: Alert, now: int) -> bool:
-        """Store a received alert; return True if it is new."""
+        """Store a received alert, or remove an alert that ended; return True if this changes the
+        set of active alerts.
+        """
         key = alert.cell * grid.SECTORS + alert.sector
         before = self._alerts.get(key)
         if alert.raised:
@@ -140,7 +145,9 @@ class LocalMap:
         return self._alerts.pop(key, None) is not None
 
     def store_standing_alerts(self, tile: int, alerts: list[Alert], now: int) -> list[int]:
-        """Store all standing alerts of a tile; return the places where this is new."""
+        """Replace the active alerts of a tile by `alerts`; return the keys (cell·4 + sector) of the
+        places that changed.
+        """
         stand = {alert.cell * grid.SECTORS + alert.sector: alert for alert in alerts}
         news = [
             key
@@ -152,7 +159,7 @@ class LocalMap:
         return news + [key for key, alert in stand.items() if self.store_alert(alert, now)]
 
     def drop_old(self, now: int) -> None:
-        """Drop data that is too old."""
+        """Remove cells and alerts that are too old."""
         for tile in [
             tile
             for tile, cells in self._tiles.items()
@@ -164,10 +171,10 @@ class LocalMap:
             del self._alerts[key]
 
     def look_up(self, key: IntArray, now: int) -> PlaceBelief:
-        """Return the current knowledge of places (n,).
+        """Return the current knowledge about the places with the keys `key` (n,).
 
-        An alert for the opposite direction counts for this side too, as long as no better grip was
-        found here since: ice and water are not limited to a lane.
+        An alert for the opposite direction also counts for this direction, unless better friction
+        was measured here after it: ice and water are not limited to a lane.
         """
         belief, basis, last, at, vehicles = self._look_up(key)
         alerted = np.zeros(len(key), np.bool_)
@@ -220,8 +227,8 @@ class LocalMap:
         )
 
     def belief_at(self, key: int, now: int) -> FloatArray | None:
-        """Return the current belief about one place, (32,); None if nothing or only a bound is
-        known.
+        """Return the current belief about one place, as probabilities (32,); None if the map has no
+        recent measured value of it.
         """
         belief, basis, last, at, _ = self._look_up(np.array([key]))
         if basis[0] != MEASURED or now - at[0] > HELD_S * NS:
@@ -230,7 +237,7 @@ class LocalMap:
         return np.asarray((1.0 - share) * belief[0] + share * mugrid.PRIOR)
 
     def keys(self) -> IntArray:
-        """Return the known places, sorted."""
+        """Return the keys (cell·4 + sector) of all known places, sorted."""
         return self._all_cells().key
 
     def _all_cells(self) -> ReceivedCells:
@@ -241,7 +248,9 @@ class LocalMap:
         return self._all
 
     def _look_up(self, key: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]:
-        """Return belief, basis, last_time, time of receipt and vehicles of places (n,)."""
+        """Return belief, basis, time of last observation, time of receipt and number of vehicles of
+        places (n,).
+        """
         whole = self._all_cells()
         if not len(whole.key):
             zero = np.zeros(len(key), np.int64)

@@ -1,7 +1,7 @@
-"""Lookout: updates what vehicles see ahead once a second in a thread of its own, and at once when
-alerts change.
+"""Lookout: computes the view ahead of each vehicle once a second on a separate thread, and
+immediately when alerts change.
 
-The estimation loop only reports its position (`see`), which never blocks.
+The estimation loop only reports positions (`see`), which never blocks.
 """
 
 from __future__ import annotations
@@ -60,11 +60,11 @@ class LookoutCounts:
     subscribers: dict[str, MapSubscriber] = field(default_factory=dict)
 
     def total_of(self, what: str) -> int:
-        """Return the sum of a counter over all subscribers."""
+        """Return the sum of one counter over all map subscribers."""
         return sum(one.counts[what] for one in self.subscribers.values())
 
     def values(self) -> dict[str, float]:
-        """Return the counters for the last line of a drive."""
+        """Return the counters for the last line of output of a drive."""
         refused = sum(
             n
             for one in self.subscribers.values()
@@ -82,13 +82,15 @@ class LookoutCounts:
 
 
 class Lookout:
-    """Looks ahead for vehicles by name.
+    """Lookout for several vehicles, identified by name.
 
     Args:
         names: the vehicles; row k of the poses is vehicle k.
-        hear: called with each warning and the vehicle's name, on the lookout's thread.
-        route_of: the given route of vehicle k; None for the roads visible in the map.
-        listening: vehicles that look ahead; all by default.
+        hear: called with the vehicle's name and each warning, on the lookout's thread.
+        route_of: returns the given route of vehicle k, or None to follow the roads visible in the
+            map.
+        listening: returns True for a vehicle that looks ahead; by default all vehicles do.
+        on_horizons: called with the vehicle's name, its horizons and its pose after each look.
     """
 
     def __init__(
@@ -113,11 +115,11 @@ class Lookout:
         self.counts = LookoutCounts()
 
     def start(self) -> None:
-        """Start to look ahead."""
+        """Start the thread that looks ahead."""
         self._thread.start()
 
     def attach(self, name: str, session: zenoh.Session) -> None:
-        """Use a vehicle's session, which is open now."""
+        """Use a vehicle's session, which has been opened."""
         k = self._number.get(name)
         if k is not None:
             watcher = self._watchers[k]
@@ -127,15 +129,16 @@ class Lookout:
             watcher.subscriber = self.counts.subscribers[name] = subscriber
 
     def see(self, poses: Sequence[Pose]) -> None:
-        """Update the positions of the vehicles; row k is vehicle k."""
+        """Update the poses of the vehicles; row k is vehicle k."""
         self._poses = poses
 
     def believe(self, places: IntArray, beliefs: tuple[FloatArray, FloatArray] | None) -> None:
-        """Update the beliefs of the vehicles' filters at their places, for the map as a prior.
+        """Update the friction beliefs of the vehicles' filters, which are combined with the map as
+        a prior.
 
         Args:
-            places: (N,) cell * 4 + sector, -1 where unknown.
-            beliefs: as of `EstimatorBank.beliefs`.
+            places: (N,) current place (cell·4 + sector) of each vehicle, -1 where unknown.
+            beliefs: result of `EstimatorBank.beliefs`.
         """
         if beliefs is None:
             return
@@ -155,11 +158,11 @@ class Lookout:
         self._here = np.column_stack([mugrid.quantiles(informed, q) for q in (0.5, 0.05, 0.95)])
 
     def outlook(self, name: str) -> Outlook | None:
-        """Return a vehicle's last view."""
+        """Return the last view ahead of a vehicle; None before the first one."""
         return self._watchers[self._number[name]].outlook
 
     def close(self, within_s: float = 1.0) -> None:
-        """Stop; the sessions stay open."""
+        """Stop the thread; the sessions stay open."""
         self._stop.set()
         self._wake.set()
         if self._thread.ident is not None:
@@ -252,8 +255,11 @@ class Lookout:
 def paths_ahead(
     pose: Pose, route: GivenRoute | None, subscriber: MapSubscriber, length: float
 ) -> list[Path]:
-    """Return the ways on: the given route, else the roads visible in the map, else straight on;
-    hold the subscriber's lock."""
+    """Return the possible paths ahead: the given route, else the roads visible in the map, else
+    straight on.
+
+    The caller must hold the subscriber's lock.
+    """
     given = route.ahead(pose, length) if route is not None else None
     if given is not None:
         return [given]
@@ -261,7 +267,7 @@ def paths_ahead(
 
 
 def runs_of_places(horizon: Horizon) -> Runs:
-    """Return a horizon as runs of metres in the same place."""
+    """Return a horizon as runs of consecutive metres in the same place."""
     key = horizon.key
     starts = np.append(
         0, np.flatnonzero((key[1:] != key[:-1]) | (horizon.basis[1:] != horizon.basis[:-1])) + 1

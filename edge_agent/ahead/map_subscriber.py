@@ -1,8 +1,8 @@
-"""Subscriptions and queries of one vehicle over its own session: alerts of the tiles ahead, the map
-along the way.
+"""Map subscriber of one vehicle on its own Zenoh session: receives alerts of the tiles ahead, and
+queries the map along the path.
 
-Zenoh's threads call back; one lock protects the received data. Invalid messages are refused and
-counted.
+Zenoh calls back on its own threads; one lock protects the received data. Invalid messages are
+rejected and counted.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ _TOPIC: Final = keys.TOPICS["ahead"]
 
 
 class MapSubscriber:
-    """Subscriber of one vehicle.
+    """Map subscriber of one vehicle.
 
     Args:
-        vehicle: its name.
-        session: its open session; owned by the caller.
-        urgent: called with the places whose alerts have changed.
-        clock: [ns UTC].
+        vehicle: name of the vehicle.
+        session: open session of the vehicle; the caller closes it.
+        urgent: called with the places (cell·4 + sector) whose alerts have changed.
+        clock: returns the time [ns UTC].
     """
 
     def __init__(
@@ -69,12 +69,12 @@ class MapSubscriber:
         self.counts: Counter[str] = Counter()
 
     def map_lock(self) -> threading.Lock:
-        """Return the lock under which `local_map` is read."""
+        """Return the lock that must be held while `local_map` is read."""
         return self._lock
 
     @property
     def local_map(self) -> LocalMap:
-        """Return the local copy of the map; hold the lock."""
+        """Return the local copy of the map; the caller must hold the lock."""
         return self._map
 
     @property
@@ -84,14 +84,15 @@ class MapSubscriber:
 
     @property
     def is_connected(self) -> bool:
-        """True if a router was connected at the last check."""
+        """Return True if a router was connected at the last check."""
         return bool(self._routers)
 
     def follow_paths(self, paths: list[Path], pose: Pose, within: float) -> None:
-        """Subscribe and query along the ways on, the likeliest first; never waits for an answer.
+        """Subscribe and send queries along the possible paths, the most likely first. The call does
+        not wait for an answer.
 
-        Alerts are subscribed to for the metres `within`; the map is requested farther ahead, see
-        `RequestLog.missing_boxes`.
+        Alerts are subscribed to for the first `within` metres; the map is requested further ahead,
+        see `RequestLog.missing_boxes`.
         """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
         back = bool(routers - self._routers)
@@ -126,13 +127,13 @@ class MapSubscriber:
             self._map.drop_old(pose.time)
 
     def publish_view(self, payload: Callable[[], bytes]) -> None:
-        """Publish the view ahead on the vehicle's own key, if somebody listens."""
+        """Publish the view ahead on the vehicle's own key, if there is a subscriber."""
         if self._publisher.matching_status.matching:  # type: ignore[attr-defined] # stub: bool
             self._publisher.put(payload())
             self.counts["told"] += 1
 
     def close(self) -> None:
-        """Stop; the session stays open."""
+        """Stop the subscriptions; the session stays open."""
         for subscriber in self._subscribers.values():
             subscriber.undeclare()
         self._subscribers.clear()

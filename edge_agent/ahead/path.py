@@ -1,12 +1,14 @@
-"""Way ahead in metres, with the cells and sectors of the map for each metre. Pure.
+"""Path ahead in steps of one metre, with the cells and sectors of the map for each metre. The
+module is pure.
 
 Legend
     s        distance ahead of the car                                             [m]     (M,)  1, 2, 3 …
     key      cell·4 + sector: a place of the map                                   int64
-    places   (M, C) keys that a metre may lie in, the likeliest first; NONE where there is none
+    places   (M, C) keys that a metre may lie in, the likeliest first; NONE fills unused columns
 
-A car of the fleet may have driven one lane aside, with a position error of 1.5 m. So each metre
-also covers places a little to the left and right, and both sectors near the border of a sector.
+A car of the fleet may have driven one lane beside the path, with a position error of 1.5 m.
+Therefore each metre also covers places a little to the left and right, and both sectors near the
+border of a sector.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ CORRIDOR_WIDENS: Final = 0.05  # per metre: a bend of a kilometre's radius
 
 
 class Pose(NamedTuple):
-    """State of a car: [deg], yaw [rad from east], speed [m/s], time [ns UTC]."""
+    """Pose of a car: latitude and longitude [deg], yaw [rad from east], speed [m/s], time [ns UTC]."""
 
     latitude: float
     longitude: float
@@ -49,10 +51,10 @@ class Pose(NamedTuple):
 
 
 class Path(NamedTuple):
-    """One way on from the car.
+    """One possible path ahead of the car.
 
     Attributes:
-        kind: route: given; road: visible in the map; corridor: straight on.
+        kind: "route" (given), "road" (visible in the map) or "corridor" (straight on).
         distance: (M,) [m].
         places: (M, C) keys.
         curvature: (M,) [1/m], positive to the left; NaN where unknown.
@@ -67,7 +69,7 @@ class Path(NamedTuple):
     y: FloatArray
 
     def first_metres(self, length: float) -> Path:
-        """Return its first metres."""
+        """Return the first `length` metres of the path."""
         n = max(int(length), 1)
         return Path(
             self.kind,
@@ -82,7 +84,9 @@ class Path(NamedTuple):
 def to_plane(
     latitude: FloatArray, longitude: FloatArray, pose: Pose
 ) -> tuple[FloatArray, FloatArray]:
-    """Return east and north [m] of the car; exact to a centimetre within a kilometre."""
+    """Return east and north coordinates [m] relative to the car; the error is below a centimetre
+    within a kilometre.
+    """
     east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
     return (np.asarray(longitude) - pose.longitude) * east, (
         np.asarray(latitude) - pose.latitude
@@ -90,7 +94,9 @@ def to_plane(
 
 
 def to_degrees(x: FloatArray, y: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
-    """Return latitude and longitude [deg] of points [m] relative to the car."""
+    """Return latitude and longitude [deg] of points given by east and north coordinates [m]
+    relative to the car.
+    """
     east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
     return pose.latitude + y / METRES_PER_DEGREE, pose.longitude + x / east
 
@@ -98,10 +104,10 @@ def to_degrees(x: FloatArray, y: FloatArray, pose: Pose) -> tuple[FloatArray, Fl
 def path_along(
     kind: Way, line: FloatArray, pose: Pose, length: float, first: IntArray | None = None
 ) -> Path:
-    """Return the way along a line (n, 2) [m] that begins at the car, at most `length` [m] long.
+    """Return the path along a line (n, 2) [m] that begins at the car, at most `length` [m] long.
 
-    `first` (n,) are known keys at the line's points; they precede those that follow from the
-    position.
+    `first` (n,) are known keys of places at the line's points. They take precedence over the keys
+    computed from the positions.
     """
     run = _distance_along(line)
     count = max(int(min(run[-1], length)), 1)
@@ -122,18 +128,18 @@ def path_along(
 
 
 def straight_path(pose: Pose, length: float) -> Path:
-    """Return the way straight on along the heading."""
+    """Return a straight path in the direction of the car's heading."""
     reach = min(length, CORRIDOR_M)
     end = [reach * np.cos(pose.yaw), reach * np.sin(pose.yaw)]
     return path_along("corridor", np.array([[0.0, 0.0], end]), pose, length)
 
 
 class GivenRoute:
-    """Given route, and the car's progress on it.
+    """Route given by the user, and the car's progress on it.
 
     Args:
-        latitude: (n,) [deg] of its points, at least two.
-        longitude: (n,) [deg].
+        latitude: (n,) latitude of its points [deg], at least two points.
+        longitude: (n,) longitude of its points [deg].
     """
 
     def __init__(self, latitude: FloatArray, longitude: FloatArray) -> None:
@@ -142,7 +148,7 @@ class GivenRoute:
         self._metre = 0.0
 
     def ahead(self, pose: Pose, length: float) -> Path | None:
-        """Return the way on along the route; None if the car has left it."""
+        """Return the path ahead along the route; None if the car has left the route."""
         x, y = to_plane(self._latitude, self._longitude, pose)
         line = np.column_stack([x, y])
         run = _distance_along(line)
@@ -156,8 +162,10 @@ class GivenRoute:
         return path_along("route", ahead, pose, length) if len(ahead) > 1 else None
 
     def _match_position(self, line: FloatArray, run: FloatArray, pose: Pose) -> float | None:
-        """Return the metre of the route at which the car is: the next one after the last, with
-        the same heading.
+        """Return the distance along the route [m] at which the car is: the next matching point
+        after the last one, with the same heading.
+
+        Return None if no point matches.
         """
         step = np.diff(line, axis=0)
         start = line[:-1]

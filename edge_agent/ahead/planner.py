@@ -1,13 +1,13 @@
-"""Speed limit for a motion planner from the lower bound of grip ahead, as Autoware's message
+"""Speed limit for a motion planner from the lower bound of friction ahead, as Autoware's message
 VelocityLimit.
 
 The limit is the speed from which the vehicle can brake comfortably to the safe speed of each place
-ahead. It falls at once and rises only after it was higher for HOLD_S, so that a planner does not
-see it flutter. An unmeasured road gives no limit.
+ahead. It decreases immediately, but increases only after the new limit was higher for HOLD_S, so
+that it does not fluctuate. An unmeasured road gives no limit.
 
-Autoware listens on `/planning/scenario_planning/max_velocity_candidates`
-(tier4_planning_msgs/msg/VelocityLimit). The message is put as rmw_zenoh puts it: CDR, with an
-attachment of number, time and identity of the sender.
+Autoware subscribes to `/planning/scenario_planning/max_velocity_candidates`
+(tier4_planning_msgs/msg/VelocityLimit). The message is published in the form of rmw_zenoh: CDR,
+with an attachment of sequence number, time and sender identity.
 """
 
 from __future__ import annotations
@@ -42,11 +42,13 @@ _GID_BYTES: Final = 16
 
 
 def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
-    """Return the highest speed [m/s] now from which each safe speed ahead is reached with COMFORT
-    after LATE_S; inf without any.
+    """Return the highest present speed [m/s] from which each safe speed ahead is reached by braking
+    with COMFORT after LATE_S.
+
+    Return inf if no safe speed is known.
 
     Args:
-        distance: (M,) [m] from the vehicle.
+        distance: (M,) distance from the vehicle [m].
         safe_speed: (M,) [m/s]; NaN where unknown.
     """
     known = np.isfinite(safe_speed)
@@ -61,13 +63,15 @@ def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
 
 
 def cautious_bound(mu: FloatArray, mu_lower: FloatArray) -> FloatArray:
-    """Return the grip that a road has with 99.5 %, from median and 5 % quantile; NaN if unknown."""
+    """Return the friction that a road exceeds with a probability of 99.5 %, from its median and 5 %
+    quantile; NaN if unknown.
+    """
     below = np.nan_to_num(mu - mu_lower)
     return np.asarray(np.maximum(mu_lower - CAUTION * below, LEAST_GRIP))
 
 
 def limit_of(horizons: list[Horizon]) -> float:
-    """Return the lowest limit over all ways on [m/s]; inf without any."""
+    """Return the lowest speed limit over all possible paths ahead [m/s]; inf if there is no limit."""
     found = []
     for one in horizons:
         known = (one.basis == MEASURED) | one.slippery
@@ -78,14 +82,16 @@ def limit_of(horizons: list[Horizon]) -> float:
 
 
 class SteadyLimit:
-    """Limit with hysteresis: it falls at once, and rises after it was higher for HOLD_S."""
+    """Limit with hysteresis: it decreases immediately, and increases only after the new limit was
+    higher for HOLD_S.
+    """
 
     def __init__(self) -> None:
         self.value = math.inf
         self._higher_since: int | None = None
 
     def update(self, limit: float, now: int) -> bool:
-        """Take a new limit [m/s] at `now` [ns]; return True if the value changed."""
+        """Process a new limit [m/s] at the time `now` [ns]; return True if the value changed."""
         if limit < self.value:
             self._higher_since = None
             changed = self.value - limit >= FALL_STEP or self.value == math.inf
@@ -115,12 +121,12 @@ def encode_limit(limit: float, now: int) -> bytes:
 
 
 class PlannerKey:
-    """Key and attachments of one sender.
+    """Zenoh key and attachments of one sender of speed limits.
 
     Args:
-        domain: of ROS.
-        type_hash: of the message in the planner's version, e.g. RIHS01_…; rmw_zenoh subscribes to
-            it literally.
+        domain: ROS domain.
+        type_hash: hash of the message type in the planner's version, e.g. RIHS01_…; rmw_zenoh
+            subscribes to exactly this hash.
     """
 
     def __init__(self, domain: int = 0, type_hash: str = ANY_HASH) -> None:
@@ -129,6 +135,6 @@ class PlannerKey:
         self._identity = secrets.token_bytes(_GID_BYTES)
 
     def attachment(self, now: int) -> bytes:
-        """Return the attachment of the next message."""
+        """Return the attachment of the next message, sent at the time `now` [ns]."""
         self._number += 1
         return struct.pack("<qqB", self._number, now, _GID_BYTES) + self._identity

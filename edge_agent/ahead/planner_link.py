@@ -1,5 +1,5 @@
-"""Zenoh session at the planner of the vehicle: its speed limit whenever it changes, and again
-every REPEAT_S.
+"""Zenoh session to the motion planner of a vehicle: publishes the speed limit at each change, and
+repeats it every REPEAT_S.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ log = logging.getLogger(__name__)
 
 
 class PlannerLink:
-    """Publishes the limit ahead of one vehicle.
+    """Publisher of the speed limit ahead of one vehicle.
 
     Args:
-        endpoint: Zenoh router of the planner; the session opens on a thread of its own.
-        type_hash: of VelocityLimit in the planner's version.
-        domain: of ROS.
+        endpoint: Zenoh router of the planner; the session is opened on a separate thread.
+        type_hash: hash of the type VelocityLimit in the planner's version.
+        domain: ROS domain.
     """
 
     def __init__(self, endpoint: str, type_hash: str, domain: int = 0) -> None:
@@ -43,7 +43,9 @@ class PlannerLink:
         self._session = open_session(self._settings)
 
     def receive_horizons(self, _: str, horizons: list[Horizon], pose: Pose) -> None:
-        """Take a look ahead; publish if the limit changed or was not repeated for REPEAT_S."""
+        """Compute the limit from the horizons; publish it if it changed or the last message is
+        REPEAT_S old.
+        """
         changed = self._limit.update(limit_of(horizons), pose.time)
         if self._session is None or not (changed or pose.time - self._sent >= REPEAT_S * NS):
             return

@@ -1,27 +1,29 @@
-"""The map as prior knowledge about the vehicle's current cell; it never affects published records.
-Pure.
+"""The map as prior knowledge about the friction in the vehicle's current cell. It never affects
+published records. The module is pure.
 
 The estimator runs without the map: its recursion, and the published evidence of a visit, are
-bit-equal with and without it. In addition, this module computes the belief of an estimator that had
-begun the visit with the map's belief:
+bit-equal with and without a map. In addition, this module computes the belief of an estimator that
+had started the visit with the map's belief:
 
-    q(μ)  ∝  [(1 - h)·w⁻(μ) + h·u(μ)] · m(μ)/u(μ)     at a cell's border
-    p_M   ∝  q · L            p  =  (1 - β')·p_M + β'·w            in the cell
+    q(μ)  ∝  [(1 - h)·w⁻(μ) + h·u(μ)] · m(μ)/u(μ)     at the border of a cell
+    p_M   ∝  q · L            p  =  (1 - β')·p_M + β'·w            inside the cell
 
 Legend
     w⁻, w   the filter's own belief at the border, and now             (32,)
-    m       the map's belief of this cell, faded with its age           (32,)
-    u       uniform on the friction grid                                (32,)
-    h       chance that the road changes at this border: how much the map's beliefs of the two cells
-            differ (total variation), BLIND where it knows only this one
+    m       the map's belief about this cell, faded with its age        (32,)
+    u       uniform distribution on the friction grid                   (32,)
+    h       probability that the road changes at this border: the difference between the map's
+            beliefs about the two cells (total variation); BLIND if only this cell is known
     L       likelihood of the visit's measurements so far               (32,)
-    β, β'   chance that the map is wrong here, before and after them: β' = β·Z_W/(β·Z_W + (1 -
-            β)·Z_M) with Z_M = Σ q·L and Z_W = Σ w⁻·L. It begins at SHARE, which
-            no map can reduce; a share KEPT of the result passes to the next visit
+    q, p_M  belief with the map at the border, and now                  (32,)
+    p       result: mixture of the beliefs with and without the map     (32,)
+    β, β'   probability that the map is wrong here, before and after the measurements: β' =
+            β·Z_W/(β·Z_W + (1 - β)·Z_M) with Z_M = Σ q·L and Z_W = Σ w⁻·L. It begins at SHARE,
+            its lowest value; a share KEPT of its excess over SHARE passes to the next visit
 
-The filter's own belief is carried over a border, never the mixture, so that no cell of the map is
-counted twice. Averaging hypotheses by their predictions: Hoeting et al., Bayesian model averaging,
-Stat. Sci. 14 (1999).
+Only the filter's own belief passes a border, never the mixture p, so that no cell of the map is
+counted twice. Averaging of hypotheses by their predictions: Hoeting et al., Bayesian model
+averaging, Stat. Sci. 14 (1999).
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ NOWHERE: Final = -1
 
 
 class MapPrior:
-    """Influence of the map on the beliefs of N vehicles."""
+    """Combination of the map's beliefs with the beliefs of N vehicles' filters."""
 
     def __init__(self, vehicles: int) -> None:
         self._key = np.full(vehicles, NOWHERE)
@@ -56,8 +58,8 @@ class MapPrior:
         self._found = np.full(vehicles, SHARE)  # now
 
     def entered_vehicles(self, keys: IntArray) -> list[int]:
-        """Return the vehicles that entered another place since the last step: their map beliefs
-        are needed.
+        """Return the indices of the vehicles that entered another place since the last step. `step`
+        needs the map's beliefs for them.
         """
         return np.flatnonzero(keys != self._key).tolist()
 
@@ -68,13 +70,13 @@ class MapPrior:
         visit: FloatArray,
         map_beliefs: dict[int, FloatArray | None],
     ) -> FloatArray:
-        """Return the beliefs of the vehicles with the map's help, (N, 32) probabilities.
+        """Return the beliefs of the vehicles combined with the map, (N, 32) probabilities.
 
         Args:
-            keys: (N,) current place of each, NOWHERE where unknown.
-            own: (N, 32) log of the filter's posterior over uniform.
-            visit: (N, 32) log-likelihood of the visit so far.
-            map_beliefs: the map's belief for the vehicles in `entered_vehicles`; None where it
+            keys: (N,) current place (cell·4 + sector) of each vehicle, NOWHERE where unknown.
+            own: (N, 32) log(posterior/uniform) of each filter.
+            visit: (N, 32) log-likelihood of the current visit so far.
+            map_beliefs: the map's belief for the vehicles in `entered_vehicles`; None where the map
                 knows nothing.
         """
         now = _normalise_rows(np.exp(own))

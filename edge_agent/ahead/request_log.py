@@ -1,9 +1,9 @@
-"""Choice of map requests: boxes along the way ahead, so that a day costs megabytes and not
-gigabytes. Pure.
+"""Choice of map requests: narrow boxes along the path ahead, so that a day needs megabytes and not
+gigabytes. The module is pure.
 
-A changed tile is published whole, each second: about 50 kB in a busy town. A car needs only what
-lies along its way, and not every second, while it must learn of ice at once. It therefore requests
-narrow boxes along its way and subscribes to the alerts of the tiles there.
+The fleet service publishes a changed tile as a whole, every second: about 50 kB in a busy town. A
+car needs only the part along its path, and not every second, but it must hear of ice immediately.
+Therefore it requests narrow boxes along its path, and subscribes to the alerts of the tiles there.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ LEAVE_S: Final = 20.0
 
 
 class Box(NamedTuple):
-    """Piece of the map [deg]."""
+    """Rectangle of the map, with its sides in degrees."""
 
     west: float
     south: float
@@ -43,20 +43,20 @@ class Box(NamedTuple):
 
 
 class RequestLog:
-    """The last MOST_BOXES requested boxes, with the time of the request."""
+    """Log of the last MOST_BOXES requested boxes, with the time of each request."""
 
     def __init__(self) -> None:
         self._boxes: deque[tuple[Box, int]] = deque(maxlen=MOST_BOXES)
 
     def request_again(self) -> None:
-        """Request everything again after a session has been reopened."""
+        """Clear the log, so that everything is requested again after a session has been reopened."""
         self._boxes.clear()
 
     def missing_boxes(self, path: Path, pose: Pose, within: float) -> list[Box]:
-        """Return the boxes to request now, along a path; they count as requested.
+        """Return the boxes to request now along a path, and record them as requested.
 
-        Nothing is requested until something nearer than `within` [m] is missing; then all of the
-        path is.
+        The result is empty while the first `within` [m] of the path are covered. Otherwise the
+        boxes cover all missing parts of the path.
         """
         latitude, longitude = to_degrees(path.x[::STEP], path.y[::STEP], pose)
         open_ = np.ones(len(latitude), np.bool_)
@@ -72,7 +72,9 @@ class RequestLog:
 
 
 class Tiles:
-    """Tiles whose alerts are subscribed to: those ahead, and for a while those that were."""
+    """Tiles whose alerts are subscribed to: the tiles ahead, and for LEAVE_S those that were ahead
+    before.
+    """
 
     def __init__(self) -> None:
         self._wanted: dict[int, int] = {}  # tile -> when it was wanted last [ns]
@@ -83,7 +85,7 @@ class Tiles:
         return list(self._wanted)
 
     def update_subscriptions(self, paths: list[Path], pose: Pose) -> tuple[list[int], list[int]]:
-        """Return the tiles to subscribe to and to unsubscribe from."""
+        """Update the set of tiles; return (tiles to subscribe to, tiles to unsubscribe from)."""
         here = int(grid.tile_of(grid.cell_of(pose.latitude, pose.longitude)))
         ahead: list[int] = [here]
         for path in paths:
@@ -107,7 +109,7 @@ class Tiles:
 
 
 def keys_of(box: Box) -> list[int]:
-    """Return the regions (z10) that a box touches, each once."""
+    """Return the regions (z10 quadints) that a box touches, each once."""
     corners = grid.cell_of(
         np.array([box.south, box.south, box.north, box.north]),
         np.array([box.west, box.east, box.west, box.east]),
@@ -120,8 +122,8 @@ def _in_order(tiles: IntArray) -> list[int]:
 
 
 def _split_path(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
-    """Return runs of the path, first and last metre, that have small boxes and contain every
-    wanted point.
+    """Return (first, last) metre of parts of the path that together contain every wanted point,
+    each with a small bounding box.
     """
     found: list[tuple[int, int]] = []
     first = last = -1

@@ -1,10 +1,11 @@
-"""Roads visible in the map: sequences of cells and sectors that vehicles visited one after the
-other.
+"""Roads visible in the map: sequences of places (cell and sector) that vehicles visited one after
+the other.
 
-Two places of the map follow each other if the second lies within two cells, in front, and vehicles
-head there as they must when they come from the first. All ways at a fork are followed, the
-straightest first. After its last known place that way continues straight on, as far as a corridor:
-the car requests the map along its way, so a shorter way would never grow.
+One place follows another if it lies within about two cells in front of it, and its sector is a
+possible heading for a vehicle that comes from there. At a fork all roads are followed, the
+straightest first. After its last known place, the straightest road is continued straight on over
+the length of a corridor. The car requests the map along its path, so without this extension the
+known road would never grow.
 """
 
 from __future__ import annotations
@@ -33,8 +34,11 @@ STEP_M: Final = 10.0  # a cell
 
 
 def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
-    """Return the ways on among known places `keys` (n,), at most `length` [m] long; none if the map
-    shows no road here."""
+    """Return the possible paths ahead along the known places `keys` (n,), at most `length` [m]
+    long.
+
+    The list is empty if the map shows no road at the car.
+    """
     latitude, longitude = grid.centre(keys // grid.SECTORS)
     x, y = to_plane(latitude, longitude, pose)
     near = np.hypot(x, y) <= length
@@ -76,7 +80,9 @@ class _Neighbours:
         self.side = side
 
     def next_places(self, here: tuple[float, float], heading: float, cells: float) -> list[int]:
-        """Return places that may come next, the likeliest first; one per road."""
+        """Return the keys of places that may come next, the most likely first, at most one per
+        road.
+        """
         reach = cells * self.side
         found = []
         column = math.floor(here[0] / self.side)
@@ -105,7 +111,10 @@ class _Neighbours:
 def _follow_way(
     graph: _Neighbours, way: list[int], pose: Pose, length: float, forks: list[list[int]]
 ) -> list[int]:
-    """Follow a way to its end; put branches on `forks`."""
+    """Follow a road from the places in `way` to its end; append branches at forks to `forks`.
+
+    Return the keys of the places along the road.
+    """
     run = 0.0
     passed = set(way)
     for _ in range(MOST_STEPS):
@@ -123,8 +132,8 @@ def _follow_way(
 
 
 def _heading_of_way(way: list[int], places: dict[int, tuple[float, float]], pose: Pose) -> float:
-    """Return the heading of the last three links, because the cell centres of a slanting road
-    zigzag.
+    """Return the mean heading [rad] of the last three steps, because the cell centres along an
+    oblique road zigzag.
     """
     last = [(0.0, 0.0), *(places[key] for key in way)][-4:]
     dx = last[-1][0] - last[0][0]

@@ -1,7 +1,8 @@
-"""Route files: GPX (track, route or way points) and GeoJSON (a LineString, or an object that
-contains one).
+"""Reader of route files: GPX (track, route or waypoints) and GeoJSON (a LineString, or an object
+that contains one).
 
-XML is read by events; a document that declares a type is refused before anything in it is expanded.
+XML is parsed as a stream of events. A document with a document type declaration is rejected before
+any of its entities is expanded.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ _POINTS: Final = ("trkpt", "rtept", "wpt")  # what a GPX file may hold, in this 
 
 
 def read_route(path: Path) -> GivenRoute:
-    """Return the route of a .gpx, .geojson or .json file.
+    """Return the route in a .gpx, .geojson or .json file.
 
     Raises:
-        InputError: the file cannot be read, or holds no line of at least two points on earth.
+        InputError: the file cannot be read, or contains no line of at least two valid points.
     """
     try:
         data = path.read_bytes()
@@ -48,7 +49,7 @@ def route_of(points: list[tuple[float, float]]) -> GivenRoute:
     """Return the route through points (latitude, longitude) [deg].
 
     Raises:
-        InputError: they are no route.
+        InputError: there are too few or too many points, or a point is out of range.
     """
     if not 2 <= len(points) <= MOST_POINTS:
         raise InputError(
@@ -103,7 +104,7 @@ def _parse_geojson(data: bytes) -> list[tuple[float, float]]:
 
 
 def _find_line(document: Any) -> list[Any]:  # noqa: ANN401 whatever JSON holds
-    """Return the coordinates of the first line in a document."""
+    """Return the coordinates of the first line in a GeoJSON document."""
     kind = document["type"]
     if kind == "LineString":
         return list(document["coordinates"])

@@ -1,8 +1,8 @@
-"""Warnings: issued when a slippery stretch comes within reach, updated when it changes, ended when
-it is over. Pure.
+"""Warnings about slippery stretches of road: issued when a stretch comes within reach, updated when
+it changes, ended when it is over. The module is pure.
 
-Reach is the stopping distance before the stretch at the present speed: reaction, a margin, and
-braking at the lower end of grip on the road up to it.
+The reach is the stopping distance before the stretch at the present speed: reaction, a margin, and
+braking at the lower end of friction on the road up to the stretch.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ SLOWEST: Final = 0.5  # [m/s] who stands has no time to a stretch
 
 @dataclass(frozen=True)
 class Active:
-    """A current warning: the reported hazard, its places, and where and when it was last
-    confirmed.
+    """A current warning: the reported hazard, its places (cell·4 + sector), and the time and
+    distance at which it was last confirmed.
     """
 
     warning: GripWarning
@@ -56,13 +56,13 @@ class _Stretch:
 def update_warnings(
     active: tuple[Active, ...], horizons: list[Horizon], pose: Pose, known: LocalMap
 ) -> tuple[tuple[Active, ...], list[GripWarning]]:
-    """Return the standing warnings after an update, and the ones to report.
+    """Return the active warnings after an update, and the warnings to report now.
 
     Args:
-        active: standing warnings before.
-        horizons: of every way on; the likeliest first.
-        pose: of the car.
-        known: the local copy of the map, ahead or not.
+        active: active warnings before the update.
+        horizons: horizons of all possible paths, the most likely first.
+        pose: pose of the car.
+        known: the local copy of the map.
     """
     issued: list[GripWarning] = []
     speed = pose.speed + GAIN if pose.speed > SLOWEST else 0.0
@@ -103,7 +103,7 @@ def update_warnings(
 
 
 def _slippery_stretches(horizon: Horizon, speed: float) -> list[_Stretch]:
-    """Return runs of slippery metres of a horizon; runs less than LINK_M apart are joined."""
+    """Return the slippery stretches of a horizon; stretches at most LINK_M apart are joined."""
     brakes = np.concatenate([[0.0], braking_from(horizon)])
     begins = math.ceil(
         speed * (REACTION_S + UPDATE_S) + MARGIN_M
@@ -138,7 +138,9 @@ def _find_runs(mask: BoolArray) -> list[tuple[int, int]]:
 
 
 def _by_place(stretches: list[_Stretch]) -> list[tuple[frozenset[int], list[_Stretch]]]:
-    """Join stretches of several ways that have places in common."""
+    """Group the stretches of several paths by common places; return (all places of the group, its
+    stretches) pairs.
+    """
     groups: list[tuple[frozenset[int], list[_Stretch]]] = []
     for stretch in stretches:
         same = [group for group in groups if group[0] & stretch.places]

@@ -1,7 +1,8 @@
-"""`edge-agent`: simulate, import, check, calibrate, replay, run, fleet, tune, evaluate, completion.
+"""`edge-agent` command line: simulate, import, check, calibrate, replay, run, fleet, tune,
+evaluate, completion.
 
-Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. Modules are imported
-when a command needs them, so that help is fast.
+Invalid input gives one line on stderr, "error: field: problem; fix", and exit code 2. Modules are
+imported only when a command needs them, so that help is fast.
 """
 
 from __future__ import annotations
@@ -110,7 +111,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run_command(
     arguments: Sequence[str], *, limited: bool, chosen: str | None
 ) -> tuple[int, bool]:
-    """Return the exit code, and whether a remaining thread would keep the process from ending."""
+    """Run a command; return its exit code, and True if a remaining thread would keep the process
+    from ending.
+    """
     args = commandline.parser_of(*LINE, chosen).parse_args(arguments)
     level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.INFO
     logging.basicConfig(

@@ -1,4 +1,4 @@
-"""`edge-agent calibrate`: learn the device errors of a car from its drives; writes a vehicle
+"""`edge-agent calibrate`: learn the sensor errors of a car from its drives, and write a vehicle
 file.
 """
 
@@ -25,7 +25,7 @@ UNITS: Final = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the command-line arguments of `edge-agent calibrate`."""
     parser.add_argument("log", type=Path, nargs="+", help="signal logs (Parquet) of one car")
     parser.add_argument(
         "--vehicle", type=Path, required=True, help="vehicle file to start from (JSON)"
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Learn, judge on held-out drives and write; return 0."""
+    """Learn a calibration, validate it on held-out drives, and write the vehicle file; return 0."""
     from edge_agent.app.estimates_file import prepare_path
     from edge_agent.calibration.held_out import learn_validated
     from edge_agent.inputs.correct import scale_axles
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:
-    """Replay a drive and return how well the estimator predicts its measurements."""
+    """Replay a drive with a vehicle; return how well the estimator predicts its measurements."""
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.calibration.held_out import Prediction
     from edge_agent.estimators.estimates import Column
@@ -89,8 +89,8 @@ def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:
 
 
 def report_lines(found: HeldOut) -> list[str]:
-    """Return the learned values with units, the groups that were left out, and the judgement on
-    held-out drives.
+    """Return the lines of the report: learned values with units, groups that were left out, and the
+    scores on held-out drives.
     """
     lines = []
     for name, estimate in found.calibration.model_dump(exclude_none=True).items():

@@ -1,4 +1,4 @@
-"""`edge-agent check`: run the signal doctor on a log; lists sound and faulty signals with their
+"""`edge-agent check`: run the signal doctor on a log; list sound and faulty signals with their
 corrections.
 """
 
@@ -20,7 +20,7 @@ FLAG_ROWS = 1000  # after which a controller's flag is looked at again
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the command-line arguments of `edge-agent check`."""
     parser.add_argument("log", type=Path, help="signal log (Parquet)")
     parser.add_argument(
         "--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json next to LOG.parquet)"
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check a log; return 0 if it has passed, 1 if a channel is faulty or unknown."""
+    """Check a log; return 0 if it passes, 1 if a channel is faulty or unknown."""
     from edge_agent.app.backfill import vehicle_file_of
     from edge_agent.app.estimates_file import prepare_path
     from edge_agent.inputs.bring_in import profile_of
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _doubted_flags(log: SignalLog) -> dict[str, str]:
-    """Return the controller flags of a log that the estimator does not trust at some time, with the
+    """Return the controller flags of a log that are ignored as implausible at some time, with the
     reason.
     """
     from edge_agent.observe.controller_flags import doubted_flags, new_flag_records, trusted_context

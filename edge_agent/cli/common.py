@@ -1,4 +1,4 @@
-"""Shared parts of the commands: vehicle names, and checks by the signal doctor."""
+"""Parts that several commands share: check of vehicle names, and check by the signal doctor."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 
 def checked_name(name: str) -> str:
-    """Return a name that may be part of a key.
+    """Return the name if it is a valid vehicle name, which may be part of a key.
 
     Raises:
-        InputError: it may not.
+        InputError: the name is invalid.
     """
     if not re.fullmatch(NAME_PATTERN, name):
         raise InputError(
@@ -29,10 +29,10 @@ def checked_name(name: str) -> str:
 
 
 def require_valid_signals(diagnosis: Diagnosis) -> None:
-    """Raise unless the signals of a log agree with each other.
+    """Raise an error unless the signals of a log passed the signal doctor.
 
     Raises:
-        InputError: the signal doctor finds a fault, or cannot decide.
+        InputError: the signal doctor found a fault, or could not decide.
     """
     from edge_agent.inputs.doctor.report import publishing_advice, report_lines
 
@@ -49,8 +49,8 @@ def require_valid_signals(diagnosis: Diagnosis) -> None:
 
 
 def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
-    """Print on stderr the faults that the signal doctor finds in a log; return notes to print
-    after the estimates.
+    """Print the faults that the signal doctor found in a log on stderr; return notes to print after
+    the estimates.
     """
     found = diagnosis.findings
     for fault in found:

@@ -1,4 +1,4 @@
-"""`edge-agent completion`: print the completion script for a shell."""
+"""`edge-agent completion`: print the script that completes commands and options in a shell."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from schemas.runtime import commandline
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the command-line arguments of `edge-agent completion`."""
     parser.add_argument("shell", metavar="|".join(commandline.SHELLS), help="shell to complete for")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the script."""
+    """Print the completion script; return 0."""
     from edge_agent.cli import COMMANDS, LINE
 
     parser = commandline.parser_of(*LINE, *(command.name for command in COMMANDS))

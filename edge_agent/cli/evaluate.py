@@ -1,4 +1,4 @@
-"""`edge-agent evaluate`: run the evaluation; writes figures.json, a Markdown table and plots."""
+"""`edge-agent evaluate`: run the evaluation, and write figures.json, a Markdown table and plots."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CARS: Final = 5  # smooth ones, and as many rough ones, of the inputs' campaign
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the command-line arguments of `edge-agent evaluate`."""
     parser.add_argument(
         "--out", type=Path, required=True, help="folder for figures.json, report.md and the plots"
     )
@@ -76,10 +76,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate; return 0 if all measured bars hold, else 1.
+    """Run the evaluation; return 0 if every measured figure meets its target, else 1.
 
     Raises:
-        InputError: too few seeds, the folder cannot be created, or matplotlib is not installed.
+        InputError: there are too few seeds, the folder cannot be created, or matplotlib is not
+            installed.
     """
     from edge_agent.lab.evaluation.bars import figures as figures_of
     from edge_agent.lab.evaluation.campaign import run_campaign as campaign

@@ -1,5 +1,5 @@
-"""`edge-agent fleet`: simulated vehicles in real time, each with its own session and name, one
-estimator bank.
+"""`edge-agent fleet`: run simulated vehicles in real time with one estimator bank; each has its own
+name and session.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the command-line arguments of `edge-agent fleet`."""
     parser.add_argument("--vehicles", type=int, default=36, help="number of vehicles (default 36)")
     parser.add_argument(
         "--scenario",
@@ -56,7 +56,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Drive until the duration has passed or a signal arrives; write the truth before the end."""
+    """Run the fleet until the duration has passed or a signal (SIGTERM, Ctrl-C) arrives; write the
+    true states before the end.
+
+    Return the exit code.
+    """
     from edge_agent.ahead.lookout import Lookout
     from edge_agent.app.agent import Agent, AgentOptions, AgentSource
     from edge_agent.app.estimates_file import prepare_path

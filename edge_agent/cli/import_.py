@@ -1,5 +1,5 @@
-"""`edge-agent import`: convert a car's recording to a signal log by a profile; without one, a
-profile is drafted.
+"""`edge-agent import`: convert a car's recording to a signal log by a profile; without a profile,
+write a draft of one.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ MOST_NAMES = 30  # of signals in an error
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the command-line arguments of `edge-agent import`."""
     parser.add_argument(
         "source",
         type=Path,
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Import; return 0 if the log was written."""
+    """Import the recordings; return 0 if the command succeeded."""
     from edge_agent.app.estimates_file import prepare_path
     from edge_agent.inputs.bring_in import database_of, read_source, write_log
     from edge_agent.inputs.doctor.adopt import align_import

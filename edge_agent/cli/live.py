@@ -1,5 +1,5 @@
 """Parts of an agent for `run` and `fleet`: warnings of the road ahead, friction as VSS signals, and
-the simulation.
+warm-up of the simulation.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from schemas.wire.ahead import GripWarning
 
 
 def warm_up_simulation(scenario: str, rate_hz: float, rough: float = 0.0) -> None:
-    """Load or compile the kernels of the simulation before its first step."""
+    """Load or compile the kernels of the simulation, by one step before the run."""
     from edge_agent.lab.simulation import SimulatedFleet
 
     with progress_messages.show_status("starting the simulation"):
@@ -29,21 +29,23 @@ def warm_up_simulation(scenario: str, rate_hz: float, rough: float = 0.0) -> Non
 
 
 class LookoutPart:
-    """A lookout that receives the map over the vehicles' sessions."""
+    """Agent part that looks ahead: it receives the map over the vehicles' sessions and gives
+    warnings.
+    """
 
     def __init__(self, lookout: Lookout) -> None:
         self._lookout = lookout
 
     def attach_session(self, name: str, session: zenoh.Session) -> None:
-        """Subscribe on a vehicle's session."""
+        """Subscribe to the map on a vehicle's session."""
         self._lookout.attach(name, session)
 
     def start_part(self) -> None:
-        """Start to look ahead."""
+        """Start the thread that looks ahead."""
         self._lookout.start()
 
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:  # noqa: ARG002 warnings need no admission
-        """Pass the vehicles' positions and their filters' beliefs to the lookout."""
+        """Pass the vehicles' positions and the friction beliefs of their filters to the lookout."""
         if pipeline.seen is None:
             return
         columns = (column.tolist() for column in pipeline.seen)
@@ -51,38 +53,43 @@ class LookoutPart:
         self._lookout.believe(pipeline.places, pipeline.beliefs())
 
     def close_part(self) -> Mapping[str, float]:
-        """Stop, and return the counts of warnings and messages."""
+        """Stop the lookout, and return the counts of warnings and messages."""
         self._lookout.close()
         return self._lookout.counts.values()
 
 
 class VssPart:
-    """Friction at the vehicles as VSS signals, if their own signals are admitted."""
+    """Agent part that reports the friction at the vehicles as VSS signals, while their records may
+    be published.
+    """
 
     def __init__(self, output: RoadFrictionOutput) -> None:
         self._output = output
 
     def attach_session(self, name: str, session: zenoh.Session) -> None:
-        """Publish on a vehicle's session."""
+        """Publish the signals on a vehicle's session."""
         self._output.attach(name, session)
 
     def start_part(self) -> None:
         """Do nothing: the output starts with the first report."""
 
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:
-        """Report the friction after a block."""
+        """Report the friction after a block, if its records may be published."""
         if admitted:
             self._output.report_grip(pipeline.grip)
 
     def close_part(self) -> Mapping[str, float]:
-        """Close the output; it has no counts."""
+        """Close the output. It has no counts, so the result is empty."""
         self._output.close()
         return {}
 
 
 def warning_lines(config: AgentConfig) -> Callable[[str, GripWarning], None]:
-    """Return a function that prints warnings on stdout: text, or JSON if the log is JSON; an
-    infinite time is null there."""
+    """Return a function that prints warnings on stdout, as text or as JSON, depending on the log
+    format.
+
+    In JSON an infinite time is null.
+    """
     say = line_logger(config.log, sys.stdout)
 
     def print_warning(vehicle: str, warning: GripWarning) -> None:

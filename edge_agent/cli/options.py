@@ -1,4 +1,4 @@
-"""Options that several commands share; light, because every help text needs them."""
+"""Options that several commands share. The module imports little, because every help text needs it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def add_estimator(parser: argparse.ArgumentParser) -> None:
-    """Declare the options for estimator and fuzzy sets."""
+    """Add the options `--estimator` and `--memberships`."""
     parser.add_argument(
         "--estimator", help="name of the estimator (default: the configuration's, aco-fckf)"
     )
@@ -23,19 +23,19 @@ def add_estimator(parser: argparse.ArgumentParser) -> None:
 
 
 def memberships_of(args: argparse.Namespace) -> Memberships | None:
-    """Return the fuzzy sets of the option; None if it was not given."""
+    """Return the fuzzy sets given by `--memberships`; None if the option was not given."""
     from edge_agent.app.tuned_memberships import load_tuned
 
     return load_tuned(args.memberships).memberships if args.memberships else None
 
 
 def add_json(parser: argparse.ArgumentParser, what: str) -> None:
-    """Declare the option for machine-readable output."""
+    """Add the option `--json` for machine-readable output."""
     parser.add_argument("--json", action="store_true", help=f"print {what} as JSON")
 
 
 def print_list(entries: Mapping[str, str], *, as_json: bool) -> None:
-    """Print names with one line about each, as text or as one JSON object."""
+    """Print names with a one-line description each, as text or as one JSON object."""
     if as_json:
         print(json.dumps(dict(entries)))
     else:

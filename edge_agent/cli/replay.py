@@ -1,5 +1,5 @@
-"""`edge-agent replay`: estimate recorded drives as fast as possible; with --publish, send one to
-the map.
+"""`edge-agent replay`: estimate recorded drives as fast as possible; with --publish, send one drive
+to the fleet service.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ PROGRESS_S = 1.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the command-line arguments of `edge-agent replay`."""
     parser.add_argument("log", type=Path, nargs="+", help="signal log (Parquet)")
     parser.add_argument(
         "--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json next to LOG.parquet)"
@@ -83,8 +83,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay logs; return 0 if all records were written and acknowledged, 1 if some were left or
-    refused, 3 if a log is not plausible.
+    """Replay logs. Return 0 if all records were written and acknowledged, 1 if records were
+    rejected or not settled, 3 if the estimates of a log are implausible.
     """
     from edge_agent.app.backfill import (
         backfill_on_spark,
@@ -171,7 +171,9 @@ def _split_names(names: str | None) -> list[str]:
 def _write_report(
     args: argparse.Namespace, log: SignalLog, vehicle: Vehicle, names: list[str]
 ) -> list[str]:
-    """Estimate with each estimator, write the report, and return notes."""
+    """Estimate a log with each of the named estimators, write the report, and return notes for the
+    user.
+    """
     import pyarrow as pa
 
     from edge_agent.app import drive_report
@@ -209,7 +211,7 @@ def _check_engine(engine: str, jobs: int, *, several: bool) -> None:
 
 
 def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
-    """Print progress on stderr; return 2 if a log could not be read, else 0."""
+    """Print the progress of the estimation on stderr; return 2 if a log could not be read, else 0."""
     bad = 0
     samples = 0
     began = time.monotonic()
@@ -270,7 +272,9 @@ def _publish_log(
 
 
 def _start_time(given: str | None, log: SignalLog) -> int:
-    """Return the time of t = 0 [ns UTC]."""
+    """Return the time of t = 0 [ns UTC]: as given, else from the log, else so that the log ends
+    now.
+    """
     from schemas.config import moment
 
     if given is not None and given != NOW:

@@ -1,5 +1,5 @@
-"""`edge-agent run`: drive one vehicle live; signals come from its buses, a simulation, or a log
-paced in real time.
+"""`edge-agent run`: run one vehicle live; signals come from its buses, a simulation, or a log
+replayed in real time.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LIVE_ROWS = 10  # of a replayed log per block: a tenth of a second at 100 Hz
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the command-line arguments of `edge-agent run`."""
     parser.add_argument(
         "--source",
         action="append",
@@ -90,7 +90,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Drive until the source ends, the duration has passed, or a signal arrives."""
+    """Run the agent until the source ends, the duration has passed, or a signal (SIGTERM, Ctrl-C)
+    arrives; return the exit code.
+    """
     with progress_messages.show_status("loading"):
         from edge_agent.app.agent import Agent, AgentSource
         from edge_agent.cli.common import checked_name

@@ -12,7 +12,7 @@ ROADS = ("level", "rolling", "stepped", "banked", "hilly")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the command-line arguments of `edge-agent simulate`."""
     parser.add_argument("manoeuvre", nargs="?", help="name of the manoeuvre; --list shows them")
     parser.add_argument("--list", action="store_true", help="list the manoeuvres and exit")
     add_json(parser, "the manoeuvres")
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate, or list the manoeuvres."""
+    """Simulate a manoeuvre, or list the manoeuvres; return 0."""
     from edge_agent.app.estimates_file import prepare_path, write_table
     from edge_agent.lab.simulation import MANOEUVRES, Fault, simulate_manoeuvre
     from schemas.errors import InputError

@@ -1,8 +1,8 @@
 """`edge-agent tune`: search the memberships by ant colony and by a random search of equal budget;
 write the best result.
 
-With --study: run paper 004's own filter under right and wrong R, several searches each, with
-figures, table and plot.
+With --study: run paper 004's own filter with correct and wrong R, several searches each; write
+figures, a table and a plot.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ POSITIONS: Final = 7  # per vertex: the default and three to each side
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `edge-agent tune`."""
+    """Add the command-line arguments of `edge-agent tune`."""
     parser.add_argument(
         "log", type=Path, nargs="*", help="your own signal logs instead of simulated drives"
     )
@@ -188,8 +188,8 @@ def run(args: argparse.Namespace) -> int:
 def _tuning_drives(
     args: argparse.Namespace, objective: str, duration_s: float
 ) -> tuple[TuningSet, TuningSet]:
-    """Return the drives for the search and the held-out drives: simulated ones, or parts of the
-    given logs.
+    """Return (drives for the search, held-out drives): simulated drives, or parts of the given
+    logs.
     """
     if not args.log:
         return record_all("train", duration_s), record_all("held_out", duration_s)
@@ -210,8 +210,9 @@ def _tuning_drives(
 
 
 def _search_worth(score: Score, objective: str) -> float:
-    """Return the score of a search: minus the cost of false and missed ice if the truth is known,
-    else the objective.
+    """Return the value of a search result, larger is better.
+
+    It is minus the cost of false and missed ice if the true friction is known, else the objective.
     """
     known = {name: value for name, value in score.model_dump().items() if value is not None}
     unknown = {"interval_score": math.nan, "coverage": math.nan}
@@ -224,7 +225,7 @@ def _search_worth(score: Score, objective: str) -> float:
 
 
 def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
-    """Run the study and write it into a folder."""
+    """Run the study with --study, and write its results into a folder; return 0."""
     from edge_agent.lab.tuning import study_report
 
     if importlib.util.find_spec("matplotlib") is None:
@@ -273,7 +274,9 @@ def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
 
 
 def _run_searches(objective: Objective, ants: int, iterations: int, seed: int) -> dict[str, Result]:
-    """Run random search and ant colony from the same start, with the same positions and budget."""
+    """Run random search and ant colony from the same start, with the same positions and budget;
+    return the results by search.
+    """
     problem = Problem(objective, choices(POSITIONS), Memberships().to_vector())
     results = {}
     for stream, (way, search) in enumerate(
@@ -290,7 +293,7 @@ def _run_searches(objective: Objective, ants: int, iterations: int, seed: int) -
 
 
 def print_line(line: str) -> None:
-    """Print a line and flush it, so that it appears at once in a pipe as well."""
+    """Print a line and flush it, so that it appears immediately in a pipe too."""
     print(line, flush=True)
 
 
@@ -298,7 +301,10 @@ def progress_printer(
     way: str, iterations: int, clock: Callable[[], float], write: Callable[[str], None]
 ) -> Progress:
     """Return a function that prints one line per iteration: best, mean, elapsed and expected
-    remaining time by `clock` [s]."""
+    remaining time.
+
+    `clock` returns the time [s].
+    """
     began = clock()
 
     def log_line(line: Iteration) -> None:
@@ -348,7 +354,7 @@ def _format_number(value: float | None, digits: int) -> str:
 
 
 def comparison_table(scores: dict[str, SplitScores]) -> str:
-    """Return the comparison as plain text, one row per search and set of drives."""
+    """Return the comparison of the searches as plain text, one row per search and set of drives."""
     lines = [
         (
             f"{'':<8} {'drives':<9} {'interval score':>15} {'coverage':>9} "
