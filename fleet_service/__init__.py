@@ -1,4 +1,4 @@
-"""The fleet service: it fuses the reports of many vehicles into one map of grip.
+"""The fleet service: it fuses the reports of many vehicles into one map of road friction.
 
     import fleet_service
     print(fleet_service.ask_archive("archive", "worst").to_pandas())

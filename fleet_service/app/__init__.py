@@ -1,4 +1,4 @@
-"""The running service: engine, sessions, jobs, metrics."""
+"""The running service: engine, Zenoh sessions, background jobs, metrics."""
 
 from typing import Final
 

@@ -1,11 +1,11 @@
-"""Clock of the service: neither a jump of the system clock nor a wrong one at the start loses or
-refuses data.
+"""Clock of the service. Neither a jump of the system clock nor a wrong system clock at the start
+makes the service lose or refuse data.
 
-A wall clock may jump: a time server corrects it, a machine wakes up, a person sets it. The service
-therefore runs on a monotonic clock from its start. It follows a jump of more than JUMP_NS only when
-reports confirm it: the clock that more of the current vehicles agree with is right. Until then
-nothing is refused for its time if it may be right by the other clock. It is not acknowledged
-either, so its sender keeps it.
+A wall clock may jump: a time server corrects it, a machine wakes up, or a person sets it. The
+service therefore runs on a monotonic clock from its start. It follows a jump of more than JUMP_NS
+only if the reports of most current vehicles agree with the wall clock. Until then, a report whose
+time is right by the other clock is not refused. It is not acknowledged either, so its sender keeps
+it.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class TimeNow(NamedTuple):
 
     Attributes:
         now: the time.
-        slack: how far beyond `now` the time of a report may lie, given the times in the archive.
-        doubt: how much further a report may lie without being refused for good.
+        slack: how far beyond `now` the time of a report may be, given the times in the archive.
+        doubt: how much further a report may be without being refused for good.
         least: lower bound of the true time.
-        sure: True if time alone may end standing alerts.
+        sure: True if the passing of time alone may end active alerts.
     """
 
     now: int
@@ -46,11 +46,12 @@ class TimeNow(NamedTuple):
 
 
 class SteadyClock:
-    """Time of the service [ns UTC].
+    """Clock of the service [ns UTC].
 
     Args:
-        seen: latest time of a report before this start, 0 if there was none.
-        wall, steady: the system's clocks [ns]; `steady` never jumps, its zero does not matter.
+        seen: latest time of a report before this start; 0 if there was none.
+        wall, steady: functions that return the system's clocks [ns]; `steady` never jumps, and its
+            zero is arbitrary.
     """
 
     def __init__(
@@ -71,8 +72,8 @@ class SteadyClock:
         self._votes: dict[str, bool] = {}  # of vehicles, for the wall clock
 
     def now(self) -> int:
-        """Return the time. It follows small forward steps of the wall clock, and larger ones
-        when reports agree.
+        """Return the time [ns]. It follows small forward steps of the wall clock at once, and
+        larger steps only when reports confirm them.
         """
         even = self._zero + self._steady()
         wall = self._wall()
@@ -116,8 +117,8 @@ class SteadyClock:
             self._confirmed = True
 
     def lag(self) -> int:
-        """Return the lag of the wall clock [ns], negative if it is ahead: the size of a jump that
-        is not followed.
+        """Return how far the wall clock is behind the service's time [ns], negative if it is ahead.
+        This is the size of a jump that is not followed.
         """
         now = self.now()
         return max(now, self._seen if self._seen > now else now) - self._wall()

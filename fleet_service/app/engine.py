@@ -1,8 +1,8 @@
-"""Core of the service without its network: messages in; alerts, tiles, acknowledgements and answers
-out.
+"""Core of the service without its network. Inputs are messages; outputs are alerts, tiles,
+acknowledgements and answers.
 
-The parts share one state (`app.state`). One worker uses `intake`, `settlement` and `alerts`. Other
-threads use `queries` and `run_between_segments`.
+The parts share one state (`app.state`). One worker thread uses `intake`, `settlement` and `alerts`.
+Other threads use `queries` and `run_between_segments`.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ T = TypeVar("T")
 
 
 class Engine:
-    """Parts of one service, with a state rebuilt from its archive.
+    """Parts of one service, with a state that is restored from its archive.
 
     Args:
         config: settings.
-        root: of the archive; it is locked while the engine is open.
-        holding: ownership of the archive, closed with the engine; None to open the archive now,
-            without a lease.
+        root: folder of the archive; it is locked while the engine is open.
+        holding: ownership of the archive, which is closed with the engine; None to open the archive
+            now, without a lease.
 
     Raises:
-        InputError: another service holds the archive.
+        InputError: another service has the archive.
         OSError: the archive cannot be read or written.
 
     Attributes:
-        alerts: standing alerts.
+        alerts: active alerts.
         copy: bucket copy of the archive; None without one.
         counts: counters of all parts.
         holding: ownership of the archive.
         intake: admission and fusion of messages.
-        queries: readers of the map.
-        seen: latest time in a report that the archive held at the start [ns].
-        settlement: segments and acknowledgements.
+        queries: access to the map for readers.
+        seen: latest time in a report that was in the archive at the start [ns].
+        settlement: writing of segments, and acknowledgements.
     """
 
     def __init__(self, config: ServiceConfig, root: Path, holding: Ownership | None = None) -> None:
@@ -95,11 +95,11 @@ class Engine:
         return self._shared.state
 
     def reload_state(self, before: Callable[[], None]) -> None:
-        """Call `before`, then replace the state by that of the archive; call it in
+        """Call `before`, then replace the state with the state of the archive. Use this only inside
         `run_between_segments`.
 
         Raises:
-            OSError: the archive cannot be read; the state stays.
+            OSError: the archive cannot be read; the state stays unchanged.
         """
         standing = self.alerts.all
         before()
@@ -110,17 +110,18 @@ class Engine:
             self.alerts.end_erased(standing)
 
     def drop_old(self) -> int:
-        """Drop old cells that are back at the prior; return their number. Call it in
-        `run_between_segments`.
+        """Drop old cells whose belief has returned to the prior; return their number. Use this only
+        inside `run_between_segments`.
         """
         with self._shared.guard:
             return self.state.drop_old()
 
     def checkpoint(self, stop: threading.Event) -> Taken | None:
-        """Return the state and the last segment it includes; None if stopped meanwhile.
+        """Return a copy of the state and the last segment that it includes; None if `stop` is set
+        meanwhile.
 
-        The worker copies the state right after a segment, when every row in it is on disk. Another
-        thread calls this.
+        Another thread calls this. The worker makes the copy directly after a segment, when all rows
+        in the state are on disk.
         """
         return self.settlement.run_between_segments(self._image, stop)
 
@@ -129,7 +130,9 @@ class Engine:
             return self.state.image(self.settlement.newest_segment, weather_files(self._root))
 
     def mark_survived(self) -> None:
-        """Record that the service has run for a while with the checkpoint it began from."""
+        """Record that the service has run well for a while with the checkpoint from which it
+        started.
+        """
         checkpoints.mark_survived(self._root)
 
     def close(self) -> None:

@@ -1,16 +1,17 @@
-"""Erasure in a running service: handles the requests of `archive.requests` in the thread of the
-background jobs.
+"""Erasure of data in a running service. The thread of the background jobs handles the requests of
+`archive.identity.erasure_requests`:
 
-    a segment; the service's state is on disk up to it
-    in a separate process:    the vehicle's rows leave the files, and all others, read again, make a
-                              checkpoint
-    between two segments:     the service drops its state and begins from that checkpoint and the
-                              log since
+    1. after a segment:               the service's state is on disk up to this segment
+    2. in a separate process:         the vehicle's rows are removed from the files; all other rows
+                                      are read again and make a checkpoint
+    3. between two later segments:    the service drops its state, and loads this checkpoint and the
+                                      segments written since
 
 Checkpoints, snapshots, retention and compaction run in the same thread, so none of them sees an
-incomplete erasure. Others wait for the lock of compaction. Messages wait for as long as a start
-from a checkpoint takes. If the service dies during the erasure, its next start finds the request,
-and no checkpoint contains the vehicle. Later measurements of the vehicle are new.
+incomplete erasure. Other processes wait for the compaction lock. Messages wait for as long as a
+start from a checkpoint takes. If the service dies during the erasure, its next start finds the
+request, and no checkpoint contains the vehicle. Later measurements of the vehicle are accepted as
+new.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from schemas.errors import InputError
 def handle_requests(
     engine: Engine, config: ServiceConfig, root: Path, stop: threading.Event
 ) -> str | None:
-    """Handle waiting requests; return a line for the operator."""
+    """Handle the waiting requests; return a line for the operator, or None."""
     rows = answered = 0
     for question in erasure_requests.open_requests(root):
         try:
@@ -65,8 +66,8 @@ def handle_requests(
 
 
 def _erase_in_copy(copy: BucketReplica) -> str | None:
-    """Erase in the copy too; return why this is incomplete, in which case a background job does
-    it later.
+    """Erase the data in the bucket copy too. Return None, or the reason why this is incomplete; a
+    background job then does it later.
     """
     try:
         copy.sync()
@@ -78,11 +79,11 @@ def _erase_in_copy(copy: BucketReplica) -> str | None:
 def _run_erasure(
     engine: Engine, config: ServiceConfig, root: Path, wanted: Erasure, stop: threading.Event
 ) -> dict[str, Any] | None:
-    """Return the result; None if the service stops before the end.
+    """Carry out one request and return its result; None if the service stops before the end.
 
     Raises:
         InputError: there is no such month, or a file is damaged.
-        OSError: a file cannot be read or written; the erasure is tried again.
+        OSError: a file cannot be read or written; the erasure is tried again later.
     """
     key_of(root, wanted.month)
     vehicle = wanted.vehicle
@@ -117,7 +118,9 @@ def _run_erasure(
 def _reload_service(
     engine: Engine, before: Callable[[], None], stop: threading.Event
 ) -> bool | None:
-    """Replace the service's state after calling `before`; None if it stops first."""
+    """Call `before`, then load the service's state again, between two segments. Return True, or
+    None if the service stops first.
+    """
 
     def work() -> bool:
         engine.reload_state(before)
@@ -127,7 +130,7 @@ def _reload_service(
 
 
 def run_erasure_process(root: Path, request: dict[str, Any]) -> dict[str, Any]:
-    """Do the part of the separate process.
+    """Carry out the part of an erasure that runs in the separate process; return its result.
 
     Raises:
         InputError, OSError: as for `retention.forget_vehicle`.

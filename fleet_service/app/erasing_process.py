@@ -1,5 +1,5 @@
-"""`python -m fleet_service.app.erasing_process ARCHIVE`: one erasure for a service, read from
-stdin.
+"""`python -m fleet_service.app.erasing_process ARCHIVE`: carries out one erasure for a service,
+described on stdin.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from schemas.runtime.process import limit_memory
 
 
 def main() -> int:
-    """Erase, and print the result."""
+    """Carry out the erasure and print the result as JSON."""
     limit_memory(*UNUSED)
     from fleet_service.app.erasing import run_erasure_process
 

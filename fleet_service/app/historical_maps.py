@@ -1,8 +1,8 @@
-"""Maps of past moments, rebuilt in a separate process: its memory is bounded in advance and
-returned at the end.
+"""Maps of past moments, rebuilt in a separate process. Its memory is limited in advance and freed
+when it ends.
 
-That process (`past_process`) reads questions as lines of JSON and writes the replies, each after
-its tile and length. Tile -1 marks an error and -2 the end of an answer.
+This process (`past_process`) reads queries as lines of JSON. It writes the replies, each preceded
+by the tile number and the length. Tile -1 marks an error and -2 the end of an answer.
 """
 
 from __future__ import annotations
@@ -42,10 +42,14 @@ _END = -2
 
 
 class PastQuery(NamedTuple):
-    """Query about a moment [ns].
+    """Query about the map at a past moment.
 
-    It has the lateness of the service [s], `only` (the only selected tile) and `public` (minimum
-    number of recent vehicles of a visible cell).
+    Attributes:
+        query: parameters of the query.
+        at: the moment [ns].
+        lateness_s: allowed lateness of the service [s].
+        only: the only selected tile; None for any.
+        public: minimum number of recent vehicles of a visible cell.
     """
 
     query: MapQuery
@@ -56,11 +60,11 @@ class PastQuery(NamedTuple):
 
 
 class HistoricalMaps:
-    """Answers about the past. The process is kept for IDLE_S for the next question, because it
-    takes a second to start.
+    """Answers to queries about past maps. Starting the process takes a second, so it is kept for
+    another IDLE_S.
 
     Args:
-        root: of the archive.
+        root: folder of the archive.
     """
 
     def __init__(self, root: Path) -> None:
@@ -70,10 +74,10 @@ class HistoricalMaps:
     def ask(
         self, question: PastQuery, wanted: Callable[[int], bool]
     ) -> Iterator[tuple[int, bytes]]:
-        """Yield tile and payload of every reply.
+        """Yield the tile number and the payload of every reply to a query.
 
         Raises:
-            InputError: too much would have to be read, or the archive cannot be read.
+            InputError: too many rows would have to be read, or the archive cannot be read.
             ChildProcessError: the process died.
         """
         box = box_of(question)
@@ -102,7 +106,7 @@ class HistoricalMaps:
             process.end()
 
     def _ask_process(self, question: PastQuery) -> tuple[_Process, bytes]:
-        """Return a process that answers the question, and the head of its first reply."""
+        """Return a process that is answering the query, and the head of its first reply."""
         if process := self._keep_process(None):
             with suppress(BrokenPipeError, ChildProcessError):  # it has just left
                 return process, process.ask(question)
@@ -115,13 +119,13 @@ class HistoricalMaps:
             raise
 
     def _keep_process(self, process: _Process | None) -> _Process | None:
-        """Keep a process for the next question, or none; return the one kept before."""
+        """Store an idle process (or None) for the next query; return the previously stored process."""
         self._idle, before = process, self._idle
         return before
 
 
 class _Process:
-    """Process that answers one question after the other, and exits when none arrives for a
+    """Process that answers queries one after the other, and exits when no query arrives for a
     while.
     """
 
@@ -134,13 +138,15 @@ class _Process:
         self.out = self._child.stdout
 
     def ask(self, question: PastQuery) -> bytes:
-        """Ask; return the head of the first reply."""
+        """Send a query to the process; return the head of the first reply."""
         self._in.write(encode_question(question))
         self._in.flush()
         return self.head()
 
     def head(self) -> bytes:
-        """Return the head of the next reply; ChildProcessError if the process has ended."""
+        """Return the head (tile number and length) of the next reply. Raise ChildProcessError if
+        the process has ended.
+        """
         head = self.out.read(_HEAD.size)
         if len(head) < _HEAD.size:
             raise ChildProcessError(f"the past map could not be rebuilt ({self._child.wait()})")
@@ -156,7 +162,7 @@ class _Process:
 
 
 def box_of(question: PastQuery) -> Box | None:
-    """Return the box that a query reads; None for the whole map."""
+    """Return the box (west, south, east, north [deg]) that a query reads; None for the whole map."""
     query = question.query
     if query.route is not None:
         longitudes, latitudes = zip(*query.route, strict=True)
@@ -170,7 +176,8 @@ def box_of(question: PastQuery) -> Box | None:
 
 
 def replies_to(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
-    """Yield tile and payload of every reply.
+    """Yield the tile number and the payload of every reply to a query; runs in the separate
+    process.
 
     Raises:
         InputError: too many rows are in the box, or the archive cannot be read.
@@ -195,7 +202,7 @@ def replies_to(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
 
 
 def encode_question(question: PastQuery) -> bytes:
-    """Return a question as a line for `answer_line`."""
+    """Return a query as a line of JSON for `answer_line`."""
     return (
         json.dumps({**question._asdict(), "query": question.query.model_dump_json()}).encode()
         + b"\n"
@@ -203,7 +210,7 @@ def encode_question(question: PastQuery) -> bytes:
 
 
 def answer_line(root: Path, line: bytes, out: BinaryIO) -> None:
-    """Answer one query about a past map, given as a line of JSON."""
+    """Answer one query about a past map, given as a line of JSON; write the replies to `out`."""
     heard = json.loads(line)
     question = PastQuery(**{**heard, "query": MapQuery.model_validate_json(heard["query"])})
     try:
@@ -217,7 +224,7 @@ def answer_line(root: Path, line: bytes, out: BinaryIO) -> None:
 
 
 def answer_all(root: Path, asked: BinaryIO, out: BinaryIO) -> None:
-    """Answer until no question arrives for IDLE_S, or ANSWERS were given."""
+    """Answer queries until none arrives for IDLE_S, or until ANSWERS queries have been answered."""
     pa.set_cpu_count(1)
     pa.set_io_thread_count(1)  # each thread that reads keeps memory of its own: 20 MB
     for _ in range(ANSWERS):

@@ -1,4 +1,6 @@
-"""Intake of a running service: messages and weather in; fused rows for the log, and alerts, out."""
+"""Intake of a running service: it takes messages and weather, passes fused rows to the segment log,
+and returns alerts.
+"""
 
 from __future__ import annotations
 
@@ -33,20 +35,20 @@ from schemas.wire import Alert, Kind
 
 
 class Intake:
-    """Admission and fusion of messages, for the worker's thread.
+    """Admission and fusion of messages; used by the worker thread.
 
     Args:
         config: settings.
-        root: of the archive.
+        root: folder of the archive.
         shared: state of the service.
-        log: queues the admitted rows for the disk.
+        log: segment log, which writes the admitted rows to disk.
         counts: counters of the service.
 
     Attributes:
         acks: acknowledgements to send.
         batches: admission of batches; replaced by `reset`.
         now: time of the last `ingest` [ns].
-        report_lag_s: time between the end of the newest visit and its arrival.
+        report_lag_s: time [s] between the end of the newest visit and its arrival.
         weather: queue of weather messages.
     """
 
@@ -74,7 +76,9 @@ class Intake:
             )
 
     def reset(self) -> None:
-        """Follow a replaced state: forget budgets and paths, which belong to the former one."""
+        """Continue with a replaced state of the service: discard budgets and paths, which belong to
+        the old state.
+        """
         self._paths = VehiclePaths()
         self._places = NewCells()
         keys = Pseudonyms(self._root / "keys")
@@ -82,8 +86,9 @@ class Intake:
         self.weather.fusion = self._shared.state.fusion
 
     def ingest(self, messages: Sequence[Message], at: int | TimeNow) -> list[Alert]:
-        """Admit and fuse messages; return the alerts that they raise or clear. `at` is the time; a
-        number is certain."""
+        """Admit and fuse messages; return the alerts that are raised or cleared. `at` is the time;
+        a plain number [ns] is taken as certain.
+        """
         at = at if isinstance(at, TimeNow) else TimeNow(at)
         ahead = int(self._config.clock_ahead_s * NS) + at.slack
         clock = Clock(at.now, ahead, int(self._config.oldest_s * NS), at.doubt, at.least)
@@ -98,7 +103,7 @@ class Intake:
 
     @property
     def times(self) -> dict[str, int]:
-        """Return the newest time that each vehicle reported in the last `ingest` [ns]."""
+        """Return the newest time [ns] that each vehicle reported in the last `ingest`."""
         return self.batches.times
 
     def _fuse(self, accepted: AcceptedBatches) -> list[Alert]:
@@ -131,8 +136,9 @@ class Intake:
         return raised
 
     def _excluded_from_fusion(self, rows: Rows) -> BoolArray:
-        """Return True for rows that are archived and not fused: their vehicle cannot be there, or
-        it reports too many new places. A publisher is no vehicle and has no path.
+        """Return a mask of rows that are archived but not fused: the vehicle cannot have been
+        there, or it reports too many new cells. Enrolled publishers (data sources that are no
+        vehicles) have no path and are not checked.
         """
         witness = rows["witness"]
         beyond = np.zeros(len(witness), bool)

@@ -1,4 +1,6 @@
-"""Background jobs of a running service for its archive, at low priority next to the worker."""
+"""Background jobs that maintain the archive of a running service, at lower priority than the
+worker.
+"""
 
 from __future__ import annotations
 
@@ -42,8 +44,8 @@ _NICE: Final = 10  # the worker goes first
 
 
 class Job(NamedTuple):
-    """Periodic work: returns a line for the operator, or None; a period of 0 seconds means
-    never.
+    """Periodic job. `work` returns a line for the operator, or None; a period `every_s` of 0 means
+    that the job never runs.
     """
 
     name: str
@@ -54,8 +56,8 @@ class Job(NamedTuple):
 def archive_jobs(
     engine: Engine, config: ServiceConfig, root: Path, moment: Callable[[], TimeNow]
 ) -> list[Job]:
-    """Return the jobs that maintain an archive, according to the settings; `moment` returns the
-    service's time.
+    """Return the jobs that maintain an archive, according to the settings. `moment` is a function
+    that returns the service's time.
     """
 
     def compaction(stop: threading.Event) -> str | None:
@@ -104,7 +106,9 @@ def archive_jobs(
     def with_disk_space(
         work: Callable[[threading.Event], str | None],
     ) -> Callable[[threading.Event], str | None]:
-        """Release the reserve to a job that makes room, if the disk is full."""
+        """Return the job `work` with a second attempt: if the disk is full, release the reserved
+        space and run the job again.
+        """
 
         def run_job(stop: threading.Event) -> str | None:
             try:
@@ -148,10 +152,10 @@ def archive_jobs(
 
 
 class BackgroundJobs:
-    """Thread that runs the jobs.
+    """Thread that runs the background jobs.
 
     Attributes:
-        failed: number of consecutive failures per job whose last run failed.
+        failed: number of consecutive failures by job; only jobs whose last run failed.
     """
 
     def __init__(
@@ -179,7 +183,7 @@ class BackgroundJobs:
 
     @property
     def has_ended(self) -> bool:
-        """Return True if the thread has ended although nobody stopped it."""
+        """Return True if the thread has ended although it was not told to stop."""
         return (
             self._thread.ident is not None
             and not self._thread.is_alive()
@@ -207,9 +211,7 @@ class BackgroundJobs:
             due[job] = time.monotonic() + again_s
 
     def _run_job(self, job: Job) -> bool:
-        """Run one turn of a job; return True on success. A failure must not affect the other
-        jobs.
-        """
+        """Run a job once; return True on success. A failure does not affect the other jobs."""
         self._busy = (job.name, time.monotonic())
         try:
             line = job.work(self._stop)

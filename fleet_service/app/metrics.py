@@ -45,8 +45,10 @@ _SINGLE: Final = {
 
 
 class Pulse(NamedTuple):
-    """Values that only the running service knows: seconds since the worker's last turn, queue
-    length, routers, clock lag [s], and how long the current tile of an answer takes [s]."""
+    """Values that only the running service knows: time since the worker's last turn [s], queue
+    length, number of connected routers, clock lag [s], and duration of the current tile of an
+    answer [s].
+    """
 
     turn_age_s: float
     queued: int
@@ -58,7 +60,7 @@ class Pulse(NamedTuple):
 def collect_metrics(
     engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path
 ) -> list[Metric]:
-    """Return all current values."""
+    """Return all current metrics of a service."""
     counts = dict(engine.counts)
     report_lag_s = engine.intake.report_lag_s
     away_s = 0.0 if engine.copy is None else engine.copy.away_s
@@ -132,7 +134,7 @@ def collect_metrics(
 
 
 def standby_metrics(config: ServiceConfig) -> list[Metric]:
-    """Return all values of a waiting service."""
+    """Return all metrics of a waiting (standby) service."""
     return [_serves_metric(config, 0.0)]
 
 
@@ -142,7 +144,7 @@ def _serves_metric(config: ServiceConfig, value: float) -> Metric:
 
 
 def health_problems(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list[str]:
-    """Return one message per problem."""
+    """Return one message per health problem; empty if the service is healthy."""
     found = [] if pulse.routers else ["no router is connected"]
     if pulse.turn_age_s > STALLED_S:
         found.append(f"the worker has been idle for {pulse.turn_age_s:.0f} s")

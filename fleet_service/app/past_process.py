@@ -1,5 +1,5 @@
-"""`python -m fleet_service.app.past_process ARCHIVE`: answers questions about the past, from
-stdin to stdout.
+"""`python -m fleet_service.app.past_process ARCHIVE`: answers queries about past maps, from stdin
+to stdout.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Loads or compiles kernels before the service is ready, because compiling takes seconds while
-vehicles wait.
+"""Compilation of the numerical functions before the service is ready. Otherwise the first vehicles
+would wait for seconds while functions are compiled.
 """
 
 from __future__ import annotations
@@ -31,8 +31,11 @@ DONE: Final = "fleet_service.compiled"  # in the cache, once all of it is there
 
 
 def warm_up() -> None:
-    """Load the kernels. If they were never compiled, a separate process compiles them: the compiler
-    leaves a hundred megabytes of fragmented memory, into which a service would grow for hours."""
+    """Load all compiled functions before they are needed.
+
+    If they were never compiled, a separate process compiles them first. The compiler leaves a
+    hundred megabytes of fragmented memory, which the service would otherwise keep for hours.
+    """
     done = Path(kernel_cache("fleet_service")) / DONE
     if not done.exists():
         beside = subprocess.run(
@@ -46,8 +49,8 @@ def warm_up() -> None:
 
 
 def exercise_map() -> None:
-    """Run a temporary map through its life: update, grow, advance, update late within the
-    window, commit, believe.
+    """Call every compiled function with a small temporary map: update, grow, advance, update late
+    within the window, commit, and read beliefs.
     """
     fusion = Fusion(2 * EPOCH_NS * 1e-9)
     for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2)):

@@ -1,4 +1,6 @@
-"""Queries to a running service: tiles, the whole map, and answers about now or the past."""
+"""Read access to a running service's map: tiles, the whole map, and answers about the present or
+the past.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +21,11 @@ from schemas.tables import MAP_SCHEMA
 
 
 class Queries:
-    """Readers of a running service's map; safe to call from several threads.
+    """Read access to a running service's map; safe to call from several threads.
 
     Args:
         config: settings.
-        root: of the archive, for maps of the past.
+        root: folder of the archive, for maps of the past.
         shared: state of the service.
     """
 
@@ -33,12 +35,14 @@ class Queries:
         self._past = HistoricalMaps(root)
 
     def tile(self, tile: int, now: int) -> bytes:
-        """Return the Arrow stream of the public cells of a tile; empty if there are none."""
+        """Return the public cells of a tile as an Arrow stream; empty bytes if there are none."""
         shown = self._shared.tiles.make(tile, now)
         return shown.payload if shown.cells.num_rows else b""
 
     def take_changed(self, now: int) -> list[int]:
-        """Return the tiles that changed since the last call, or whose changes are published now."""
+        """Return the tiles that changed for readers since the last call. With privacy on, these are
+        the tiles whose changes are published now.
+        """
         state = self._shared.state
         if state.public is not None:
             with self._shared.guard:
@@ -47,15 +51,15 @@ class Queries:
         return state.map.take_dirty()
 
     def changed_tiles(self, now: int) -> list[tuple[int, bytes]]:
-        """Return tile and payload of every tile that changed since the last call and is not
-        empty.
+        """Return the tile number and the payload of every non-empty tile that changed since the
+        last call.
         """
         changed = self.take_changed(now)
         return [(tile, stream) for tile in changed if (stream := self.tile(tile, now))]
 
     def whole_map(self, now: int) -> pa.Table:
-        """Return all public cells; the lock is held for a few at a time, so that ingest
-        continues.
+        """Return all public cells as a table. The lock is held for a few cells at a time, so that
+        ingest continues.
         """
         tables = []
         shared = self._shared
@@ -69,7 +73,7 @@ class Queries:
     def answer(
         self, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None
     ) -> Iterator[tuple[int, bytes]]:
-        """Yield tile and payload of every reply to a query, computed on demand; see
+        """Yield the tile number and the payload of every reply to a query, computed on demand; see
         `serve.query.answer_query`.
 
         Raises:

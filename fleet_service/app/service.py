@@ -1,4 +1,4 @@
-"""The running service: Zenoh on one side, the engine on the other, one worker between them.
+"""The running service. One worker thread connects Zenoh and the engine.
 
 subscribers ─► inbox ─► worker: ingest ─► alerts at once
                                 flush ─► thread: segment on disk ─► acknowledgements
@@ -58,7 +58,7 @@ class Service:
 
     Args:
         config: settings.
-        root: of the archive.
+        root: folder of the archive.
         log_line: called with lines for the operator.
         holding: ownership of the archive; None to open it without a lease.
 
@@ -120,8 +120,8 @@ class Service:
 
     @property
     def exit_code(self) -> int:
-        """Return 0 if all admitted data are on disk and nothing failed, else 1. The result is 1 as
-        well if another service took over.
+        """Return 0 if all admitted data are on disk and nothing failed, else 1. If another service
+        has taken over, the result is 1 too.
         """
         return (
             1
@@ -159,15 +159,18 @@ class Service:
                 raise
 
     def _has_lost_archive(self, came: Callable[[], bool]) -> bool:
-        """Return True if another service has taken over, by the lease, or by its tokens while the
-        bucket does not answer."""
+        """Return True if another service has taken over. The lease shows this; while the bucket
+        does not answer, liveliness tokens of another service show it.
+        """
         holding = self.engine.holding
         if not holding.may_acknowledge and came():
             holding.mark_lost()
         return holding.is_lost
 
     def _hanging(self) -> str | None:
-        """Return the part outside the worker that died or hangs, so that only a restart helps."""
+        """Return a description of a part outside the worker that has died or hangs, so that only a
+        restart helps; None if there is none.
+        """
         if self.engine.settlement.hangs_s >= HANGS_S:
             return (
                 f"a segment write has been in progress for {self.engine.settlement.hangs_s:.0f} s"
@@ -177,8 +180,8 @@ class Service:
         return "upkeep has ended" if self._upkeep.has_ended else None
 
     def _works(self) -> bool:
-        """Return True if this service serves its regions: a router is connected and the worker
-        turns.
+        """Return True if this service can serve its regions: a router is connected and the worker
+        is running.
         """
         session = self._session
         turn_age_s = time.monotonic() - self._stepped_at
@@ -187,7 +190,7 @@ class Service:
         )
 
     def _serve_monitoring(self) -> AbstractContextManager[str | None]:
-        """Serve metrics and health if the settings ask for it."""
+        """Return a context that serves metrics and health, if the settings ask for it."""
         config = self._config
         engine = self.engine
         root = self._root
@@ -243,13 +246,13 @@ class Service:
                 queryable.undeclare()
 
     def _hand_over(self, query: zenoh.Query, session: zenoh.Session) -> None:
-        """Stop in good order, for the named standby."""
+        """Answer a hand-over request: stop regularly, in favour of the named standby."""
         self.engine.holding.to = (
             handover.answer_request(query, session, self._config.regions) or self.engine.holding.to
         )
 
     def _standing(self, asked: zenoh.Query) -> None:
-        """Reply with the standing alerts, for late clients."""
+        """Answer a query for the active alerts, which clients ask when they start late."""
         expression = asked.key_expr
         with asked:
             for tile, alerts in self.engine.alerts.encode_tiles(
@@ -295,8 +298,8 @@ class Service:
             self.engine.mark_survived()
 
     def _shut_down(self, session: zenoh.Session, stop: threading.Event) -> None:
-        """Process and settle waiting messages within LEAVE_S; senders keep messages that were not
-        settled.
+        """Process and acknowledge the waiting messages within LEAVE_S. Senders keep messages that
+        were not acknowledged.
         """
         if self.engine.holding.is_lost:
             self._followed = True
@@ -379,12 +382,14 @@ class Service:
 
 
 def ingest_messages(engine: Engine, clock: SteadyClock, messages: list[Message]) -> list[Alert]:
-    """Let an engine process messages now, and pass their times to the clock."""
+    """Let the engine process messages now, and pass their times to the clock; return the alerts
+    that are raised or cleared.
+    """
     alerts = engine.intake.ingest(messages, clock.moment())
     clock.record_reports(engine.intake.times)
     return alerts
 
 
 def publish_message(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> None:
-    """Publish with the quality of service of the key's topic."""
+    """Publish a message with the quality of service of its key's topic."""
     session.put(key, payload, encoding=encoding, **zenoh_session.quality_of(keys.parse(key).topic))

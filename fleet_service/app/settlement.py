@@ -1,4 +1,4 @@
-"""Settlement of admitted batches: segments on disk (and in the bucket) first, then
+"""Settlement of admitted batches: first write segments to disk (and to the bucket), then send
 acknowledgements.
 """
 
@@ -27,12 +27,12 @@ T = TypeVar("T")
 
 
 class Settlement:
-    """Flushes of the log and the acknowledgements that follow, for the worker's thread.
+    """Writing of segments, and the acknowledgements that follow; used by the worker thread.
 
     Args:
         shared: state of the service.
         intake: owner of the waiting acknowledgements.
-        log: rows that wait for the disk.
+        log: segment log with the rows that wait for the disk.
         holding: ownership of the archive.
         counts: counters of the service.
 
@@ -58,7 +58,7 @@ class Settlement:
 
     @property
     def is_full(self) -> bool:
-        """Return True if too many rows wait for the disk, or batches for the copy."""
+        """Return True if too many rows wait for the disk, or too many batches for the bucket copy."""
         return self._log.rows >= WAITING_ROWS or self._log.unsettled >= WAITING_BATCHES
 
     @property
@@ -68,19 +68,18 @@ class Settlement:
 
     @property
     def hangs_s(self) -> float:
-        """Return the time [s] since the write of the current segment began; 0 if none is written."""
+        """Return the time [s] since the current segment write began; 0 if no write is running."""
         return self._log.hangs_s
 
     @property
     def newest_segment(self) -> Cut:
-        """Return the last written segment."""
+        """Return the position of the last written segment."""
         return self._log.newest
 
     def run_between_segments(self, work: Callable[[], T], stop: threading.Event) -> T | None:
-        """Let the worker run `work` right after a segment, when every row it took is on disk;
-        return the result.
-
-        None if stopped meanwhile. Another thread calls this.
+        """Let the worker run `work` directly after a segment, when all rows that the service
+        accepted are on disk. Return the result of `work`, or None if `stop` is set meanwhile. Other
+        threads call this.
 
         Raises:
             OSError: no segment could be written for too long.
@@ -88,10 +87,11 @@ class Settlement:
         return self._tasks.ask(work, stop)
 
     def flush(self) -> list[tuple[str, bytes]]:
-        """Write waiting rows as durable segments; return vehicle and bytes of the acknowledgements
-        to send.
+        """Write the waiting rows as durable segments; return (vehicle, bytes) of each
+        acknowledgement to send.
 
-        A full disk is counted, and the next call tries again; nothing of it is acknowledged.
+        If the disk is full, the failure is counted, nothing is acknowledged, and the next call
+        tries again.
         """
         acks = self._acknowledge(self._log.flush)
         if not self.failing:
@@ -99,10 +99,11 @@ class Settlement:
         return acks
 
     def begin_flush(self) -> list[tuple[str, bytes]]:
-        """Begin a flush; messages may be processed while segments are written. `end_flush` returns
-        the acks.
+        """Begin to write the waiting rows; messages may be processed meanwhile. `end_flush` returns
+        the acknowledgements.
 
-        If work waits for `run_between_segments`, this is `flush`.
+        If work waits for `run_between_segments`, do a complete `flush` and return its
+        acknowledgements.
         """
         if self._tasks:
             return self.flush()
@@ -110,7 +111,7 @@ class Settlement:
         return []
 
     def end_flush(self) -> list[tuple[str, bytes]]:
-        """Return the acknowledgements of a flush that was begun and has ended."""
+        """Return the acknowledgements of a flush that has ended; empty if no flush has ended."""
         return self._acknowledge(self._log.end) if self._log.ended else []
 
     def _acknowledge(self, durable: Callable[[], list[BatchId]]) -> list[tuple[str, bytes]]:

@@ -1,4 +1,6 @@
-"""Alerts that stand, for publication: by tile, in turn for late clients, and their ends."""
+"""Active ("standing") alerts of a service for publication: by tile, repeated in turn for clients
+that start late, and end messages.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ ERASED: Final = "the reports behind the alert were erased"
 
 
 class StandingAlerts:
-    """Standing alerts of a running service.
+    """Active alerts of a running service.
 
     Args:
         shared: state of the service.
@@ -32,21 +34,21 @@ class StandingAlerts:
 
     @property
     def count(self) -> int:
-        """Return the number of cells under alert."""
+        """Return the number of slots (cell and sector) with an active alert."""
         return len(self._shared.state.alerts.slots)
 
     @property
     def slots(self) -> IntArray:
-        """Return the slots under alert, (k,)."""
+        """Return the slots with an active alert, (k,)."""
         return np.array(sorted(self._shared.state.alerts.slots), np.int64)
 
     @property
     def all(self) -> list[Alert]:
-        """Return the standing alerts."""
+        """Return the active alerts."""
         return self._shared.state.alerts.standing_alerts
 
     def encode_tiles(self, is_wanted: Callable[[int], bool]) -> list[tuple[int, bytes]]:
-        """Return tile and payload of the standing alerts of selected tiles."""
+        """Return the tile number and the payload of the active alerts, for each selected tile."""
         tiles: dict[int, list[Alert]] = {}
         with self._shared.guard:
             for alert in self.all:
@@ -58,8 +60,8 @@ class StandingAlerts:
         ]
 
     def next_to_repeat(self, most: int) -> list[Alert]:
-        """Return at most `most` standing alerts, in turn, so that clients that were away receive
-        them too.
+        """Return the next active alerts to publish again, at most `most`, in turn. In this way
+        clients that were offline receive them too.
         """
         with self._shared.guard:
             standing = self.all
@@ -69,15 +71,15 @@ class StandingAlerts:
         return out
 
     def end_erased(self, before: Iterable[Alert]) -> None:
-        """End those of the alerts `before` an erasure that do not stand any more; call with the
-        guard held.
+        """End the alerts that were active before an erasure (`before`) and no longer are. Call this
+        with the lock held.
         """
         still = {(alert.cell, alert.sector) for alert in self.all}
         ended = [alert for alert in before if (alert.cell, alert.sector) not in still]
         self._erased += [replace(alert, raised=False, reason=ERASED) for alert in ended]
 
     def expire(self, now: int) -> list[Alert]:
-        """Return the ends of the alerts that expired or were erased, at `now` [ns]."""
+        """Return the end messages of alerts that have expired by `now` [ns] or were erased."""
         with self._shared.guard:
             ended = [replace(alert, time=now) for alert in self._erased]
             self._erased = []

@@ -1,5 +1,5 @@
-"""State of a service, loaded from the newest checkpoint and the log after it, or from the log
-alone.
+"""State of a service, loaded from the newest checkpoint and the rows archived after it, or from
+archived rows alone.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ class ServiceState(NamedTuple):
     """State of a service.
 
     Attributes:
-        fusion, map, alerts: of all observations.
-        streams: admitted batches.
+        fusion, map, alerts: result of all observations.
+        streams: record of admitted batches.
         weather: all weather reports used.
-        refused: checkpoints that could not be loaded.
-        public: what readers may see; None for everything.
+        refused: number of checkpoints that could not be loaded.
+        public: cells that readers may see; None if they may see all cells.
     """
 
     fusion: Fusion
@@ -67,8 +67,8 @@ class ServiceState(NamedTuple):
     public: PublicCells | None
 
     def drop_old(self) -> int:
-        """Drop cells not visited for KEPT_NS, whose belief is the prior again; return their
-        number.
+        """Drop cells that were not visited for KEPT_NS, whose belief has therefore returned to the
+        prior; return their number.
         """
         newest = self.fusion.checkpoint or 0
         stale = self.fusion.untouched(newest - KEPT_NS)
@@ -84,8 +84,9 @@ class ServiceState(NamedTuple):
         return 0
 
     def image(self, cut: Cut, weather: Iterable[Path]) -> Taken:
-        """Return the content of a checkpoint, which includes everything up to the segment `cut` and
-        these weather files."""
+        """Return the content of a checkpoint that includes everything up to the segment `cut`, and
+        these weather files.
+        """
         tables = image_of(self.fusion, self.alerts.standing_alerts, self.streams)
         if self.public is not None:
             tables |= public_tables(self.public)
@@ -93,16 +94,16 @@ class ServiceState(NamedTuple):
 
 
 class SharedState:
-    """State of a running service as its threads see it: the worker changes it, queries read it.
+    """State of a running service that several threads use: the worker changes it, queries read it.
 
     Args:
-        state: loaded from the archive.
+        state: state loaded from the archive.
         public_vehicles: minimum number of vehicles of a public cell.
 
     Attributes:
-        guard: lock held while the map is changed or read.
+        guard: lock that is held while the map is changed or read.
         state: current state; replaced as a whole by `adopt`.
-        tiles: cached tiles of its map.
+        tiles: cached tiles of the current map.
     """
 
     def __init__(self, state: ServiceState, public_vehicles: int) -> None:
@@ -117,8 +118,8 @@ class SharedState:
 
 
 def public_tables(public: PublicCells) -> dict[str, pa.Table]:
-    """Return public cells as tables of a checkpoint; bits and part of the visitors' window are
-    columns of one length.
+    """Return the public cells as tables for a checkpoint. All columns of a table have the same
+    length.
     """
     columns = public.visitors.columns()
     part = np.full(len(columns["bits"]), columns["part"][0])
@@ -135,10 +136,10 @@ def load_state(
     damaged: Callable[[Path, str], None] = skip_damaged,
     until: Cut | None = None,
 ) -> ServiceState:
-    """Load the state from the archive; of uncompacted segments, those written up to `until`.
+    """Load the state from the archive. With `until`, use only segments written up to this position.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the archive cannot be read.
     """
     begin = load_restart(root, config.lateness_s, (VISITORS, WAITING, PRESENT))
     fusion = begin.fusion

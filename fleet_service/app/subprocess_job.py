@@ -1,5 +1,5 @@
-"""Work in a separate process: its memory is returned at the end, and it shares no interpreter
-with the worker.
+"""Work in a separate process. Its memory is freed when it ends, and it does not compete with the
+worker for the interpreter lock.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ LOOK_S: Final = 0.1  # between two looks whether it shall stop
 def run_module(
     what: str, module: str, words: Sequence[str], stop: threading.Event, document: str | None = None
 ) -> str | None:
-    """Run a module as a process with `document` on its stdin; return its stdout, or None if it was
-    stopped. The process must tolerate a kill at any instant.
+    """Run a Python module as a process, with `document` on its stdin. Return its stdout, or None if
+    `stop` was set. The process must tolerate being killed at any time.
 
     Raises:
-        InputError: it failed.
+        InputError: the process failed.
     """
     command = [sys.executable, "-m", module, *words]
     pipe = subprocess.PIPE

@@ -1,4 +1,4 @@
-"""Work that other threads want the worker to do between two segments."""
+"""Work that other threads ask the worker to do between two segments."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ T = TypeVar("T")
 
 
 class Tasks:
-    """Queue of work that other threads request from the worker; true if it is not empty."""
+    """Queue of work that other threads ask the worker to do; `bool()` of it is True if it is not
+    empty.
+    """
 
     def __init__(self) -> None:
         self._queue: queue.SimpleQueue[tuple[Future[Any], Callable[[], object]]] = (
@@ -26,7 +28,7 @@ class Tasks:
         return not self._queue.empty()
 
     def ask(self, work: Callable[[], T], stop: threading.Event) -> T | None:
-        """Queue work and return its result; None if stopped meanwhile.
+        """Queue work, wait, and return its result; None if `stop` is set meanwhile.
 
         Raises:
             OSError: no segment could be written for too long.

@@ -1,1 +1,3 @@
-"""Reconstruction of a service's state from the archive: restarts, checkpoints and past moments."""
+"""Reconstruction of a service's state from the archive, for restarts and for maps of past moments;
+checkpoints.
+"""

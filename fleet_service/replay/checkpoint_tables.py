@@ -1,8 +1,7 @@
 """Lossless conversion of a fusion to Arrow tables and back, so that a restart needs no complete
 replay.
 
-The caller stores the tables and decides which rows of the log are newer (`received_at`); this
-module does no I/O.
+The caller stores the tables and decides which archived rows are newer. This module does no I/O.
 """
 
 from __future__ import annotations
@@ -22,8 +21,9 @@ _KEY: Final = b"gripmap.checkpoint"
 
 
 def tables_of(fusion: Fusion) -> dict[str, pa.Table]:
-    """Return the complete state of a fusion, one table per name; columns of different length are
-    stored as one list each."""
+    """Return the complete state of a fusion as tables by name. Each column is stored as one list,
+    because columns may differ in length.
+    """
     out = {}
     for name, columns in image_of(fusion).items():
         arrays = [_to_list(column) for column in columns.values()]
@@ -33,13 +33,13 @@ def tables_of(fusion: Fusion) -> dict[str, pa.Table]:
 
 
 def _to_list(column: NDArray[Any]) -> pa.Array[Any]:
-    """Return one list that holds a column."""
+    """Return a column as a list array with one item: the list of all values."""
     return pa.LargeListArray.from_arrays(pa.array([0, len(column)], pa.int64()), pa.array(column))
 
 
 def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
-    """Return the values of a list column as a numpy array. Numbers are a view, because Arrow's own
-    conversion would import another library.
+    """Return the values of a list column as a NumPy array. Numbers are a view of the same memory.
+    Arrow's own conversion is not used, because it would import another library.
     """
     whole = (
         column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
@@ -52,10 +52,11 @@ def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
 
 
 def fusion_from(tables: dict[str, pa.Table], lateness_s: float) -> Fusion:
-    """Restore a fusion; it continues exactly like the one passed to `tables_of`.
+    """Return the fusion that tables describe; it continues exactly like the one passed to
+    `tables_of`.
 
     Raises:
-        InputError: tables are of another version, or incomplete.
+        InputError: the tables are of another version, or incomplete.
     """
     versions = {(table.schema.metadata or {}).get(_KEY, b"").decode() for table in tables.values()}
     if versions != {VERSION}:

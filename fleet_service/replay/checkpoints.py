@@ -1,14 +1,16 @@
-"""Checkpoints: state of a service when all rows up to a segment were on disk; a restart replays the
-later segments.
+"""Checkpoints. A checkpoint is the state of a service after all rows up to a certain segment; a
+restart replays only later segments.
 
-    checkpoints/EPOCH-NUMBER/NAME.arrow          the newest segment that it includes
-    checkpoints/EPOCH-NUMBER/manifest.json       a digest of every file, and the weather that it
-                                                 includes
+    checkpoints/EPOCH-NUMBER/NAME.arrow          tables; the folder is named after the newest
+                                                 segment that is included
+    checkpoints/EPOCH-NUMBER/manifest.json       a digest of every file, and the names of the
+                                                 weather files that are included
 
-A folder appears when it is complete. Compiled code follows the numbers in a checkpoint without
-checks, so nothing of it is used before all digests are verified. A checkpoint with which a service
-died several times shortly after the start is not tried again. The log is the authority: a
-checkpoint that is missing, damaged or of another version only costs the time of a replay.
+A folder appears only when it is complete. Compiled code uses row numbers from a checkpoint without
+checks, so all digests are verified before use. If a service died several times shortly after
+starting from a checkpoint, the checkpoint is not used again. The archived rows remain the
+authority: a checkpoint that is missing, damaged or of another version only costs the time of a
+replay.
 """
 
 from __future__ import annotations
@@ -41,9 +43,9 @@ class Taken(NamedTuple):
     """Content of a checkpoint.
 
     Attributes:
-        tables: by name.
-        cut: the last segment that they include.
-        weather: names of the weather files that they include.
+        tables: tables by name.
+        cut: last segment that the tables include.
+        weather: names of the weather files that the tables include.
     """
 
     tables: dict[str, pa.Table]
@@ -52,7 +54,7 @@ class Taken(NamedTuple):
 
 
 def save_checkpoint(root: Path, taken: Taken) -> Path:
-    """Store a checkpoint, and keep the one before it.
+    """Store a checkpoint, and keep the previous one; return the folder.
 
     Raises:
         OSError: the disk is full; earlier checkpoints stay.
@@ -84,7 +86,7 @@ def save_checkpoint(root: Path, taken: Taken) -> Path:
 
 
 def list_checkpoints(root: Path) -> list[Path]:
-    """Return the checkpoints, newest first."""
+    """Return the folders of the checkpoints, newest first."""
     return _checkpoint_folders(root)[::-1]
 
 
@@ -92,8 +94,9 @@ def load_checkpoint(path: Path) -> Taken:
     """Return a checkpoint after verification.
 
     Raises:
-        InputError: it is damaged, of a former form, or a service died with it too often.
-        OSError: it cannot be read.
+        InputError: the checkpoint is damaged, has an old form, or too many starts with it have
+            failed.
+        OSError: a file cannot be read.
     """
     try:
         manifest = json.loads((path / _MANIFEST).read_bytes())
@@ -116,19 +119,19 @@ def load_checkpoint(path: Path) -> Taken:
 
 
 def mark_begun(path: Path) -> None:
-    """Record that a service begins from a checkpoint; `mark_survived` removes the record."""
+    """Record that a service is starting from a checkpoint; `mark_survived` removes the record."""
     with suppress(OSError):  # a full disk does not keep a service from its start
         (path / _TRIED).write_text(str(_count_tries(path) + 1))
 
 
 def mark_survived(root: Path) -> None:
-    """Record that the service runs well with its checkpoint."""
+    """Record that the service runs well with the checkpoint from which it started."""
     for path in _checkpoint_folders(root):
         (path / _TRIED).unlink(missing_ok=True)
 
 
 def file_digest(path: Path) -> str:
-    """Return the hash of a file; that of nothing if it does not exist."""
+    """Return the hash of a file; if the file does not exist, the hash of empty content."""
     state = blake2b(digest_size=16)
     with suppress(FileNotFoundError), path.open("rb") as file:
         while chunk := file.read(_CHUNK):

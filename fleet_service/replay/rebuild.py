@@ -1,5 +1,5 @@
-"""Replay of an archive: the batches that a service holds and the beliefs of its fusion, now or
-at a past moment.
+"""Replay of an archive: it restores the record of accepted batches, and the beliefs of the fusion,
+for now or for a past moment.
 """
 
 from __future__ import annotations
@@ -63,7 +63,9 @@ MARGIN_DEG: Final = 0.002
 
 
 class Begin(NamedTuple):
-    """Start of a replay: the first day of measurement, and the position in the log."""
+    """Start of a replay: the first day of measurement, and the positions in the sequence of
+    segments after which and up to which rows are read.
+    """
 
     day: int | None = None
     after: layout.Cut | None = None
@@ -76,13 +78,13 @@ def restore_streams(
     begin: Begin = Begin(),  # noqa: B008 immutable
     damaged: Damaged = skip_damaged,
 ) -> None:
-    """Record every archived batch as admitted, file by file.
+    """Record every archived batch as accepted, file by file.
 
     Args:
-        root: of the archive.
-        streams: recorded batches, which are updated.
-        begin: where the replay begins.
-        damaged: called with a damaged file.
+        root: folder of the archive.
+        streams: record of accepted batches; updated.
+        begin: start of the replay.
+        damaged: called with each damaged file.
     """
     for kind, first in layout.FIRST_TIME.items():
         columns = (*IDENTITY, "first_held", first)
@@ -100,7 +102,7 @@ def restore_streams(
 
 
 def pseudonym_numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
-    """Return pseudonyms (n,) as numbers."""
+    """Return pseudonyms (n,), given as text, as 64-bit numbers."""
     chunked = (
         pseudonyms if isinstance(pseudonyms, pa.ChunkedArray) else pa.chunked_array([pseudonyms])
     )
@@ -114,12 +116,13 @@ def pseudonym_numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntAr
 
 
 class Since(NamedTuple):
-    """Selection of a replay: from a position in the log and a day on, received until `until` [ns],
-    near `box` [deg].
+    """Selection of rows for a replay: from a segment position and a day on, received until `until`
+    [ns], near `box` [deg].
 
-    Cells do not depend on each other once weights are known, so cells well inside a box get the
-    same belief as in a complete replay. Of compacted files that extend beyond the position, the
-    batches in `known` are left out. More rows than `most` are an error.
+    Once the vehicles' weights are known, cells do not depend on each other. Therefore cells well
+    inside a box get the same belief as in a complete replay. Compacted files may contain batches
+    from before the start position; batches in `known` are left out. If there are more rows than
+    `most`, an error is raised.
     """
 
     begin: Begin = Begin()
@@ -129,8 +132,8 @@ class Since(NamedTuple):
     most: int | None = None
 
     def near(self) -> Box | None:
-        """Return the box with twice the margin; zones that touch it have the files with the
-        rows.
+        """Return the box enlarged by twice the margin, or None. The files of all zones that touch
+        it must be read.
         """
         if self.box is None:
             return None
@@ -143,7 +146,7 @@ class Since(NamedTuple):
         )
 
     def where(self) -> list[ValueRange] | None:
-        """Return the row filters; None for all rows."""
+        """Return the filters that select the rows; None for all rows."""
         found = (
             [] if self.until is None else [ValueRange("received_at", most=self.until // US_STEP)]
         )
@@ -158,7 +161,7 @@ Heard = Callable[[Observations], AbstractContextManager[None]]
 
 
 def ignore_observations(_: Observations) -> AbstractContextManager[None]:
-    """Ignore observations."""
+    """Return a context that does nothing, for a replay without a listener."""
     return nullcontext()
 
 
@@ -168,7 +171,8 @@ def too_much() -> InputError:
 
 
 def fusion_with_weather(root: Path, lateness_s: float, until: int) -> Fusion:
-    """Return a fusion with the weather received until a moment [ns], and no observation yet.
+    """Return a fusion with the weather received until the time `until` [ns], and without
+    observations.
 
     Raises:
         OSError: the archive cannot be read.
@@ -186,10 +190,11 @@ def past_fusion(
     most: int | None = None,
     listener: Callable[[Fusion], Heard] | None = None,
 ) -> Fusion:
-    """Return the fusion of a service that had received everything until a moment [ns], near a box
-    [deg].
+    """Return the state of the fusion after everything that was received until the time `until`
+    [ns], near a box [deg].
 
-    The object that `listener` makes for it follows the fusion of observations as a context.
+    `listener` is called with the fusion. It returns a context in which each group of observations
+    is fused, so that the listener can follow the fusion.
 
     Raises:
         InputError: there are more rows than `most`.
@@ -205,10 +210,11 @@ def past_fusion(
 
 
 def first_day(root: Path) -> int | None:
-    """Return the first day that matters to a service: layout.MAP_DAYS before the last day with
-    rows.
+    """Return the first day that matters to a service (days since 1970): layout.MAP_DAYS before the
+    last day with rows; None for an empty archive.
 
-    Older batches are not sent again (ServiceConfig.oldest_s), and they do not show in the map.
+    Vehicles do not send older batches again (ServiceConfig.oldest_s), and older batches no longer
+    affect the map.
     """
     found = [
         layout.day_of(folder)
@@ -225,17 +231,17 @@ def replay(
     damaged: Damaged = skip_damaged,
     heard: Heard = ignore_observations,
 ) -> Iterator[Updated]:
-    """Replay the archive into `fusion` in order of time, with the weights that were used; yield
-    once per epoch.
+    """Replay the archive into `fusion` in order of time, with the vote weights that were used at
+    the first fusion; yield once per epoch.
 
-    One day is read at a time, a large one in parts, so that memory does not grow with the archive.
+    One day is read at a time, a large day in parts, so that memory does not grow with the archive.
 
     Args:
-        root: of the archive.
-        fusion: a new one, or one that holds everything before `since`.
+        root: folder of the archive.
+        fusion: a new fusion, or one that contains everything before `since`.
         since: selection of rows.
-        damaged: called with a damaged file.
-        heard: context in which observations are fused.
+        damaged: called with each damaged file.
+        heard: context in which each group of observations is fused.
     """
     last = None if since.until is None else since.until // layout.DAY_NS + 1
     where = since.where()
@@ -267,14 +273,14 @@ def replay(
 
 
 def _recorded_result(rows: segments.Rows) -> RecordedResult:
-    """Return lateness and weight of rows as they were used at the first fusion."""
+    """Return lateness and vote weight of rows as recorded at the first fusion."""
     return RecordedResult(rows["late"].astype(bool), rows["late_by"], rows["weight"])
 
 
 def _join_parts(
     parts: list[tuple[Observations, RecordedResult]],
 ) -> tuple[Observations, RecordedResult]:
-    """Return parts joined in order."""
+    """Return several parts joined into one, in order."""
     of = Observations(
         **{
             f.name: np.concatenate([getattr(o, f.name) for o, _ in parts])
@@ -292,7 +298,7 @@ def _join_parts(
 def _select_rows(
     o: Observations, before: RecordedResult, rows: BoolArray | IntArray | slice
 ) -> tuple[Observations, RecordedResult]:
-    """Return a selection of rows."""
+    """Return the selected rows of the observations and of their recorded results."""
     return o.take(rows), RecordedResult(
         before.late[rows], before.late_by[rows], before.weight[rows]
     )
@@ -301,7 +307,7 @@ def _select_rows(
 def _fuse_epochs(
     fusion: Fusion, o: Observations, before: RecordedResult, heard: Heard
 ) -> Iterator[Updated]:
-    """Fuse rows epoch by epoch, by the time at which they were fused originally."""
+    """Fuse rows epoch by epoch, in order of the time at which they were first fused."""
     time = o.time + before.late_by
     order = np.argsort(time, kind="stable")
     o, before = _select_rows(o, before, order)
@@ -315,11 +321,11 @@ def _fuse_epochs(
 
 
 def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.Table]:
-    """Yield the rows of a listing in chunks of about CHUNK_ROWS, each later than the one before and
-    cut between epochs.
+    """Yield the rows of a listing in chunks of about CHUNK_ROWS, in order of time. Chunks are cut
+    between epochs.
 
-    A file is read once, or once per part of a day with more than PART_ROWS. Vehicles are numbers.
-    If the number of rows is not bounded, a part is read while the one before is used.
+    A file is read once, or once per part of a day with more than PART_ROWS. Vehicles are given as
+    numbers. If the number of rows is not limited, a part is read while the previous one is used.
 
     Raises:
         InputError: there are more than `most` rows.
@@ -335,8 +341,9 @@ def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.T
 
 
 def _prefetch_parts(parts: Iterator[_Held]) -> Iterator[_Held]:
-    """Yield the same parts, each made in a thread while the one before is used: reading is a third
-    of a start's time."""
+    """Yield the same parts. A thread prepares each part while the previous one is used, because
+    reading takes a third of the start time.
+    """
     with ThreadPoolExecutor(1, "reads ahead") as thread:
         coming = thread.submit(next, parts, None)
         while (part := coming.result()) is not None:
@@ -387,11 +394,11 @@ def _split_parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
 
 
 class _Held:
-    """Rows that wait, by chunk, compressed to a third of their memory.
+    """Waiting rows by chunk, compressed to a third of their memory.
 
     Args:
-        name: of the column of times.
-        borders: of the chunks [ns].
+        name: name of the column of times.
+        borders: times between the chunks [ns].
     """
 
     def __init__(self, name: str, borders: list[int]) -> None:
@@ -402,7 +409,7 @@ class _Held:
         self.rows = 0
 
     def take(self, table: pa.Table) -> None:
-        """Add rows to those that `keep` or `forget` decides on."""
+        """Add rows provisionally; `keep` or `forget` then decides about them."""
         time = segments.to_nanoseconds(table[self._name])
         order = np.argsort(time, kind="stable")
         table = _with_numbers(table).take(order)
@@ -415,18 +422,18 @@ class _Held:
                 self._taken.append((k, stop - start, sink.getvalue()))
 
     def keep(self) -> None:
-        """Keep the added rows."""
+        """Keep the provisionally added rows."""
         for k, rows, packed in self._taken:
             self._kept[k].append(packed)
             self.rows += rows
         self._taken.clear()
 
     def forget(self) -> None:
-        """Drop the added rows: their file is damaged."""
+        """Drop the provisionally added rows, because their file is damaged."""
         self._taken.clear()
 
     def chunks(self) -> Iterator[pa.Table]:
-        """Yield the rows of each chunk that has any, in order; call it once."""
+        """Yield the rows of each non-empty chunk, in order; call this only once."""
         for k, packed in enumerate(self._kept):
             self._kept[k] = []
             if packed:
@@ -434,22 +441,23 @@ class _Held:
 
 
 def _time_borders(low: int, high: int, rows: int, most: int) -> list[int]:
-    """Return times from `low` to `high` [ns], between epochs, with about `most` rows between two if
-    rows are even in time."""
+    """Return times from `low` to `high` [ns] that divide the interval at epoch borders. If rows are
+    evenly distributed in time, about `most` rows lie between two times.
+    """
     epochs = (high - low) // EPOCH_NS
     parts = max(1, min(-(-rows // most), epochs))
     return [low + int(part) * EPOCH_NS for part in np.linspace(0, epochs, parts + 1)]
 
 
 def _with_numbers(table: pa.Table) -> pa.Table:
-    """Return a table with numbers for pseudonyms, which takes less than half the memory."""
+    """Return the table with numbers in place of pseudonyms, which takes less than half the memory."""
     at = table.column_names.index("vehicle")
     return table.set_column(at, "vehicle", pa.array(pseudonym_numbers(table["vehicle"])))
 
 
 def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
-    """Return the maximum number of rows that `past_fusion` would read, by footers alone; counting stops
-    beyond `most`.
+    """Return an upper bound of the number of rows that `past_fusion` would read, from file footers
+    alone. Counting stops beyond `most`.
 
     Raises:
         OSError: the archive cannot be read.
@@ -469,8 +477,8 @@ def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
 
 
 def _rows_of(path: Path, box: Box | None = None) -> int:
-    """Return the rows of a file by its footer, of row groups near a box; 0 if it cannot be read
-    or does not exist.
+    """Return the number of rows of a file, from its footer, counting only row groups near a box; 0
+    if the file does not exist or cannot be read.
     """
     try:
         footer = pq.read_metadata(path)

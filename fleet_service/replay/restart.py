@@ -1,5 +1,5 @@
-"""Begin of a restart: the newest readable checkpoint, or an empty state; later rows come from the
-log.
+"""Start of a service: load the newest readable checkpoint, or an empty state. The caller then
+replays the rows archived later.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ ABOVE: Final = "streams_above"
 
 
 class Restart(NamedTuple):
-    """Initial state of a service.
+    """Initial state of a service, from a checkpoint.
 
     Attributes:
-        fusion: of the checkpoint, or a new one.
-        streams: batches admitted then.
-        standing: alerts that stood then.
-        cut: the last segment it includes; None for none.
-        weather: names of the weather files it includes.
-        refused: checkpoints that could not be read: damaged, or of another version.
+        fusion: fusion of the checkpoint, or a new one.
+        streams: record of the batches accepted until then.
+        standing: alerts that were active then.
+        cut: last segment that is included; None without a checkpoint.
+        weather: names of the weather files that are included.
+        refused: number of checkpoints that could not be used: damaged, or of another version.
         extra_tables: additional tables of the checkpoint, as columns.
     """
 
@@ -50,8 +50,8 @@ class Restart(NamedTuple):
 
 
 def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()) -> Restart:
-    """Load the initial state from the archive in a folder; `extra_tables` names additional tables
-    that the service stored with those of `image_of`.
+    """Return the initial state from the newest usable checkpoint of an archive. `extra_tables`
+    names additional tables that the service stored with those of `image_of`.
     """
     refused = 0
     for path in checkpoints.list_checkpoints(root):
@@ -84,7 +84,7 @@ def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()
 def image_of(
     fusion: Fusion, standing: list[Alert], streams: SequenceTrackers
 ) -> dict[str, pa.Table]:
-    """Return the tables of a checkpoint from which `restart` restores the state."""
+    """Return the tables of a checkpoint, from which `load_restart` restores the state."""
     columns, above = streams.columns()
     return tables_of(fusion) | {
         ALERTS: pa.Table.from_pylist([asdict(alert) for alert in standing]),

@@ -1,1 +1,1 @@
-"""Output of the map: cells, tiles, queries, alerts."""
+"""Output of the map: cells, tiles, answers to queries, alerts."""

@@ -1,5 +1,6 @@
-"""Low-grip alerts: raised when at least two vehicles support a firm belief, cleared with hysteresis
-and a reason. Pure."""
+"""Low-friction alerts. An alert is raised when at least two vehicles support a firm belief that a
+cell is slippery. It is cleared with hysteresis, and with a stated reason. Pure.
+"""
 
 from __future__ import annotations
 
@@ -42,13 +43,13 @@ QUIET_NS: Final = 1800 * NS  # an alert whose ice nobody confirmed for so long m
 
 
 class Alerts:
-    """Set of cells under alert.
+    """Cells that have an active alert.
 
     Args:
         fusion: owner of the cells.
-        idle_roads: limit on alerts on roads where only the witnesses drive; None for no limit, in
-            simulations.
-        is_private: True if times and numbers of vehicles are given in steps.
+        idle_roads: limit on alerts on roads where only the supporting vehicles drive; None for no
+            limit, in simulations.
+        is_private: True if times and numbers of vehicles are rounded for privacy.
     """
 
     def __init__(
@@ -61,16 +62,16 @@ class Alerts:
 
     @property
     def slots(self) -> set[int]:
-        """Return the slots under alert."""
+        """Return the slots (cell and sector) that have an active alert."""
         return set(self._standing)
 
     @property
     def standing_alerts(self) -> list[Alert]:
-        """Return the standing alerts as they were raised."""
+        """Return the active alerts, as they were when they were raised."""
         return list(self._standing.values())
 
     def resume(self, standing: Sequence[Alert]) -> None:
-        """Continue with alerts that stood before a restart."""
+        """Continue with alerts that were active before a restart."""
         slots = self._fusion.slots_of(
             np.array([a.cell for a in standing], np.int64),
             np.array([a.sector for a in standing], np.int64),
@@ -80,12 +81,13 @@ class Alerts:
         }
 
     def renumber(self, place: IntArray) -> None:
-        """Update slots after the fusion renumbered them; `place` is the new number of each. No slot
-        under alert is removed."""
+        """Update the slot numbers after the fusion renumbered them; `place` contains the new number
+        of each slot. The fusion must not have removed a slot with an active alert.
+        """
         self._standing = {int(place[slot]): alert for slot, alert in self._standing.items()}
 
     def update(self, slots: IntArray) -> list[Alert]:
-        """Return the alerts that updated cells raise or clear."""
+        """Return the alerts that are raised or cleared because the cells `slots` (k,) were updated."""
         time = self._fusion.live.time[slots]
         slippery = self._fusion.slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
@@ -108,8 +110,9 @@ class Alerts:
         return out + [self._clear(int(slots[k]), int(time[k]), reason) for k in gripping.tolist()]
 
     def _is_admitted(self, slot: int, time: int) -> bool:
-        """Return False on an idle road if its witnesses have supported alerts in too many other
-        places lately.
+        """Return True if an alert may be raised under the limit for idle roads. It may not if only
+        its supporting vehicles drive there and they have recently supported alerts in too many
+        other places.
         """
         live = self._fusion.live
         if self._idle_roads is None or live.vehicles[slot] >= OTHERS_NEEDED:
@@ -120,11 +123,12 @@ class Alerts:
         )
 
     def _suspects(self, slots: IntArray) -> IntArray:
-        """Return the slots with enough sources of ice, of updated ones (k,) and of the others on
-        their stretches.
+        """Return the slots with enough sources of ice: among the updated slots (k,) and the others
+        on their slippery stretches. A source is a vehicle whose report supports an alert.
 
-        Neighbours confirm, they do not accuse: each has a source of its own and is likely slippery
-        by its own reports, or it lies between cells with sources.
+        Neighbouring cells can confirm ice in a cell, but they are not enough alone. Each returned
+        slot either has a source of its own and is likely slippery by its own reports, or lies
+        between cells with sources.
         """
         fusion = self._fusion
         slots = slots[self._own_sources(slots, ICE)[:, 0] > 0]
@@ -143,22 +147,22 @@ class Alerts:
         return np.asarray(near[enough & (accused | along.around)])
 
     def _own_sources(self, slots: IntArray, side: int) -> IntArray:
-        """Return the times of a side's sources within the hour before the last report of slots
-        (k,); see `Fusion.sources`.
+        """Return the times [ns] of the sources for one side (ice or grip) of slots (k,), (k,
+        SOURCES), within the hour before the slot's last report; see `Fusion.sources`.
         """
         return self._fusion.sources(slots, side, self._fusion.live.time[slots] - SOURCE_NS)
 
     def _can_clear(self, slots: IntArray) -> BoolArray:
-        """Return True for slots (k,) that have two more sources of grip within the hour than of
-        ice, or as many as are remembered.
+        """Return a mask of slots (k,): True if sources of grip outnumber sources of ice by two
+        within the hour, or if there are as many sources of grip as the fusion remembers.
         """
         grip = (self._own_sources(slots, GRIP) > 0).sum(axis=1)
         ice = (self._own_sources(slots, ICE) > 0).sum(axis=1)
         return np.asarray(grip >= np.minimum(ice + 2, SOURCES))
 
     def expire(self, now: int) -> list[Alert]:
-        """Return the alerts that expire by `now` [ns]: less likely than not, and not confirmed
-        for QUIET_NS.
+        """Return the end messages of alerts that expire by `now` [ns]: slippery road is less likely
+        than not, and no source has confirmed it for QUIET_NS.
         """
         slots = np.array(sorted(self._standing), np.int64)
         forgotten = self._fusion.sources(slots, ICE, now - QUIET_NS)[:, 0] == 0

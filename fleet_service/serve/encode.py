@@ -25,7 +25,9 @@ _END: Final = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # a message without a head: t
 
 
 def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
-    """Return cells in the schema of the map, with their age at `now` [ns]. A bound has no mu."""
+    """Return cells as an Arrow batch in the schema of the map, with their age at `now` [ns]. `mu`
+    is null for a cell with only a lower bound.
+    """
     latitude, longitude = grid.centre(cells.cell)
     west, south, east, north = grid.bounds(cells.cell)
     lower, middle, upper = quantiles(cells.belief, (LOWER, 0.5, UPPER))
@@ -60,12 +62,14 @@ def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
 
 
 def cell_table(fusion: Fusion, slots: IntArray, now: int) -> pa.Table:
-    """Return the cells of `slots` as believed at `now` [ns], in the schema of the map."""
+    """Return the cells of `slots` as a table in the schema of the map, with beliefs for the time
+    `now` [ns].
+    """
     return pa.Table.from_batches([batch_of(view_cells(fusion, slots, now), now)])
 
 
 def encode_tile(cells: pa.RecordBatch, form: Format, tile: int) -> bytes:
-    """Return the cells of a tile in one of the three forms."""
+    """Return the cells of a tile encoded as Arrow, GeoJSON or JSON."""
     if form is Format.ARROW:
         return arrow_stream(cells)
     rows = _json_rows(cells)
@@ -86,20 +90,20 @@ def encode_tile(cells: pa.RecordBatch, form: Format, tile: int) -> bytes:
 
 
 def _encode_rows(rows: Iterable[dict[str, Any]]) -> str:
-    """Encode rows as JSON one by one; a single call for thousands would hold the interpreter
-    lock too long.
+    """Return rows as JSON text. They are encoded one by one, because a single call for thousands of
+    rows would hold the interpreter lock too long.
     """
     return ", ".join(json.dumps(row, allow_nan=False) for row in rows)
 
 
 def arrow_stream(cells: pa.RecordBatch) -> bytes:
-    """Return cells as an Arrow stream of one batch."""
+    """Return cells as an Arrow stream with one batch."""
     return b"".join([_SCHEMA, cells.serialize(), _END])
 
 
 def _json_rows(table: pa.RecordBatch) -> list[dict[str, Any]]:
-    """Return rows with times as ISO 8601 text and single-precision numbers without surplus
-    digits.
+    """Return rows as dictionaries for JSON: times as ISO 8601 text, floats rounded to single
+    precision.
     """
     columns: dict[str, list[Any]] = {}
     for f in table.schema:

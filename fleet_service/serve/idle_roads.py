@@ -1,10 +1,10 @@
-"""Limit on alerts that two vehicles raise alone on roads without other vehicles. Pure.
+"""Limit on alerts that two vehicles raise alone, on roads without other vehicles. Pure.
 
-Two enrolled vehicles that agree can report ice anywhere, on a path that is plausible. On a road
-with other traffic the others contradict them. On a road that no third vehicle ever reported nobody
-does. Each vehicle may therefore support such alerts in at most MOST_AREAS areas of AREA_M within
-AREA_NS. Farther along, their paths are not distinct enough from one vehicle's, and a third vehicle
-is needed; until then the map shows the ice, without an alert.
+Two enrolled vehicles that collude could report ice anywhere along plausible paths. On a road with
+other traffic, other vehicles contradict them. On a road that no third vehicle has reported, no
+other vehicle does. Therefore each vehicle may support such alerts in at most MOST_AREAS areas of
+AREA_M within AREA_NS. Beyond this limit a third vehicle is needed; until then the map shows the
+ice, but no alert is raised.
 """
 
 from __future__ import annotations
@@ -26,19 +26,20 @@ VEHICLES: Final = 100_000  # that are remembered
 
 
 class IdleRoads:
-    """Areas in which each vehicle supported alerts on idle roads lately."""
+    """Record of the areas in which each vehicle has recently supported alerts on idle roads."""
 
     def __init__(self) -> None:
         self._areas: dict[int, list[tuple[int, FloatArray]]] = {}
 
     def admit(self, cell: int, witnesses: Sequence[int], time: int, needed: int) -> bool:
-        """Return True if an alert may be raised, and charge its witnesses.
+        """Return True if an alert may be raised; in this case, record the area for its supporting
+        vehicles.
 
         Args:
-            cell: of the alert.
-            witnesses: numbers of the vehicles that support it.
-            time: of the alert [ns].
-            needed: minimum number of witnesses with an area left.
+            cell: cell of the alert.
+            witnesses: numbers of the vehicles that support the alert.
+            time: time of the alert [ns].
+            needed: minimum number of supporting vehicles that have not reached their limit.
         """
         place = np.array(grid.centre(cell), float)
         able = [vehicle for vehicle in witnesses if self._has_area(vehicle, place, time)]

@@ -1,4 +1,4 @@
-"""The map: the cells of each tile, and the tiles that changed. Pure."""
+"""The map: which cells belong to each tile, and which tiles have changed. Pure."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PARTS: Final = 32  # of a tile's index before they are joined: each costs as muc
 
 
 class MapState:
-    """Tiles of a fusion.
+    """Index from the tiles of the map to the cells of a fusion.
 
     Args:
         fusion: owner of the cells.
@@ -33,7 +33,7 @@ class MapState:
         self.change = 0  # how often anything changed
 
     def mark_changed(self, slots: IntArray) -> None:
-        """Record cells that were updated."""
+        """Record that cells (slots) were updated, so that their tiles count as changed."""
         self._index()
         self.change += 1
         tiles = distinct_values(tile_of(self.fusion, slots)).tolist()
@@ -41,7 +41,9 @@ class MapState:
         self._changed.update(dict.fromkeys(tiles, self.change))
 
     def changed_at(self, tile: int) -> int:
-        """Return the value of `change` when the tile last changed; 0 if it never did."""
+        """Return the value of the counter `change` at the last change of a tile; 0 if it never
+        changed.
+        """
         return self._changed.get(tile, 0)
 
     def take_dirty(self) -> list[int]:
@@ -51,7 +53,7 @@ class MapState:
         return dirty
 
     def tiles(self) -> list[int]:
-        """Return all tiles that have a cell."""
+        """Return all tiles that contain at least one cell."""
         self._index()
         return sorted(self._slots)
 
@@ -69,7 +71,9 @@ class MapState:
         return sum(map(len, self._slots.get(tile, ())))
 
     def rebuild(self) -> None:
-        """Rebuild the tiles after the fusion renumbered its slots."""
+        """Discard the index, so that it is built again; call this after the fusion renumbered its
+        slots.
+        """
         self._slots.clear()
         self._indexed = 0
 

@@ -1,10 +1,11 @@
-"""Imputation of unvisited cells from visited neighbours: wider, and marked as borrowed. Pure.
+"""Estimates for unvisited cells from visited neighbours ("borrowed" values): wider, and marked as
+such. Pure.
 
 A neighbour may be another kind of road (a bridge, the other side of a shadow), so half of the
-imputed belief is the prior. Along a route the order of cells is known. There a cell borrows from
+estimated belief is the prior. Along a route the order of cells is known. There a cell borrows from
 the nearest visited cells before and behind it, up to REACH cells away, and the share of the prior
-grows with the distance. If both sides are visited, each counts by its share. Different surfaces on
-the two sides therefore give a wide belief and not a mean surface.
+grows with the distance. If both sides are visited, each side has its share. Two different surfaces
+therefore give a wide belief, and not a belief about a surface in the middle.
 """
 
 from __future__ import annotations
@@ -27,12 +28,14 @@ KEPT: Final = 0.8
 def impute_cells(
     source: Readable, tile: int, known: IntArray, route: IntArray | None, now: int
 ) -> CellView:
-    """Return the cells of a tile that are not `known` next to those of its cells that are, same
-    sector; along a route, the cells of its keys.
+    """Return a view of unvisited cells of a tile with beliefs estimated from visited neighbours.
+    These are the cells next to the cells in `known`, in the same sector; along a `route`, the cells
+    of its keys.
 
-    The belief is half the prior and half the mean of the visited neighbours, less of them at
-    greater distance. `vehicles` is the minimum of theirs, so that an imputed value is never more
-    public than its sources. Times are the newest and oldest of theirs.
+    A belief is half the prior and half the mean of the visited neighbours; at greater distance, the
+    share of the neighbours is smaller. `vehicles` is the minimum over these neighbours, so that an
+    estimated value is never more public than its sources. `first` and `last` are the oldest and the
+    newest time of the neighbours.
     """
     live = source.live
     slots = known[grid.tile_of(live.key[known] // grid.SECTORS) == tile]
@@ -83,10 +86,11 @@ def impute_cells(
 def _route_gaps(
     source: Readable, route: IntArray, tile: int, known: IntArray
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return unknown keys of a route in a tile, the slots of the nearest visited ones before and
-    behind, and their shares.
+    """Return the unvisited keys of a route in a tile, the slots of the nearest visited keys before
+    and behind each, and the share of each.
 
-    A key appears once for each side within REACH; adjacent keys are handled as neighbours.
+    A key appears once for each side on which a visited key is within REACH. Directly adjacent keys
+    are excluded, because they are handled as neighbours.
     """
     slots = source.slots_of(route // grid.SECTORS, route % grid.SECTORS)
     slots = np.where(np.isin(slots, known), slots, -1)

@@ -1,10 +1,11 @@
-"""Cells that readers may see where persons are kept private: a lone vehicle changes nothing. Pure.
+"""Cells that readers may see if persons are kept private: the passage of a single vehicle changes
+nothing that is visible. Pure.
 
-Readers see a copy of the map. A cell is copied at a moment of a time grid at which LEAST vehicles
-have visited the cell since it was last copied, and as many have been in its tile within the running
-hour. So neither a cell nor its moment points at one vehicle: one that comes late completes no count
-that others began. Until then it is shown as if the visits since had not happened, aged to the time
-of reading. Nothing that is more slippery than shown waits: it is copied at once.
+Readers see a copy of the map. Copies are made only at fixed times (every PERIOD_NS). A cell is
+copied if at least LEAST vehicles have visited it since its last copy, and as many have been in its
+tile within the current hour. So neither the cell nor the time of the copy points to one vehicle.
+Between copies, readers see the cell without the newer visits, aged to the time of reading. There is
+one exception for safety: a cell that has become more slippery than shown is copied at once.
 
 Legend
     k        LEAST, `public_vehicles` of the settings
@@ -44,16 +45,16 @@ PRESENT: Final = "present"
 
 
 class PublicCells:
-    """Public cells of a fusion; use it under the lock of the map.
+    """Public copy of the cells of a fusion; use it only while holding the lock of the map.
 
     Args:
         fusion: owner of the cells.
         visitors: recent vehicles per cell.
         least: minimum number of vehicles of a public cell, at least 2.
-        tables: what `columns` returned when the fusion was saved.
+        tables: result of `columns` from a checkpoint; None for a new start.
 
     Attributes:
-        visitors: see above.
+        visitors: the argument of that name.
     """
 
     def __init__(
@@ -82,7 +83,9 @@ class PublicCells:
 
     @property
     def live(self) -> Cells:
-        """Return the cells as they were copied; rows of cells that are not public are not for readers."""
+        """Return the cells as they were copied. Rows of cells that are not public must not be shown
+        to readers.
+        """
         self._add_slots()
         return cells_of(self._rows)
 
@@ -92,12 +95,12 @@ class PublicCells:
         return self._fusion.beliefs(slots, now, self._rows)
 
     def slots_of(self, cell: IntArray, sector: IntArray) -> IntArray:
-        """Return the slot of each cell and sector, -1 if no vehicle has reported it."""
+        """Return the slot of each cell and sector; -1 if no vehicle has reported it."""
         return self._fusion.slots_of(cell, sector)
 
     @contextmanager
     def follow(self, o: Observations) -> Iterator[None]:
-        """Follow the fusion of observations, which happens within this context."""
+        """Update the public copy for observations that the caller fuses inside this context."""
         now = int(o.time.max(initial=0))
         self.publish(now)
         yield
@@ -128,8 +131,8 @@ class PublicCells:
         return found
 
     def renumber(self, place: IntArray) -> None:
-        """Update slots after the fusion renumbered them; `place` is the new number, -1 for
-        removed ones.
+        """Update the slot numbers after the fusion renumbered them; `place` contains the new
+        numbers, -1 for removed slots.
         """
         self.visitors.renumber(place)
         stay = np.flatnonzero(place[: self._size] >= 0)
@@ -137,8 +140,8 @@ class PublicCells:
         self._size = len(stay)
 
     def publish(self, now: int) -> None:
-        """Publish the cells that enough vehicles visited, if a moment of the time grid has passed
-        by `now` [ns].
+        """Copy the cells that enough vehicles have visited, if a copy time has passed by `now`
+        [ns].
         """
         self._add_slots()
         if now // PERIOD_NS <= self._period:
@@ -164,8 +167,9 @@ class PublicCells:
             self._published.append(slots)
 
     def columns(self) -> dict[str, dict[str, IntArray]]:
-        """Return tables of columns from which a restart goes on, without the visitors: the rows of
-        cells that differ from the fusion's, as numbers, and the vehicles of tiles.
+        """Return the state as tables of columns for a checkpoint, without the visitors. The tables
+        contain the rows that differ from the fusion's rows, encoded as integers, and the vehicles
+        of each tile.
         """
         self._add_slots()
         used = slice(self._size)
@@ -190,7 +194,7 @@ class PublicCells:
         return {WAITING: {"rows": np.concatenate(parts, axis=1).reshape(-1)}, PRESENT: present}
 
     def _restore(self, tables: Mapping[str, dict[str, IntArray]]) -> None:
-        """Restore what `columns` returned."""
+        """Restore the state from the result of `columns`."""
         belief = mugrid.BINS * FULL.itemsize // 8
         numbers = tables[WAITING]["rows"].reshape(-1, 3 + belief + CELL.itemsize // 8)
         slots = numbers[:, 0]
@@ -204,7 +208,7 @@ class PublicCells:
         self._period = int(present["period"].max(initial=0))
 
     def _copy_more_slippery(self, slots: IntArray, now: int) -> None:
-        """Copy those of the slots that are more slippery than shown."""
+        """Copy those of the slots that have become clearly more slippery than readers see."""
         current = self._fusion.beliefs(slots, now)
         shown = self.beliefs(slots, now)
         worse = (current - shown) @ SLIPPERY_SHARE >= MORE_SLIPPERY
@@ -214,14 +218,14 @@ class PublicCells:
         self._pending[slots[self._shown[slots]]] = 0
 
     def _copy(self, slots: IntArray) -> None:
-        """Copy cells as they are now."""
+        """Copy the current state of cells to the public copy."""
         live = self._fusion.store.state.live
         self._rows.belief[slots] = live.belief[slots]
         self._rows.cells[slots] = live.cells[slots]
 
     def _add_slots(self) -> None:
-        """Add the fusion's new slots, as nobody had visited them; room doubles, so that it is rarely
-        made.
+        """Add the fusion's new slots, in the state of an unvisited cell. The memory is doubled when
+        it is full, so that this is rare.
         """
         if self._size == self._fusion.size:
             return
@@ -235,7 +239,7 @@ class PublicCells:
         self._size = self._fusion.size
 
     def _take_rows(self, slots: IntArray, room: int | None = None) -> None:
-        """Keep these rows alone, in room for so many."""
+        """Reduce the copy to these rows, in arrays with room for `room` rows."""
         room = len(slots) if room is None else room
         rows = Rows(no_beliefs(room), rows_of_lines(room, CELL), self._rows.reporters)
         rows.belief[: len(slots)] = self._rows.belief[slots]

@@ -1,4 +1,6 @@
-"""Answers to queries, one tile at a time: select → view → impute → encode. Pure."""
+"""Answers to map queries, one tile at a time: select cells, compute beliefs, estimate unvisited
+cells, encode. Pure.
+"""
 
 from __future__ import annotations
 
@@ -25,13 +27,13 @@ def answer_query(
     now: int,
     only: int | None = None,
 ) -> Iterator[tuple[int, bytes]]:
-    """Yield tile and payload of every reply, computed on demand.
+    """Yield the tile number and the payload of every reply, computed on demand.
 
     Args:
         cache: the tiles of the map.
-        query: its parameters.
-        wanted: returns True if a tile's key matches the query's.
-        now: for ages and forgetting [ns].
+        query: parameters of the query.
+        wanted: function that returns True if a tile's key matches the query's key.
+        now: time [ns] for which beliefs and ages are computed.
         only: the only matching tile, if the query's key names it.
 
     Raises:
@@ -50,7 +52,7 @@ def answer_query(
 
 
 class AnswerSize(NamedTuple):
-    """Upper bound of an answer's size."""
+    """Upper bound of the size of an answer: number of cells and number of tiles."""
 
     cells: int
     tiles: int
@@ -59,7 +61,9 @@ class AnswerSize(NamedTuple):
 def size_asked(
     cache: TileCache, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None
 ) -> AnswerSize:
-    """Return the size of all tiles that an answer reads; arguments and errors as for `answer_query`."""
+    """Return an upper bound of an answer's size: all tiles that it must read. Arguments and errors
+    are the same as for `answer_query`.
+    """
     route = keys_along(query.route) if query.route else None
     tiles = [
         tile
@@ -73,7 +77,7 @@ def size_asked(
 def _select_tiles(
     cache: TileCache, query: MapQuery, route: IntArray | None, only: int | None
 ) -> list[int]:
-    """Select the tiles that may contain cells of the answer."""
+    """Return the tiles that may contain cells of the answer."""
     if route is not None:
         tiles = np.unique(grid.tile_of(route // grid.SECTORS))
     elif only is not None:
@@ -89,7 +93,9 @@ def _select_tiles(
 def _view_tile(
     cache: TileCache, tile: int, query: MapQuery, route: IntArray | None, now: int
 ) -> ShownTile:
-    """View and impute the cells of one tile that may match; along a route in its order."""
+    """Return the cells of one tile that may match, including estimated cells if the query asks for
+    them; along a route, in the order of the route.
+    """
     with cache.guard:
         fusion = cache.state.fusion
         slots = cache.state.slots(tile)
@@ -111,11 +117,11 @@ def _view_tile(
 
 
 def _select_rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
-    """Select the cells with enough vehicles that touch the box.
+    """Return the rows of the cells that have enough vehicles and touch the box.
 
-    Usually that is a complete tile, or a contiguous part of it. Every step that releases the
-    interpreter lock may wait for it ten times as long as the step takes, so cells are compared one
-    by one only if necessary.
+    Usually this is a complete tile, or a contiguous part of it. Each step that releases the
+    interpreter lock may wait ten times as long as the step takes, so cells are compared one by one
+    only if necessary.
     """
     columns = shown.columns
     run = slice(0, len(shown.cells))
@@ -140,7 +146,7 @@ def _select_rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
 def _encode_tile(
     shown: ShownTile, rows: slice | BoolArray, form: Format, tile: int
 ) -> bytes | None:
-    """Encode the selected cells of a tile; None if there are none."""
+    """Return the selected cells of a tile in encoded form; None if no cell is selected."""
     if isinstance(rows, slice):
         count = max(rows.stop - rows.start, 0)
         if form is Format.ARROW and shown.payload and count == len(shown.cells):

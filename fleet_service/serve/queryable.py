@@ -1,15 +1,19 @@
-"""Scheduling of queries: cheap ones are answered in Zenoh's thread, expensive ones in a thread of
-their own, tile by tile.
+"""Scheduling of queries. Cheap queries are answered in Zenoh's thread, expensive ones in a separate
+thread, tile by tile.
 
 Zenoh queries are anonymous, so per-client limits are impossible. Queries are scheduled by estimated
-cost instead. The next tile always belongs to the query that would have ended first on an idle
-service (`_Heavy.rank`). A small query therefore overtakes a large earlier one, and a stream of
-small ones cannot starve a large one. If too many wait, the most expensive one gets an error that
-asks it to retry. Cheap answers together take at most LIGHT_PER_S; beyond that they are treated as
-expensive ones, smallest first. After each tile of an expensive answer the thread rests as long as
-the tile took. A query beyond the size limit is an error with a hint. One past map is rebuilt at a
-time, in a separate process; a few such queries wait for their turn, and further ones get an error
-that asks them to retry.
+cost instead:
+
+- The next tile belongs to the query that would have ended first on an idle service
+  (`_QueuedQuery.rank`). So a small query overtakes a large earlier one, but a stream of small
+  queries cannot starve a large one.
+- If too many queries wait, the most expensive one gets an error that asks the client to retry.
+- Cheap answers together take at most LIGHT_PER_S. Beyond that they are queued as expensive ones,
+  smallest first.
+- After each tile of an expensive answer, the thread rests as long as the tile took.
+- A query beyond the size limit gets an error with a hint.
+- One past map is rebuilt at a time, in a separate process. A few such queries wait for their turn;
+  further ones get an error that asks the client to retry.
 """
 
 from __future__ import annotations
@@ -56,12 +60,12 @@ def _past_is_busy() -> InputError:
 
 
 class Answering(NamedTuple):
-    """Functions that answer queries.
+    """Functions that produce answers to queries.
 
     Attributes:
-        size: returns the upper bound of an answer's cells and tiles.
-        answer: yields tile and payload of every reply to a query, for the tiles that a predicate
-            accepts, and the only one if the query's key names a tile.
+        size: returns an upper bound of the number of cells and tiles of an answer.
+        answer: yields the tile number and payload of every reply. Arguments are the query, a
+            function that accepts tiles, and the only possible tile if the query's key names one.
     """
 
     size: Callable[[MapQuery, Callable[[int], bool], int | None], AnswerSize]
@@ -73,8 +77,8 @@ class _QueuedQuery:
     """Expensive query that waits or is partly answered.
 
     Attributes:
-        rank: time at which it would be answered on an idle service [s].
-        number: of earlier queries.
+        rank: time [s] at which the query would be finished on an idle service.
+        number: serial number of the query, which decides between equal ranks.
     """
 
     rank: float
@@ -86,13 +90,13 @@ class _QueuedQuery:
 
 @dataclass
 class _Answered:
-    """Marker: True if an answer is complete."""
+    """Flag: True if an answer is complete."""
 
     whole: bool = True
 
 
 class _TokenBucket:
-    """Token bucket for cheap answers."""
+    """Token bucket that limits the total cost of cheap answers per second."""
 
     def __init__(self) -> None:
         self._left = LIGHT_PER_S
@@ -100,7 +104,7 @@ class _TokenBucket:
         self._guard = threading.Lock()
 
     def take(self, cost: float) -> bool:
-        """Take `cost` from the bucket; return False if it is too empty."""
+        """Take `cost` from the bucket; return False, and take nothing, if the bucket contains less."""
         with self._guard:
             now = time.monotonic()
             self._left = min(LIGHT_PER_S, self._left + (now - self._since) * LIGHT_PER_S)
@@ -112,12 +116,12 @@ class _TokenBucket:
 
 
 class MapQueryable:
-    """Handler of map queries: answers cheap ones at once, and queues or refuses expensive ones.
+    """Handler of map queries: answers cheap queries at once, and queues or refuses expensive ones.
 
     Args:
-        answering: estimates the size of answers and produces them.
-        counts: counter that is increased under `queries`, `heavy_queries`, `refused_queries`,
-            `bad_queries.FIELD` and `answer_failures`.
+        answering: functions that estimate the size of answers and produce them.
+        counts: counters; `queries`, `heavy_queries`, `refused_queries`, `bad_queries.FIELD` and
+            `answer_failures` are increased.
     """
 
     def __init__(self, answering: Answering, counts: Counter[str]) -> None:
@@ -133,14 +137,14 @@ class MapQueryable:
 
     @property
     def hangs_s(self) -> float:
-        """Return the time [s] that the current tile of an expensive answer has taken; 0 without
-        one.
+        """Return the time [s] since the current tile of an expensive answer was begun; 0 if no tile
+        is being computed.
         """
         since = self._busy_since
         return 0.0 if since is None else time.monotonic() - since
 
     def __call__(self, request: zenoh.Query) -> None:
-        """Answer one query, now or later."""
+        """Answer one query at once, or queue or refuse it."""
         self._counts["queries"] += 1
         try:
             pairs: Iterable[tuple[str, str]] = request.parameters  # type: ignore[assignment] # stub: no iterable
@@ -177,7 +181,9 @@ class MapQueryable:
             self._refuse(request, _past_is_busy())
 
     def _wait_for_past(self, request: zenoh.Query, wanted: MapQuery) -> None:
-        """Answer when the questions before are answered, or refuse after PAST_WAIT_S."""
+        """Answer a query about a past map after the earlier such queries; refuse it if it waits
+        longer than PAST_WAIT_S.
+        """
         try:
             if self._past.acquire(timeout=PAST_WAIT_S):
                 self._answer_past(request, wanted)
@@ -228,7 +234,7 @@ class MapQueryable:
             time.sleep(min(REST * (time.monotonic() - began), LONGEST_REST_S))
 
     def _goes_on(self, heavy: _QueuedQuery) -> bool:
-        """Answer with one more tile; return True if there may be others."""
+        """Answer a queued query with one more tile; return True if further tiles may follow."""
         request = heavy.request
         with self._reply_to(request) as answered:
             if heavy.tiles is None:
@@ -252,7 +258,9 @@ class MapQueryable:
 
     @contextmanager
     def _reply_to(self, request: zenoh.Query) -> Iterator[_Answered]:
-        """Reply to a request and close it unless more follows; a failure becomes an error reply."""
+        """Provide a context in which a request is answered. At the end, close the request unless
+        more replies follow. An exception becomes an error reply.
+        """
         answered = _Answered()
         try:
             yield answered
@@ -285,8 +293,9 @@ class MapQueryable:
 
 
 def _key_filter(request: zenoh.Query) -> tuple[Callable[[int], bool], int | None]:
-    """Return a predicate for tiles whose key matches the query's, and the only such tile if the
-    query's key names it."""
+    """Return two items: a function that accepts tiles whose key matches the query's key, and the
+    only such tile if the key names one (else None).
+    """
     expression = request.key_expr
     only = _tile_of_key(str(expression))
     return (
@@ -296,7 +305,7 @@ def _key_filter(request: zenoh.Query) -> tuple[Callable[[int], bool], int | None
 
 @lru_cache(1 << 12)
 def _tile_of_key(expression: str) -> int | None:
-    """Return the tile that a key names; None if it names none or several."""
+    """Return the tile that a key names; None if the key names no tile or several."""
     try:
         return keys.parse(expression).quadint
     except InputError:

@@ -1,7 +1,8 @@
-"""Cache of tiles for readers: made on request or for publication, and reused while they are fresh.
+"""Cache of encoded tiles for readers. A tile is made on request or for publication, and reused
+while it is fresh.
 
-A tile is at most SHOWN_NS old and holds everything that was acknowledged or alerted before the
-query. Most queries under load then cost a look-up.
+A returned tile is at most SHOWN_NS old and contains everything that was acknowledged or alerted
+before the query. Under load, most queries cost only a look-up.
 """
 
 from __future__ import annotations
@@ -40,15 +41,15 @@ class ShownTile(NamedTuple):
     """Cells of a tile as readers see them.
 
     Attributes:
-        cells: in the schema of the map.
-        columns: SELECTED_BY as arrays (k,).
-        payload: all cells as an Arrow stream that shares memory with `cells`, from south to north;
-            empty if the cells have another order and are used once.
-        least: minimum number of vehicles of its cells.
-        common: west, south, east and north that all cells touch, if they are ordered from south to
-            north.
+        cells: cells in the schema of the map.
+        columns: the columns SELECTED_BY as arrays (k,).
+        payload: all cells as an Arrow stream, from south to north, which shares memory with
+            `cells`; empty if the cells have another order and are used for one query only.
+        least: smallest number of vehicles among the cells.
+        common: box (west, south, east, north) that all cells touch, if the cells are ordered from
+            south to north.
         made: time of creation [ns].
-        change: last change of the map that it contains.
+        change: number of the last change of the map that is included.
     """
 
     cells: pa.RecordBatch
@@ -65,9 +66,9 @@ class TileCache:
 
     Args:
         state: the map.
-        guard: lock held while the map is read, but not while Arrow is written.
-        least: minimum number of vehicles of a public cell, ever.
-        public: what readers may see where persons are kept private; None for everything.
+        guard: lock that is held while the map is read, but not while Arrow data are written.
+        least: minimum number of vehicles that must ever have visited a public cell.
+        public: public copy of the cells if persons are kept private; None to show everything.
     """
 
     def __init__(
@@ -86,13 +87,15 @@ class TileCache:
         self._acknowledged = 0  # change up to which all must be seen
 
     def acknowledge(self) -> None:
-        """Record that everything in the map was acknowledged or alerted: no older tile is shown
-        from now on.
+        """Record that everything in the map has been acknowledged or alerted. Tiles made before
+        this are no longer shown.
         """
         self._acknowledged = self.state.change
 
     def shown(self, tile: int, now: int) -> ShownTile:
-        """Return a tile that is fresh enough for a query at `now` [ns]."""
+        """Return a tile that is fresh enough for a query at `now` [ns]: from the cache, or newly
+        made.
+        """
         kept = self._kept.get(tile)
         if kept is None or not 0 <= now - kept.made <= SHOWN_NS:
             return self.make(tile, now)
@@ -100,7 +103,7 @@ class TileCache:
         return kept if whole else self.make(tile, now)
 
     def make(self, tile: int, now: int) -> ShownTile:
-        """Make a tile from the state of the map at `now` [ns], and keep it."""
+        """Make a tile from the state of the map at `now` [ns], and store it in the cache."""
         with self.guard:
             change = self.state.change
             cells = self.seen(self._from_south(self.public(self.state.slots(tile), now)), now)
@@ -117,15 +120,15 @@ class TileCache:
 
     @property
     def source(self) -> Readable:
-        """Return the cells that readers may see."""
+        """Return the cells that readers may see: the public copy, or the fusion itself."""
         return self.state.fusion if self._public is None else self._public
 
     def coarse(self, cells: CellView) -> CellView:
-        """Return cells with times and counts as readers see them."""
+        """Return the cells with times and counts rounded for privacy, if persons are kept private."""
         return cells if self._public is None else coarsen_cells(cells)
 
     def public(self, slots: IntArray, now: int) -> IntArray:
-        """Return the slots that are public at `now` [ns]."""
+        """Return those of the slots that are public at `now` [ns]."""
         slots = slots[self.state.fusion.live.vehicles[slots] >= self._least]
         return slots if self._public is None else self._public.select(slots, now)
 
@@ -147,7 +150,7 @@ class TileCache:
 
 
 def used_once(cells: CellView, now: int) -> ShownTile:
-    """Return cells in an order of their own, for a single query."""
+    """Return cells in the given order, as a tile for a single query that is not cached."""
     batch = batch_of(cells, now)
     return ShownTile(batch, selected_by(batch))
 

@@ -1,10 +1,11 @@
-"""Publication of changed tiles in rounds, a few tiles per turn of the worker, so that
-acknowledgements never wait.
+"""Publication of changed tiles in rounds. Only a few tiles are published per turn of the worker, so
+that acknowledgements never wait.
 
-A round takes all tiles that changed since the last one. It begins at the moments of a time grid. A
-moment at which the last round is not complete is skipped and counted, and its changes go to the
-next round. A tile is therefore published once a second if there is time, and in turn otherwise. The
-grid's offset is private: the instant of a publication does not reveal when a vehicle passed.
+A round takes all tiles that changed since the last round. Rounds begin at fixed times, `every_s`
+apart. If the last round is not complete at such a time, the time is skipped and counted, and the
+changes go to the next round. A tile is therefore published once a second if there is enough time,
+and in turn otherwise. The offset of the fixed times is random and secret, so that the time of a
+publication does not reveal when a vehicle passed.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ SHARE_S: Final = 0.02
 
 
 class TileRounds:
-    """Rounds of one service; for one thread.
+    """Publication rounds of one service; for use by one thread.
 
     Args:
-        every_s: distance of the moments of the grid.
-        changed: returns the tiles that changed since its last call.
-        put: makes a tile and publishes it.
-        counts: takes `tile_rounds_skipped`.
-        clock: monotonic seconds.
+        every_s: time between the beginnings of two rounds [s].
+        changed: function that returns the tiles that changed since its last call.
+        put: function that makes a tile and publishes it.
+        counts: counters; `tile_rounds_skipped` is increased.
+        clock: function that returns monotonic time [s].
     """
 
     def __init__(
@@ -46,12 +47,12 @@ class TileRounds:
 
     @property
     def waiting(self) -> int:
-        """Return the number of tiles of the round that are not published yet."""
+        """Return the number of tiles of the current round that are not published yet."""
         return len(self._left)
 
     def begin(self) -> bool:
-        """Begin a round if its moment has come; return True if it has, even if the previous
-        round continues instead.
+        """Begin a round if its time has come. Return True if the time has come, even if the
+        previous round is continued instead.
         """
         passed = int((self._clock() - self._due) // self._every_s) + 1
         if passed <= 0:
@@ -65,7 +66,7 @@ class TileRounds:
         return True
 
     def go_on(self, share_s: float = SHARE_S) -> None:
-        """Publish tiles of the round for `share_s`; at least one if there is one."""
+        """Publish tiles of the current round for `share_s` [s], but at least one tile."""
         end = self._clock() + share_s
         while self._left:
             self._put(self._left.popleft())
@@ -73,7 +74,9 @@ class TileRounds:
                 break
 
     def finish(self, most_s: float) -> None:
-        """Publish the remaining tiles and later changes within `most_s`, because the service stops."""
+        """Publish the remaining and newly changed tiles, for at most `most_s` [s], because the
+        service stops.
+        """
         known = set(self._left)
         self._left.extend(tile for tile in self._changed() if tile not in known)
         self.go_on(most_s)

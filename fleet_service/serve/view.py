@@ -1,4 +1,4 @@
-"""View of cells: their state at one moment, as columns that do not change any more. Pure."""
+"""View of cells: a copy of their state at one moment, as columns that no longer change. Pure."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ COUNT_STEPS: Final = np.array([0, 1, 2, 3, 5, *(m * 10**e for e in range(1, 9) f
 
 
 class CellView(NamedTuple):
-    """Cells as believed at one moment: columns (k,) and beliefs (k, 32).
+    """State of cells at one moment: columns (k,) and beliefs (k, 32).
 
     Attributes:
-        cell, sector: place.
-        belief: about the road.
-        values: votes with a value.
-        vehicles, observations: numbers of them.
+        cell, sector: place and direction.
+        belief: belief about the friction of the road.
+        values: number of votes with a value of μ (not only a lower bound).
+        vehicles, observations: number of vehicles and of observations.
         first, last: times of the first and the last observation [ns].
-        imputed: True if the belief was made from neighbours.
+        imputed: True if the belief was estimated from neighbours.
     """
 
     cell: IntArray
@@ -52,7 +52,9 @@ class CellView(NamedTuple):
 
 
 class Readable(Protocol):
-    """Cells of a map and the beliefs about them: a fusion, or what is public of it."""
+    """Interface to the cells of a map and their beliefs: implemented by a fusion and by its public
+    copy.
+    """
 
     @property
     def live(self) -> Cells:
@@ -62,12 +64,12 @@ class Readable(Protocol):
         """Return the belief about the road of each slot, (k, 32), predicted to `now` [ns]."""
 
     def slots_of(self, cell: IntArray, sector: IntArray) -> IntArray:
-        """Return the slot of each cell and sector, -1 for none."""
+        """Return the slot of each cell and sector; -1 if there is none."""
 
 
 def view_cells(source: Readable, slots: IntArray, now: int) -> CellView:
-    """Return the cells of `slots` as believed at `now` [ns]; copies, so that the fusion may
-    continue.
+    """Return a view of the cells of `slots` with beliefs for the time `now` [ns]. The data are
+    copied, so that the fusion may continue.
     """
     live = source.live
     key = live.key[slots]
@@ -85,8 +87,8 @@ def view_cells(source: Readable, slots: IntArray, now: int) -> CellView:
 
 
 def coarsen_cells(cells: CellView) -> CellView:
-    """Return the cells as readers see them with privacy on: no single passage shows in a time or
-    a count.
+    """Return the cells with times and counts rounded for privacy, so that no single passage of a
+    vehicle is visible.
     """
     vehicles, observations = (
         coarse_counts(np.asarray(column, np.int64))
@@ -97,27 +99,27 @@ def coarsen_cells(cells: CellView) -> CellView:
 
 
 def coarse_counts(counts: IntArray) -> IntArray:
-    """Return counts in steps of 1, 2, 5, rounded down."""
+    """Return counts rounded down to 0, 1, 2, 3, 5, 10, 20, 50, 100 and so on."""
     return COUNT_STEPS[np.maximum(np.searchsorted(COUNT_STEPS, counts, "right") - 1, 0)]
 
 
 def join_views(*views: CellView) -> CellView:
-    """Return views joined into one."""
+    """Return several views joined into one."""
     return CellView(*(np.concatenate(columns) for columns in zip(*views, strict=True)))
 
 
 def is_measured(
     lower: FloatArray, upper: FloatArray, values: Float32Array, p_slippery: FloatArray
 ) -> BoolArray:
-    """Return True for beliefs that contain more than a lower bound, (k,).
+    """Return a mask of beliefs (k,): True if the belief contains more than a lower bound.
 
-    A belief that calls the road slippery always does, wherever it came from: values of the other
-    headings lower it too, and ice that is known must never be shown as unknown.
+    This always includes a belief that the road is slippery, whatever its source: values from other
+    headings lower it too, and known ice must never be shown as unknown.
 
     Args:
-        lower, upper: ends of the interval, (k,).
+        lower, upper: ends of the interval of μ, (k,).
         values: number of votes with a value, (k,).
-        p_slippery: probability of less friction than SLIPPERY_MU, (k,).
+        p_slippery: probability of μ below SLIPPERY_MU, (k,).
     """
     narrow = upper - lower < MEASURED_WIDTH * PRIOR_WIDTH
     valued = (values > 0) & ((upper < PRIOR_UPPER - MEASURED_DROP) | narrow)

@@ -1,7 +1,8 @@
-"""Number of distinct vehicles in a cell recently: a lower bound, in sixteen bytes per cell. Pure.
+"""Number of distinct vehicles that were recently in a cell: a lower bound, in sixteen bytes per
+cell. Pure.
 
-The data of k vehicles hides each of them only while there are k. If a cell stayed public for ever,
-a single car at night would be visible in it.
+The data of k vehicles hide each single vehicle only while there are k of them. If a cell stayed
+public for ever, a single car at night would be visible in it.
 """
 
 from __future__ import annotations
@@ -26,10 +27,11 @@ _SHIFT: Final = np.uint64(58)
 
 
 class Visitors:
-    """Vehicles of each slot of a fusion, each as one bit of 64 in each part of the window.
+    """Recent vehicles of each slot of a fusion. Each vehicle is one bit of 64, in each part of a
+    time window.
 
     Args:
-        fusion: owner of the slots; it must receive observations before they are passed to `add`.
+        fusion: owner of the slots; it must process observations before they are passed to `add`.
     """
 
     def __init__(self, fusion: Fusion) -> None:
@@ -55,15 +57,17 @@ class Visitors:
         return self._part * PART_NS
 
     def count(self, slots: IntArray, now: int) -> IntArray:
-        """Return the distinct vehicles (k,) of slots within the window that ends at `now` [ns]."""
+        """Return the number of distinct vehicles of each slot (k,) within the time window that ends
+        at `now` [ns].
+        """
         self._grow()
         ago = max(now // PART_NS - self._part, 0)
         within = self._bits[slots, : max(PARTS - ago, 0)]
         return np.asarray(np.bitwise_count(np.bitwise_or.reduce(within, axis=1)), np.int64)
 
     def renumber(self, place: IntArray) -> None:
-        """Update slots after the fusion renumbered them; `place` is the new number, -1 for
-        removed ones.
+        """Update the slot numbers after the fusion renumbered them; `place` contains the new
+        numbers, -1 for removed slots.
         """
         stay = np.flatnonzero(place >= 0)
         longer = np.zeros((len(place), PARTS), np.uint64)
@@ -80,7 +84,9 @@ class Visitors:
 
     @staticmethod
     def of(fusion: Fusion, columns: dict[str, IntArray]) -> Visitors:
-        """Restore the visitors from `columns`; empty if the columns do not match the fusion."""
+        """Return the visitors that `columns` describes; empty if the columns do not match the
+        fusion.
+        """
         made = Visitors(fusion)
         bits = columns["bits"]
         if len(bits) == PARTS * fusion.size:
@@ -89,14 +95,14 @@ class Visitors:
         return made
 
     def _grow(self) -> None:
-        """Make room for new slots; the size doubles, so this is rare."""
+        """Make room for new slots. The memory is doubled when it is full, so that this is rare."""
         if len(self._bits) < self._fusion.size:
             longer = np.zeros((2 * self._fusion.size, PARTS), np.uint64)
             longer[: len(self._bits)] = self._bits
             self._bits = longer
 
     def _move_on(self, part: int) -> None:
-        """Begin a part of the window and drop older parts."""
+        """Begin the window's part number `part` and drop parts that are too old."""
         ago = part - self._part
         if ago > 0:
             self._bits[:, ago:] = self._bits[:, : max(PARTS - ago, 0)]

@@ -1,1 +1,1 @@
-"""Assignment of regions to services: tokens, lease, ownership, hand-over."""
+"""Assignment of map regions to services: announcement of regions, and hand-over between services."""

@@ -1,10 +1,10 @@
-"""Live hand-over of a region: the active service stops in good order, and its lease goes to a named
-standby.
+"""Live hand-over of a region: the active service stops regularly, and a named standby gets its
+lease.
 
     client                                   active service
     get gripmap/v1/shard/SERVICE?to=NAME ──► checks that NAME stands by for its regions, replies
     watches the tokens                       writes and uploads a checkpoint
-                                             stops as always: flush, acknowledge, undeclare
+                                             stops: flush, acknowledge, undeclare its token
                                              releases the lease for NAME
                                              NAME acquires it, restores the map, declares its token
 """
@@ -30,19 +30,22 @@ FIX: Final = "start it with --standby, the same settings and a name of its own"
 
 
 class HandoverResult(NamedTuple):
-    """Result: the service that left, and how long the region had no service [s]."""
+    """Result of a hand-over: name of the service that stopped, and time [s] for which the region
+    had no service.
+    """
 
     service: str
     pause_s: float
 
 
 def answer_request(query: zenoh.Query, session: zenoh.Session, served: Sequence[str]) -> str | None:
-    """Answer a hand-over request; return the target, or None if it is impossible.
+    """Answer a hand-over request; return the name of the standby, or None if the hand-over is
+    impossible.
 
     Args:
-        query: as `hand_over` sends it.
-        session: of the service.
-        served: its region expressions.
+        query: request as sent by `hand_over`.
+        session: Zenoh session of the service.
+        served: region expressions of the service.
     """
     with query:
         to = str(query.parameters).removeprefix("to=")
@@ -66,16 +69,17 @@ def answer_request(query: zenoh.Query, session: zenoh.Session, served: Sequence[
 def hand_over(
     session: zenoh.Session, region: str, to: str, say: Callable[[str], None]
 ) -> HandoverResult | None:
-    """Make a region's service hand over; None if the target serves the region already.
+    """Ask the service of a region to hand over to a standby, and wait. Return the result, or None
+    if the standby already serves the region.
 
     Args:
-        session: of a client with a service certificate.
-        region: key expression.
+        session: Zenoh session of a client with a service certificate.
+        region: key expression of the region.
         to: name of the standby.
-        say: called with a line of progress.
+        say: called with lines about the progress.
 
     Raises:
-        InputError: the region has no service, the standby does not wait, or it did not take over.
+        InputError: the region has no service, the standby is not waiting, or it did not take over.
     """
     with presence.track_tokens(session) as there:
         service = _find_server(there, region)
@@ -105,7 +109,7 @@ def _find_server(there: presence.PresenceTracker, region: str) -> str | None:
 
 
 def _request_handover(session: zenoh.Session, service: str, to: str) -> str:
-    """Request the hand-over; return the regions that move."""
+    """Send the hand-over request; return the regions that are handed over, as text."""
     for reply in session.get(f"{keys.shard_key(service)}?to={to}", timeout=ANSWER_S):
         if reply.ok is not None:
             return reply.ok.payload.to_string().replace(",", ", ")

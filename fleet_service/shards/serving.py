@@ -1,5 +1,5 @@
-"""Announcement of served regions, and exclusion of a second service: queries would reach only
-one of two.
+"""Announcement of the regions that a service serves. A second service for the same region is
+excluded, because each query would reach only one of them.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ def claim_regions(
     stop: threading.Event,
     former: Collection[str] = (),
 ) -> Iterator[frozenset[ServiceToken]]:
-    """Claim regions exclusively until the block ends.
+    """Claim regions exclusively until the block ends; yield the tokens of this service.
 
     Args:
-        session: of the service.
-        name: of the service.
-        regions: key expressions.
-        stop: ends the wait for another service's token.
-        former: names of earlier holders of this service's lease; their remaining tokens are about
-            to go.
+        session: Zenoh session of the service.
+        name: name of the service.
+        regions: key expressions of the regions.
+        stop: event that ends the wait for another service's token.
+        former: names of earlier holders of this service's lease; their remaining tokens are
+            ignored, because they will disappear soon.
 
     Raises:
         InputError: another service has one of the regions.
@@ -52,8 +52,10 @@ def claim_regions(
 
 @contextmanager
 def announce_regions(session: zenoh.Session, mine: frozenset[ServiceToken]) -> Iterator[None]:
-    """Announce that regions are served while the block runs. The queryables must answer before and
-    after the block: an empty answer of a served region means that nothing is known there."""
+    """Announce that regions are served while the block runs. The service must be able to answer
+    queries before the block begins and until after it ends: an empty answer from an announced
+    region means that no data exist there.
+    """
     with _hold_tokens(_declare_tokens(session, mine, SERVES)):
         yield
 
@@ -71,9 +73,10 @@ def _hold_tokens(held: list[zenoh.LivelinessToken]) -> Iterator[None]:
 def watch_successors(
     session: zenoh.Session, mine: frozenset[ServiceToken]
 ) -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns True if another service took these regions since the block
-    began. A service that is cut off from its bucket learns so that it was replaced, and stops
-    serving outdated data."""
+    """Yield a function that returns True if another service has taken these regions since the block
+    began. In this way a service that cannot reach its bucket learns that it was replaced, and stops
+    serving outdated data.
+    """
     with presence.track_tokens(session) as there:
         before = there.active
         yield lambda: bool(rival_tokens(mine, there.active - before))
@@ -82,8 +85,8 @@ def watch_successors(
 def rival_tokens(
     mine: frozenset[ServiceToken], there: set[ServiceToken], former: Collection[str] = ()
 ) -> list[ServiceToken]:
-    """Return the tokens of other services for the same regions, except those of `former`
-    services.
+    """Return the tokens of other services for overlapping regions, sorted. Tokens of the `former`
+    services are excluded.
     """
     others = (one for one in there - mine if one.service not in former)
     return sorted(one for one in others if any(overlap(one.region, own.region) for own in mine))
@@ -132,8 +135,10 @@ def _declare_tokens(
 def standby_signs(
     config: ServiceConfig, stop: threading.Event, alive: Callable[[], None] = lambda: None
 ) -> Iterator[tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]] | None]:
-    """Yield the signs of a standby: whether it reaches a router, whether a service's token is
-    active, and `alive`. None if it is no standby or was stopped before it reached a router."""
+    """Yield the functions of a standby for the lease: whether it reaches a router, whether a
+    service's token is active, and `alive`. Yield None if the service is no standby, or was stopped
+    before it reached a router.
+    """
     session = (
         zenoh_session.open_session(config.zenoh, stop, config.name) if config.standby else None
     )
