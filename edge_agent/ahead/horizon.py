@@ -1,4 +1,5 @@
-"""Horizon: what the map knows about each metre ahead, and the safe speed there. The module is pure.
+"""Horizon: knowledge of the map about each metre ahead, and the safe speed there. The module is
+pure.
 
 A metre that the map does not know limits no speed and causes no warning.
 """

@@ -6,7 +6,7 @@ Legend
     key      cell·4 + sector: a place of the map                                   int64
     places   (M, C) keys that a metre may lie in, the likeliest first; NONE fills unused columns
 
-A car of the fleet may have driven one lane beside the path, with a position error of 1.5 m.
+A car of the fleet may have driven one lane away from the path, with a position error of 1.5 m.
 Therefore each metre also covers places a little to the left and right, and both sectors near the
 border of a sector.
 """
