@@ -51,7 +51,7 @@ def test_missed_bars_come_first_and_are_marked(folder: Path) -> None:
     )
     assert results.keep_figures("demo", left).startswith("demo: 2 figures")
     page = results.results_page()
-    assert "2 figures have a bar; 1 hold and 1 do not." in page
+    assert "2 figures have a target; 1 meet it and 1 miss it." in page
     assert f"|`demo.b` {results.MISSED}|0.2|≤ 0.1|" in page.split("\n## ")[1]
     section = page[page.index("## `make demo`") :]
     assert "seeds 1 to 3" in section
