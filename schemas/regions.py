@@ -81,7 +81,9 @@ class Rank:
         self._place = {key: place for place, key in enumerate(keys_along(route).tolist())}
 
     def of(self, cell: int, sector: int) -> int:
-        """Return the position of a cell and sector along the route, a number for comparison only."""
+        """Return the position of a cell and sector along the route, a number for comparison
+        only.
+        """
         return self._place.get(cell * grid.SECTORS + sector, len(self._place))
 
     def order(self, cells: IntArray, sectors: IntArray) -> IntArray:

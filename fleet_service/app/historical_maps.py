@@ -119,7 +119,9 @@ class HistoricalMaps:
             raise
 
     def _keep_process(self, process: _Process | None) -> _Process | None:
-        """Store an idle process (or None) for the next query; return the previously stored process."""
+        """Store an idle process (or None) for the next query; return the previously stored
+        process.
+        """
         self._idle, before = process, self._idle
         return before
 
@@ -162,7 +164,9 @@ class _Process:
 
 
 def box_of(question: PastQuery) -> Box | None:
-    """Return the box (west, south, east, north [deg]) that a query reads; None for the whole map."""
+    """Return the box (west, south, east, north [deg]) that a query reads; None for the whole
+    map.
+    """
     query = question.query
     if query.route is not None:
         longitudes, latitudes = zip(*query.route, strict=True)

@@ -58,7 +58,9 @@ class Settlement:
 
     @property
     def is_full(self) -> bool:
-        """Return True if too many rows wait for the disk, or too many batches for the bucket copy."""
+        """Return True if too many rows wait for the disk, or too many batches for the bucket
+        copy.
+        """
         return self._log.rows >= WAITING_ROWS or self._log.unsettled >= WAITING_BATCHES
 
     @property

@@ -100,7 +100,9 @@ class Fusion:
         self._shape = UNKNOWN_SHAPE
 
     def resume(self, epoch: int | None, vote_weights: list[VoteWeights], reports: Reports) -> None:
-        """Continue from a checkpoint: its epoch, vote weights and weather; the caller has set `store`."""
+        """Continue from a checkpoint: its epoch, vote weights and weather; the caller has set
+        `store`.
+        """
         self._epoch = epoch
         self.vote_weights = vote_weights
         self.reports = reports
@@ -269,7 +271,9 @@ class Fusion:
         return road_beliefs(rows, self.store.table, self._weather, kernels, slots, now)
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
-        """Return the slot of each pair of cell and sector, -1 if no vehicle has reported the pair."""
+        """Return the slot of each pair of cell and sector, -1 if no vehicle has reported the
+        pair.
+        """
         return self.store.slots_of(cell * grid.SECTORS + sector)
 
     def trust(self, vehicle: int) -> float:

@@ -40,7 +40,9 @@ class Bucket:
         self._left: dict[int, tuple[float, float]] = {}
 
     def take(self, vehicle: int, wanted: int, now: float) -> int:
-        """Take up to `wanted` from a vehicle's budget at time `now` [s]; return the amount taken."""
+        """Take up to `wanted` from a vehicle's budget at time `now` [s]; return the amount
+        taken.
+        """
         left, since = self._left.get(vehicle, (self._at_once, now))
         left = min(self._at_once, left + max(now - since, 0.0) * self._rate)
         given = min(wanted, int(left))

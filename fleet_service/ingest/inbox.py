@@ -173,7 +173,9 @@ class BatchIntake:
         self.times: dict[str, int] = {}  # newest that each vehicle told in the last call [ns]
 
     def accept(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, AcceptedBatches]:
-        """Return the rows of valid, new batches, by kind; all other batches are refused or counted."""
+        """Return the rows of valid, new batches, by kind; all other batches are refused or
+        counted.
+        """
         self.times.clear()
         self._now = clock.now / NS
         if abs(clock.now - self._forgot) > FORGET_NS:
@@ -441,7 +443,9 @@ def _select_batches(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, In
 def _with_identity(
     kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: IntArray, clock: Clock
 ) -> Rows:
-    """Return the rows with columns for the identity of their batches, as the archive stores them."""
+    """Return the rows with columns for the identity of their batches, as the archive stores
+    them.
+    """
     numbers = np.array([stream.key[0] for stream, _ in batches], np.int64)
     identity = {
         "vehicle": pseudonym_texts(numbers),

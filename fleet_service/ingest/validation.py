@@ -76,7 +76,9 @@ class Clock(NamedTuple):
 
 
 class Refusal(NamedTuple):
-    """Reason for a refusal: the rule (for counting), the row number, and the text for the sender."""
+    """Reason for a refusal: the rule (for counting), the row number, and the text for the
+    sender.
+    """
 
     rule: str
     row: int

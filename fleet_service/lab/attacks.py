@@ -93,7 +93,9 @@ def _attacking_rows(v: Visits, count: int) -> BoolArray:
 
 
 def claim_random(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return visits in which the attackers claim random values with high confidence at every visit."""
+    """Return visits in which the attackers claim random values with high confidence at every
+    visit.
+    """
     v = drive.visits
     claim = rng.uniform(0.05, 1.2, len(v))
     return _with_claims(v, _attacking_rows(v, ATTACKERS), claim)

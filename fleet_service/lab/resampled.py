@@ -84,7 +84,9 @@ def attach_truth(observations: dict[str, Any], truth: TrueVisits) -> DrivenVisit
 
 
 def join_ways(ways: Sequence[DrivenVisits]) -> DrivenVisits:
-    """Return the visits of several ways as one; vehicles of different ways are different vehicles."""
+    """Return the visits of several ways as one; vehicles of different ways are different
+    vehicles.
+    """
     begins = np.cumsum([0, *(int(way.vehicle.max()) + 1 for way in ways)])
     columns = zip(*(vars(way.reports).values() for way in ways), strict=True)
     return DrivenVisits(

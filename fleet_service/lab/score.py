@@ -1,4 +1,6 @@
-"""Scores of map answers against the truth: coverage, error, interval score and calibration. Pure."""
+"""Scores of map answers against the truth: coverage, error, interval score and calibration.
+Pure.
+"""
 
 from __future__ import annotations
 

@@ -450,7 +450,9 @@ def _time_borders(low: int, high: int, rows: int, most: int) -> list[int]:
 
 
 def _with_numbers(table: pa.Table) -> pa.Table:
-    """Return the table with numbers in place of pseudonyms, which takes less than half the memory."""
+    """Return the table with numbers in place of pseudonyms, which takes less than half the
+    memory.
+    """
     at = table.column_names.index("vehicle")
     return table.set_column(at, "vehicle", pa.array(pseudonym_numbers(table["vehicle"])))
 

@@ -342,7 +342,9 @@ class Lease:
     def _create_next(
         self, found: LeaseRecord | None, known: Callable[[], int], stop: threading.Event
     ) -> bool:
-        """Create the lease object with the next number; return False if another service was faster."""
+        """Create the lease object with the next number; return False if another service was
+        faster.
+        """
         number = 1 if found is None else found.number + 1
         epoch = max(int(time.time()), known() + 1, 0 if found is None else found.epoch + 1)
         before = () if found is None else tuple(dict.fromkeys((*found.before, found.service)))

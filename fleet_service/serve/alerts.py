@@ -87,7 +87,9 @@ class Alerts:
         self._standing = {int(place[slot]): alert for slot, alert in self._standing.items()}
 
     def update(self, slots: IntArray) -> list[Alert]:
-        """Return the alerts that are raised or cleared because the cells `slots` (k,) were updated."""
+        """Return the alerts that are raised or cleared because the cells `slots` (k,) were
+        updated.
+        """
         time = self._fusion.live.time[slots]
         slippery = self._fusion.slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))

@@ -90,7 +90,9 @@ class PublicCells:
         return cells_of(self._rows)
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
-        """Return the belief about the road of each slot, (k, 32), as readers see it at `now` [ns]."""
+        """Return the belief about the road of each slot, (k, 32), as readers see it at `now`
+        [ns].
+        """
         self._add_slots()
         return self._fusion.beliefs(slots, now, self._rows)
 

@@ -104,7 +104,9 @@ class _TokenBucket:
         self._guard = threading.Lock()
 
     def take(self, cost: float) -> bool:
-        """Take `cost` from the bucket; return False, and take nothing, if the bucket contains less."""
+        """Take `cost` from the bucket; return False, and take nothing, if the bucket contains
+        less.
+        """
         with self._guard:
             now = time.monotonic()
             self._left = min(LIGHT_PER_S, self._left + (now - self._since) * LIGHT_PER_S)

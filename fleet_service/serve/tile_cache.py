@@ -124,7 +124,9 @@ class TileCache:
         return self.state.fusion if self._public is None else self._public
 
     def coarse(self, cells: CellView) -> CellView:
-        """Return the cells with times and counts rounded for privacy, if persons are kept private."""
+        """Return the cells with times and counts rounded for privacy, if persons are kept
+        private.
+        """
         return cells if self._public is None else coarsen_cells(cells)
 
     def public(self, slots: IntArray, now: int) -> IntArray:

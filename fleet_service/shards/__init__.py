@@ -1,1 +1,3 @@
-"""Assignment of map regions to services: announcement of regions, and hand-over between services."""
+"""Assignment of map regions to services: announcement of regions, and hand-over between
+services.
+"""

@@ -68,7 +68,9 @@ def own_drafts(folder: Path) -> Iterator[Path]:
 
 
 def sweep_drafts(folder: Path) -> None:
-    """Remove the drafts of attempts that were killed; call this only while no attempt is running."""
+    """Remove the drafts of attempts that were killed; call this only while no attempt is
+    running.
+    """
     for drafts in folder.glob(f"{_OWN}*"):
         shutil.rmtree(drafts, ignore_errors=True)
 

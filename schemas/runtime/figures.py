@@ -102,7 +102,9 @@ def markdown(figures: Sequence[Figure]) -> str:
 
 
 def row(figure: Figure) -> list[str]:
-    """Return four table cells for a figure: name, value with unit, target, and whether it is met."""
+    """Return four table cells for a figure: name, value with unit, target, and whether it is
+    met.
+    """
     signs = {"less": "≤ ", "more": "≥ "}
     bar = figure.bar
     value = f"{figure.value:.4g} {figure.unit}"

@@ -55,7 +55,9 @@ def limit_memory(*without: str) -> None:
 
 
 def trim_memory() -> None:
-    """Give unused memory back to the system, after work that needed much memory for a short time."""
+    """Give unused memory back to the system, after work that needed much memory for a short
+    time.
+    """
     with suppress(AttributeError, OSError):
         ctypes.CDLL(None).malloc_trim(0)
 
@@ -123,7 +125,9 @@ def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], No
 
 
 def log_as(form: Form, stream: TextIO, **who: object) -> None:
-    """Send warnings of the program and its libraries to `stream`, in the given form (text or JSON)."""
+    """Send warnings of the program and its libraries to `stream`, in the given form (text or
+    JSON).
+    """
     handler = logging.StreamHandler(stream)
     handler.setFormatter(
         _Formatter(who) if form == "json" else logging.Formatter("%(levelname)s: %(message)s")

@@ -133,7 +133,9 @@ def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN40
 
 
 def head_of(kind: Kind, payload: bytes, encoding: str) -> Head | None:
-    """Return the head of a batch whose records are invalid; None if the head cannot be read either."""
+    """Return the head of a batch whose records are invalid; None if the head cannot be read
+    either.
+    """
     try:
         found = parse(payload, encoding, MESSAGES[kind], ENCODING[kind])
     except WireError:

@@ -88,7 +88,9 @@ def record_erasure(folder: Path, month: str, newest: int, pseudonym: str | None 
 
 
 class ErasedData(NamedTuple):
-    """Erased data: time ranges that apply to all vehicles, and the end [ns] per pseudonym number."""
+    """Erased data: time ranges that apply to all vehicles, and the end [ns] per pseudonym
+    number.
+    """
 
     months: list[Span]
     vehicles: dict[int, int]

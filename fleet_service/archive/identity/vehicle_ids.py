@@ -155,7 +155,9 @@ def numbers_of(known: Mapping[int, int], pseudonyms: IntArray) -> IntArray:
 
 
 def forget_vehicles(folder: Path, month: str, pseudonym: int | None = None) -> None:
-    """Remove one vehicle's line of a month; if `pseudonym` is None, remove all lines of the month."""
+    """Remove one vehicle's line of a month; if `pseudonym` is None, remove all lines of the
+    month.
+    """
     for path in _month_files(folder):
         if path.name.partition(".")[0] != month:
             continue

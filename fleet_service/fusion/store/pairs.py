@@ -132,7 +132,9 @@ def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: 
 
 @refcount_free_inlined
 def returning_bit(number: int) -> np.uint64:
-    """Return the bit that represents a vehicle in `Cells.returned`; several vehicles share a bit."""
+    """Return the bit that represents a vehicle in `Cells.returned`; several vehicles share a
+    bit.
+    """
     return np.uint64(1) << ((np.uint64(number) * _FIBONACCI) >> np.uint64(58))
 
 

@@ -130,7 +130,9 @@ class Store:
         return self._slots
 
     def slots_for(self, keys: IntArray) -> IntArray:
-        """Return the slot of each key. An unknown key gets a new slot, which begins with the prior."""
+        """Return the slot of each key. An unknown key gets a new slot, which begins with the
+        prior.
+        """
         slots = self.slots_of(keys)
         new = np.flatnonzero(slots == NONE)
         if not len(new):
