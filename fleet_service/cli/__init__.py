@@ -1,8 +1,8 @@
 """`fleet-service`: run, query, watch, page, router, hand-over, compact, retention, forget, export,
 roads, analyze, rebuild, certs, evaluate, completion.
 
-Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. Modules are imported
-when a command needs them, so that help is fast.
+Bad input is reported as one line on stderr, "error: field: problem; fix", with exit code 2. Modules
+are imported only when a command needs them, so that help is fast.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ LINE: Final = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command.
+    """Run the command that `argv` names.
 
     Returns:
         the exit code; 2 after a one-line error that names the field and the fix.

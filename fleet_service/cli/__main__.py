@@ -1,4 +1,4 @@
-"""`python -m fleet_service.cli`."""
+"""`python -m fleet_service.cli`: the same as the command `fleet-service`."""
 
 from fleet_service.cli import main
 from schemas.runtime.process import exit_fast

@@ -1,5 +1,5 @@
-"""`fleet-service analyze`: ask one of the questions about a part of an archive; print the answer
-or write a file.
+"""`fleet-service analyze`: answer one of the predefined questions about a part of an archive; print
+the answer or write it to a file.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ USUAL_VEHICLES: Final = 2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     parser.description = "; ".join(
         f"{question.name}: {question.about}" for question in known_questions().values()
     )
@@ -93,7 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Ask, print the answer, and write it on request."""
+    """Answer the question, print the answer, and write it to a file if requested."""
     question = _checked_question(arguments)
     progress_messages.set_status(f"{question.name}: loading DuckDB and Ibis")
     from fleet_service.analytics import engines, output
@@ -149,8 +149,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _report_covered_box(arguments: argparse.Namespace, bbox: tuple[float, ...]) -> None:
-    """Report the box of all observations if a queried box is empty: latitude and longitude may be
-    swapped.
+    """Print the box that contains all observations, after a query found none in its box: latitude
+    and longitude may be swapped.
     """
     from fleet_service.analytics import engines
     from fleet_service.archive.export.extract import Extract
@@ -174,7 +174,7 @@ def _within_seconds(text: str | None) -> float | None:
 
 
 def _checked_question(arguments: argparse.Namespace) -> Question:
-    """Return the question, after all checks that need no computation."""
+    """Return the question after all checks of the options that need no computation."""
     question = question_of(arguments.question)
     if arguments.out is not None:
         commandline.ending_of("out", commandline.out_folder("out", arguments.out), ENDINGS)

@@ -1,4 +1,6 @@
-"""`fleet-service certs`: check options, enrol, and print the next steps."""
+"""`fleet-service certs`: create the certificates of everyone on the enrolment list, and print the
+next steps.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ SHOWN = 8  # names of a kind
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     parser.add_argument(
         "--fleet",
         metavar="FILE",
@@ -66,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Enrol everyone on the list."""
+    """Check the options, then create missing certificates and router configurations."""
     from fleet_service.enrolment.fleet import Enrolment
     from schemas.config import load
 

@@ -1,7 +1,8 @@
-"""`fleet-service cits`: alerts as DENM at an AMQP 1.0 interchange, and foreign DENM as a witness,
-until a signal.
+"""`fleet-service cits`: exchange hazard messages with cooperative ITS until a signal arrives.
 
-Messages are not signed: that is the gateway's task.
+Alerts are sent as DENM (Decentralized Environmental Notification Messages) to an AMQP 1.0
+interchange. DENM from others count as reports of one vehicle. Messages are not signed: that is the
+gateway's task.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from schemas.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     add_connection(parser)
     parser.add_argument(
         "--amqp", metavar="URL", required=True, help="interchange, e.g. amqps://host:5671"
@@ -56,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve until a signal."""
+    """Send and receive until a signal arrives."""
     from fleet_service.client.cits import gateway
     from fleet_service.client.cits.properties import Originator
     from fleet_service.client.map_client import connection_settings

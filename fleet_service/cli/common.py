@@ -1,4 +1,4 @@
-"""Shared parts of the commands: signals, the router, the selected part of an archive."""
+"""Shared parts of the commands: signals, connection to the router, selected part of an archive."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ UNITS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 def stop_on_signals() -> threading.Event:
-    """Return an event that SIGTERM and Ctrl-C set."""
+    """Return an event that is set by SIGTERM and Ctrl-C."""
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
@@ -35,7 +35,7 @@ def stop_on_signals() -> threading.Event:
 
 
 def add_connection(parser: argparse.ArgumentParser) -> None:
-    """Declare how to reach the map."""
+    """Declare the options for the connection to the map's router."""
     parser.add_argument("--connect", metavar="ENDPOINT", help="router, e.g. tcp/127.0.0.1:7447")
     parser.add_argument(
         "--config", metavar="FILE", help="JSON file with a `zenoh` section, as for run"
@@ -43,7 +43,7 @@ def add_connection(parser: argparse.ArgumentParser) -> None:
 
 
 def add_supplier(parser: argparse.ArgumentParser) -> None:
-    """Declare the supplier of a DATEX II publication."""
+    """Declare the options for the supplier of a DATEX II publication."""
     parser.add_argument("--country", metavar="CC", help="datex: country of the supplier, e.g. se")
     parser.add_argument(
         "--supplier",
@@ -59,10 +59,10 @@ def add_supplier(parser: argparse.ArgumentParser) -> None:
 
 
 def supplier_of(arguments: argparse.Namespace) -> Supplier:
-    """Return the supplier of a DATEX II publication.
+    """Return the supplier of a DATEX II publication from the options.
 
     Raises:
-        InputError: it is missing, or the country is not valid.
+        InputError: an option is missing, or the country is not valid.
     """
     from fleet_service.client.datex import Supplier
 
@@ -92,7 +92,7 @@ def add_part(parser: argparse.ArgumentParser) -> None:
 
 
 def add_archive(parser: argparse.ArgumentParser, *, required: bool = True) -> None:
-    """Declare the archive of a command, and the form of its report."""
+    """Declare the options for the archive of a command, and for the form of its report."""
     parser.add_argument(
         "--archive",
         metavar="DIR",
@@ -104,13 +104,15 @@ def add_archive(parser: argparse.ArgumentParser, *, required: bool = True) -> No
 
 
 def add_dry_run(parser: argparse.ArgumentParser) -> None:
-    """Declare the safety options of a destructive command."""
+    """Declare the safety options of a command that deletes data."""
     parser.add_argument("--dry-run", action="store_true", help="only print the planned changes")
     parser.add_argument("--yes", action="store_true", help="do not ask for confirmation")
 
 
 def confirm(arguments: argparse.Namespace, what: str) -> bool:
-    """Ask for confirmation on a terminal; return True without a terminal."""
+    """Ask the user for confirmation; return True if the user agrees, or if there is no terminal to
+    ask on.
+    """
     if arguments.yes or not sys.stdin.isatty():
         return True
     progress_messages.stop_status()
@@ -119,10 +121,10 @@ def confirm(arguments: argparse.Namespace, what: str) -> bool:
 
 
 def duration_s(field: str, text: str) -> float:
-    """Return a duration in seconds from its usual notation, such as 90min or 12h.
+    """Return a duration in seconds from text such as 90min or 12h.
 
     Raises:
-        InputError: it is none.
+        InputError: the text is not a duration.
     """
     found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)(s|min|h|d)", text)
     if found is None:
@@ -131,10 +133,10 @@ def duration_s(field: str, text: str) -> float:
 
 
 def time_span(arguments: argparse.Namespace) -> tuple[int, int]:
-    """Return begin and end [ns] from the options of `add_part`.
+    """Return begin and end [ns] of the time range that the options of `add_part` select.
 
     Raises:
-        InputError: one of them is not a time, or the end is not after the begin.
+        InputError: an option is not a time, or the end is not after the begin.
     """
     since = 0 if arguments.since is None else moment(arguments.since, "from")
     if arguments.last is not None:
@@ -156,7 +158,7 @@ def time_span(arguments: argparse.Namespace) -> tuple[int, int]:
 
 
 class ArchiveReport(NamedTuple):
-    """Report of a command: a line for people, values for programs."""
+    """Report of a command: one line of text for people, and the same values for programs."""
 
     line: str
     values: dict[str, object]
@@ -165,7 +167,7 @@ class ArchiveReport(NamedTuple):
 def on_archive(
     arguments: argparse.Namespace, command: Callable[[argparse.Namespace], ArchiveReport]
 ) -> int:
-    """Run a command on its archive and print its report.
+    """Run a command on its archive and print its report; return the exit code.
 
     Raises:
         InputError: there is no such archive, or it cannot be read or written.
@@ -188,11 +190,11 @@ def on_archive(
 
 
 def compact_first(root: Path) -> None:
-    """Compact waiting segments so that they count; if that is impossible, print how much is left
-    out.
+    """Compact the waiting segments of an archive, so that their rows are included in the answer. If
+    that is impossible, print how many segments are left out.
 
     Raises:
-        InputError: the folder is no archive.
+        InputError: the folder is not an archive.
     """
     from fleet_service.archive.format import layout, segments
     from fleet_service.archive.maintenance.compaction import compact
@@ -211,8 +213,8 @@ def compact_first(root: Path) -> None:
 
 
 def describe_covered_box(what: str, box: Sequence[float], asked: Sequence[float]) -> str:
-    """Return the message for a queried box that holds no data: it states the box that the data
-    cover, and says so if latitude and longitude seem to be exchanged. Boxes are west, south, east,
+    """Return a message for a queried box that contains no data. It states the box that the data
+    cover, and mentions if latitude and longitude seem to be swapped. Boxes are west, south, east,
     north [deg].
     """
     sides = ",".join(f"{side:.3f}" for side in box)

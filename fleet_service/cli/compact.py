@@ -1,5 +1,5 @@
-"""`fleet-service compact`: sort the log into files by date and zone. The service may run
-meanwhile.
+"""`fleet-service compact`: move new rows of an archive from segments to files by date and zone. The
+service may be running.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from schemas.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     add_archive(parser)
     parser.add_argument(
         "--put-to",
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command on its archive."""
+    """Compact the archive, and copy new files to a mirror if requested."""
     return on_archive(arguments, _compact_archive)
 
 

@@ -8,12 +8,12 @@ from schemas.runtime import commandline
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     parser.add_argument("shell", metavar="|".join(commandline.SHELLS), help="shell to complete for")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the script."""
+    """Print the completion script."""
     from fleet_service.cli import COMMANDS, LINE
 
     parser = commandline.parser_of(*LINE, *(command.name for command in COMMANDS))

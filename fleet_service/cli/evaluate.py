@@ -1,4 +1,6 @@
-"""`fleet-service evaluate`: simulated fleets, compared with the truth and with simple rules."""
+"""`fleet-service evaluate`: simulate fleets, and compare the service's map with the true road and
+with simple rules.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ PARTS: Final = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     parser.add_argument(
         "--out", metavar="DIR", type=Path, required=True, help="folder for figures, table and plots"
     )
@@ -59,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, and print the table of bars."""
+    """Run the evaluation, and print the table of figures with their targets."""
     from fleet_service.lab import campaign
     from schemas.runtime import figures
 

@@ -1,4 +1,4 @@
-"""`fleet-service export`: write a part of the archive, or the map as of a moment, as a file for
+"""`fleet-service export`: write a part of the archive, or the map at a past moment, to a file for
 other programs.
 
 `export datex` queries the running services instead, and writes the slippery stretches for road
@@ -54,7 +54,7 @@ _NEEDS: Final = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     add_archive(parser, required=False)
     parser.add_argument(
         "what",
@@ -110,7 +110,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command on its archive, or on the answers of the services.
+    """Export from the archive, or from the live map of the running services.
 
     Raises:
         InputError: an option is missing, or belongs to another kind of export.
@@ -145,7 +145,7 @@ def _register_iceberg(arguments: argparse.Namespace) -> ArchiveReport:
 
 
 def _route_costs(arguments: argparse.Namespace) -> int:
-    """Write the costs of low grip for a route planner, from the live map and a road network."""
+    """Write the costs of low friction for a route planner, from the live map and a road network."""
     from fleet_service.analytics.roads.network import read_network
     from fleet_service.client import map_client, routing
 

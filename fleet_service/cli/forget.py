@@ -1,5 +1,5 @@
-"""`fleet-service forget`: forget a vehicle or a complete month; a running service does it
-itself.
+"""`fleet-service forget`: erase one vehicle's data of a month, or the key of a complete month. If a
+service is running, it carries out the erasure.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LOOK_S: Final = 5.0  # ... and whether it is still there
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     add_archive(parser)
     parser.add_argument("--period", metavar="MONTH", required=True, help="e.g. 2026-01")
     parser.add_argument("--vehicle", metavar="NAME", help="remove only this vehicle's rows")
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command on its archive."""
+    """Erase the selected data."""
     return on_archive(arguments, _forget_data)
 
 
@@ -89,10 +89,11 @@ def _forget_data(arguments: argparse.Namespace) -> ArchiveReport:
 
 
 def _erase_or_request(root: Path, wanted: Erasure, config: str | None) -> ErasureResult:
-    """Erase, in the archive's copy too, or let the service that holds the archive do it.
+    """Erase the data, in the archive's copy too. If a service is running on the archive, let the
+    service do this.
 
     Raises:
-        InputError: there is no such month, a file is damaged, or the copy is not reached.
+        InputError: there is no such month, a file is damaged, or the copy cannot be reached.
         OSError: a file cannot be read or written.
     """
     from fleet_service.archive.format.files import is_served
@@ -125,10 +126,11 @@ def _erase_or_request(root: Path, wanted: Erasure, config: str | None) -> Erasur
 
 @contextmanager
 def _sync_copy(root: Path, path: str | None) -> Iterator[None]:
-    """Let the archive's copy follow, if it has one.
+    """Synchronise the archive's bucket copy, if any, after the block.
 
     Raises:
-        InputError: its settings are unknown, and nothing was done; or it was not reached.
+        InputError: the settings of the copy are unknown, and nothing was done; or the copy could
+            not be reached.
     """
     from fleet_service.replication.replica import BucketReplica
     from fleet_service.replication.upload_journal import last_copy_url

@@ -9,7 +9,7 @@ from fleet_service.cli.common import add_connection
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     parser.add_argument("region", metavar="REGION", help="region key expression, e.g. 1202/310/*")
     parser.add_argument(
         "--to", metavar="NAME", required=True, help="name of the standby that takes over"
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Hand over, and print how long the region had no service."""
+    """Move the region, and print how long it had no service."""
     from fleet_service.client import map_client
     from fleet_service.shards.handover import hand_over
     from schemas.config import REGION_PATTERN

@@ -1,4 +1,4 @@
-"""`fleet-service page`: the live map in a browser."""
+"""`fleet-service page`: serve the live map as a web page."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     parser.add_argument(
         "--archive",
         metavar="DIR",
@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve the page until a signal."""
+    """Serve the page until a signal arrives."""
     from fleet_service.client import map_client
 
     try:
@@ -104,10 +104,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check_archive(root: Path) -> None:
-    """Warn if the archive does not exist yet: a service that starts for the first time creates it.
+    """Print a note if the archive does not exist yet; a service creates it when it starts for the
+    first time.
 
     Raises:
-        InputError: the folder has other contents.
+        InputError: the folder contains something else.
     """
     from fleet_service.archive.format.layout import require_archive
 

@@ -1,4 +1,4 @@
-"""`fleet-service query`: query the map once."""
+"""`fleet-service query`: query the map once, and print or write the answer."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NOBODY: Final = 1  # exit code where nobody serves what was asked for, or some o
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     parser.add_argument("--bbox", metavar="W,S,E,N", help="box in degrees (default: everything)")
     parser.add_argument(
         "--route",
@@ -54,7 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Query, and print or write the answer; 1 if a part of the area has no service."""
+    """Query the map, and print or write the answer. Return exit code 1 if no service answers for a
+    part of the area.
+    """
     form = _output_format(arguments.out, arguments.format)
     from fleet_service.client import map_client
 
@@ -91,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _say_what_is_covered(arguments: argparse.Namespace) -> None:
-    """Print the box of the whole map if a queried box is empty: latitude and longitude may be
+    """Print the box of the whole map, after a queried box was empty: latitude and longitude may be
     swapped.
     """
     from fleet_service.client import map_client

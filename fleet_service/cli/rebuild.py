@@ -1,4 +1,4 @@
-"""`fleet-service rebuild`: compute the map and the roll-ups of an archive again from raw
+"""`fleet-service rebuild`: compute the map and the hourly statistics of an archive again from raw
 observations.
 """
 
@@ -14,7 +14,7 @@ from schemas.runtime import progress_messages
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     add_archive(parser)
     parser.add_argument(
         "--out",
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command on its archive."""
+    """Compute map and hourly statistics, and write them to the output folder."""
     return on_archive(arguments, _rebuild_maps)
 
 

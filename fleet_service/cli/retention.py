@@ -1,4 +1,4 @@
-"""`fleet-service retention`: remove old raw rows. The service may run meanwhile."""
+"""`fleet-service retention`: remove old raw rows from an archive. The service may be running."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fleet_service.cli.common import ArchiveReport, add_archive, add_dry_run, co
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     add_archive(parser)
     parser.add_argument(
         "--raw-days",
@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command on its archive."""
+    """Remove the old rows."""
     return on_archive(arguments, _retire_rows)
 
 

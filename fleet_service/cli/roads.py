@@ -1,5 +1,5 @@
-"""`fleet-service roads`: assign each cell and sector to a link of a road network, for `analyze
-contract`.
+"""`fleet-service roads`: assign each cell and sector to a link of a road network. `analyze
+contract` uses the result.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from schemas.runtime import commandline, progress_messages
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     parser.add_argument(
         "extract",
         metavar="EXTRACT",
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read the network, join, write.
+    """Read the road network, assign cells to links, and write the table.
 
     Raises:
         InputError: the extract cannot be read, or the file cannot be written.

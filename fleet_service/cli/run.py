@@ -1,4 +1,4 @@
-"""`fleet-service run`: run the service until a signal."""
+"""`fleet-service run`: run the service until a signal arrives."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FREEING_S = 0.4  # of them, for a bucket to take a word
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     parser.add_argument(
         "--config", metavar="FILE", help="configuration file (JSON); every setting has a default"
     )
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the service."""
+    """Run the service; return its exit code."""
     with progress_messages.show_status("loading"):
         from fleet_service.app.precompile import warm_up
         from fleet_service.app.service import Service
@@ -107,8 +107,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _open_archive(
     config: ServiceConfig, root: Path, stop: threading.Event, log_line: Callable[[str], None]
 ) -> Ownership | None:
-    """Open the archive once it is available; None if stopped before. A standby serves its
-    metrics while it waits.
+    """Wait until the archive is available, and open it; return None if stopped before. A standby
+    serves its metrics while it waits.
     """
     from fleet_service.app.metrics import standby_metrics
     from fleet_service.replication.ownership import acquire_archive
@@ -142,7 +142,8 @@ def _force_exit_when_stuck(
     service: Service,
     log_line: Callable[[str], None],
 ) -> None:
-    """End a service whose shutdown hangs, on a frozen router or a long compaction.
+    """End the process if the shutdown of the service hangs, for example because of a frozen router
+    or a long compaction.
 
     Every running operation may be interrupted, because vehicles keep each report until it is
     acknowledged. The exit code is that of a normal end. The lease is released, because a standby

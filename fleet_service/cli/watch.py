@@ -1,4 +1,4 @@
-"""`fleet-service watch`: print tiles and alerts as they change."""
+"""`fleet-service watch`: print changed tiles and alerts as they arrive."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     parser.add_argument("--bbox", metavar="W,S,E,N", help="only tiles that touch this box")
     parser.add_argument(
         "--alerts",
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Watch until a signal."""
+    """Watch the map until a signal arrives."""
     from fleet_service.client import map_client, watching
 
     stop = stop_on_signals()
@@ -67,7 +67,9 @@ def run(arguments: argparse.Namespace) -> int:
 def _watch_with_webhook(
     arguments: argparse.Namespace, watch: Callable[[Callable[[StretchAlert], None]], None]
 ) -> int:
-    """Watch and send alerts; return 1 if any was lost or could not be delivered."""
+    """Watch the map and send alerts to a webhook. Return 1 if an alert was lost or could not be
+    delivered, else 0.
+    """
     from fleet_service.client.alert_queue import AlertQueue
     from fleet_service.client.webhook import Webhook, check_url, queue_path
     from schemas.runtime.metrics import serve_metrics

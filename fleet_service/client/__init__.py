@@ -1,1 +1,1 @@
-"""Clients of the map: query it, watch it, forward its alerts."""
+"""Clients of the map: they query it, watch it, and forward its alerts."""

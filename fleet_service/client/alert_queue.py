@@ -1,4 +1,4 @@
-"""Bounded queue of messages in a file, which survives the end of the process."""
+"""Bounded queue of messages in a file, so that messages survive the end of the process."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ MOST_WAITING: Final = 1000
 
 
 class AlertQueue:
-    """Queue of texts in an SQLite file; the oldest are dropped when it is full.
+    """Queue of texts in an SQLite file; when it is full, the oldest texts are dropped.
 
     Args:
-        path: of the file, created if missing; this queue owns it until `close`.
+        path: path of the file, which is created if missing; this queue has exclusive use of it
+            until `close`.
         most: maximum number of waiting messages.
 
     Raises:
@@ -50,10 +51,10 @@ class AlertQueue:
             return int(self._file.execute("SELECT count(*) FROM waiting").fetchone()[0])
 
     def append(self, text: str) -> int:
-        """Append a message; return the number of messages that were dropped to make room.
+        """Append a message; return the number of old messages that were dropped to make room.
 
         Raises:
-            sqlite3.Error: it cannot be stored.
+            sqlite3.Error: the message cannot be stored.
         """
         with self._guard:
             self._file.execute("INSERT INTO waiting (text) VALUES (?)", (text,))
@@ -63,7 +64,7 @@ class AlertQueue:
             ).rowcount
 
     def read_first(self) -> tuple[int, str] | None:
-        """Return number and text of the oldest message; None if the queue is empty."""
+        """Return the number and the text of the oldest message; None if the queue is empty."""
         with self._guard:
             row = self._file.execute(
                 "SELECT number, text FROM waiting ORDER BY number LIMIT 1"
@@ -71,7 +72,7 @@ class AlertQueue:
         return None if row is None else (int(row[0]), str(row[1]))
 
     def remove(self, number: int) -> bool:
-        """Remove a message; return False if it was dropped before."""
+        """Remove the message with this number; return False if it had already been dropped."""
         with self._guard:
             return (
                 self._file.execute("DELETE FROM waiting WHERE number = ?", (number,)).rowcount > 0

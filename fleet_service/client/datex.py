@@ -1,12 +1,12 @@
 """Slippery stretches as a DATEX II publication (version 3) for a National Access Point. Pure.
 
-A stretch is a situation of category a of the safety-related traffic information (Regulation (EU)
-886/2013, temporary slippery road). Its condition is `slippery`, never `ice`: grip is known, its
-cause is not. A situation keeps its id. The version of its record increases with every change. When
-the alert is over, the record is published with its end for another KEPT_S.
+A stretch is published as a situation of category a of safety-related traffic information
+(Regulation (EU) 886/2013, temporary slippery road). Its condition is `slippery`, never `ice`,
+because the map knows the friction but not its cause. A situation keeps its id; the version of its
+record increases with every change. When the alert is over, the record is published with its end
+time for another KEPT_S.
 
-Only the previous publication must be kept: the next one is made from it and from the standing
-alerts.
+Each publication is made from the previous one and the active alerts; no other state must be stored.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class Supplier:
 
     Attributes:
         country: two letters, ISO 3166.
-        name: of the supplier at its National Access Point.
-        status: real, or one of the exercises of the standard.
+        name: name of the supplier at its National Access Point.
+        status: real, or one of the kinds of exercise of the standard.
 
     Raises:
         InputError: the country is not valid, or the name is empty.
@@ -62,7 +62,7 @@ class Supplier:
     status: Literal["real", "test", "technicalExercise", "securityExercise"] = "test"
 
     def __post_init__(self) -> None:
-        """Check country and name."""
+        """Check country and name; raise InputError if one is not valid."""
         if not re.fullmatch("[a-z]{2}", self.country):
             raise InputError(
                 "country", f"{self.country!r} is not a country code", "give two letters, e.g. se"
@@ -78,15 +78,15 @@ def make_publication(
     before: bytes | None = None,
     is_heard: Callable[[float, float], bool] = lambda *_: True,
 ) -> bytes:
-    """Return the publication as of now [ns UTC].
+    """Return the publication at time `now` as an XML document.
 
     Args:
-        supplier: of the publication.
-        standing: every stretch under alert.
-        now: [ns UTC].
+        supplier: supplier of the publication.
+        standing: every stretch with an active alert.
+        now: current time [ns UTC].
         before: the previous publication; None to start a new one.
-        is_heard: returns True if a service answers for a place (latitude, longitude); elsewhere
-            nothing ends.
+        is_heard: function that returns True if a service answers for a place (latitude, longitude).
+            Situations elsewhere are not ended.
 
     Raises:
         InputError: `before` is not a publication.
@@ -131,7 +131,7 @@ def make_publication(
 
 
 def same_but_for_time(one: bytes, other: bytes) -> bool:
-    """Return True if two publications describe the same road conditions."""
+    """Return True if two publications are equal except for their publication time."""
     cut = re.compile(rb"<com:publicationTime>[^<]*</com:publicationTime>")
     return cut.sub(b"", one) == cut.sub(b"", other)
 
@@ -183,7 +183,9 @@ def _make_record(alert: StretchAlert, name: str, now: int) -> ET.Element:
 
 
 def _make_location(alert: StretchAlert) -> ET.Element:
-    """Return a line from end to end in driving direction; a point if the stretch is one cell."""
+    """Return the location element of a stretch: a line from end to end in driving direction; a
+    point if the stretch is one cell.
+    """
     points = list(alert.points)
     line = len(alert.points) > 1
     kind = "loc:LinearLocation" if line else "loc:PointLocation"
@@ -220,8 +222,8 @@ def _make_location(alert: StretchAlert) -> ET.Element:
 
 
 def _next_version(record: ET.Element, old: ET.Element) -> ET.Element:
-    """Return a record as the next version of an old one; the old one if nothing but times has
-    changed.
+    """Return `record` as the next version of an old record. If only times differ, return the old
+    record.
     """
     for tag in (
         "sit:situationRecordCreationTime",
@@ -241,7 +243,7 @@ def _next_version(record: ET.Element, old: ET.Element) -> ET.Element:
 
 
 def _end_record(record: ET.Element, now: int) -> ET.Element | None:
-    """Return a record with its end; None if the end was published long enough."""
+    """Return a record with its end time; None if the end has been published long enough."""
     period = _find_element(record, "sit:validity/com:validityTimeSpecification")
     end = period.find("com:overallEndTime", _SPACES)
     if end is not None:
@@ -259,8 +261,8 @@ def _has_ended(record: ET.Element) -> bool:
 
 
 def _same_place(alert: StretchAlert, old: dict[str, ET.Element], written: set[str]) -> str | None:
-    """Return the situation that has a cell of a stretch, if a restarted reader gave it another
-    name.
+    """Return the id of an earlier situation that shares a cell with the stretch; None if there is
+    none. A reader that was restarted gives the same stretch another name.
     """
     cells = {
         f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points
@@ -283,7 +285,7 @@ def _cell_coordinates(record: ET.Element) -> set[str]:
 
 
 def _parse_records(document: bytes) -> dict[str, ET.Element]:
-    """Return the records of a publication by id."""
+    """Return the situation records of a publication by id."""
     problem = InputError("out", "is not a publication of this command", "name another file")
     try:
         root = ET.fromstring(document)

@@ -1,4 +1,6 @@
-"""DATEX II publication as a file: written once, or updated while alerts come and go."""
+"""DATEX II publication as a file: written once, or kept up to date while alerts are raised and
+cleared.
+"""
 
 from __future__ import annotations
 
@@ -25,12 +27,13 @@ REFRESH_S: Final = 60.0
 
 
 class DatexFile:
-    """One publication, stored in a file and continued from it.
+    """Publication that is stored in a file; each version continues the previous content of the
+    file.
 
     Args:
-        supplier: of the publication.
-        path: the file; its content is continued.
-        say: called with a line when it changes.
+        supplier: supplier of the publication.
+        path: path of the file.
+        say: called with a line of text when the content changes.
 
     Raises:
         InputError: the file has other content.
@@ -47,20 +50,22 @@ class DatexFile:
 
     @property
     def is_due(self) -> bool:
-        """Return True if the time of publication must be renewed."""
+        """Return True if the publication is so old that it must be written again."""
         return time.monotonic() >= self._written + REFRESH_S
 
     def keep_up(
         self, standing: list[StretchAlert], is_heard: Callable[[float, float], bool]
     ) -> None:
-        """Write the publication if its content changed, or if it is old.
+        """Write the publication if its content has changed, or if it is old.
 
         Args:
-            standing: every stretch under alert.
-            is_heard: returns True if a service answers for a place (latitude, longitude).
+            standing: every stretch with an active alert.
+            is_heard: function that returns True if a service answers for a place (latitude,
+                longitude).
 
         Raises:
-            InputError: the file cannot be written; `document` is the new one nevertheless.
+            InputError: the file cannot be written; the attribute `document` is the new version all
+                the same.
         """
         before = self.document
         new = make_publication(self._supplier, standing, time.time_ns(), before, is_heard)
@@ -76,20 +81,20 @@ class DatexFile:
 
 
 class StretchOutput(Protocol):
-    """Publication of stretches that is kept current."""
+    """Interface of an output that publishes slippery stretches and is kept up to date."""
 
     @property
     def is_due(self) -> bool:
-        """Return True if it must be looked at without news."""
+        """Return True if the output must be updated even though no alert has changed."""
 
     def keep_up(
         self, standing: list[StretchAlert], is_heard: Callable[[float, float], bool]
     ) -> None:
-        """Publish the standing stretches."""
+        """Publish the stretches with an active alert."""
 
 
 class DatexFeed:
-    """Keeps a publication current with received alerts.
+    """Updater that keeps a publication consistent with received alerts.
 
     Args:
         file: the publication.
@@ -104,13 +109,15 @@ class DatexFeed:
         self._is_heard: Callable[[float, float], bool] = lambda *_: False
 
     def apply_alert(self, alert: wire.Alert) -> None:
-        """Record that an alert was raised or cleared, or still stands."""
+        """Record that an alert was raised, cleared, or repeated because it is still active."""
         with self._lock:
             self._stretches.apply_alert(alert)
             self._has_news = True
 
     def query_alerts(self, session: zenoh.Session) -> None:
-        """Query all standing alerts. Alerts of places without a service do not end."""
+        """Query all active alerts, and end the others. Alerts at places for which no service
+        answers are not ended.
+        """
         found = standing_alerts(session)
         self._heard = {}
 
@@ -128,7 +135,7 @@ class DatexFeed:
             self._has_news = True
 
     def write_if_due(self) -> None:
-        """Write the publication if it changed or its time is due.
+        """Write the publication if alerts have changed, or if it is old.
 
         Raises:
             InputError: the file cannot be written.
@@ -145,11 +152,11 @@ class DatexFeed:
 def publish_alerts(
     connection: ZenohSettings, feed: DatexFeed, stop: threading.Event | None
 ) -> None:
-    """Write the publication once, or with `stop` keep it current until that is set.
+    """Write the publication once; with `stop`, keep it up to date until this event is set.
 
     Raises:
-        InputError: no router, or no service answers at the start: an absent service does not mean a
-            dry road.
+        InputError: no router answers, or no service answers at the start. Without a service the
+            road must not be published as dry.
     """
     with open_connected(connection) as session:
         session.declare_subscriber(

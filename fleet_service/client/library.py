@@ -1,4 +1,4 @@
-"""Query of the live map from a program."""
+"""Query of the live map from a Python program."""
 
 from __future__ import annotations
 
@@ -23,9 +23,11 @@ def ask_map(
     schemas.tables.MAP_CELL.
 
     Args:
-        endpoint: of a router, e.g. tcp/127.0.0.1:7447; or settings with certificates.
+        endpoint: address of a router, e.g. tcp/127.0.0.1:7447; or connection settings with
+            certificates.
         bbox: west, south, east, north [deg].
-        route: longitude, latitude [deg] of points; returns the cells ahead in driving order.
+        route: points (longitude, latitude) [deg]; the result has the cells along the route in
+            driving order.
         min_vehicles: minimum number of vehicles of a cell.
         at: moment of the map; without a zone it is UTC.
 

@@ -1,4 +1,4 @@
-"""Client of the map for the commands `query` and `watch`."""
+"""Client of the live map, used by the commands `query` and `watch` among others."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ class Answer:
     """All replies to one query, joined.
 
     Attributes:
-        table: of an answer in Arrow.
-        document: of an answer in another format.
+        table: cells, if the answer is in Arrow format.
+        document: content, if the answer is in another format.
         served: True if a service answered.
-        missing: requested regions without a service, or whose service left meanwhile.
-        regions: served regions, where services announce them.
+        missing: requested regions that have no service, or whose service stopped meanwhile.
+        regions: regions that services announce.
     """
 
     table: pa.Table | None
@@ -65,7 +65,9 @@ class Answer:
 
     @property
     def gap_description(self) -> str | None:
-        """Return a description of the missing part of the answer."""
+        """Return a description of the regions that are missing from the answer; None if it is
+        complete.
+        """
         if not self.missing:
             return None
         more = f" and {len(self.missing) - NAMED} more" if len(self.missing) > NAMED else ""
@@ -74,8 +76,8 @@ class Answer:
 
 
 def connection_settings(connect: str | None, config: Path | str | None) -> ZenohSettings:
-    """Return the connection settings: the configuration's, with `connect` instead of its
-    endpoints.
+    """Return the connection settings from a configuration file; if `connect` is given, it replaces
+    the endpoints.
     """
     found = load(config, ServiceConfig).zenoh
     return found if connect is None else found.model_copy(update={"connect": [connect]})
@@ -126,7 +128,7 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
 def query_replies(
     session: zenoh.Session, key: str, parameters: Mapping[str, str]
 ) -> Iterator[tuple[str, bytes]]:
-    """Yield key and payload of every reply for a key expression of the map.
+    """Yield key and payload of every reply to a query on a key expression of the map.
 
     Raises:
         InputError: a service refused the query.
@@ -142,11 +144,12 @@ def query_replies(
 
 
 def served_table(answer: Answer) -> pa.Table:
-    """Return the cells of an Arrow answer; missing regions are logged and named in the schema's
-    metadata.
+    """Return the cells of an Arrow answer. Missing regions are logged, and named in the metadata of
+    the schema.
 
     Raises:
-        InputError: no service answered, or the answer is empty and part of the area has no service.
+        InputError: no service answered, or the answer is empty and a part of the area has no
+            service.
     """
     if not answer.served or answer.table is None:
         raise InputError(
@@ -167,13 +170,14 @@ def served_table(answer: Answer) -> pa.Table:
 
 
 def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
-    """Return True if any service answers for the map. This distinguishes an empty answer from no
-    answer.
+    """Return True if any service answers for the queried part of the map. This distinguishes an
+    empty map from a missing service.
 
-    A service has a token, which not every reader may see, and it answers for the tiles of its
-    regions. A router matches only services that answer for all of a key expression. Without a
-    place, a service of the whole world is found by any tile, and a service of a region by its
-    answer.
+    There are three signs. First, a service answers for the tile at the start of the route or at a
+    corner of the box (or at an arbitrary place). Second, if no place is queried, a service replies
+    to a query of the whole map. Third, a service's liveliness token is visible, which not every
+    reader may see. A router matches only services that answer for all of a key expression, so one
+    sign alone is not enough.
     """
     point = asked.route[0] if asked.route else asked.bbox[:2] if asked.bbox else None
     if is_place_served(session, *(reversed(point) if point else (0.0, 0.0))):
@@ -187,7 +191,7 @@ def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
 
 
 def is_place_served(session: zenoh.Session, latitude: float, longitude: float) -> bool:
-    """Return True if a service answers for the tile of a place [deg]; a negative result takes
+    """Return True if a service answers for the tile of a place [deg]. If none does, this takes
     SERVED_S.
     """
     tile = grid.tile_of(int(grid.cell_of(latitude, longitude)))
@@ -215,7 +219,7 @@ def open_connected(connection: ZenohSettings) -> zenoh.Session:
 
 
 def _join_replies(asked: query.MapQuery, payloads: list[bytes]) -> Answer:
-    """Join replies into one answer; along a route in driving order."""
+    """Join the replies to a query into one answer; along a route, cells are in driving order."""
     rank = regions.Rank(asked.route) if asked.route else None
     if asked.format is Format.ARROW:
         parts = [decode_tile(payload) for payload in payloads]
@@ -266,7 +270,7 @@ def write_answer(answer: Answer, path: Path) -> None:
 
 
 def format_answer(answer: Answer) -> str:
-    """Return an answer for the terminal."""
+    """Return an answer as text for the terminal."""
     if answer.table is None:
         return json.dumps(answer.document, indent=1)
     lines = ["  ".join(f"{name:>12}" for name in SHOWN)]

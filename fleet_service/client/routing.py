@@ -1,10 +1,10 @@
-"""Grip along road links as costs of a route planner: factors for Valhalla, a model for GraphHopper.
-Pure.
+"""Low friction along road links as costs for route planners: cost factors for Valhalla, a custom
+model for GraphHopper. Pure.
 
-The factor comes from the lower bound of grip. Only measured and borrowed cells count: a cell
-without excitation has a low bound because nothing is known there, and unknown is not slippery. A
-factor is a cost, not a time: Valhalla scales the travel time that it reports by it, so the time of
-a chosen route must be asked for again without factors.
+The factor is computed from the lower bound of friction. Only measured and estimated ("borrowed")
+cells count. In other cells the lower bound is low because no vehicle has tested the grip, which
+does not mean that the road is slippery. A factor is a cost, not a time. Valhalla also multiplies
+the reported travel time by it, so the time of a chosen route must be queried again without factors.
 """
 
 from __future__ import annotations
@@ -49,14 +49,16 @@ class RoadLine(NamedTuple):
 
 
 class CostLine(NamedTuple):
-    """Part of a road with one factor; points are (longitude, latitude)."""
+    """Part of a road with one cost factor; points are (longitude, latitude) [deg]."""
 
     factor: float
     points: list[tuple[float, float]]
 
 
 def cost_factors(mu_lower: FloatArray) -> FloatArray:
-    """Return the factor of each lower bound of grip: 1 from GOOD_GRIP on, at most MOST."""
+    """Return the cost factor for each lower bound of friction (n,): 1 from GOOD_GRIP on, at most
+    MOST.
+    """
     ratio = GOOD_GRIP / np.maximum(mu_lower, 1e-3)
     exact = np.clip(ratio**POWER, 1.0, MOST)
     steps = np.array(STEPS)
@@ -64,11 +66,11 @@ def cost_factors(mu_lower: FloatArray) -> FloatArray:
 
 
 def cost_lines(table: pa.Table, roads: Iterable[RoadLine]) -> list[CostLine]:
-    """Return the parts of roads that cost more than their time.
+    """Return the parts of roads with a cost factor above 1.
 
     Args:
         table: cells of the map, as a query returns them.
-        roads: directed links of the network.
+        roads: directed links of the road network.
     """
     key, factor = _sorted_factors(table)
     out: list[CostLine] = []
@@ -87,7 +89,9 @@ def cost_lines(table: pa.Table, roads: Iterable[RoadLine]) -> list[CostLine]:
 
 
 def ice_cells(table: pa.Table) -> list[list[tuple[float, float]]]:
-    """Return rings (longitude, latitude) of the cells that are surely ice."""
+    """Return the outlines (rings of (longitude, latitude) [deg]) of the cells that are almost
+    certainly icy.
+    """
     upper, slippery = (
         np.nan_to_num(_float_column(table, name), nan=1.0) for name in ("mu_upper", "p_slippery")
     )
@@ -101,7 +105,7 @@ def ice_cells(table: pa.Table) -> list[list[tuple[float, float]]]:
 def valhalla_request(
     lines: Sequence[CostLine], rings: Sequence[list[tuple[float, float]]] = ()
 ) -> dict[str, Any]:
-    """Return the fields to merge into a Valhalla request for a route."""
+    """Return the fields that must be merged into a route request to Valhalla."""
     features = [
         {
             "type": "Feature",
@@ -117,7 +121,9 @@ def valhalla_request(
 
 
 def graphhopper_model(lines: Sequence[CostLine]) -> dict[str, Any]:
-    """Return a custom model for GraphHopper: one area per class of cost, and the priority there."""
+    """Return a custom model for GraphHopper: one area for each cost factor, and the priority of
+    roads in it.
+    """
     areas = []
     priority = []
     for number, factor in enumerate(STEPS[1:], 1):
@@ -142,7 +148,9 @@ def _has_evidence(table: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
 
 
 def _sorted_factors(table: pa.Table) -> tuple[IntArray, FloatArray]:
-    """Return cell and sector as one sorted number, and the factor there."""
+    """Return the keys (cell and sector as one number) of the map's cells in ascending order, and
+    the cost factor of each.
+    """
     counts = _has_evidence(table)
     cell, sector = (
         np.asarray(table[name].to_numpy(), np.int64)[counts] for name in ("cell", "sector")
@@ -154,8 +162,8 @@ def _sorted_factors(table: pa.Table) -> tuple[IntArray, FloatArray]:
 
 
 def _sample_road(road: RoadLine) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return points every STEP_M along a road, with the yaw there; none of a road without
-    length.
+    """Return latitude, longitude and yaw of points every STEP_M along a road; empty arrays for a
+    road without length.
     """
     east = METRES_PER_DEGREE * np.cos(np.radians(float(np.mean(road.latitude))))
     dx = np.diff(road.longitude) * east
@@ -174,8 +182,8 @@ def _sample_road(road: RoadLine) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _find_cost_runs(
     cost: FloatArray, latitude: FloatArray, longitude: FloatArray
 ) -> list[CostLine]:
-    """Return the runs of one factor; a run that is too short joins the dearer neighbour's class
-    by its own end.
+    """Return the parts of a road with the same cost factor above 1. A part that is too short is
+    extended at both ends.
     """
     ends = np.flatnonzero(np.r_[True, np.diff(cost) != 0.0, True])
     out = []
@@ -197,7 +205,7 @@ def _find_cost_runs(
 
 
 def _ring_around(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return the ring around a line, HALF_WIDTH_M to both sides."""
+    """Return a ring (closed polygon) around a line, HALF_WIDTH_M wide on both sides."""
     longitude, latitude = np.array(points).T
     east = METRES_PER_DEGREE * np.cos(np.radians(latitude.mean()))
     dx = np.gradient(longitude) * east

@@ -1,8 +1,8 @@
-"""Alerts of stretches of road, made from alerts of cells and headings. Pure.
+"""Alerts of road stretches, made from alerts of single cells and headings. Pure.
 
-Cells under alert within LINK_CELLS of each other are one stretch, both driving directions together.
-A stretch keeps its id from the first cell to the last. When two grow together the older id stays;
-when one splits, the larger part keeps it.
+Cells with an active alert that are at most LINK_CELLS apart form one stretch; both driving
+directions belong to the same stretch. A stretch keeps its id from the first cell to the last. When
+two stretches merge, the older id stays. When a stretch splits, the larger part keeps the id.
 """
 
 from __future__ import annotations
@@ -28,18 +28,20 @@ ROUND: Final = 1.3  # a stretch less elongated than that has no direction
 
 @dataclass(frozen=True)
 class StretchAlert:
-    """Stretch of road that is slippery, or no longer is.
+    """Alert of a road stretch that is slippery, or no longer is.
 
     Attributes:
-        id: the same from the first cell to the last.
-        state: raised; changed (it grew or shrank); cleared.
-        since, time: begin, and time of this state [ns since 1970, UTC].
-        length_m: along its road direction, at least a cell.
-        direction: of the road, e.g. north-south; headings: of the vehicles that found it.
-        latitude, longitude: its centre [deg]; bbox: west, south, east, north [deg].
-        mu, mu_lower, mu_upper, p_slippery: of the cell with the lowest mu.
-        vehicles: largest number of any cell.
-        reason: of the last cell that changed it.
+        id: identifier, which stays the same as long as the stretch exists.
+        state: raised; changed (the stretch grew or shrank); cleared.
+        since, time: begin of the alert, and time of this state [ns since 1970, UTC].
+        length_m: length along the road [m], at least that of a cell.
+        direction: direction of the road, e.g. north-south.
+        headings: driving directions of the vehicles that found it.
+        latitude, longitude: centre [deg].
+        bbox: west, south, east, north [deg].
+        mu, mu_lower, mu_upper, p_slippery: values of the cell with the lowest mu.
+        vehicles: largest number of vehicles of any cell.
+        reason: reason from the last cell that changed the stretch.
         points: latitude and longitude [deg] of the cells from one end to the other; branches are
             left out.
     """
@@ -64,7 +66,7 @@ class StretchAlert:
     points: tuple[tuple[float, float], ...]
 
     def to_json_values(self) -> dict[str, Any]:
-        """Return all values for JSON; times as ISO 8601, UTC."""
+        """Return all values in a form that JSON supports; times are ISO 8601 text, UTC."""
         return asdict(self) | {"since": format_time(self.since), "time": format_time(self.time)}
 
     def to_line(self) -> str:
@@ -81,12 +83,12 @@ class StretchAlert:
 
 
 def format_time(ns: int) -> str:
-    """Return a time as text."""
+    """Return a time [ns since 1970] as ISO 8601 text, UTC."""
     return f"{datetime.fromtimestamp(ns // NS, UTC):%Y-%m-%dT%H:%M:%SZ}"
 
 
 class Stretches:
-    """Standing stretches, updated by alerts of cells."""
+    """Stretches with an active alert, updated by alerts of single cells."""
 
     def __init__(self) -> None:
         self._standing: dict[tuple[int, int], Alert] = {}
@@ -95,7 +97,7 @@ class Stretches:
         self._last: Alert | None = None
 
     def apply_alert(self, alert: Alert) -> None:
-        """Record that a cell's alert was raised or cleared; repetition has no effect."""
+        """Record that the alert of a cell was raised or cleared; repeating a call has no effect."""
         place = (alert.cell, alert.sector)
         if alert.raised:
             self._standing[place] = alert
@@ -104,7 +106,9 @@ class Stretches:
         self._last = alert
 
     def replace_alerts(self, standing: Iterable[Alert], is_heard: Callable[[Alert], bool]) -> None:
-        """Replace the standing alerts; others end if a service answers for their place."""
+        """Replace the active alerts with the alerts in `standing`. Alerts that are not in it end
+        only if `is_heard` says that a service answers for their place.
+        """
         present = {(alert.cell, alert.sector): alert for alert in standing}
         self._standing = {
             place: one
@@ -116,11 +120,11 @@ class Stretches:
 
     @property
     def standing(self) -> list[StretchAlert]:
-        """Return all standing stretches, as `take_changes` returned them last."""
+        """Return all stretches with an active alert, as of the last call of `take_changes`."""
         return list(self._known.values())
 
     def take_changes(self) -> list[StretchAlert]:
-        """Return the changes since the last call."""
+        """Return the stretches that were raised, changed or cleared since the last call."""
         found = self._group_by_stretch()
         out = []
         for name, group in found.items():
@@ -140,7 +144,7 @@ class Stretches:
         return out
 
     def _group_by_stretch(self) -> dict[str, list[Alert]]:
-        """Return the standing alerts by stretch."""
+        """Return the active alerts of cells, grouped by the id of their stretch."""
         alerts = sorted(self._standing.values(), key=lambda one: (one.time, one.cell, one.sector))
         label = link_cells(np.array([one.cell for one in alerts], np.int64))
         parts: list[list[Alert]] = [[] for _ in range(int(label.max(initial=-1)) + 1)]
@@ -241,8 +245,8 @@ def _new_name(first: Alert) -> str:
 
 
 def _centre_line(cell: IntArray) -> tuple[tuple[float, float], ...]:
-    """Return the centres [deg] of distinct cells along the longest path from neighbour to
-    neighbour.
+    """Return the centres [deg] of distinct cells along the longest path between neighbouring
+    cells.
     """
     places = np.stack(grid.deinterleave(cell), axis=1).astype(np.float64)
     tree = _span_tree(places)
@@ -256,8 +260,8 @@ def _centre_line(cell: IntArray) -> tuple[tuple[float, float], ...]:
 
 
 def _span_tree(places: FloatArray) -> list[list[tuple[int, float]]]:
-    """Return the neighbours of each place (n, 2), with distances, in a minimum spanning tree
-    (Prim); places more than LINK_CELLS apart are no neighbours.
+    """Return a minimum spanning tree (Prim) of places (n, 2): for each place, its neighbours in the
+    tree with distances. Places more than LINK_CELLS apart are not connected.
     """
     tree: list[list[tuple[int, float]]] = [[] for _ in places]
     nearest = np.full(len(places), np.inf)
@@ -280,8 +284,8 @@ def _span_tree(places: FloatArray) -> list[list[tuple[int, float]]]:
 
 
 def _walk_tree(tree: list[list[tuple[int, float]]], start: int) -> tuple[FloatArray, list[int]]:
-    """Return the distance of each place from `start` along the tree, -1 where it is not joined, and
-    the place before it.
+    """Return the distance of each place from `start` along the tree, -1 if the place is not
+    connected, and the previous place on the path.
     """
     length = np.full(len(tree), -1.0)
     before = [start] * len(tree)
@@ -300,8 +304,9 @@ def _walk_tree(tree: list[list[tuple[int, float]]], start: int) -> tuple[FloatAr
 def _measure_shape(
     cell: IntArray,
 ) -> tuple[float, str, tuple[float, float], tuple[float, float, float, float]]:
-    """Return length [m], direction, centre [deg] and box [deg] of cells; the direction is that of
-    the largest spread."""
+    """Return length [m], direction, centre [deg] and box [deg] of a set of cells. The direction is
+    that of the largest spread.
+    """
     west, south, east, north = grid.bounds(cell)
     scale = METRES_PER_DEGREE * math.cos(math.radians(float(south.mean())))
     x = (west + east) / 2 * scale

@@ -1,5 +1,5 @@
-"""Print changes of the map: one line per changed tile, per alert, and per region that loses or
-regains its service.
+"""Watch for changes of the map: print one line per changed tile, per alert, and per region that
+loses or regains its service.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ GATHER_S: Final = 0.3  # time for which alerts of neighbouring cells are merged
 
 
 class WatchOptions(NamedTuple):
-    """Selection of the changes to print.
+    """Options that select the changes to print.
 
     Attributes:
-        bbox: west,south,east,north as text; None for everything.
+        bbox: west,south,east,north as text; None for the whole map.
         only_alerts: True to omit lines for tiles.
         as_json: True to print each line as JSON.
     """
@@ -43,9 +43,9 @@ def watch_map(
     print_line: Callable[[str], None],
     on_alert: Callable[[StretchAlert], None] = lambda _: None,
 ) -> None:
-    """Print one line per change until `stop` is set. Wait until a router is reachable.
+    """Print one line per change until `stop` is set. If no router is reachable, wait for one.
 
-    `print_line` receives the lines, `on_alert` every alert that changed.
+    `print_line` is called with each line, and `on_alert` with every alert that has changed.
 
     Raises:
         InputError: the box is not valid.
@@ -114,7 +114,7 @@ def watch_map(
 
 
 def standing_alerts(session: zenoh.Session) -> list[wire.Alert]:
-    """Return the standing alerts of all services that answer."""
+    """Return the active alerts of all services that answer."""
     replies = (
         reply.ok
         for reply in session.get(f"{keys.ROOT}/alert/**", timeout=TIMEOUT_S)

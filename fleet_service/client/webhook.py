@@ -1,9 +1,10 @@
-"""Webhook for alerts of stretches, in the format of Alertmanager's webhook receivers (version 4).
+"""Webhook for alerts of road stretches, in the format of Alertmanager's webhook receivers (version
+4).
 
-Every receiver of Alertmanager webhooks accepts them: paging services, chat bridges, scripts.
-Delivery is at least once and in order. A message leaves the queue only after a 2xx answer within
-TIMEOUT_S. Redirects are not followed, because a POST would become an empty GET. Messages that are
-not delivered are counted and reported.
+Every receiver of Alertmanager webhooks accepts this format: paging services, chat bridges, scripts.
+Delivery is at least once and in order. A message is removed from the queue only after a 2xx answer
+within TIMEOUT_S. Redirects are not followed, because a POST would become an empty GET. Messages
+that cannot be delivered are counted and reported.
 """
 
 from __future__ import annotations
@@ -78,19 +79,20 @@ def alert_message(alert: StretchAlert) -> dict[str, Any]:
 
 
 def queue_path(url: str) -> Path:
-    """Return the default file of the queue for a receiver."""
+    """Return the default path of the queue file for a receiver's URL."""
     state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
     return state / "gripmap" / f"webhook-{hashlib.sha256(url.encode()).hexdigest()[:16]}.sqlite"
 
 
 class Webhook:
-    """Sender of alerts with a thread of its own; `close` sends waiting alerts once.
+    """Sender of alerts with its own thread; `close` tries once more to send waiting alerts.
 
     Args:
-        url: of the receiver, http or https.
-        say: called with a line when the receiver goes away or returns, and for every loss.
-        queue: of messages that wait; messages of an earlier process are sent first.
-        timeout_s: of a whole request [s].
+        url: URL of the receiver, http or https.
+        say: called with a line of text when the receiver becomes unreachable or reachable, and for
+            every lost message.
+        queue: queue of waiting messages; messages of an earlier process are sent first.
+        timeout_s: time limit of a whole request [s].
 
     Raises:
         InputError: the URL is not valid, or the package for HTTP is missing.
@@ -118,16 +120,18 @@ class Webhook:
 
     @property
     def lost_count(self) -> int:
-        """Number of alerts that will never be delivered."""
+        """Number of alerts that can no longer be delivered."""
         return sum(self.counts[name] for name in LOSSES)
 
     @property
     def waiting_count(self) -> int:
-        """Number of alerts in the queue; after `close`, of those that stayed in it."""
+        """Number of alerts in the queue; after `close`, the number that remained undelivered."""
         return self._undelivered if self._is_closed else len(self._queue)
 
     def health_problems(self) -> list[str]:
-        """Return one message per problem; empty if every alert is delivered or under way."""
+        """Return one message per problem; empty if no alert is lost and the receiver can be
+        reached.
+        """
         out = (
             [f"webhook: {self._failure}; {self.waiting_count} alerts wait"] if self._failure else []
         )
@@ -148,7 +152,7 @@ class Webhook:
         ]
 
     def send(self, alert: StretchAlert) -> None:
-        """Queue an alert."""
+        """Add an alert to the queue."""
         try:
             dropped = self._queue.append(json.dumps(alert_message(alert)))
         except sqlite3.Error as error:
@@ -159,7 +163,9 @@ class Webhook:
         self._more.set()
 
     def close(self) -> None:
-        """Try to send waiting alerts once, and stop; undelivered alerts stay in the file."""
+        """Try once to send the waiting alerts, and stop; undelivered alerts stay in the queue
+        file.
+        """
         self._stop.set()
         self._more.set()
         self._thread.join(2 * self._timeout_s)
@@ -198,8 +204,8 @@ class Webhook:
             runner.run(client.aclose())
 
     def _send_first(self, runner: asyncio.Runner, client: httpx.AsyncClient) -> str | None:
-        """Send the oldest message; return None if there is none, "" if it is settled, else the
-        reason of failure.
+        """Send the oldest message. Return None if there is none, "" if the message was delivered or
+        refused for good, else the reason of the failure.
         """
         try:
             first = self._queue.read_first()
@@ -231,7 +237,9 @@ class Webhook:
             self._failure = ""
 
     async def _post_message(self, client: httpx.AsyncClient, text: str) -> int:
-        """Return the status of the answer; its body is not read."""
+        """Send a message and return the HTTP status of the answer; the body of the answer is not
+        read.
+        """
         async with asyncio.timeout(self._timeout_s):
             headers = {"Content-Type": "application/json"}
             async with client.stream(
@@ -241,7 +249,7 @@ class Webhook:
 
 
 def check_url(url: str) -> None:
-    """Raise InputError if a URL is not valid, or the package for HTTP is missing."""
+    """Raise InputError if a URL is not valid, or if the package for HTTP is missing."""
     try:
         parts = urlsplit(url)
         is_valid = (
@@ -262,7 +270,9 @@ def check_url(url: str) -> None:
 
 
 def _failure_of(status: int) -> str | None:
-    """Return the reason for which a message must be sent again; None if it is settled."""
+    """Return the reason why a message must be sent again; None if the status means that it was
+    delivered or refused for good.
+    """
     if 200 <= status < 300 or status in REFUSALS:
         return None
     if 300 <= status < 400:

@@ -1,1 +1,3 @@
-"""Enrolment: the list of names, their certificates, and their rights at the routers."""
+"""Enrolment: the list of permitted names, their certificates, and their access rights at the
+routers.
+"""

@@ -1,5 +1,5 @@
-"""Configuration of a router: mutual TLS, and an access list that denies everything not listed here.
-Pure.
+"""Configuration of a Zenoh router: mutual TLS, and an access list that denies everything not listed
+here. Pure.
 
 | role    | may publish                              | may read and query                  |
 |---------|------------------------------------------|-------------------------------------|
@@ -10,10 +10,10 @@ Pure.
 | service | everything under gripmap/ but PRIVATE    | the same                            |
 | router  | messages that others may publish, between routers | the same                   |
 
-PRIVATE is ahead/NAME and vss/NAME: the map ahead of a vehicle, and the friction at it. Zenoh
-decides by the common name of the certificate and reads the list once, at its start. Denials are
-silent for the sender. A put on a wildcard counts as a put on every matching key, so it must lie
-completely within a rule.
+PRIVATE stands for the keys ahead/NAME and vss/NAME: the road ahead of a vehicle, and the friction
+at the vehicle. Zenoh decides by the common name of the certificate. It reads the list only at its
+start. The sender is not informed about denials. Publishing on a wildcard counts as publishing on
+every matching key, so a rule must allow all of them.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ Section = dict[str, Any]
 
 
 def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Section:
-    """Return the configuration of router `name`; `certificates` is the folder with its
+    """Return the configuration of the router `name`; `certificates` is the folder that contains its
     certificate and key.
     """
     router = fleet.routers[name]
@@ -91,13 +91,13 @@ def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Sec
 
 
 def rate_caps(fleet: Enrolment, name: str) -> list[Section]:
-    """Return the caps on messages of one session at router `name`, so that a flooding vehicle does
-    not slow down others.
+    """Return limits on the message rate of a session at the router `name`, so that a flooding
+    vehicle does not slow down others.
 
-    Zenoh counts per session and rule, and cannot tell a vehicle from a router. A session of another
-    router carries many vehicles and must not be capped. Routers reach each other over TLS only, so
-    QUIC is capped everywhere, and TLS where no other router arrives: on the interfaces named for
-    vehicles, and where there is one router.
+    Zenoh counts messages per session and rule, and cannot distinguish a vehicle from a router. A
+    session of another router carries the messages of many vehicles and must not be limited. Routers
+    reach each other over TLS only. Therefore QUIC is limited everywhere. TLS is limited where no
+    other router connects: on the interfaces named for vehicles, and if there is only one router.
     """
     router = fleet.routers[name]
     caps = [_rate_cap("quic", {"link_protocols": ["quic"]})] if router.quic else []
@@ -122,7 +122,7 @@ def _rate_cap(name: str, where: Section) -> Section:
 
 
 def access_control(fleet: Enrolment) -> Section:
-    """Return the access list of all routers."""
+    """Return the access list, which is the same for all routers."""
     rules = [
         _allow_rule("everything", ("ingress", "egress"), MESSAGES, [EVERYTHING]),
         _allow_rule("private", ("ingress", "egress"), MESSAGES, keys.private_keys("*"))
@@ -226,7 +226,9 @@ def _allow_rule(
 
 
 def _no_larger() -> Section:
-    """Stop batches at the first router if they are larger than the service reads."""
+    """Return a rule that stops batches at the first router if they are larger than the service
+    accepts.
+    """
     return {
         "id": "batches",
         "flows": ["ingress"],
@@ -237,8 +239,8 @@ def _no_larger() -> Section:
 
 
 def _no_larger_private() -> Section:
-    """Stop messages of one vehicle for its owner at the first router if they are larger than any
-    agent writes.
+    """Return a rule that stops private messages of a vehicle at the first router if they are larger
+    than any agent writes.
     """
     return {
         "id": "private",
@@ -250,7 +252,9 @@ def _no_larger_private() -> Section:
 
 
 def _no_payload() -> Section:
-    """Stop payloads of queries at the first router: a query is its key and its parameters."""
+    """Return a rule that stops queries with a payload at the first router: a query consists of its
+    key and parameters only.
+    """
     return {
         "id": "questions",
         "flows": ["ingress"],
@@ -261,7 +265,7 @@ def _no_payload() -> Section:
 
 
 def _topic_priority(topic: keys.Topic) -> Section:
-    """Replace the sender's priority by that of the topic."""
+    """Return a rule that replaces the sender's priority with that of the topic."""
     return {
         "id": f"priority-{topic.name}",
         "flows": ["ingress"],

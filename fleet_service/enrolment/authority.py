@@ -1,11 +1,11 @@
 """Certificate authority in a folder, and the certificates that it issues (elliptic curve P-256,
 X.509 version 3).
 
-    DIR/authority/ca.pem  ca.key      signs; stays on this machine
-    DIR/authority/next.*  old.pem     another authority on its way in, or out
-    DIR/trust.pem                     what everyone trusts
-    DIR/NAME.pem  NAME.key            of each name
-    DIR/revoked/NAME.pem              of names that were taken off the list
+    DIR/authority/ca.pem  ca.key      current authority; its key stays on this machine
+    DIR/authority/next.*  old.pem     next authority, and previous one, during a change of authority
+    DIR/trust.pem                     authorities that all participants trust
+    DIR/NAME.pem  NAME.key            certificate and key of each name
+    DIR/revoked/NAME.pem              certificates of names that were removed from the list
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class KeyPair(NamedTuple):
     key: Key
 
     def write(self, stem: Path) -> None:
-        """Write STEM.pem and STEM.key; `read_pair` detects a pair that was written half."""
+        """Write STEM.pem and STEM.key. If only one of them is written, `read_pair` detects this."""
         secret = self.key.private_bytes(
             serialization.Encoding.PEM,
             serialization.PrivateFormat.PKCS8,
@@ -47,18 +47,18 @@ class KeyPair(NamedTuple):
 
 
 def to_pem(certificate: x509.Certificate) -> bytes:
-    """Return a certificate as text."""
+    """Return a certificate in PEM format."""
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
 def write_atomically(path: Path, data: bytes, mode: int) -> None:
-    """Replace a file atomically; its mode is never wider than `mode`."""
+    """Replace a file atomically; its permissions are never wider than `mode`."""
     with open_durably(path, mode) as file:
         file.write(data)
 
 
 def read_pair(stem: Path) -> KeyPair | None:
-    """Return the pair at STEM.pem and STEM.key; None if it is missing or its halves do not match.
+    """Return the pair at STEM.pem and STEM.key; None if a file is missing or the two do not match.
 
     Raises:
         InputError: a file exists and is not valid.
@@ -79,7 +79,7 @@ def read_pair(stem: Path) -> KeyPair | None:
 
 
 def read_certificate(path: Path) -> x509.Certificate | None:
-    """Return a certificate; None if there is none.
+    """Return the certificate in a file; None if the file does not exist.
 
     Raises:
         InputError: the file is not a certificate.
@@ -95,7 +95,7 @@ def read_certificate(path: Path) -> x509.Certificate | None:
 
 
 def new_authority(days: float, now: datetime) -> KeyPair:
-    """Create a self-signed authority that cannot sign other authorities."""
+    """Return a new self-signed authority, valid for `days`, that cannot sign other authorities."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _subject_name(f"gripmap authority {now:%Y-%m-%d} {x509.random_serial_number():x}"[:64])
     certificate = (
@@ -110,10 +110,11 @@ def new_authority(days: float, now: datetime) -> KeyPair:
 def issue_certificate(
     authority: KeyPair, name: str, hosts: Sequence[str], days: float, now: datetime
 ) -> KeyPair:
-    """Issue a certificate for a name; with `hosts` it is also valid for a server under them.
+    """Issue a certificate for a name; with `hosts` it is also valid for a server at these host
+    names.
 
     Raises:
-        InputError: it would outlive the authority.
+        InputError: the certificate would outlive the authority.
     """
     until = now + timedelta(days=days)
     if until > authority.certificate.not_valid_after_utc:
@@ -141,7 +142,7 @@ def issue_certificate(
 
 
 def alternative_names(name: str, hosts: Sequence[str]) -> list[x509.GeneralName]:
-    """Return the names and addresses that a certificate is valid for."""
+    """Return the names and addresses for which a certificate is valid."""
     found: list[x509.GeneralName] = [x509.DNSName(name)]
     for host in hosts:
         try:

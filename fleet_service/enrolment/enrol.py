@@ -1,7 +1,8 @@
-"""Enrolment: creates missing certificates and router configurations from the enrolment file, and
-revokes removed names.
+"""Enrolment of names: creates missing certificates and router configurations from the enrolment
+file, and revokes the certificates of removed names.
 
-A repeated run changes only what changed in the file or is about to expire.
+A repeated run changes only certificates whose entry in the file has changed, or that are about to
+expire.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ PRIVATE: Final = 0o700  # of the authority's folder
 
 @dataclass(frozen=True)
 class Terms:
-    """Validity of certificates in days.
+    """Validity periods [days].
 
     Attributes:
-        days: of a certificate.
-        ca_days: of an authority.
-        renew_days: a certificate that ends sooner is renewed.
+        days: validity of a certificate.
+        ca_days: validity of an authority.
+        renew_days: a certificate with less remaining validity is renewed.
     """
 
     days: float = 365.0
@@ -39,7 +40,9 @@ class Terms:
 
 @dataclass
 class EnrolmentResult:
-    """Names of vehicles, grouped by result."""
+    """Result of an enrolment: names with a new certificate, names whose certificate was kept, and
+    revoked names.
+    """
 
     made: list[str] = field(default_factory=list)
     kept: list[str] = field(default_factory=list)
@@ -47,12 +50,12 @@ class EnrolmentResult:
 
 
 class Registry:
-    """Folder of an authority.
+    """Folder of a certificate authority, and the operations on it.
 
     Args:
-        folder: DIR of `authority`; created if it does not exist.
-        terms: validity.
-        now: the time, with zone.
+        folder: DIR as described in `authority`; created if it does not exist.
+        terms: validity periods.
+        now: current time, with time zone.
         used_at: folder in which the routers will find their files (default: `folder`).
     """
 
@@ -70,11 +73,11 @@ class Registry:
             inner.mkdir(mode=PRIVATE, exist_ok=True)
 
     def enrol(self, fleet: Enrolment, step: Step | None = None) -> EnrolmentResult:
-        """Bring certificates and router configurations up to date.
+        """Bring certificates and router configurations up to date with the enrolment file.
 
         Args:
-            fleet: everybody who takes part.
-            step: of the change to another authority.
+            fleet: content of the enrolment file.
+            step: step of a change to another authority; None for none.
 
         Raises:
             InputError: a file is damaged, a name was revoked, or a step is out of order.
@@ -120,7 +123,7 @@ class Registry:
         return signer
 
     def _switch(self) -> None:
-        """Let the next authority sign; an interrupted call can be repeated."""
+        """Make the next authority the signing one; an interrupted call can be repeated."""
         following = ca.read_pair(self._authority / "next")
         leaving = ca.read_certificate(self._authority / "ca.pem")
         if following is None or leaving is None:
@@ -149,8 +152,9 @@ class Registry:
         )
 
     def _refuse_revoked(self, name: str, signer: x509.Certificate) -> None:
-        """Refuse a revoked name: the access list knows names, so a lost certificate would be
-        valid again.
+        """Raise an error for a revoked name whose old certificate is still valid. The access list
+        contains only names, so enrolling the name again would make the old, possibly stolen
+        certificate valid again.
         """
         lost = ca.read_certificate(self._revoked / f"{name}.pem")
         if (
@@ -167,8 +171,8 @@ class Registry:
         )
 
     def leaving(self, fleet: Enrolment) -> list[str]:
-        """Return names that have a certificate of this authority and are not on the list:
-        `enrol` would revoke them.
+        """Return the names that have a certificate of this authority but are not in the enrolment
+        file; `enrol` would revoke them.
         """
         found = (
             ca.read_certificate(self._authority / f"{name}.pem") for name in ("ca", "next", "old")
@@ -181,8 +185,8 @@ class Registry:
         ]
 
     def _leaves(self, path: Path, fleet: Enrolment, signers: list[x509.Certificate]) -> bool:
-        """Return True if a file is a certificate of this authority for a name that is not on the
-        list.
+        """Return True if a file is a certificate of this authority for a name that is not in the
+        enrolment file.
         """
         if path.stem in {*fleet.names, "trust"}:
             return False

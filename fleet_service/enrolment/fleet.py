@@ -1,5 +1,5 @@
-"""Enrolment file: every name that may open a session, by role; the only source of certificates
-and access list.
+"""Enrolment file: every name that may open a Zenoh session, by role. Certificates and access list
+are made from it alone.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Host = Annotated[str, AfterValidator(_checked_host)]
 
 
 class Router(Settings):
-    """One router."""
+    """One Zenoh router."""
 
     hosts: list[Host] = Field(
         default=["127.0.0.1", "localhost"],
@@ -58,25 +58,25 @@ class Router(Settings):
 
     @property
     def endpoints(self) -> list[str]:
-        """Return its endpoints for clients, in the order in which they try them."""
+        """Return the router's endpoints for clients, in the order in which clients try them."""
         return [_format_endpoint(protocol, self.hosts[0], self.port) for protocol in self.protocols]
 
     @property
     def router_endpoint(self) -> str:
-        """Return its endpoint for other routers: TLS, so that caps on QUIC apply to vehicles
-        only.
+        """Return the router's endpoint for other routers. It uses TLS, so that rate limits on QUIC
+        apply to vehicles only.
         """
         return _format_endpoint("tls", self.hosts[0], self.port)
 
     @property
     def listens(self) -> list[str]:
-        """Return its listen addresses."""
+        """Return the addresses on which the router listens."""
         return [_format_endpoint(protocol, self.listen, self.port) for protocol in self.protocols]
 
     @property
     def protocols(self) -> list[str]:
-        """Return its transports: QUIC survives a change of the car's address and has a stream
-        per priority.
+        """Return the router's transports. QUIC comes first: it survives a change of the car's
+        network address and has one stream per priority.
         """
         return ["quic", "tls"] if self.quic else ["tls"]
 
@@ -86,7 +86,9 @@ def _format_endpoint(protocol: str, host: str, port: int) -> str:
 
 
 class Enrolment(Settings):
-    """Names by role. A name has one role, because the certificate contains only the name."""
+    """Names by role. Each name has one role only, because the certificate contains only the
+    name.
+    """
 
     routers: dict[VehicleName, Router] = Field(
         min_length=1, description="routers; each connects to those before it"

@@ -1,6 +1,6 @@
-"""Door to cooperative ITS: alerts leave as ETSI DENM over AMQP 1.0, and foreign DENM come in as a
-witness.
+"""Gateway to cooperative ITS (C-ITS). Alerts are sent as ETSI DENM (hazard messages) over AMQP 1.0;
+DENM from other stations are used as reports of one additional vehicle.
 
-Messages are not signed here. Signing (ETSI TS 103 097) and its certificates belong to the gateway
-of the operator, between this and the interchange.
+Messages are not signed here. The operator's own gateway, between this program and the interchange,
+must sign them (ETSI TS 103 097).
 """

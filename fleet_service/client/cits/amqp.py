@@ -1,5 +1,5 @@
-"""AMQP 1.0 link to an interchange: messages out until each is accepted, and messages in, on a
-thread of their own.
+"""AMQP 1.0 connection to an interchange, on its own thread. It sends each message until it is
+accepted, and receives messages.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 
 class Parcel(NamedTuple):
-    """A message with a name of its sender's."""
+    """Message with the name that its sender gave it."""
 
     name: str
     body: bytes
@@ -36,7 +36,7 @@ class Parcel(NamedTuple):
 
 
 class _AmqpEvents(MessagingHandler):
-    """Events of the connection; everything here runs on the thread of the container."""
+    """Handler of connection events; all methods run on the thread of the AMQP container."""
 
     def __init__(self, link: AmqpLink) -> None:
         super().__init__(prefetch=CREDIT, auto_accept=True)
@@ -121,16 +121,16 @@ class AmqpLink:
 
     Attributes:
         is_connected: True while the interchange answers.
-        is_waking: True from the first message that is queued until the thread looks at the queue.
-        rejected: messages that it refused.
+        is_waking: True from the time when a message is queued until the thread reads the queue.
+        rejected: number of messages that the interchange refused.
 
     Args:
         url: amqp://HOST:PORT or amqps://HOST:PORT.
         target: address to send to; "" to send nothing.
         source: address to receive from; "" to receive nothing.
-        selector: of the messages to receive, e.g. "messageType = 'DENM'".
-        on_accepted: called with the name of each message that needs not be sent again.
-        on_message: called with body and properties of each message that comes in.
+        selector: filter on the messages to receive, e.g. "messageType = 'DENM'".
+        on_accepted: called with the name of each message that need not be sent again.
+        on_message: called with body and properties of each received message.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class AmqpLink:
         self._thread = threading.Thread(target=self._container.run, name="amqp", daemon=True)
 
     def open(self) -> AmqpLink:
-        """Connect, and keep connecting, on a thread."""
+        """Start the thread that connects, and reconnects after a loss."""
         self._thread.start()
         return self
 

@@ -1,5 +1,5 @@
-"""DENM of low adhesion (ETSI EN 302 637-3, cause code 6): a record, its bytes by unaligned PER,
-and back. Pure.
+"""DENM (hazard message of cooperative ITS) about low adhesion (ETSI EN 302 637-3, cause code 6): a
+record, and its encoding as bytes in unaligned PER. Pure.
 """
 
 from __future__ import annotations
@@ -64,20 +64,22 @@ class Denm:
     """One DENM.
 
     Attributes:
-        station, sequence: identity of the event: originating station and its number there.
+        station, sequence: identity of the event: originating station, and number of the event at
+            this station.
         sender: station that sends this message.
-        detected, referenced: time of detection, and of this version [ns since 1970, UTC].
-        termination: isCancellation by the originating station, isNegation by another one; None
+        detected, referenced: time of detection, and time of this version [ns since 1970, UTC].
+        termination: isCancellation by the originating station, isNegation by another station; None
             while the event lasts.
         position: latitude and longitude [deg].
-        position_std: [m] of each axis.
-        validity_s: after `detected`, for how long the event is taken for present.
-        quality: 0 (unknown) to 7.
+        position_std: standard deviation of the position on each axis [m].
+        validity_s: time after `detected` for which receivers assume that the event lasts [s].
+        quality: information quality, 0 (unknown) to 7.
         cause, sub_cause: codes; 6 is adhesion.
         history: further points of the event [deg].
-        traces: ways that lead to the event, each from the event backwards [deg].
-        heading: [deg from north, clockwise] of the traffic concerned; None for both directions.
-        both_ways: with a heading, the opposite direction is concerned too.
+        traces: paths that lead to the event, each from the event backwards [deg].
+        heading: heading of the traffic concerned [deg from north, clockwise]; None for both
+            directions.
+        both_ways: True if `heading` is given and the opposite direction is concerned too.
     """
 
     station: int
@@ -99,10 +101,10 @@ class Denm:
 
 
 def encode_denm(denm: Denm) -> bytes:
-    """Return the bytes of a DENM, written straight from the record.
+    """Return the bytes of a DENM, encoded directly from the record.
 
-    The layout is that of `denm.asn`. A general encoder takes three times as long, most of it for the
-    names of the fields.
+    The layout is that of `denm.asn`. A general encoder takes three times as long, mostly because of
+    the names of the fields.
 
     Raises:
         OverflowError: a number does not fit into the bits of its field.
@@ -121,10 +123,10 @@ def encode_denm(denm: Denm) -> bytes:
 
 
 def decode_denm(data: bytes) -> Denm:
-    """Return the DENM of bytes.
+    """Return the DENM that is encoded in `data`.
 
     Raises:
-        InputError: they are not a DENM.
+        InputError: the bytes are not a DENM.
     """
     try:
         message = compiled_denm().decode("DENM", data)
@@ -153,7 +155,7 @@ def utc_of(its_ms: int) -> int:
 
 @cache
 def compiled_denm() -> Any:  # noqa: ANN401 the library has no types
-    """Return the general encoder and decoder of `denm.asn`."""
+    """Return a general encoder and decoder for `denm.asn`."""
     try:
         import asn1tools
     except ImportError as error:
@@ -216,7 +218,9 @@ def _write_location(out: BitWriter, denm: Denm) -> None:
 
 
 def _encode_deltas(origin: Point, points: Iterable[Point]) -> list[int]:
-    """Return the bits of the points within reach: north, east and unavailable height."""
+    """Return the encoded offsets of points from `origin`, one number of bits per point: north,
+    east, and an unavailable height. Points out of reach are left out.
+    """
     found = list[int]()
     height = 12_800 - LEAST["height"]
     for point in points:
@@ -268,7 +272,7 @@ def _read_message(message: Mapping[str, Any]) -> Denm:
 
 
 def _heading(location: Mapping[str, Any]) -> float | None:
-    """Return the heading of the event [deg from north]; None where it is not known."""
+    """Return the heading of the event [deg from north]; None if it is unknown."""
     tenths = location.get("eventPositionHeading", {}).get("headingValue", UNAVAILABLE["heading"])
     return None if tenths == UNAVAILABLE["heading"] else tenths / 10.0
 
@@ -280,7 +284,9 @@ def _decode_delta(origin: Point, delta: Mapping[str, int]) -> Point:
 def approach_points(
     position: Point, heading: float, metres: tuple[float, ...] = (100.0, 300.0, 600.0)
 ) -> tuple[Point, ...]:
-    """Return points of the way to an event along its heading [deg from north], nearest first."""
+    """Return points on the approach to an event along its heading [deg from north], at the given
+    distances [m], nearest first.
+    """
     north = math.cos(math.radians(heading))
     east = math.sin(math.radians(heading))
     width = METRES_PER_DEGREE * math.cos(math.radians(position[0]))

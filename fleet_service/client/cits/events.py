@@ -1,8 +1,8 @@
-"""Events of one originating station: which stretch under alert has which number, and what must be
-sent when. Pure.
+"""Events of one originating station: the event number of each stretch with an active alert, and the
+messages that must be sent. Pure.
 
-A stretch is one event from its first to its last cell, also over restarts: the book is kept in a
-file and continued. An event is sent when it begins, when it changes, before its validity ends, and
+A stretch is one event from its first to its last cell, even over restarts, because the events are
+saved to a file. An event is sent when it begins, when it changes, before its validity ends, and
 once more when it is over.
 """
 
@@ -29,16 +29,16 @@ TERMINATED_NS: Final = VALID_NS  # for which the number of an ended event is not
 
 @dataclass(frozen=True)
 class OpenEvent:
-    """An event that was sent.
+    """Event that has been sent.
 
     Attributes:
-        name: of the stretch.
+        name: id of the stretch.
         sequence: number of the event.
-        detected, sent: first detection, and time of the last message [ns UTC].
-        state: content of the last message, compared to detect changes.
-        position: latitude and longitude [deg] of the event; stays, so that an update refers to the
-            same place.
-        ended: [ns UTC], 0 while it lasts.
+        detected, sent: time of the first detection, and of the last message [ns UTC].
+        state: content of the last message, which is compared to detect changes.
+        position: latitude and longitude [deg] of the event; never changed, so that all messages
+            refer to the same place.
+        ended: end of the event [ns UTC], 0 while it lasts.
     """
 
     name: str
@@ -55,10 +55,10 @@ class EventBook:
 
     Args:
         station: identifier of the originating station.
-        content: what `content` returned before; None for a new book.
+        content: saved value of the property `content`; None for a new book.
 
     Raises:
-        InputError: the content is of another station or not valid.
+        InputError: the content belongs to another station or is not valid.
     """
 
     def __init__(self, station: int, content: dict[str, Any] | None = None) -> None:
@@ -75,12 +75,12 @@ class EventBook:
 
     @property
     def open_events(self) -> list[OpenEvent]:
-        """Return the events that last."""
+        """Return the events that have not ended."""
         return [event for event in self._events.values() if not event.ended]
 
     @property
     def content(self) -> dict[str, Any]:
-        """Return the book as values that JSON can hold, to be saved to a file."""
+        """Return all events in a form that JSON supports, to be saved to a file."""
         return {
             "station": self.station,
             "next": self._next,
@@ -90,12 +90,14 @@ class EventBook:
     def update(
         self, standing: Sequence[StretchAlert], now: int, is_heard: Callable[[float, float], bool]
     ) -> list[Denm]:
-        """Return the messages that are due; events of places without a service do not end.
+        """Return the messages that are due now. Events at places for which no service answers are
+        not ended.
 
         Args:
-            standing: every stretch under alert.
-            now: [ns UTC].
-            is_heard: returns True if a service answers for a place (latitude, longitude).
+            standing: every stretch with an active alert.
+            now: current time [ns UTC].
+            is_heard: function that returns True if a service answers for a place (latitude,
+                longitude).
         """
         out: list[Denm] = []
         for name in [
@@ -148,8 +150,8 @@ class EventBook:
         )
 
     def _common_fields(self, event: OpenEvent, now: int, termination: Termination | None) -> Denm:
-        """Return the fields common to all messages of an event; the detection time of an update or
-        end is now.
+        """Return a message with the fields that all messages of an event have; its detection time
+        is `now` [ns UTC].
         """
         return Denm(
             self.station,
@@ -194,7 +196,9 @@ class EventBook:
 
 
 def _reported_state(alert: StretchAlert) -> tuple[float, ...]:
-    """Return the properties whose change is sent to receivers: extent, sub-cause, and witnesses."""
+    """Return the properties whose change is reported to receivers: size, whether it is ice, and
+    number of vehicles.
+    """
     return (
         float(alert.cells),
         round(alert.length_m),

@@ -1,8 +1,8 @@
-"""Foreign DENM as reports of one witness, so that the fusion weighs and trusts them like a vehicle
-of that name. Pure.
+"""DENM of other stations, converted to reports of one vehicle name. The fusion weighs and trusts
+this name like a vehicle. Pure.
 
-All reports of one interchange have one name. An alert needs two sources, so they raise nothing
-alone.
+All DENM of one interchange have the same name. An alert needs two independent sources, so they
+cannot raise an alert alone.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ POSITION_STD: Final = 10.0  # [m] where a message does not say
 def encode_reports(
     denm: Denm, name: str, boot: int, first_seq: int, now: int
 ) -> list[tuple[str, bytes]]:
-    """Return keys and JSON of the batches of an event; none if it says nothing about grip here and
-    now.
+    """Return keys and JSON payloads of the batches for a DENM; empty if the DENM says nothing about
+    friction at present.
 
     Args:
-        denm: received.
-        name: of the witness.
+        denm: received message.
+        name: vehicle name for the reports.
         boot: random number of this start.
-        first_seq: next number of the batches.
-        now: [ns UTC].
+        first_seq: sequence number of the first batch.
+        now: current time [ns UTC].
     """
     if not _is_grip_report(denm, now):
         return []
@@ -80,8 +80,9 @@ def encode_reports(
 def _headings(denm: Denm) -> tuple[float, ...]:
     """Return the headings [deg from north] of the traffic concerned.
 
-    Without a heading both directions of the road are concerned. The first other point of a trace or
-    of the history gives the road's axis; where there is none, all four sectors are meant.
+    If the DENM states no heading, both directions of the road are concerned. Then the nearest other
+    point of a trace or of the history gives the road's axis. If there is no such point, return all
+    four quarters.
     """
     if denm.heading is not None:
         return (denm.heading, denm.heading + 180.0) if denm.both_ways else (denm.heading,)

@@ -1,4 +1,4 @@
-"""Running gateway: the map's alerts on one side, the interchange on the other."""
+"""Running gateway between the map's alerts and an interchange of cooperative ITS."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ log = logging.getLogger(__name__)
 
 
 class Sending(NamedTuple):
-    """Needs of our DENM: address, station, publisher and state file."""
+    """Settings for sending DENM: address at the interchange, station identifier, publisher, and
+    state file.
+    """
 
     target: str
     station: int
@@ -37,7 +39,9 @@ class Sending(NamedTuple):
 
 
 class Receiving(NamedTuple):
-    """Needs of foreign DENM: address, selector, and the name of the witness."""
+    """Settings for receiving DENM: address at the interchange, selector, and vehicle name for the
+    reports.
+    """
 
     source: str
     selector: str
@@ -45,11 +49,12 @@ class Receiving(NamedTuple):
 
 
 class Witness:
-    """Puts foreign DENM on the bus as reports of one name.
+    """Publisher that converts received DENM to reports of one vehicle name and publishes them on
+    Zenoh.
 
     Attributes:
-        refused: messages that are no DENM.
-        silent: DENM that say nothing about grip here and now.
+        refused: number of messages that are not a DENM.
+        silent: number of DENM that say nothing about friction at present.
     """
 
     def __init__(
@@ -67,7 +72,7 @@ class Witness:
         self._session.close()
 
     def publish_report(self, body: bytes, _: Mapping[str, Any]) -> None:
-        """Publish the report of grip in a message."""
+        """Publish the report about friction that a received message contains."""
         try:
             batches = encode_reports(
                 decode_denm(body), self._name, self._boot, self._seq, self._clock()
@@ -89,7 +94,7 @@ def run_gateway(
     receiving: Receiving | None,
     stop: threading.Event,
 ) -> None:
-    """Send and receive until `stop` is set.
+    """Send and receive DENM until `stop` is set.
 
     Raises:
         InputError: no service answers, the state file has other content, or a package is missing.

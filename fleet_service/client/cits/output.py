@@ -1,5 +1,5 @@
-"""Alerts as DENM at an interchange: what must be sent is on disk before it is sent, until it is
-accepted.
+"""Output of alerts as DENM to an interchange. Each message is saved to a file before it is sent,
+and stays in it until it is accepted.
 """
 
 from __future__ import annotations
@@ -24,14 +24,16 @@ CHECK_S: Final = 10.0  # between two looks for events whose validity must be ren
 
 
 class DenmOutput:
-    """Keeps an interchange current with the standing stretches.
+    """Output that keeps an interchange up to date with the active alerts.
 
     Args:
         station: identifier of the originating station.
-        originator: for the properties.
-        path: file of events and of messages that are not yet accepted; it is continued.
-        send: takes a message; `mark_accepted` is called with its name once it is accepted.
-        clock: [ns UTC].
+        originator: publisher, for the properties of the messages.
+        path: file of the events and of the messages that are not accepted yet; its content is
+            continued.
+        send: function that sends a message; `mark_accepted` must be called with the message's name
+            once it is accepted.
+        clock: function that returns the time [ns UTC].
 
     Raises:
         InputError: the file has other content.
@@ -62,7 +64,9 @@ class DenmOutput:
 
     @property
     def is_due(self) -> bool:
-        """Return True if the validity of events must be looked at."""
+        """Return True if it is time to check whether events must be sent again before their
+        validity ends.
+        """
         return time.monotonic() >= self._checked + CHECK_S
 
     @property
@@ -72,11 +76,11 @@ class DenmOutput:
 
     @property
     def open_event_count(self) -> int:
-        """Number of events that last."""
+        """Number of events that have not ended."""
         return len(self._book.open_events)
 
     def mark_accepted(self, name: str) -> None:
-        """Record that a message was accepted."""
+        """Record that the interchange accepted the message with this name."""
         with self._lock:
             self._pending.pop(name, None)
 
@@ -86,8 +90,9 @@ class DenmOutput:
         """Send the messages that are due.
 
         Args:
-            standing: every stretch under alert.
-            is_heard: returns True if a service answers for a place (latitude, longitude).
+            standing: every stretch with an active alert.
+            is_heard: function that returns True if a service answers for a place (latitude,
+                longitude).
 
         Raises:
             InputError: the file cannot be written; nothing was sent.

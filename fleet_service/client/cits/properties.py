@@ -20,8 +20,9 @@ class Originator:
 
     Attributes:
         country: two letters, ISO 3166.
-        publisher: its identifier, by convention the country and five digits, e.g. SE00001.
-        publication: name of this publication there.
+        publisher: identifier of the publisher, by convention the country and five digits, e.g.
+            SE00001.
+        publication: name of this publication of the publisher.
 
     Raises:
         InputError: country or publisher is not valid.
@@ -32,7 +33,7 @@ class Originator:
     publication: str = "gripmap"
 
     def __post_init__(self) -> None:
-        """Check country and publisher."""
+        """Check country and publisher; raise InputError if one is not valid."""
         if not re.fullmatch("[A-Z]{2}", self.country):
             raise InputError(
                 "country",
@@ -46,11 +47,11 @@ class Originator:
 
 
 def message_properties(denm: Denm, originator: Originator) -> dict[str, Any]:
-    """Return the properties by which subscribers select.
+    """Return the properties by which subscribers select messages.
 
-    The quadtree has the keys of all points of the event, each between commas, so that `quadTree
-    LIKE '%,120002%'` selects all events within a square. Its digits are those of this project's
-    cells and regions.
+    The property `quadTree` contains the quadkeys of all points of the event, each between commas.
+    So `quadTree LIKE '%,120002%'` selects all events within a square. The digits are the same as in
+    this project's cells and regions.
     """
     return {
         "messageType": "DENM",
@@ -72,7 +73,9 @@ def message_properties(denm: Denm, originator: Originator) -> dict[str, Any]:
 
 
 def quadtree_keys(denm: Denm) -> str:
-    """Return the keys of all squares of an event."""
+    """Return the quadkeys of all squares that an event touches, separated and enclosed by
+    commas.
+    """
     latitude, longitude = zip(denm.position, *denm.history, strict=True)
     squares = set(grid.cell_of(latitude, longitude, zoom=QUAD_ZOOM).tolist())
     return f",{','.join(sorted(grid.quadkey(square, QUAD_ZOOM) for square in squares))},"

@@ -1,22 +1,22 @@
-"""Bits of unaligned PER: numbers in as many bits as their range needs, most significant first.
-Pure.
+"""Bit writer for unaligned PER (an ASN.1 encoding): each number takes only as many bits as its
+range needs, most significant bit first. Pure.
 """
 
 from __future__ import annotations
 
 
 class BitWriter:
-    """A run of bits that grows."""
+    """Growing sequence of bits."""
 
     def __init__(self) -> None:
         self._bits = 0
         self._count = 0
 
     def write(self, value: int, width: int) -> None:
-        """Append a number.
+        """Append a number as `width` bits.
 
         Raises:
-            OverflowError: it does not fit into the bits.
+            OverflowError: the number does not fit into the bits.
         """
         if value < 0 or value >> width:
             raise OverflowError(f"{value} does not fit into {width} bits")
@@ -24,6 +24,6 @@ class BitWriter:
         self._count += width
 
     def to_bytes(self) -> bytes:
-        """Return the bits, filled with zeros up to a whole byte."""
+        """Return the bits as bytes; the last byte is filled with zeros."""
         spare = -self._count % 8
         return (self._bits << spare).to_bytes((self._count + spare) // 8, "big")
