@@ -1,3 +1,3 @@
-"""Questions to the archive, written once as Ibis expressions: DuckDB runs them on one machine,
-Spark on a cluster.
+"""Predefined questions about an archive, written as Ibis expressions: DuckDB evaluates them on one
+machine, Spark on a cluster.
 """

@@ -1,5 +1,5 @@
-"""Query engines: DuckDB in this process, or Spark. Both see the archive's files as the same Ibis
-tables.
+"""Query engines: DuckDB in this process, or Spark. Both present the archive's files as the same
+Ibis tables.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ NAMES: Final = {"observations": layout.TABLES[Kind.OBSERVATION], "map": snapshot
 
 @dataclass
 class QueryEngine:
-    """Connection to an engine, with the files of one part of an archive.
+    """Connection to an engine, with the files of the selected part of an archive.
 
     Args:
         name: one of ENGINES.
-        root: of the archive; only compacted files are read.
+        root: folder of the archive; only compacted files are read.
         part: selected times and box.
         progress: True to let the engine draw its own progress bar.
 
@@ -68,8 +68,8 @@ class QueryEngine:
             self.connection.raw_sql(f"SET enable_progress_bar = {str(self.progress).lower()}")
 
     def files(self, table: str) -> list[Path]:
-        """Return the files of a table that may hold rows of the part; a snapshot counts until
-        the day after its own.
+        """Return the files of a table that may contain rows of the selected part. A map snapshot is
+        included up to the day after its own.
         """
         before = 1 if table == "map" else 0
         first = self.part.since // layout.DAY_NS - before
@@ -82,10 +82,11 @@ class QueryEngine:
         ]
 
     def observations(self) -> Table:
-        """Return rows of observations of the part; `time` is in seconds since 1970, `day` a date.
+        """Return a table of the selected observations; `time` is in seconds since 1970, `day` is a
+        date.
 
         Raises:
-            InputError: there are none.
+            InputError: there are no observations.
         """
         paths = self.files("observations")
         if not paths:
@@ -104,10 +105,11 @@ class QueryEngine:
         return t
 
     def maps(self) -> Table:
-        """Return rows of the snapshots of the map; `snapshot` is their time in seconds since 1970.
+        """Return a table of the map's snapshots; `snapshot` is the time of the snapshot in seconds
+        since 1970.
 
         Raises:
-            InputError: there are none.
+            InputError: there are no snapshots.
         """
         paths = self.files("map")
         if not paths:
@@ -119,19 +121,19 @@ class QueryEngine:
         return self._read("map", paths, "snapshot_time", "snapshot", _MAP_COLUMNS)
 
     def rows(self) -> int:
-        """Return the number of rows of observations in the files, from their footers."""
+        """Return the number of observations in the selected files, read from their footers."""
         return sum(int(pq.read_metadata(path).num_rows) for path in self.files("observations"))
 
     def answer(self, expression: Table) -> pa.Table:
-        """Run an expression and return its result."""
+        """Evaluate an Ibis expression and return its result as an Arrow table."""
         found: pa.Table = expression.to_pyarrow()
         return found
 
     def _read(
         self, name: str, paths: Sequence[Path], moment: str, seconds: str, columns: str = "*"
     ) -> Table:
-        """Return a table of files, with whole seconds since 1970 for one column; the engines
-        count them differently.
+        """Return a table of the given files, with an additional column `seconds`: the time column
+        `moment` in whole seconds since 1970. The engines convert times differently.
         """
         texts = [str(path) for path in paths]
         if self._spark is None:
@@ -154,8 +156,8 @@ class QueryEngine:
 
 
 def has_value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
-    """Return True for rows that give a value of mu and not only a bound: their vehicles used
-    EXCITED_SHARE of it (see the contract).
+    """Return a condition that is true for rows with a value of mu and not only a lower bound: the
+    vehicle used at least the share EXCITED_SHARE of mu (see the contract).
 
     NaN is larger than any number in both engines, so it is checked explicitly.
     """

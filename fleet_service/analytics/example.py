@@ -1,8 +1,7 @@
-"""Example to start from: a week of an archive in five figures.
+"""Example to start from: five figures about an archive.
 
-python -m fleet_service.analytics.example --archive DIR --out FOLDER python -m
-fleet_service.analytics.example --out
-FOLDER            # of a synthetic archive
+python -m fleet_service.analytics.example --archive DIR --out FOLDER
+python -m fleet_service.analytics.example --out FOLDER            # with a synthetic archive
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ WORLD = synthetic.SyntheticFleet(rows=60_000, days=3, vehicles=60, roads=16, len
 
 
 def whole_archive(root: Path) -> Extract:
-    """Return the selection of all days of an archive."""
+    """Return a selection that contains all days of an archive."""
     days = [
         layout.day_of(folder)
         for folder in layout.day_folders(root, layout.TABLES[Kind.OBSERVATION])
@@ -36,7 +35,9 @@ def whole_archive(root: Path) -> Extract:
 
 
 def draw_figures(root: Path, folder: Path) -> dict[str, pa.Table]:
-    """Ask, draw, and return the answers."""
+    """Answer five questions, draw a figure of each answer into `folder`, and return the answers by
+    name.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     engine = QueryEngine("duckdb", root, whole_archive(root))
     middle = (engine.part.since + engine.part.until) // 2
@@ -58,7 +59,7 @@ def draw_figures(root: Path, folder: Path) -> dict[str, pa.Table]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the example."""
+    """Run the example; return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m fleet_service.analytics.example")
     parser.add_argument("--archive", type=Path, help="compacted archive (default: a synthetic one)")
     parser.add_argument("--out", type=Path, required=True, help="output folder for the figures")

@@ -1,4 +1,4 @@
-"""Questions to an archive from a program: an answer is an Arrow table."""
+"""Questions about an archive from a Python program; answers are Arrow tables."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def ask_archive(
     options: Options | None = None,
     engine: str = "duckdb",
 ) -> pa.Table:
-    """Ask one of the questions of the compacted files (`fleet-service compact`); times are ISO
-    8601, UTC.
+    """Return the answer to one of the predefined questions about the compacted files
+    (`fleet-service compact`). Times are ISO 8601, UTC.
 
     Raises:
-        InputError: there is no such question or archive, no data in that part, or an option is
-            missing.
+        InputError: there is no such question or archive, no data in the selected part, or an option
+            is missing.
     """
     root = Path(archive)
     require_archive(root)
@@ -51,14 +51,16 @@ def ask_archive(
 def map_of_archive(
     archive: Path | str, *, at: str | None = None, bbox: Box | None = None
 ) -> pa.Table:
-    """Return the map as of a time, or of now, replayed from the archive, as a GeoParquet table."""
+    """Return the map at the time `at` (default: now), replayed from the archive, as a GeoParquet
+    table.
+    """
     root = Path(archive)
     require_archive(root)
     return map_at(root, _make_extract(None, at, bbox))
 
 
 def write_answer(table: pa.Table, question: str, path: Path | str) -> None:
-    """Write an answer in the format of the ending: .parquet, .geo.parquet, .geojson, .csv, .png,
-    .svg, .pdf, .html.
+    """Write an answer to a file; the ending selects the format: .parquet, .geo.parquet, .geojson,
+    .csv, .png, .svg, .pdf, .html.
     """
     output.write(table, question_of(question), Path(path))

@@ -1,4 +1,4 @@
-"""Options of questions, apart from the selection of the archive's part."""
+"""Options of the questions, in addition to the selected part of the archive."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ class Options:
     """Options of all questions; each question uses some of them.
 
     Attributes:
-        at: moment of a treatment, or of a replay [ns].
-        stations: table of station readings, CSV or Parquet.
-        least_vehicles: minimum number of vehicles of a slippery stretch or spell.
-        step_s: time between the frames of an animated replay; None for one map.
-        lateness_s: of the service whose map is replayed.
-        roads: table of `fleet-service roads`.
-        level: agreed grip.
-        within_s: time within which it must be restored.
-        report: called with lines of progress.
+        at: time of a road treatment, or of a replayed map [ns].
+        stations: table of weather station readings, CSV or Parquet.
+        least_vehicles: minimum number of vehicles that report a slippery stretch or spell.
+        step_s: time between the frames of an animated replay [s]; None for one map.
+        lateness_s: allowed lateness of the service whose map is replayed [s].
+        roads: table made by `fleet-service roads`.
+        level: minimum friction that a maintenance contract requires.
+        within_s: time within which this friction must be restored [s].
+        report: called with lines about the progress.
     """
 
     at: int | None = None

@@ -1,5 +1,5 @@
-"""Output of answers: terminal table, Parquet, GeoParquet, GeoJSON, CSV, plot, or a map that
-needs no network.
+"""Output of answers: table for the terminal, Parquet, GeoParquet, GeoJSON, CSV, plot, or an HTML
+map that needs no network.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ TIMES: Final = ("onset", "last", "end", "time", "begin")  # seconds since 1970
 
 
 def format_text(table: pa.Table, question: Question) -> str:
-    """Return the first rows in the question's order, for the terminal."""
+    """Return the first rows of an answer, in the question's order, as a text table for the
+    terminal.
+    """
     shown = add_places(order_rows(table, question).slice(0, SHOWN_ROWS))
     names = [
         name for name in shown.schema.names if not pa.types.is_nested(shown.schema.field(name).type)
@@ -65,7 +67,9 @@ def format_text(table: pa.Table, question: Question) -> str:
 
 
 def format_json_lines(table: pa.Table, question: Question) -> str:
-    """Return all rows in the question's order as JSON lines; times are ISO 8601, UTC."""
+    """Return all rows of an answer, in the question's order, as lines of JSON; times are ISO 8601,
+    UTC.
+    """
     return "\n".join(
         json.dumps({name: _json_value(name, v) for name, v in row.items()}, allow_nan=False)
         for row in add_places(order_rows(table, question)).to_pylist()
@@ -81,7 +85,9 @@ def _json_value(name: str, value: object) -> object:
 
 
 def order_rows(table: pa.Table, question: Question) -> pa.Table:
-    """Return the rows in the question's order; ties are ordered by the other columns."""
+    """Return the rows in the question's order; rows with equal values are ordered by the other
+    columns.
+    """
     name = question.order.removeprefix("-")
     others = [f.name for f in table.schema if f.name != name and not pa.types.is_nested(f.type)]
     keys: list[Any] = [(name, "descending" if question.order.startswith("-") else "ascending")]
@@ -107,10 +113,11 @@ def _cell_text(name: str, value: object) -> str:
 
 
 def write(table: pa.Table, question: Question, path: Path) -> None:
-    """Write an answer in the format of the name's ending.
+    """Write an answer to a file; the ending of its name selects the format.
 
     Raises:
-        InputError: the ending is unknown, the answer has no coordinates, or the file cannot be written.
+        InputError: the ending is unknown, the answer has no coordinates, or the file cannot be
+            written.
     """
     table = order_rows(table, question)
     with commandline.report_write_errors(path):
@@ -131,8 +138,8 @@ def write(table: pa.Table, question: Question, path: Path) -> None:
 
 
 def times_as_timestamps(table: pa.Table) -> pa.Table:
-    """Return an answer whose seconds since 1970 are timestamps, which text files write as ISO
-    8601.
+    """Return the answer with times (seconds since 1970) converted to timestamps, which text files
+    contain as ISO 8601.
     """
     for place, field in enumerate(table.schema):
         if field.name in TIMES and pa.types.is_integer(field.type):
@@ -143,8 +150,8 @@ def times_as_timestamps(table: pa.Table) -> pa.Table:
 
 
 def add_places(table: pa.Table) -> pa.Table:
-    """Return an answer with the coordinates of its cells, if it has cells and no coordinates
-    yet.
+    """Return the answer with latitude and longitude of its cells, if it has cells and no
+    coordinates yet.
     """
     names = table.schema.names
     if "cell" not in names or "latitude" in names or "west" in names:
@@ -157,7 +164,9 @@ def add_places(table: pa.Table) -> pa.Table:
 
 
 def add_geometry(table: pa.Table, question: Question) -> pa.Table:
-    """Return an answer with the polygons of its cells, or of its boxes."""
+    """Return the answer with the polygons of its cells; for rows of several cells, with
+    multi-polygons.
+    """
     if "cell" not in table.schema.names:
         raise InputError(
             "out",
@@ -172,7 +181,7 @@ def add_geometry(table: pa.Table, question: Question) -> pa.Table:
 
 
 def _row_cells(table: pa.Table) -> list[list[int]]:
-    """Return the cells of each row."""
+    """Return the list of cells of each row."""
     found: list[Any] = table[PARTS].to_pylist()
     return found
 
@@ -193,8 +202,8 @@ def plot(table: pa.Table, question: Question, path: Path) -> None:
 
 
 def make_page(table: pa.Table, question: Question) -> str:
-    """Return an HTML page with the answer's coloured cells, with frames if it has any; it needs
-    no network.
+    """Return an HTML page with a map of the answer's coloured cells, animated if the answer has
+    frames. The page needs no network.
     """
     if question.colour is None or "cell" not in table.schema.names:
         raise InputError(

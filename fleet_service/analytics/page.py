@@ -1,7 +1,7 @@
-"""Map of cells as one HTML file that needs no network: panels, frames that play, a scale with
-ticks.
+"""Map of cells as one HTML file that needs no network, with panels, an animation of frames, and a
+colour scale.
 
-It works with mouse, touch and keyboard. Unmeasured cells are hatched and have no colour.
+It can be used with mouse, touch and keyboard. Unmeasured cells are hatched and have no colour.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ class Scale:
     """Meaning of the colours.
 
     Attributes:
-        label: of the scale, with its unit.
-        low, high: values at its ends.
+        label: label of the scale, with its unit.
+        low, high: values at the two ends of the scale.
         ticks: values and their labels.
-        dark_is_high: True if large values are dark; else small ones.
-        unknown: text of a hatched place.
+        dark_is_high: True if large values are dark, False if small values are dark.
+        unknown: text for a hatched (unmeasured) place.
     """
 
     label: str
@@ -47,16 +47,16 @@ GRIP_SCALE: Final = Scale(
 
 @dataclass(frozen=True)
 class DrawnCells:
-    """Drawn content: rows, each with one or more squares of the map.
+    """Content to draw: rows, each with one or more squares of the map.
 
     Attributes:
         boxes: west, south, east, north [deg] of each square.
-        part: row of each square; None if row k has square k.
+        part: row number of each square; None if row k has the single square k.
         sector: heading sector of each row, 0 east to 3 south.
-        panels: name and value per row of each panel; None is 'not measured'.
-        names, rows: texts shown for a row.
-        frames, frame: names of the frames, and the number of each row's.
-        lasting: rows whose value still grows.
+        panels: for each panel, its name and one value per row; None means 'not measured'.
+        names, rows: names of the texts shown for a row, and the texts.
+        frames, frame: names of the frames, and the frame number of each row.
+        lasting: for each row, True if its value is still growing.
     """
 
     boxes: Sequence[Sequence[float]]
@@ -78,8 +78,8 @@ def render(
     about: str = "",
     table: Sequence[Sequence[str]] | None = None,
 ) -> str:
-    """Return the HTML page. `table` has the rows of a table below the map; its first row is the
-    header.
+    """Return the HTML page as text. `table` contains the rows of a table below the map; the first
+    row is the header.
     """
     data: dict[str, Any] = {
         "title": title,

@@ -1,4 +1,4 @@
-"""Map of an archive as of a moment, or of now, with the polygons of its cells."""
+"""Map of an archive at a past moment, or now, with the polygons of its cells."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ LATENESS_S = 120.0  # ServiceConfig.lateness_s
 
 
 def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
-    """Return the beliefs at a moment [ns] about visited cells that touch a box [deg]."""
+    """Return a table of the visited cells that touch a box [deg], with their beliefs at the time
+    `at` [ns].
+    """
     slots = np.flatnonzero(
         fusion.live.vehicles[: fusion.size] > 0
     )  # a poor fix makes neighbours that nobody visited
@@ -28,8 +30,8 @@ def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
 
 
 def map_at(root: Path, part: Extract, lateness_s: float = LATENESS_S) -> pa.Table:
-    """Return the map at the end of a part, replayed from everything received by then, as a
-    GeoParquet table.
+    """Return the map at the end of the selected part, replayed from everything received until then,
+    as a GeoParquet table.
     """
     return snapshot_table(
         visited_cells(past_fusion(root, lateness_s, part.until, part.bbox), part.until, part.bbox),
@@ -38,7 +40,9 @@ def map_at(root: Path, part: Extract, lateness_s: float = LATENESS_S) -> pa.Tabl
 
 
 def snapshot_table(table: pa.Table, at: int) -> pa.Table:
-    """Return cells as believed at a moment [ns], as the GeoParquet table of a snapshot."""
+    """Return cells with their beliefs at the time `at` [ns] in the GeoParquet form of a map
+    snapshot.
+    """
     time = pa.array(np.full(table.num_rows, at // tables.US_STEP)).cast(tables.US)
     table = table.append_column("snapshot_time", time).sort_by(
         [("cell", "ascending"), ("sector", "ascending")]

@@ -1,4 +1,6 @@
-"""Plots of the answers, one kind per question: PNG for a page, SVG and PDF for print."""
+"""Plots of the answers, one kind of plot per question: PNG for the screen, SVG and PDF for
+print.
+"""
 
 from __future__ import annotations
 
@@ -45,8 +47,9 @@ def draw(table: pa.Table, name: str, about: str, path: Path) -> None:
 
 
 def cell_shapes(cell: IntArray, sector: IntArray | None = None) -> FloatArray:
-    """Return squares of cells, (n, 4, 2), or the quarters of their heading sectors, (n, 3, 2) [m
-    from the south-west]."""
+    """Return the corners of cells as squares, (n, 4, 2) [m], or with sectors as triangles (quarters
+    of the cells), (n, 3, 2). The origin is the south-west corner of all cells.
+    """
     west, south, *_ = grid.bounds(cell)
     scale = METRES_PER_DEGREE * np.cos(np.radians(south.mean())) if len(cell) else 1.0
     x, y = grid.outline(cell, sector)
@@ -59,7 +62,9 @@ def cell_shapes(cell: IntArray, sector: IntArray | None = None) -> FloatArray:
 def paint(
     axes: Axes, shapes: FloatArray, values: FloatArray, limits: tuple[float, float] = GRIP_RANGE
 ) -> PolyCollection:
-    """Draw shapes in the colours of grip; those without a value are hatched and have no colour."""
+    """Draw shapes in the colours of friction; shapes without a value are hatched and have no
+    colour.
+    """
     known = np.isfinite(values)
     if not known.all():
         axes.add_collection(
@@ -138,7 +143,7 @@ def _draw_worst(figure: Figure, table: pa.Table) -> None:
 
 
 def _make_panels(figure: Figure, count: int) -> list[Axes]:
-    """Return `count` axes, three per row."""
+    """Return `count` axes of a figure, three per row."""
     columns = min(count, 3) or 1
     rows = -(-count // 3) or 1
     if count > 1:
@@ -294,7 +299,7 @@ def _draw_replay(figure: Figure, table: pa.Table) -> None:
 
 
 def _first_two(figure: Figure, table: pa.Table) -> None:
-    """Plot the first two numeric columns of a plug-in's question against each other."""
+    """Plot the first two numeric columns against each other; used for questions of plug-ins."""
     numbers = [
         f.name for f in table.schema if pa.types.is_floating(f.type) or pa.types.is_integer(f.type)
     ][:2]

@@ -1,14 +1,14 @@
-"""Rebuilding of the map and the roll-ups of an archive from raw observations, zone by zone: here,
-or on Spark.
+"""Rebuilding of the map and the hourly statistics (roll-up) of an archive from raw observations,
+zone by zone, on this machine or on Spark.
 
-    OUT/map/date=2026-01-31/zone=q1202310/20260131T070000Z.parquet   the map of a moment, all
+    OUT/map/date=2026-01-31/zone=q1202310/20260131T070000Z.parquet   the map of one moment, all
                                                                      visited cells
     OUT/rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet  a part per compacted file, all
-    days
+                                                                     days
 
-Cells do not depend on each other once the weights are known. A zone therefore needs its own rows
-and those of a margin around it, and gives the same result as a replay of everything. Both engines
-run the same function for each zone and write the same bytes.
+Once the vehicles' weights are known, cells do not depend on each other. A zone therefore needs its
+own rows and those of a margin around it, and gives the same result as a replay of the whole
+archive. Both engines run the same function for each zone and write the same bytes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ ENGINES: Final = ("local", "spark")
 
 
 class Rebuild(NamedTuple):
-    """Task: archive, output folder, moment of the map [ns], the service's lateness."""
+    """Task of a rebuild: archive, output folder, time of the map [ns], and allowed lateness of the
+    service [s].
+    """
 
     root: Path
     out: Path
@@ -45,7 +47,7 @@ class Rebuild(NamedTuple):
 
 
 class RebuildResult(NamedTuple):
-    """Result of a zone: cells of the map, parts of the roll-up."""
+    """Result for one zone: number of cells of the map, and number of roll-up files."""
 
     zone: int
     cells: int
@@ -53,10 +55,11 @@ class RebuildResult(NamedTuple):
 
 
 def require_empty(out: Path) -> None:
-    """Raise unless a folder is empty or new, because parts of another archive would add up.
+    """Raise unless a folder is empty or new. Otherwise statistics of another archive in it would be
+    added to the new ones.
 
     Raises:
-        InputError: it has content, or cannot be created.
+        InputError: the folder has content, or cannot be created.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -72,12 +75,12 @@ def require_empty(out: Path) -> None:
 
 
 def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
-    """Rebuild all zones; yield the result of each, in order.
+    """Rebuild all zones; yield the result of each zone, in order.
 
     Raises:
-        InputError: there are no compacted observations, a file is of a newer version, the engine is
-            unknown or not installed.
-        OSError: something cannot be read or written.
+        InputError: there are no compacted observations, a file has a newer version, or the engine
+            is unknown or not installed.
+        OSError: a file cannot be read or written.
     """
     if engine not in ENGINES:
         raise InputError("engine", f"{engine!r} is unknown", f"use one of {', '.join(ENGINES)}")
@@ -92,18 +95,19 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
 
 
 def zones_of(root: Path) -> list[int]:
-    """Return the zones that an archive has compacted observations of."""
+    """Return the zones for which an archive has compacted observations."""
     return sorted(
         {layout.partition_of(path).zone for path in layout.compacted_files(root, Kind.OBSERVATION)}
     )
 
 
 def rebuild_zone(wanted: Rebuild, zone: int) -> RebuildResult:
-    """Rebuild one zone; repeated or concurrent calls leave its files once.
+    """Rebuild one zone. Repeated or concurrent calls write the same files, so the result is the
+    same as after one call.
 
     Raises:
-        InputError: a file is of a newer version.
-        OSError: something cannot be read or written.
+        InputError: a file has a newer version.
+        OSError: a file cannot be read or written.
     """
     west, south, east, north = (float(side) for side in grid.bounds(zone, grid.ZONE_ZOOM))
     box = (west, south, east, north)
@@ -135,7 +139,7 @@ def _compute_part(path: Path) -> pa.Table | None:
 def _write_atomically(
     out: Path, drafts: Path, path: Path, table: pa.Table, encoding: Encoding
 ) -> None:
-    """Write a file atomically, also if another process writes the same one."""
+    """Write a file atomically, even if another process writes the same file at the same time."""
     write_table(table, drafts / path.name, encoding, named=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     (drafts / path.name).rename(path)

@@ -1,7 +1,8 @@
-"""Synthetic archive for example, tests and benchmarks: roads, trips, ice at night, biased vehicles.
+"""Synthetic archive for examples, tests and benchmarks: roads, trips, ice at night, biased
+vehicles.
 
-Its rows have the shape of the real estimator's: two visits in three only bound mu, a third gives a
-value.
+Its rows resemble those of the real estimator: two of three visits give only a lower bound of mu,
+the third gives a value.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ _STD: Final = 0.05
 
 @dataclass(frozen=True)
 class SyntheticFleet:
-    """Size: rows, days, vehicles, roads and cells per road; one road in `icy` freezes at night."""
+    """Size of the synthetic archive: number of rows, days, vehicles, roads, and cells per road
+    (`length`). One of `icy` roads freezes at night.
+    """
 
     rows: int
     days: int = 7
@@ -45,7 +48,7 @@ class SyntheticFleet:
 
 
 def write_archive(root: Path, world: SyntheticFleet, segment_rows: int = 20_000) -> None:
-    """Write the inbox of an archive, segment by segment, in order of time.
+    """Write the inbox of an archive in order of time, one segment after another.
 
     Raises:
         OSError: the disk is full.
@@ -58,7 +61,7 @@ def write_archive(root: Path, world: SyntheticFleet, segment_rows: int = 20_000)
 
 
 def make_chunks(world: SyntheticFleet, hours: int = 6) -> Iterator[Rows]:
-    """Yield rows of a few hours each, in order of time."""
+    """Yield rows in order of time, in chunks of `hours` hours each."""
     rng = np.random.default_rng(world.seed)
     bias = rng.normal(0.0, 0.04, world.vehicles)
     spans = world.days * 24 // hours
@@ -158,8 +161,8 @@ def _make_chunk(
 def _draw_positions(
     road: IntArray, along: IntArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return position with the receiver's noise, and yaw; a road is straight, one in two runs
-    north.
+    """Return latitude and longitude [deg] with the noise of the receiver, and yaw [rad]. Roads are
+    straight, and every second one runs north.
     """
     step = 360.0 / (1 << grid.CELL_ZOOM)
     north = road % 2 == 1
@@ -183,7 +186,9 @@ def night_factor(seconds: FloatArray) -> FloatArray:
 def truth_of(
     world: SyntheticFleet, road: IntArray, along: IntArray, seconds: FloatArray
 ) -> FloatArray:
-    """Return the friction: dry, and ice on the middle fifth of icy roads in the small hours."""
+    """Return the true friction: dry, except ice on the middle fifth of icy roads during the
+    night.
+    """
     middle = np.abs(along - world.length // 2) < world.length // 10
     return np.where((road % world.icy == 0) & middle & (night_factor(seconds) > 0.5), ICE, DRY)
 
@@ -191,8 +196,8 @@ def truth_of(
 def _make_likelihoods(
     rng: np.random.Generator, mu: FloatArray, used: FloatArray, excited: BoolArray
 ) -> ByteArray:
-    """Return likelihoods (n, 32): a flank on each side of a value, or up to the grip used for a
-    bound.
+    """Return likelihoods (n, 32) in steps. A value has a flank on both sides; a bound has a flank
+    only below the grip used.
     """
     distance = (mugrid.CENTRES - np.where(excited, mu, used)[:, None]).astype(np.float32)
     flank = rng.uniform(0.02, 0.08, (2, len(mu), 1)).astype(np.float32)

@@ -1,1 +1,3 @@
-"""The live page: the map, its alerts and its past in a browser, with the rights of a reader."""
+"""The live page: the map, its alerts and its past in a web browser. The page has only the access
+rights of a reader.
+"""

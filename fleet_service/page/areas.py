@@ -1,5 +1,5 @@
-"""Areas with data: neighbouring tiles together, with their cells, alerts and the nearest place
-name.
+"""Areas with data: groups of neighbouring tiles, with the number of their cells and alerts, and the
+nearest place name.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ MOST: Final = 100
 
 
 def found_in(world: MapMirror, named: Sequence[tuple[str, float, float]]) -> list[dict[str, Any]]:
-    """Return the areas: `name` (empty if none is near), `box`, `latitude`, `longitude`, `cells` and
-    `alerts`.
+    """Return the areas with data; each has `name` (empty if no named place is near), `box`,
+    `latitude`, `longitude`, `cells` and `alerts`.
 
     Args:
         world: the mirrored map.

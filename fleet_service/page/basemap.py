@@ -1,9 +1,9 @@
-"""Base map below the roads: vector or raster tiles of a file, served here, or raster tiles from an
-address.
+"""Base map below the roads: vector or raster tiles from a file that this server reads, or raster
+tiles from a web address.
 
-Files are MBTiles 1.3 (github.com/mapbox/mbtiles-spec: a table of SQLite, rows counted from the
-south) with images or with vector tiles, and PMTiles 3 with vector tiles. The layers of vector tiles
-are those of OpenMapTiles or Protomaps.
+Supported files are MBTiles 1.3 (github.com/mapbox/mbtiles-spec: an SQLite table, rows counted from
+the south) with images or vector tiles, and PMTiles 3 with vector tiles. The layers of vector tiles
+must be those of OpenMapTiles or Protomaps.
 """
 
 from __future__ import annotations
@@ -37,13 +37,15 @@ _TAG: Final = re.compile(r"<[^>]*>")
 
 
 class TileSource(Protocol):
-    """Tiles of a file."""
+    """Interface of a file with map tiles."""
 
     kind: str
     zooms: tuple[int, int]
 
     def picture(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return a tile, counted from the north-west; None if there is none."""
+        """Return a tile as bytes, with rows counted from the north; None if there is no such
+        tile.
+        """
         ...
 
 
@@ -51,10 +53,10 @@ class TileFile:
     """Tiles of an MBTiles file; thread-safe.
 
     Args:
-        path: ends in .mbtiles.
+        path: path that ends in .mbtiles.
 
     Raises:
-        InputError: it does not exist, or has no tiles.
+        InputError: the file does not exist, or has no tiles.
     """
 
     def __init__(self, path: Path) -> None:
@@ -82,7 +84,9 @@ class TileFile:
         self.zooms = (int(least), int(most))
 
     def picture(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return an unpacked tile, counted from the north-west; None if there is none."""
+        """Return an unpacked tile, with rows counted from the north; None if there is no such
+        tile.
+        """
         if not 0 <= zoom <= DEEPEST or not 0 <= max(x, y) < 1 << zoom:
             return None
         asked = (
@@ -110,15 +114,22 @@ class _Pmtiles:
         self.metadata = self._file.metadata
 
     def picture(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return a tile, counted from the north-west; None if there is none."""
+        """Return a tile as bytes, with rows counted from the north; None if there is no such
+        tile.
+        """
         if not 0 <= zoom <= DEEPEST or not 0 <= max(x, y) < 1 << zoom:
             return None
         return self._file.tile(zoom, x, y)
 
 
 class BaseMap(NamedTuple):
-    """Address of the tiles with {z}, {x} and {y}, its zoom levels, the file, if there is one,
-    and who made the map.
+    """Base map.
+
+    Attributes:
+        address: address of the tiles with {z}, {x} and {y}.
+        zooms: smallest and largest zoom level.
+        file: file of the tiles; None for tiles from elsewhere.
+        attribution: authors of the map.
     """
 
     address: str
@@ -128,15 +139,16 @@ class BaseMap(NamedTuple):
 
     @property
     def is_vector(self) -> bool:
-        """True for vector tiles."""
+        """True if the tiles are vector tiles."""
         return self.file is not None and self.file.kind == KINDS[VECTOR]
 
 
 def base_map(text: str, attribution: str | None = None) -> BaseMap:
-    """Return a base map from the text of the option; `attribution` replaces that of the file.
+    """Return a base map from the text of the command-line option. `attribution` replaces the
+    attribution in the file.
 
     Raises:
-        InputError: the text is neither an address of tiles nor a file of them.
+        InputError: the text is neither an address of tiles nor a file with tiles.
     """
     if text.endswith((MBTILES, PMTILES)):
         file = TileFile(Path(text)) if text.endswith(MBTILES) else _Pmtiles(Path(text))

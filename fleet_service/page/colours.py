@@ -1,9 +1,11 @@
-"""Colours of cells: fewer colours for less certain cells, and none for a mere bound.
+"""Colours of cells. Less certain cells have fewer possible colours, and a cell with only a lower
+bound has none.
 
 Value-suppressing palette (Correll, Moritz and Heer, CHI 2018): four classes of mu if its interval
-is narrow, two if it is middling, one grey if it is wide. A cell that is slippery even at the upper
-end keeps its colour, however wide, and one that is more likely slippery than not is never grey or
-hollow. The colours are those of `schemas.runtime.palette`.
+is narrow, two classes if it is of medium width, one grey if it is wide. There are two exceptions. A
+cell that is slippery even at the upper end of its interval keeps its colour, however wide the
+interval is. A cell that is more likely slippery than not is never grey or hollow. The colours are
+those of `schemas.runtime.palette`.
 """
 
 from __future__ import annotations
@@ -32,8 +34,8 @@ DARK_ALERT: Final = "#ff6b86"
 
 
 def colour_of(mu: float, lower: float, upper: float, p_slippery: float = 0.0) -> str:
-    """Return the colour of a measured mu with its 5 % and 95 % quantiles and its probability of
-    being slippery.
+    """Return the colour of a cell with a measured mu, its 5 % and 95 % quantiles, and its
+    probability of being slippery.
     """
     width = round(upper - lower, 6)  # a step of the records is .005
     if upper < SLIPPERY_MU or width < NARROW:
@@ -46,7 +48,7 @@ def colour_of(mu: float, lower: float, upper: float, p_slippery: float = 0.0) ->
 
 
 def as_json() -> dict[str, Any]:
-    """Return the palette for the page, for light and for dark ground."""
+    """Return the palette for the page, for light and for dark backgrounds."""
     light = {"four": FOUR, "two": TWO, "little": LITTLE, "ground": GROUND, "alert": ALERT}
     dark = {
         "four": DARK_FOUR,

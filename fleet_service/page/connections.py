@@ -1,9 +1,9 @@
-"""Bounded connections of the web server; half-open connections time out.
+"""Limit on the connections of the web server, with a time limit for half-open connections.
 
-A connection that has begun no request, or not ended its head, after HEAD_S is closed. When all
-places are taken, a new connection takes the place of the oldest one without a request, or else of
-the address with the most connections. Repeated messages of the web server are logged once per
-LOG_S.
+A connection is closed if it has not sent the complete head of a request within HEAD_S. When the
+maximum number of connections is open, a new connection replaces the oldest connection without a
+request, or else one of the address with the most connections. Repeated messages of the web server
+are logged once per LOG_S.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class BoundedProtocol(H11Protocol):
     _head_timer: asyncio.TimerHandle | None = None  # None: not accepted
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Accept a connection if there is a place, and wait for its first request."""
+        """Accept a connection if the limit allows it, and wait for its first request."""
         self.host = (transport.get_extra_info("peername") or ("",))[0]
         if len(self.connections) >= MOST and not self._make_place():
             transport.abort()
@@ -38,21 +38,23 @@ class BoundedProtocol(H11Protocol):
         self._await_request()
 
     def data_received(self, data: bytes) -> None:
-        """Ignore data of a connection that was not accepted; wait for the rest of a request."""
+        """Process received data, and wait for the rest of a request. Data of a connection that was
+        not accepted are ignored.
+        """
         if self._head_timer is not None:
             super().data_received(data)
             if self.is_silent and self._head_timer.when() <= self.loop.time():
                 self._await_request()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the connection, if it was accepted."""
+        """Clean up after the end of a connection that was accepted."""
         if self._head_timer is not None:
             self._head_timer.cancel()
             super().connection_lost(exc)
 
     def _make_place(self) -> bool:
-        """Close a connection without a request, or one of the address with the most; return False
-        if there is none.
+        """Close a connection without a request, or one of the address with the most connections.
+        Return False if no connection may be closed.
         """
         others = [one for one in self.connections if isinstance(one, BoundedProtocol)]
         found = [one for one in others if one.is_silent]
@@ -69,14 +71,14 @@ class BoundedProtocol(H11Protocol):
 
     @property
     def is_silent(self) -> bool:
-        """Return True while no request is answered."""
+        """Return True while no request of the connection is being answered."""
         return bool(self.cycle is None or self.cycle.response_complete)
 
     def _await_request(self) -> None:
         self._head_timer = self.loop.call_later(HEAD_S, self._close_silent, self.cycle)
 
     def _close_silent(self, before: object) -> None:
-        """Close the connection if no request has followed the one `before`."""
+        """Close the connection if no request has come since the request `before`."""
         if not self.is_silent:
             return
         if self.cycle is before:
@@ -86,7 +88,9 @@ class BoundedProtocol(H11Protocol):
 
 
 class RareMessages(logging.Filter):
-    """Filter that passes a message once per LOG_S, with the number of equal ones in between."""
+    """Log filter that passes each message at most once per LOG_S, and adds the number of equal
+    messages that were held back.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -94,7 +98,7 @@ class RareMessages(logging.Filter):
         self._more: Counter[str] = Counter()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return True to log the record."""
+        """Return True if the record may be logged."""
         text = str(record.msg)
         if time.monotonic() - self._passed.get(text, -LOG_S) < LOG_S:
             self._more[text] += 1
@@ -106,12 +110,12 @@ class RareMessages(logging.Filter):
 
 
 def limit_messages() -> None:
-    """Limit the messages of the web server and of its event loop."""
+    """Limit repeated log messages of the web server and of its event loop."""
     rare = RareMessages()
     for logger in (log, logging.getLogger("uvicorn.error")):
         logger.addFilter(rare)
 
 
 def report_loop_error(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Log an error of the event loop in one line."""
+    """Log an error of the event loop as one line."""
     log.warning("web server: %s", context.get("exception") or context.get("message"))

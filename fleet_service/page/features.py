@@ -1,9 +1,9 @@
-"""Documents of OGC API Features, Part 1: Core (OGC 17-069r4), with one collection: `grip`, the
-map's cells. Pure.
+"""Documents of OGC API Features, Part 1: Core (OGC 17-069r4), with one collection `grip`: the map's
+cells. Pure.
 
 A feature is a cell and heading. Its geometry is the quarter of the cell on the side of the heading.
-A bound has no `mu`, and unknown values are null or absent. The time of a feature is that of its
-newest observation.
+A feature with only a lower bound has no `mu`, and unknown values are null or absent. The time of a
+feature is that of its newest observation.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ class FeatureQuestion(NamedTuple):
     Attributes:
         bbox: west, south, east, north [deg]; None for everywhere.
         since: minimum time of the newest observation [ns]; 0 for no limit.
-        at: moment of the map [ns]; None for now.
+        at: time of the map [ns]; None for now.
         limit: maximum number of features.
-        after: place (cell · 4 + sector) after which to continue.
+        after: key (cell · 4 + sector) after which to continue.
     """
 
     bbox: Box | None = None
@@ -77,7 +77,9 @@ def _make_link(href: str, rel: str, kind: str, title: str) -> dict[str, str]:
 
 
 def landing_document(base: str) -> dict[str, Any]:
-    """Return the landing page; `base` is the address without a final slash."""
+    """Return the landing page of the interface as a JSON document; `base` is the address without a
+    final slash.
+    """
     return {
         "title": "GripMap",
         "description": ABOUT,
@@ -92,18 +94,20 @@ def landing_document(base: str) -> dict[str, Any]:
 
 
 def conformance_document() -> dict[str, Any]:
-    """Return the conformance classes."""
+    """Return the list of conformance classes as a JSON document."""
     return {"conformsTo": list(CONFORMANCE)}
 
 
 def collections_document(base: str, extent: Box | None) -> dict[str, Any]:
-    """Return the list of collections, which has one entry."""
+    """Return the list of collections, which has one entry, as a JSON document."""
     links = [_make_link(f"{base}/collections", "self", JSON, "this document")]
     return {"links": links, "collections": [collection_document(base, extent)]}
 
 
 def collection_document(base: str, extent: Box | None) -> dict[str, Any]:
-    """Return the collection; `extent` is the box of all cells, if there are any."""
+    """Return the description of the collection as a JSON document; `extent` is the box of all
+    cells, or None if there are none.
+    """
     own = f"{base}/collections/{COLLECTION}"
     found: dict[str, Any] = {
         "id": COLLECTION,
@@ -123,8 +127,9 @@ def collection_document(base: str, extent: Box | None) -> dict[str, Any]:
 
 
 def feature_schema(base: str) -> dict[str, Any]:
-    """Return the JSON Schema of a feature for GDAL, so that a reader that first sees only bounds
-    knows `mu` is a number."""
+    """Return the JSON Schema of a feature. GDAL needs it to know that `mu` is a number, even if the
+    first features have no `mu`.
+    """
     columns = {
         f.name: {**_TYPES[f.type], "description": f"{f.meaning} [{f.unit}]"} for f in COLUMNS
     }
@@ -142,7 +147,7 @@ def feature_schema(base: str) -> dict[str, Any]:
 
 
 def api_definition(base: str) -> dict[str, Any]:
-    """Return the definition of the interface, OpenAPI 3.0."""
+    """Return the definition of the interface in OpenAPI 3.0."""
 
     def describe_route(summary: str, *parameters: dict[str, Any]) -> dict[str, Any]:
         answers = {
@@ -209,13 +214,13 @@ def api_definition(base: str) -> dict[str, Any]:
 def page_of(
     features: Iterable[dict[str, Any]], more: bool, address: str, following: str, stamp: str
 ) -> dict[str, Any]:
-    """Return features as one page of an answer.
+    """Return features as one page of an answer (GeoJSON).
 
     Args:
-        features: each with its id.
-        more: True if there are more.
-        address: of this page.
-        following: of the next page.
+        features: features with their ids.
+        more: True if more features follow on a next page.
+        address: address of this page.
+        following: address of the next page.
         stamp: time of the data, ISO 8601.
     """
     found = list(features)
@@ -232,7 +237,7 @@ def page_of(
 
 
 def with_identity(features: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]]:
-    """Yield features with their id, and without the properties that repeat the geometry."""
+    """Yield features with their id. Properties that repeat the geometry are left out."""
     names = {field.name for field in COLUMNS}
     for feature in features:
         properties = {name: value for name, value in feature["properties"].items() if name in names}
@@ -244,7 +249,7 @@ def with_identity(features: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]
 
 
 def extent_of(tiles: Iterable[int]) -> Box | None:
-    """Return the box of tiles [deg]; None without tiles."""
+    """Return the box [deg] that encloses the given tiles; None if there are no tiles."""
     sides = [grid.bounds(tile, grid.TILE_ZOOM) for tile in tiles]
     if not sides:
         return None

@@ -1,4 +1,6 @@
-"""Static files of the page, read and compressed once, with its modules bundled into one script."""
+"""Static files of the page, read and compressed once. The JavaScript modules are bundled into one
+script.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +28,10 @@ class _File(NamedTuple):
 
 
 class Files:
-    """Files of a folder.
+    """Static files of a folder.
 
     Args:
-        folder: read once.
+        folder: folder, which is read once.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -43,19 +45,19 @@ class Files:
         self._files = {name: _pack_file(name, text) for name, text in plain.items()}
 
     def texts(self, accepted: str) -> str:
-        """Return the name of the text table in the browser's first available language; English
-        otherwise.
+        """Return the file name of the page's texts in the first language of the browser that is
+        available, or else in English.
 
         Args:
-            accepted: the header `Accept-Language`, the best language first.
+            accepted: value of the header `Accept-Language`, the preferred language first.
         """
         wanted = [one.partition(";")[0].strip().lower() for one in accepted.split(",")]
         names = [f"texts.{tag}.json" for one in wanted for tag in (one, one.partition("-")[0])]
         return next((name for name in names if name in self._files), ENGLISH)
 
     def answer(self, name: str, request: Request, vary: str = "Accept-Encoding") -> Response | None:
-        """Return a file in a form the browser accepts, or "not modified"; None if there is no
-        such file.
+        """Return a response with a file, compressed if the browser accepts this, or "not modified".
+        Return None if there is no such file.
         """
         file = self._files.get(name)
         if file is None:

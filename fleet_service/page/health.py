@@ -1,5 +1,5 @@
-"""Metrics of services for the health view, read over HTTP because a reader does not receive them
-over Zenoh.
+"""Metrics of services for the health view. They are read over HTTP, because services do not publish
+them over Zenoh.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class ServiceHealth:
     """Metrics of services, by address.
 
     Args:
-        addresses: such as http://127.0.0.1:9464.
+        addresses: addresses such as http://127.0.0.1:9464.
     """
 
     def __init__(self, addresses: list[str]) -> None:
@@ -33,7 +33,9 @@ class ServiceHealth:
         self._before: dict[str, tuple[float, float]] = {}
 
     def services(self) -> list[dict[str, Any]]:
-        """Return one entry per service: `address`, `answers`, and its values."""
+        """Return one entry per service: `address`, `answers` (True if it answered), and its
+        values.
+        """
         with self._lock:
             if time.monotonic() - self._asked >= KEPT_S:
                 self._answers = [self._ask(address) for address in self._addresses]
@@ -78,8 +80,8 @@ class ServiceHealth:
 
 
 def parse_metrics(text: str) -> dict[str, dict[str, float]]:
-    """Return the values of an OpenMetrics text by name and label; "" is the label of a single
-    value.
+    """Return the values in an OpenMetrics text, by name and label; the label of a single value is
+    "".
     """
     found: dict[str, dict[str, float]] = {}
     for line in text.splitlines():

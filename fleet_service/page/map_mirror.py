@@ -1,4 +1,6 @@
-"""Mirror of the live map: tiles as records, alerts as stretches, served regions. No network."""
+"""Local copy ("mirror") of the live map: tiles as records, and alerts as stretches. This module
+does not use the network.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ _EMPTY: Final = np.zeros(0, records.RECORD)
 
 @dataclass
 class MirroredTile:
-    """Tile: its records, number of changes, time of receipt [s since 1970], cached blocks."""
+    """One tile: its records, number of changes, time of receipt [s since 1970], and cached encoded
+    blocks by level.
+    """
 
     cells: Records = field(default_factory=lambda: _EMPTY)
     version: int = 0
@@ -50,7 +54,7 @@ class MapMirror:
         self.heard = 0.0  # when any service said anything [s since 1970]
 
     def take_tile(self, tile: int, table: pa.Table, now: float) -> None:
-        """Replace a tile."""
+        """Replace the content of a tile with a received table."""
         cells = records.of_table(table)
         with self._lock:
             self.heard = now
@@ -64,7 +68,7 @@ class MapMirror:
             held.made = {}
 
     def take_alert(self, alert: Alert, now: float) -> None:
-        """Record that an alert of a cell was raised, repeated or cleared."""
+        """Record that the alert of a cell was raised, repeated or cleared."""
         with self._lock:
             self.heard = now
             self.alerts_heard += 1
@@ -73,21 +77,23 @@ class MapMirror:
     def take_standing(
         self, standing: Iterable[Alert], served: Callable[[int], bool], now: float
     ) -> None:
-        """Replace the standing alerts of all served cells."""
+        """Replace the active alerts. `served` tells whether a service answers for a cell; alerts of
+        other cells are kept.
+        """
         with self._lock:
             self.heard = now
             self.alerts_heard += 1
             self._stretches.replace_alerts(standing, lambda alert: served(alert.cell))
 
     def remember(self, now: float) -> None:
-        """Keep the map of this moment for the slider."""
+        """Store the present map as a recent moment for the time slider."""
         with self._lock:
             self.recent.keep(
                 now, {tile: held.cells for tile, held in self._tiles.items() if len(held.cells)}
             )
 
     def places(self) -> tuple[IntArray, IntArray]:
-        """Return cell and sector of all records, (n,) each."""
+        """Return cell and sector of all records, two arrays (n,)."""
         with self._lock:
             held = [
                 (tile, one.cells["place"].astype(np.int64)) for tile, one in self._tiles.items()
@@ -98,7 +104,7 @@ class MapMirror:
         return place // grid.SECTORS, place % grid.SECTORS
 
     def changes(self) -> list[TileBlock]:
-        """Return the changes of each tile since the last call."""
+        """Return one block per changed tile with its changes since the last call."""
         with self._lock:
             before = self._before
             self._before = {}
@@ -113,20 +119,20 @@ class MapMirror:
             return found
 
     def alerts_changed(self) -> bool:
-        """Return True if stretches changed since the last call."""
+        """Return True if stretches with an alert have changed since the last call."""
         with self._lock:
             found = bool(self._stretches.take_changes()) or self._alerts_changed
             self._alerts_changed = False
             return found
 
     def stretches(self) -> list[StretchAlert]:
-        """Return the standing stretches with everything received until now."""
+        """Return the stretches with an active alert, according to everything received until now."""
         with self._lock:
             self._alerts_changed |= bool(self._stretches.take_changes())
             return self._stretches.standing
 
     def standing(self) -> list[dict[str, Any]]:
-        """Return the standing stretches, newest first."""
+        """Return the stretches with an active alert in a form for JSON, newest first."""
         with self._lock:
             return [
                 one.to_json_values()
@@ -139,7 +145,9 @@ class MapMirror:
             return [tile for tile, held in self._tiles.items() if len(held.cells)]
 
     def oldest(self, before: float, most: int) -> list[int]:
-        """Return tiles not received since `before` [s since 1970], oldest first."""
+        """Return at most `most` tiles that were not received since `before` [s since 1970], oldest
+        first.
+        """
         with self._lock:
             late = [
                 (held.heard, tile)
@@ -149,13 +157,17 @@ class MapMirror:
         return [tile for _, tile in sorted(late)[:most]]
 
     def touch(self, tile: int, now: float) -> None:
-        """Record that a tile was queried and is unchanged, or that no service answers for it."""
+        """Record that a tile was queried at time `now`, and is unchanged or has no service that
+        answers.
+        """
         with self._lock:
             if tile in self._tiles:
                 self._tiles[tile].heard = now
 
     def encoded(self, tile: int, level: int) -> bytes:
-        """Return a complete tile at a level; empty if it is unknown."""
+        """Return a complete tile as an encoded block at a zoom level; empty bytes if the tile is
+        unknown.
+        """
         with self._lock:
             held = self._tiles.get(tile)
             if held is None or not held.version:
@@ -170,17 +182,17 @@ class MapMirror:
             return self._tiles[tile].version if tile in self._tiles else 0
 
     def rows(self, tiles: Iterable[int]) -> int:
-        """Return the number of records of tiles."""
+        """Return the total number of records of the given tiles."""
         with self._lock:
             return sum(len(self._tiles[tile].cells) for tile in tiles if tile in self._tiles)
 
 
 def block_at(level: int, tile: int, cells: Records, version: int, moment: float) -> bytes:
-    """Return a complete tile at a level as bytes."""
+    """Return a complete tile as an encoded block at a zoom level."""
     seen = cells if level == records.CELL_LEVEL else records.aggregate_worst(cells, level)
     return TileBlock(tile, level, version, 0, moment, seen).encoded()
 
 
 def box_of(tile: int, zoom: int = grid.TILE_ZOOM) -> list[float]:
-    """Return west, south, east, north [deg]."""
+    """Return west, south, east, north [deg] of a tile."""
     return [float(side) for side in grid.bounds(tile, zoom)]

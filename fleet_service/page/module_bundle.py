@@ -1,8 +1,8 @@
-"""Bundler of the page's ES modules into one script. Pure.
+"""Bundler that joins the page's ES modules into one script. Pure.
 
-Browsers open six connections per host, so two dozen modules delay the first paint. In the bundle
-each module is a function that is called once, after the modules it imports, and returns its
-exports. There is no build step: the server bundles when it starts.
+Browsers open only six connections per host, so two dozen modules delay the first display. In the
+bundle, each module is a function that returns its exports. It is called once, after the modules
+that it imports. There is no build step: the server makes the bundle when it starts.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ _OTHER: Final = re.compile(r"^(?:import|export)\b.*$", re.MULTILINE)
 
 
 def bundle_modules(modules: Mapping[str, str], main: str) -> str:
-    """Return one script that does what `main` does.
+    """Return one script with the same effect as the module `main`.
 
     Args:
-        modules: their text by name; imported as `./NAME.js`.
-        main: the module that is run, and that no module imports.
+        modules: text of each module by name; a module is imported as `./NAME.js`.
+        main: name of the module to run, which no other module imports.
 
     Raises:
         ValueError: an import or export has another form than `import { a, b } from "./name.js";`,
-            or there is a circle.
+            or imports are circular.
         KeyError: a module is missing.
     """
     wanted: defaultdict[str, set[str]] = defaultdict(set)
@@ -55,7 +55,9 @@ def _wrap_module(name: str, body: str, exported: list[str]) -> str:
 
 
 def _strip_imports(text: str) -> str:
-    """Return a module's text without imports and exports."""
+    """Return a module's text with its imports replaced by constants, and without the keyword
+    `export`.
+    """
     text = _IMPORT.sub(
         lambda m: f"const {{ {m[1].replace(' as ', ': ')} }} = from_{m[2]};", _EXPORT.sub("", text)
     )

@@ -1,7 +1,7 @@
-"""Past of the map: available moments, a past map, a cell's history.
+"""The map's past: available moments, the map at a moment, and the history of a cell.
 
-The last minutes come from memory, earlier moments from the snapshots of a service. Snapshots hold
-public cells only, so this data is as public as the map itself.
+The last minutes come from memory, earlier moments from a service's snapshots. Snapshots contain
+public cells only, so these data are as public as the map itself.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ _OF_HISTORY: Final = ("mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehi
 
 
 class Moments:
-    """Recent moments, and the snapshots of an archive.
+    """Moments of the past: recent ones in memory, and the snapshots of an archive.
 
     Args:
-        root: of the archive; None without one.
-        recent: moments of the live map that this page received.
+        root: folder of the archive; None without an archive.
+        recent: moments of the live map that this page has received.
     """
 
     def __init__(self, root: Path | None, recent: RecentMoments | None = None) -> None:
@@ -58,19 +58,21 @@ class Moments:
 
     @property
     def has_archive(self) -> bool:
-        """True if an archive was named."""
+        """True if an archive is given."""
         return self._root is not None
 
     def times(self) -> list[int]:
-        """Return all moments [s since 1970], oldest first."""
+        """Return all available moments [s since 1970], oldest first."""
         return sorted({*self._files(), *self._recent.times()})[-MOST:]
 
     def tiles(self, moment: int) -> list[int]:
-        """Return the tiles with cells at a moment."""
+        """Return the tiles that had cells at a moment."""
         return list(self._at(moment))
 
     def encoded(self, moment: int, tile: int, level: int) -> bytes:
-        """Return a complete tile at a moment; empty if it had no cells."""
+        """Return a complete tile at a moment as an encoded block; empty bytes if the tile had no
+        cells.
+        """
         cells = self._at(moment).get(tile)
         return b"" if cells is None else map_mirror.block_at(level, tile, cells, 1, float(moment))
 
@@ -95,7 +97,9 @@ class Moments:
         return found
 
     def _recent_history(self, moment: int, cell: int, sector: int) -> list[dict[str, Any]]:
-        """Return the belief about a cell at a recent moment, or nothing."""
+        """Return the belief about a cell at a recent moment as a list with one item; empty if the
+        cell was unknown.
+        """
         tile = int(grid.tile_of(cell))
         place = (cell & 0x3FFF) * grid.SECTORS + sector
         held = (self._recent.at(moment) or {}).get(tile)

@@ -1,4 +1,4 @@
-"""Routes of OGC API Features: the map for QGIS, ArcGIS and GDAL."""
+"""HTTP routes of OGC API Features, which make the map available to QGIS, ArcGIS and GDAL."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _OWN: Final = f"/collections/{COLLECTION}"
 
 
 class FeatureRoutes:
-    """Handlers, one method per route.
+    """Request handlers of OGC API Features, one method per route.
 
     Args:
-        world: knows which tiles have cells now.
-        reader: queries cells.
+        world: mirrored map, which knows the tiles that have cells now.
+        reader: client that queries cells.
     """
 
     def __init__(self, world: MapMirror, reader: Reader) -> None:
@@ -85,8 +85,8 @@ class FeatureRoutes:
         )
 
     async def items(self, request: Request) -> Response:
-        """Return features ordered by place, from `after` on; `next` continues at the same place
-        even if features change meanwhile.
+        """Return features ordered by key (cell and sector), from `after` on. The link `next`
+        continues after the last key, even if features change meanwhile.
         """
         question = request_params.parse_features(request, time.time_ns())
         if not self._reader.is_served:
@@ -125,7 +125,7 @@ class FeatureRoutes:
         return JSONResponse(answer, media_type=GEOJSON, headers={"Cache-Control": "no-store"})
 
     async def item(self, request: Request) -> Response:
-        """Return one feature as it is now."""
+        """Return one feature with its present values."""
         place = request_params.parse_feature_id(request.path_params["feature"])
         table = await run_in_threadpool(
             self._cells, FeatureQuestion(_place_box(place), after=place - 1, limit=1)
@@ -146,7 +146,8 @@ class FeatureRoutes:
         return PlainTextResponse("no vehicle has visited this place: its grip is unknown\n", 404)
 
     def _cells(self, question: FeatureQuestion) -> pa.Table:
-        """Return the rows by place, with one more than requested if there are more.
+        """Return the requested cells ordered by key. If there are more cells than the limit, one
+        additional row is returned.
 
         Raises:
             InputError: a service refused the query.
@@ -165,7 +166,7 @@ class FeatureRoutes:
         return pa.concat_tables(found).slice(0, question.limit + 1)
 
     def _tiles(self, question: FeatureQuestion) -> Iterator[pa.Table]:
-        """Yield cells one tile at a time, in the order of tiles."""
+        """Yield the cells one tile at a time, ordered by tile."""
         parameters = {}
         if question.bbox is not None:
             parameters["bbox"] = ",".join(f"{side:.9f}" for side in question.bbox)
@@ -186,8 +187,8 @@ class FeatureRoutes:
 
 
 def wants_json(request: Request) -> bool:
-    """Return True for a program, which gets the landing page of the interface and not the map
-    for people.
+    """Return True if the request comes from a program, which gets the landing page of the interface
+    instead of the live page.
     """
     form = request.query_params.get("f")
     if form is not None:

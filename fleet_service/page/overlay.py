@@ -1,6 +1,7 @@
-"""Overlay map, such as a simulation's truth: a Parquet file of cell, sector and mu.
+"""Additional map drawn over the live one, such as the true friction of a simulation: a Parquet file
+of cell, sector and mu.
 
-The file is read on request, because it may appear while the page runs.
+The file is read on each request, because it may appear while the page is running.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from schemas.errors import InputError
 
 
 def read_overlay(path: Path | None) -> dict[str, list[Any]] | None:
-    """Return cell (as text), sector and mean mu of each place; None if there is no file yet.
+    """Return cell (as text), sector and mean mu of each cell and sector; None if the file does not
+    exist yet.
 
     Raises:
         InputError: the file has other columns.

@@ -1,7 +1,7 @@
-"""Subscriber of the page, with the rights of a reader: it receives tiles and alerts, queries those
-that it missed, and tracks served regions.
+"""Zenoh client of the page, with the rights of a reader. It receives tiles and alerts, queries
+those that it has missed, and tracks served regions.
 
-It publishes nothing. If the access list hides tokens, it works without them.
+It publishes nothing. If the access list hides liveliness tokens, it works without them.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ REGIONS: Final = 256  # that are watched for a service
 
 
 class Reader:
-    """One session of the page.
+    """Zenoh session of the page.
 
     Args:
-        connection: how to reach the router.
-        world: receives the data.
+        connection: connection settings for the router.
+        world: mirrored map, which receives the data.
     """
 
     def __init__(self, connection: ZenohSettings, world: MapMirror) -> None:
@@ -59,7 +59,7 @@ class Reader:
         self._tried = -AGAIN_S
 
     def run(self, stop: threading.Event) -> None:
-        """Receive until `stop` is set."""
+        """Receive data until `stop` is set."""
         session = zenoh_session.open_session(self._connection, stop)
         if session is None:
             return
@@ -103,8 +103,8 @@ class Reader:
         return self._answers(int(grid.region_of(int(grid.cell_of(latitude, longitude)))))
 
     def regions(self) -> list[dict[str, Any]]:
-        """Return regions with cells: their box, whether a service answers, and since when none
-        does.
+        """Return the regions with cells: their box, whether a service answers for them, and, if
+        not, since when.
         """
         return [
             {
@@ -120,8 +120,8 @@ class Reader:
         ]
 
     def _note_fallen(self, services: presence.PresenceTracker) -> None:
-        """Record regions that lost their service and have no known cell; others are found
-        through their cells.
+        """Record regions that have lost their service and have no known cell. Regions with known
+        cells are checked through their cells.
         """
         here = {token.region for token in services.active}
         known = [keys.chunks(region, grid.REGION_ZOOM) for region in self._queriers]
@@ -135,11 +135,13 @@ class Reader:
         self._fallen = {region: self._fallen.get(region, time.time()) for region in fallen}
 
     def names(self, kind: str) -> list[str]:
-        """Return names with a token; empty if the access list hides them."""
+        """Return the names that have a liveliness token of this kind; empty if the access list
+        hides them.
+        """
         return sorted(self._names[kind])
 
     def ask(self, selector: str, parameters: Mapping[str, str]) -> Iterator[tuple[int, pa.Table]]:
-        """Yield tile and cells of every reply.
+        """Yield the tile number and the cells of every reply to a query.
 
         Raises:
             InputError: a service refused the query, or no router is connected.
@@ -169,8 +171,8 @@ class Reader:
             (names.add if sample.kind == zenoh.SampleKind.PUT else names.discard)(str(parsed.name))
 
     def _ask_all(self, session: zenoh.Session) -> None:
-        """Query everything that existed before this page. It subscribed first, so nothing is
-        missed in between.
+        """Query all tiles and alerts that existed before this session. The subscriptions were made
+        earlier, so no change in between is missed.
         """
         try:
             for tile, table in self.ask(map_client.EVERYWHERE, {}):
@@ -221,12 +223,12 @@ class Reader:
         return querier is not None and bool(querier.matching_status.matching)
 
     def _sees_services(self) -> bool:
-        """Return True if a service answers for any place: by its token, or by its answers if tokens
-        are hidden.
+        """Return True if a service answers for any place. A service's token shows this; if tokens
+        are hidden, its answers show it.
 
-        A router matches only services that answer for all of a key expression. A service of the
-        whole world is found by any tile, a service of a region by the known regions, and before any
-        region is known by its answer.
+        A router matches only services that answer for all of a key expression. Therefore a service
+        of the whole world is found by any tile, and a service of a region by a region already
+        known. Before any region is known, only a reply to a query shows a service.
         """
         if self._names["shard"] or any(self._answers(region) for region in self._queriers):
             return True
@@ -246,14 +248,16 @@ class Reader:
 
 
 def _box_of_expression(region: str) -> list[float]:
-    """Return west, south, east, north [deg] of the square that its first digits name."""
+    """Return west, south, east, north [deg] of the square that the leading digits of a region
+    expression name.
+    """
     digits = region.partition("*")[0].replace("/", "")
     return box_of(grid.from_quadkey(digits), len(digits))
 
 
 @contextlib.contextmanager
 def _refusals_logged(sample: zenoh.Sample) -> Iterator[None]:
-    """Log a malformed message and continue."""
+    """Log an error that a malformed message causes inside the block, and continue."""
     try:
         yield
     except (InputError, WireError, KeyError) as error:

@@ -1,4 +1,4 @@
-"""Recent moments of the live map, kept in memory: the past of the first hour, before any
+"""Recent moments of the live map in memory. They are the map's past in the first hour, before a
 snapshot exists. Pure.
 """
 
@@ -18,15 +18,15 @@ THINNED_S: Final = 60
 
 
 class RecentMoments:
-    """Records of all tiles at moments [s since 1970], oldest first; arrays are shared, never
-    copied.
+    """Records of all tiles at moments [s since 1970], oldest first. The arrays are shared with the
+    live map and never copied.
     """
 
     def __init__(self) -> None:
         self._kept: OrderedDict[int, dict[int, Records]] = OrderedDict()
 
     def keep(self, now: float, tiles: Mapping[int, Records]) -> None:
-        """Keep the tiles of a moment, unless the last one is too near or nothing has changed
+        """Store the tiles of a moment, unless the last moment is too recent or nothing has changed
         since.
         """
         moment = int(now)
@@ -48,7 +48,7 @@ class RecentMoments:
         return list(self._kept)
 
     def at(self, moment: int) -> dict[int, Records] | None:
-        """Return the tiles of a moment; None if it is not kept."""
+        """Return the tiles of a moment; None if the moment is not stored."""
         return self._kept.get(moment)
 
 

@@ -1,9 +1,9 @@
-"""Cells of the map as 13-byte records, one block per tile, for the page. When zoomed out, worst
-first. Pure.
+"""Map cells as 13-byte records for the page, one block per tile. At small zoom levels, cells are
+aggregated to the worst value. Pure.
 
 A block is a head of 32 bytes followed by its columns, little-endian, so that a browser can use them
 without copying: `last` (4 bytes per cell), `place` (2), and `mu`, `lower`, `upper`, `slippery`,
-`basis`, `vehicles`, `unknown` (1 each). It ends at a multiple of four bytes.
+`basis`, `vehicles`, `unknown` (1 each). The length of a block is a multiple of four bytes.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ class TileBlock(NamedTuple):
 
     Attributes:
         tile: z14 quadint.
-        level: zoom of the places, 14 to 21.
-        version: counts the changes of a tile, from 1.
-        base: the version that this changes; 0 for a complete tile.
-        moment: of the data [s since 1970].
-        records: by place; `basis` GONE removes a place.
+        level: zoom of the records, 14 to 21.
+        version: number of changes of the tile, from 1.
+        base: version to which the changes apply; 0 for a complete tile.
+        moment: time of the data [s since 1970].
+        records: records ordered by place; `basis` GONE means that the place is removed.
     """
 
     tile: int
@@ -81,9 +81,11 @@ class TileBlock(NamedTuple):
 
 
 def of_table(table: pa.Table) -> Records:
-    """Return cells of one tile (the schema of the map, n rows) as records (n,), by place.
+    """Return the cells of one tile (table in the schema of the map, n rows) as records (n,),
+    ordered by place within the tile.
 
-    An interval is rounded outwards and P(slippery) upwards, so no cell appears drier than reported.
+    Intervals are rounded outwards and P(slippery) upwards, so that no cell appears drier than
+    reported.
     """
     found = np.zeros(table.num_rows, RECORD)
     found["last"] = np.clip(table["last_time"].cast(pa.int64()).to_numpy() // NS, 0, 2**32 - 1)
@@ -112,7 +114,7 @@ def _to_steps(
 
 
 def as_values(row: Any) -> dict[str, Any]:  # noqa: ANN401 one record
-    """Return a record in numbers; `mu` is None where nothing was measured."""
+    """Return a record as numbers; `mu` is None if no value was measured."""
     measured = row["basis"] != BOUND and row["mu"] != NO_NUMBER
     return {
         "mu": int(row["mu"]) / MU_STEPS if measured else None,
@@ -125,12 +127,12 @@ def as_values(row: Any) -> dict[str, Any]:  # noqa: ANN401 one record
 
 
 def aggregate_worst(records: Records, level: int) -> Records:
-    """Return records of cells (n,) aggregated to their ancestors at `level`, 14 to 21, all headings
-    together.
+    """Return records of cells (n,) aggregated to their ancestors at the zoom `level`, 14 to 21. All
+    headings are combined.
 
-    An ancestor has the minimum of each quantile of the measured cells below it, and so the largest
-    P(slippery): no cell below is more slippery than its ancestor. `unknown` is the share of cells
-    and headings below with bounds only.
+    For each quantile of mu, an ancestor has the minimum over the measured cells in it, and the
+    largest P(slippery). So no cell is more slippery than its ancestor appears. `unknown` is the
+    share of cells and headings in it that have only lower bounds.
     """
     if not len(records):
         return records
@@ -157,7 +159,7 @@ def aggregate_worst(records: Records, level: int) -> Records:
 
 
 def changed_records(before: Records, after: Records) -> Records:
-    """Return the records that turn `before` into `after`, both by place."""
+    """Return the records that change `before` into `after`; all are ordered by place."""
     places = np.union1d(before["place"], after["place"])
     old, new = (np.zeros(len(places), RECORD) for _ in range(2))
     for one, records in ((old, before), (new, after)):

@@ -1,4 +1,6 @@
-"""Parsing of request parameters from browsers; every parameter is treated as hostile."""
+"""Parsing of parameters in requests from browsers. Every parameter is checked, because a request
+may be malicious.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +22,12 @@ WORLD: Final = (-180.0, -90.0, 180.0, 90.0)
 
 
 def parse_moment(request: Request) -> int | None:
-    """Return `at` [s since 1970]; None for now."""
+    """Return the parameter `at` [s since 1970]; None if absent, which means now."""
     return _parse_number(request, "at", 0, 1 << 33) if "at" in request.query_params else None
 
 
 def parse_level(request: Request) -> int:
-    """Return the zoom of the places, 14 to 21."""
+    """Return the parameter `level`: the zoom of the records, 14 to 21."""
     return (
         _parse_number(request, "level", LEAST_LEVEL, CELL_LEVEL)
         if "level" in request.query_params
@@ -34,7 +36,7 @@ def parse_level(request: Request) -> int:
 
 
 def parse_tiles(request: Request) -> list[int]:
-    """Return z14 quadints, at most some hundred."""
+    """Return the parameter `tiles` as z14 quadints; at most MOST_TILES are allowed."""
     words = request.query_params.get("tiles", "").split(",")
     if len(words) > MOST_TILES:
         raise InputError("tiles", f"are {len(words)}", f"request at most {MOST_TILES} at once")
@@ -42,14 +44,14 @@ def parse_tiles(request: Request) -> list[int]:
 
 
 def parse_view(request: Request) -> View:
-    """Return the part of the map that a watcher looks at."""
+    """Return the part of the map that a browser shows: box and zoom level."""
     text = request.query_params.get("bbox")
     box = WORLD if text is None else query.parse({"bbox": text}).bbox or WORLD
     return View(box, parse_level(request))
 
 
 def parse_features(request: Request, now: int) -> FeatureQuestion:
-    """Return a query for features, now [ns].
+    """Return the query for features that a request contains; `now` is the time [ns].
 
     Raises:
         InputError: a parameter is unknown or not valid.
@@ -65,17 +67,18 @@ def parse_features(request: Request, now: int) -> FeatureQuestion:
 
 
 def parse_feature_id(text: str) -> int:
-    """Return the place (cell · 4 + sector) of a feature's id."""
+    """Return the key (cell · 4 + sector) from a feature's id."""
     cell, _, sector = text.partition("-")
     found = _parse_whole("feature", cell, 0, 4**grid.CELL_ZOOM - 1) * grid.SECTORS
     return found + _parse_whole("feature", sector, 0, grid.SECTORS - 1)
 
 
 def _parse_interval(text: str, now: int) -> tuple[int, int | None]:
-    """Return the begin [ns] of the selected observations, and the moment [ns] of the map (None for
+    """Return the begin [ns] of the selected observations, and the time [ns] of the map (None for
     now).
 
-    RFC 3339: an instant, or an interval of which one side may be open (`..` or nothing).
+    The text is in the notation of RFC 3339: an instant, or an interval, one side of which may be
+    open (`..` or nothing).
     """
     first, is_interval, last = text.partition("/")
     begin = _parse_instant(first)
@@ -104,13 +107,13 @@ def _parse_instant(text: str) -> int | None:
 
 
 def parse_place(request: Request) -> tuple[int, int]:
-    """Return cell and sector."""
+    """Return cell and sector from the path of a request."""
     cell = _parse_whole("cell", request.path_params["cell"], 0, 4**grid.CELL_ZOOM - 1)
     return cell, _parse_whole("sector", request.path_params["sector"], 0, grid.SECTORS - 1)
 
 
 def parse_route(request: Request) -> tuple[list[tuple[float, float]], str]:
-    """Return the points (longitude, latitude) of a route, and their text."""
+    """Return the points (longitude, latitude) of a route, and the same points as text."""
     text = request.query_params.get("points", "")
     found = query.parse({"route": text}).route
     return list(found or ()), text

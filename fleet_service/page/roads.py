@@ -1,8 +1,9 @@
-"""Roads of the page: lines and place names of a GeoJSON file, or lines learned from the cells that
-vehicles visited.
+"""Roads of the page: lines and place names from a GeoJSON file, or lines derived from the cells
+that vehicles visited.
 
-The page draws one ribbon per direction along each line. Lines of a file have names; learned lines
-follow the centres of neighbouring cells of one heading, smoothed. Pure but for reading the file.
+The page draws one ribbon per direction along each line. Lines of a file have names. Derived lines
+follow the centres of neighbouring cells with the same heading, smoothed. Pure except for reading
+the file.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ class Line(NamedTuple):
     """Line of a road.
 
     Attributes:
-        name: empty if unknown.
-        points: longitude and latitude [deg] along it.
+        name: name of the road; empty if unknown.
+        points: longitude and latitude [deg] along the line.
         directions: 1 for forward, 2 for backward, 3 for both.
     """
 
@@ -46,13 +47,13 @@ class Line(NamedTuple):
 
 
 class RoadMap(NamedTuple):
-    """Lines, and names of places with longitude and latitude [deg]."""
+    """Lines of roads, and names of places with longitude and latitude [deg]."""
 
     lines: list[Line]
     places: list[tuple[str, float, float]]
 
     def as_json(self) -> dict[str, Any]:
-        """Return the road map for the page."""
+        """Return the road map in a form for JSON."""
         lines = [
             {"name": line.name, "points": line.points, "directions": line.directions}
             for line in self.lines
@@ -61,10 +62,11 @@ class RoadMap(NamedTuple):
 
 
 def read_roads(path: Path) -> RoadMap:
-    """Return the lines and named points of a GeoJSON file; `name` and `oneway` are properties.
+    """Return the lines and named points of a GeoJSON file. The properties `name` and `oneway` are
+    used.
 
     Raises:
-        InputError: it cannot be read, or holds no line.
+        InputError: the file cannot be read, or contains no line.
     """
     try:
         features = json.loads(path.read_bytes())["features"]
@@ -101,7 +103,7 @@ def _add_feature(found: RoadMap, geometry: dict[str, Any], about: dict[str, Any]
 
 
 def learned_lines(cell: IntArray, sector: IntArray) -> list[Line]:
-    """Return one line per chain of neighbouring cells of a heading.
+    """Return one line per chain of neighbouring cells with the same heading.
 
     Args:
         cell: (n,) z21 quadints.
@@ -117,10 +119,10 @@ def learned_lines(cell: IntArray, sector: IntArray) -> list[Line]:
 
 
 def _merge_side_by_side(cells: list[tuple[int, int]], heading: int) -> dict[int, list[float]]:
-    """Return the positions across the heading by the column along it.
+    """Return, for each column of cells along the heading, the positions across the heading.
 
-    The receiver's error spreads one lane over neighbouring cells. Cells of one column that are at
-    most AHEAD apart become one position, their mean.
+    The receiver's error spreads one lane over neighbouring cells. Therefore cells of one column
+    that are at most AHEAD apart become one position, their mean.
     """
     dx, dy = _STEP[heading]
     columns: dict[int, list[int]] = {}
@@ -138,8 +140,8 @@ def _merge_side_by_side(cells: list[tuple[int, int]], heading: int) -> dict[int,
 
 
 def _chain_cells(cells: list[tuple[int, int]], heading: int) -> Iterable[list[tuple[float, float]]]:
-    """Yield chains of positions in the order of travel: each goes on to the next one ahead that
-    has no other.
+    """Yield chains of positions in the order of travel. Each position is followed by the nearest
+    position ahead that is not in another chain.
     """
     dx, dy = _STEP[heading]
     here = _merge_side_by_side(cells, heading)
@@ -168,8 +170,8 @@ def _chain_cells(cells: list[tuple[int, int]], heading: int) -> Iterable[list[tu
 
 
 def _smooth_chain(chain: FloatArray) -> list[list[float]]:
-    """Return longitude and latitude [deg] of a chain of cells (n, 2), each the mean of its
-    neighbours.
+    """Return longitude and latitude [deg] of a chain of cells (n, 2), smoothed with a moving
+    average.
     """
     half = SMOOTHED // 2
     padded = (

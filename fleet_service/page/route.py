@@ -1,7 +1,8 @@
-"""Grip along a route: stretches of the same cell and heading in order, measured or not.
+"""Friction along a route: stretches in order, each within the same cell and heading, measured or
+not.
 
-An unmeasured part is a stretch of its own without a number. It is neither dry nor slippery, and it
-is counted.
+An unmeasured part is a stretch without a value. It counts neither as dry nor as slippery, but its
+length is counted.
 """
 
 from __future__ import annotations
@@ -26,13 +27,12 @@ Points = Sequence[tuple[float, float]]
 
 
 def grip_profile(points: Points, table: pa.Table) -> dict[str, Any]:
-    """Return the stretches along a route of (longitude, latitude) [deg], with the cells that a
+    """Return the friction along a route of (longitude, latitude) [deg], from the cells that a
     service returned.
 
     Returns:
         `length_m`; `share` of the length by basis; `stretches` with from_m, to_m, middle, basis
-        and, where measured, mu, its quantiles, P(slippery), age_s and safe speeds [m/s] by metres
-        of sight; `worst`: index of the least lower end, or None.
+        and, where measured, mu, its quantiles, P(slippery), age_s and safe speeds [m/s] by sight distance [m]; `worst`: index of the stretch with the lowest lower bound, or None.
 
     Raises:
         InputError: the route is too long or not valid.
@@ -74,8 +74,8 @@ def grip_profile(points: Points, table: pa.Table) -> dict[str, Any]:
 
 
 def safe_speeds(mu_lower: float) -> dict[str, float]:
-    """Return the speed [m/s] from which a car stops with the lower end of grip, by metres of
-    sight.
+    """Return the highest speed [m/s] from which a car can stop within each sight distance [m],
+    given the lower bound of mu. The keys are the distances as text.
     """
     return {str(sight): float(stopping_speed(mu_lower, sight)) for sight in SIGHTS_M}
 
@@ -91,8 +91,8 @@ def _describe_cell(cell: dict[str, Any]) -> dict[str, Any]:
 
 
 def _sample_route(points: Points) -> tuple[Any, Any, Any, Any]:
-    """Return longitude and latitude [deg], metres along and heading sector of each step of the
-    route.
+    """Return longitude and latitude [deg], distance from the start [m] and heading sector of points
+    along the route.
     """
     corners = np.array(points)
     if corners.ndim != 2 or len(corners) < 2:

@@ -1,5 +1,5 @@
-"""Process of the page: a reader's session in a thread and a web server on loopback, until a
-signal.
+"""Process of the page: a Zenoh session in a thread and a web server, which run until a signal
+arrives.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ class PageSettings:
     """Settings of the page.
 
     Attributes:
-        connection: how to reach the router.
-        host, port: where to listen; port 0 selects a free one.
-        names: host names under which a proxy forwards requests; empty and not on loopback accepts
-            any.
-        archive: of the service, for the past; None without one.
+        connection: connection settings for the router.
+        host, port: listen address; port 0 selects a free port.
+        names: host names under which a proxy forwards requests; if empty, any name is accepted
+            unless the page listens on loopback.
+        archive: folder of a service's archive, for the past; None without an archive.
         metrics: addresses of services' metrics, for the health view.
-        overlay: Parquet of cell, sector, mu to draw over the map.
-        base_map: tiles below the roads; None without one.
-        roads: lines to draw the ribbons along; None to learn them from the cells.
-        datex: a DATEX II publication to maintain and to serve; None without one.
-        most: maximum number of watchers.
+        overlay: Parquet file of cell, sector and mu to draw over the map.
+        base_map: tiles below the roads; None without a base map.
+        roads: lines along which ribbons are drawn; None to derive them from the cells.
+        datex: DATEX II publication to keep up to date and to serve; None without one.
+        most: maximum number of browsers that receive live changes.
     """
 
     connection: ZenohSettings
@@ -70,7 +70,7 @@ class PageSettings:
 
 
 def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None]) -> None:
-    """Serve until `stop` is set; print `page: ADDRESS` when it listens.
+    """Serve until `stop` is set; call `say` with `page: ADDRESS` when the server listens.
 
     Raises:
         InputError: the port is in use.
@@ -122,7 +122,7 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
 def update_publication(
     file: DatexFile, world: MapMirror, reader: Reader, stop: threading.Event
 ) -> None:
-    """Keep a publication current with the received alerts until `stop` is set."""
+    """Keep a publication consistent with the received alerts until `stop` is set."""
     seen = -1
     while not stop.wait(GATHER_S):
         if not reader.is_served or (world.alerts_heard == seen and not file.is_due):

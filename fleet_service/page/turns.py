@@ -1,10 +1,11 @@
-"""Turns for requests, so that one client does not take the page, or the past, from the others.
+"""Queues for requests, so that one client cannot block the page, or queries about the past, for the
+others.
 
-At most RUNNING requests of one client are computed at a time; the others wait, one a connection.
+At most RUNNING requests of one client are computed at a time; its other requests wait.
 
-A service rebuilds one past map at a time. The page asks one question at a time, in the order of
-arrival, and holds at most MOST_WAITING of one client. After each question it pauses for as long as
-the question took, so that other readers of the service get their turn as well.
+A service rebuilds one past map at a time. Therefore the page sends one query about the past at a
+time, in the order of arrival, and queues at most MOST_WAITING of one client. After each such query
+it pauses for as long as the query took, so that other readers of the service get their turn.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ LONGEST_PAUSE_S: Final = 2.0
 
 
 class TooManyQuestionsError(Exception):
-    """A client, or all clients together, have too many questions waiting."""
+    """Error: one client, or all clients together, have too many queries waiting."""
 
 
 class RequestTurns:
-    """Turns of all clients; used in one event loop."""
+    """Limit on the concurrent requests of each client; for use in one event loop."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
@@ -35,7 +36,7 @@ class RequestTurns:
 
     @asynccontextmanager
     async def take(self, client: str) -> AsyncIterator[None]:
-        """Wait for a turn and hold it while the block runs."""
+        """Wait until the client may compute another request, and count it while the block runs."""
         self._counts[client] += 1
         try:
             async with self._free.setdefault(client, asyncio.Semaphore(RUNNING)):
@@ -47,7 +48,7 @@ class RequestTurns:
 
 
 class PastTurns:
-    """Queue of questions about the past; used in one event loop."""
+    """Queue of queries about the past; for use in one event loop."""
 
     def __init__(self) -> None:
         self._lock = asyncio.Lock()
@@ -56,10 +57,10 @@ class PastTurns:
 
     @asynccontextmanager
     async def take(self, client: str) -> AsyncIterator[None]:
-        """Wait for a turn and hold it while the block runs.
+        """Wait until it is this query's turn, and occupy the queue while the block runs.
 
         Raises:
-            TooManyQuestionsError: too many questions wait.
+            TooManyQuestionsError: too many queries are waiting.
         """
         if self._waiting[client] >= MOST_WAITING or len(+self._waiting) >= MOST_CLIENTS:
             raise TooManyQuestionsError

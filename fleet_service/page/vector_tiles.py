@@ -1,9 +1,9 @@
-"""Vector tiles: an encoder of Mapbox Vector Tiles 2.1, and a reader of PMTiles 3. Pure but for the
-reader's file.
+"""Vector tiles: an encoder of Mapbox Vector Tiles 2.1, and a reader of PMTiles 3 files. Pure except
+for the reader's file.
 
 The encoder is for small generated maps such as the demo's town; it writes the layers that the
-page's base map draws. The reader serves an operator's own extract, one file, without a server of
-tiles. References: github.com/mapbox/vector-tile-spec/tree/master/2.1,
+page's base map draws. The reader serves tiles from an operator's own file, so that no tile server
+is needed. References: github.com/mapbox/vector-tile-spec/tree/master/2.1,
 github.com/protomaps/PMTiles/blob/main/spec/v3.
 """
 
@@ -38,8 +38,12 @@ MOST_UNPACKED: Final = 16 << 20  # bytes of a tile or of a directory without com
 
 
 class TileShape(NamedTuple):
-    """Shape of a layer: points, lines or rings in units of the tile (EXTENT across, y down), and
-    its tags.
+    """Shape in a layer of a vector tile.
+
+    Attributes:
+        kind: points, lines or rings.
+        parts: coordinates of each part in units of the tile (EXTENT across, y down).
+        tags: properties of the shape.
     """
 
     kind: int
@@ -48,7 +52,7 @@ class TileShape(NamedTuple):
 
 
 def encode_tile(layers: Mapping[str, Iterable[TileShape]]) -> bytes:
-    """Return a tile of these layers; a layer without shapes is left out."""
+    """Return a vector tile with the given layers; layers without shapes are left out."""
     return b"".join(
         _bytes_field(3, _encode_layer(name, list(shapes)))
         for name, shapes in layers.items()
@@ -128,8 +132,8 @@ def _bytes_field(number: int, body: bytes) -> bytes:
 
 
 def unpack_tile(tile: bytes) -> bytes | None:
-    """Return a tile without the compression that most files give it; None if it is damaged or
-    larger than MOST_UNPACKED.
+    """Return a tile after decompression, if it is compressed; None if it is damaged or larger than
+    MOST_UNPACKED.
     """
     if not tile.startswith(_GZIP):
         return tile if len(tile) <= MOST_UNPACKED else None
@@ -145,10 +149,10 @@ class PmtilesFile:
     """Vector tiles of a PMTiles file; thread-safe.
 
     Args:
-        path: ends in .pmtiles.
+        path: path that ends in .pmtiles.
 
     Raises:
-        InputError: it does not exist, is no PMTiles 3, or holds no vector tiles.
+        InputError: the file does not exist, is not PMTiles 3, or contains no vector tiles.
     """
 
     def __init__(self, path: Path) -> None:
@@ -177,8 +181,8 @@ class PmtilesFile:
         self.metadata: dict[str, Any] = about_map if isinstance(about_map, dict) else {}
 
     def tile(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return a tile, counted from the north-west, unpacked; None if there is none, or if the
-        file is damaged there.
+        """Return a tile, unpacked, with rows counted from the north; None if there is no such tile,
+        or if the file is damaged there.
         """
         try:
             return self._find_tile(zoom, x, y)
@@ -213,8 +217,8 @@ class PmtilesFile:
 
 
 def _find_entry(directory: bytes, wanted: int) -> tuple[int, int, int] | None:
-    """Return offset, size and run of the last entry at or before a tile's number; a run of 0 is
-    a leaf directory.
+    """Return offset, size and run length of the last directory entry whose number is at most
+    `wanted`. A run length of 0 means a leaf directory.
     """
     numbers = _decode_varints(directory)
     count = next(numbers)
@@ -247,8 +251,8 @@ def _decode_varints(data: bytes) -> Iterator[int]:
 
 
 def _hilbert_number(zoom: int, x: int, y: int) -> int:
-    """Return the number of a tile: those of all smaller zooms, then the place on the Hilbert
-    curve.
+    """Return the number of a tile in PMTiles: the number of tiles of all smaller zooms, plus the
+    position on the Hilbert curve.
     """
     found: int = (4**zoom - 1) // 3
     side = 1 << zoom >> 1

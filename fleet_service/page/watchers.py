@@ -1,10 +1,10 @@
-"""Server-sent events to browsers: each has a view and a short queue; a slow one gets a request to
-reload.
+"""Server-sent events to browsers. Each browser has a view and a short queue; a browser that is too
+slow is asked to reload.
 
 tiles    blocks in base64, one per line: changed cells, or a complete tile when zoomed out
-alerts   all standing stretches
-beat     time, served regions, standing alerts: every two seconds
-reload   this watcher missed something and must query again
+alerts   all stretches with an active alert
+beat     time, served regions, number of active alerts: every two seconds
+reload   this browser has missed an event and must query again
 """
 
 from __future__ import annotations
@@ -30,11 +30,13 @@ _RELOAD: Final = b"event: reload\ndata: {}\n\n"
 
 
 class TooManyWatchersError(Exception):
-    """The maximum number of watchers is reached."""
+    """Error: the maximum number of watching browsers is reached."""
 
 
 class View(NamedTuple):
-    """Part of the map of a watcher: west, south, east, north [deg], and the level of its places."""
+    """Part of the map that a browser shows: west, south, east, north [deg], and the zoom level of
+    its records.
+    """
 
     box: Box
     level: int
@@ -47,12 +49,12 @@ class _OpenPage(NamedTuple):
 
 
 class Watchers:
-    """All watching browsers; used in one event loop.
+    """All watching browsers; for use in one event loop.
 
     Args:
-        world: the map.
-        state: returns services and health for a beat.
-        most: maximum number of watchers.
+        world: the mirrored map.
+        state: function that returns the state of services for a `beat` event.
+        most: maximum number of watching browsers.
     """
 
     def __init__(
@@ -68,13 +70,13 @@ class Watchers:
         return len(self._watchers)
 
     def enter(self, view: View, client: str = "") -> AsyncIterator[bytes]:
-        """Yield events for a view from now on, until the watcher leaves.
+        """Return the stream of events for a view, from now on, until the browser disconnects.
 
-        Places are shared fairly: if all are taken, the client with the most streams loses one to a
-        client with fewer.
+        Streams are shared fairly: if the maximum is reached, the client with the most streams loses
+        one to a client with fewer.
 
         Raises:
-            TooManyWatchersError: the browser must come again later.
+            TooManyWatchersError: no stream can be ended; the browser must try again later.
         """
         if len(self._watchers) >= self._most:
             self._make_place(client)
@@ -101,7 +103,7 @@ class Watchers:
             self._watchers.pop(watcher.queue, None)
 
     async def run(self) -> None:
-        """Push changes until cancelled."""
+        """Send changes to the browsers until cancelled."""
         beaten = 0.0
         while True:
             await asyncio.sleep(FLUSH_S)
@@ -122,7 +124,7 @@ class Watchers:
         return {"now": time.time(), "heard": self._world.heard, **self._state()}
 
     def push(self, changes: list[TileBlock]) -> None:
-        """Send changes to the watchers whose view they touch."""
+        """Send changed blocks to the browsers whose view they touch."""
         lines: dict[tuple[int, int], bytes] = {}  # of (tile, level): made once for all who watch it
         for watcher in list(self._watchers.values()):
             found = []

@@ -1,6 +1,6 @@
-"""Routes of the page: files, cells by tile, events, one cell, moments, a route, health.
+"""HTTP routes of the page: files, cells by tile, events, one cell, moments, a route, health.
 
-Every answer forbids inline scripts, foreign content, and framing.
+Every answer has headers that forbid inline scripts, content from other hosts, and framing.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ BLOCKS: Final = "application/vnd.gripmap.blocks"
 
 
 class Sources(NamedTuple):
-    """Data sources of the routes."""
+    """Data sources from which the routes answer."""
 
     world: MapMirror
     reader: Reader
@@ -56,12 +56,12 @@ class Sources(NamedTuple):
 def make_application(
     sources: Sources, hosts: Iterable[str], lifespan: Callable[[Starlette], Any]
 ) -> ASGIApp:
-    """Return the web application, with compression and the headers of every answer.
+    """Return the web application, with compression and security headers.
 
     Args:
-        sources: of the answers.
-        hosts: accepted host names; empty accepts any.
-        lifespan: runs next to it.
+        sources: data sources.
+        hosts: accepted host names; if empty, any name is accepted.
+        lifespan: context that runs as long as the application.
     """
     routes = Routes(sources)
     base = sources.base_map
@@ -98,7 +98,7 @@ def make_application(
 
 
 class Routes:
-    """Handlers, one method per route."""
+    """Request handlers of the page, one method per route."""
 
     def __init__(self, sources: Sources) -> None:
         self._of = sources
@@ -106,7 +106,7 @@ class Routes:
         self.features = FeatureRoutes(sources.world, sources.reader)
 
     async def index(self, request: Request) -> Response:
-        """Return the page; to a program, the landing page of OGC API Features."""
+        """Return the live page. A program gets the landing page of OGC API Features instead."""
         if ogc.wants_json(request):
             return await self.features.landing(request)
         found = self._files.answer("index.html", request, "Accept, Accept-Encoding")
@@ -114,19 +114,19 @@ class Routes:
         return found
 
     async def file(self, request: Request) -> Response:
-        """Return one of the page's files."""
+        """Return one of the page's static files."""
         found = self._files.answer(request.path_params["name"], request)
         return PlainTextResponse("no such file\n", 404) if found is None else found
 
     async def texts(self, request: Request) -> Response:
-        """Return the texts of the page in the browser's language, if there is a file for it."""
+        """Return the texts of the page in the browser's language if available, else in English."""
         name = self._files.texts(request.headers.get("accept-language", ""))
         found = self._files.answer(name, request, "Accept-Encoding, Accept-Language")
         assert found is not None
         return found
 
     async def settings(self, _: Request) -> Response:
-        """Return the numbers and colours that the page computes with."""
+        """Return constants and colours that the page's scripts need."""
         base = self._of.base_map
         return JSONResponse(
             {
@@ -148,7 +148,7 @@ class Routes:
         )
 
     async def roads(self, _: Request) -> Response:
-        """Return the lines along which ribbons are drawn: of the operator's file, or learned
+        """Return the lines along which the page draws ribbons: from the operator's file, or derived
         from the cells.
         """
         if self._of.roads is not None:
@@ -157,12 +157,14 @@ class Routes:
         return JSONResponse(RoadMap(lines, []).as_json() | {"learned": True})
 
     async def areas(self, _: Request) -> Response:
-        """Return the areas with data, the most alerts first."""
+        """Return the areas with data, those with the most alerts first."""
         named = self._of.roads.places if self._of.roads is not None else []
         return JSONResponse(await run_in_threadpool(areas.found_in, self._of.world, named))
 
     async def picture(self, request: Request) -> Response:
-        """Return a tile of the operator's file; empty if there is none."""
+        """Return a base map tile from the operator's file; status 204 without content if there is
+        no such tile.
+        """
         file = self._of.base_map and self._of.base_map.file
         if not file:
             return PlainTextResponse("this page serves no tiles; see --base-map\n", 404)
@@ -175,7 +177,7 @@ class Routes:
         )
 
     async def tiles(self, request: Request) -> Response:
-        """Return the tiles with cells, now or `at` a moment."""
+        """Return the tiles that have cells, now or at the time `at`."""
         at = request_params.parse_moment(request)
         found = (
             self._of.world.tiles()
@@ -185,8 +187,8 @@ class Routes:
         return JSONResponse(found)
 
     async def blocks(self, request: Request) -> Response:
-        """Return blocks of `tiles` at a `level`, now or `at` a moment; with `borrowed`, borrowed
-        cells too.
+        """Return encoded blocks of the requested `tiles` at a zoom `level`, now or at the time
+        `at`. With `borrowed`, cells estimated from neighbours are included.
         """
         wanted = request_params.parse_tiles(request)
         level = request_params.parse_level(request)
@@ -214,7 +216,7 @@ class Routes:
         )
 
     async def events(self, request: Request) -> Response:
-        """Stream the changes in `bbox` at a `level`, from now on."""
+        """Return a stream of the changes in `bbox` at a zoom `level`, from now on."""
         try:
             stream = self._of.watchers.enter(
                 request_params.parse_view(request), request.client.host if request.client else ""
@@ -227,7 +229,7 @@ class Routes:
         return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
     async def cell(self, request: Request) -> Response:
-        """Return one cell and heading as the service knows it now."""
+        """Return the present values of one cell and heading."""
         cell, sector = request_params.parse_place(request)
         return JSONResponse(await run_in_threadpool(self._cell, cell, sector))
 
@@ -243,17 +245,17 @@ class Routes:
         return None
 
     async def history(self, request: Request) -> Response:
-        """Return the belief about a cell at the stored moments."""
+        """Return the belief about a cell at each stored moment."""
         return JSONResponse(
             await run_in_threadpool(self._of.moments.history, *request_params.parse_place(request))
         )
 
     async def times(self, _: Request) -> Response:
-        """Return the stored moments."""
+        """Return the stored moments [s since 1970]."""
         return JSONResponse(await run_in_threadpool(self._of.moments.times))
 
     async def route(self, request: Request) -> Response:
-        """Return the grip along `points`."""
+        """Return the friction along the route `points`."""
         points, text = request_params.parse_route(request)
         return JSONResponse(await run_in_threadpool(self._profile, points, text))
 
@@ -300,15 +302,15 @@ class Routes:
         )
 
     async def overlay(self, _: Request) -> Response:
-        """Return the overlay map, or null."""
+        """Return the additional map, or null."""
         return JSONResponse(await run_in_threadpool(overlay.read_overlay, self._of.overlay))
 
 
 def with_turns(
     turns: RequestTurns, answer: Callable[[Request], Awaitable[Response]]
 ) -> Callable[[Request], Awaitable[Response]]:
-    """Wrap a handler so that a client waits for its turn, and a bad request gets an answer with
-    the problem and the fix.
+    """Return a request handler in which a client waits for its turn. An invalid request is answered
+    with the problem and the fix.
     """
 
     async def answer_or_refuse(request: Request) -> Response:
@@ -324,7 +326,9 @@ def with_turns(
 
 
 class Guarded:
-    """Adds the headers of every answer, and refuses foreign host names against DNS rebinding."""
+    """Wrapper of the web application that adds security headers to every answer, and refuses
+    foreign host names (against DNS rebinding).
+    """
 
     def __init__(self, app: ASGIApp, hosts: frozenset[str], base_map: str | None) -> None:
         self._app = app
@@ -344,7 +348,9 @@ class Guarded:
         ]
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Forward a request and add the headers."""
+        """Process a request: refuse a foreign host name, otherwise forward the request and add the
+        headers to the answer.
+        """
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -370,14 +376,16 @@ def _host_name(scope: Scope) -> str:
 
 
 def origin_of(address: str) -> str:
-    """Return scheme, host and port of an address; empty for this host."""
+    """Return scheme, host and port of an address; empty if the address has no host and so refers to
+    this server.
+    """
     parts = urlsplit(address)
     return f"{parts.scheme}://{parts.netloc}" if parts.netloc else ""
 
 
 @contextlib.asynccontextmanager
 async def push_changes(watchers: Watchers) -> AsyncIterator[None]:
-    """Push changes while the block runs; then end all streams."""
+    """Send changes to the browsers while the block runs; then end all streams."""
     import asyncio
 
     task = asyncio.create_task(watchers.run())

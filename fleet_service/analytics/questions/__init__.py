@@ -1,4 +1,4 @@
-"""Table of questions: name, description, and possible forms of the answer."""
+"""Table of the predefined questions: name, description, and the possible forms of the answer."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ class Question(NamedTuple):
     """One question.
 
     Attributes:
-        about: one line for the help.
-        order: column by which the terminal shows rows, descending with a leading minus.
-        colour: column that a map colours cells by; None if the answer has no place.
-        answer: function of a plug-in's question; None for a module here.
+        name: name of the question on the command line.
+        about: one line of help text.
+        order: column by which the terminal sorts rows; a leading minus means descending.
+        colour: column that gives the colour of cells on a map; None if the answer has no place.
+        answer: function that answers a question of a plug-in; None for a question of this package.
     """
 
     name: str
@@ -35,7 +36,9 @@ class Question(NamedTuple):
 
     @property
     def ask(self) -> Callable[[QueryEngine, Options], pa.Table]:
-        """Return the function that answers it; imported on demand, because Ibis is heavy."""
+        """Return the function that answers the question. It is imported on demand, because Ibis
+        takes long to import.
+        """
         if self.answer is not None:
             return self.answer
         module = import_module(f"fleet_service.analytics.questions.{self.name.replace('-', '_')}")
@@ -90,8 +93,8 @@ log = logging.getLogger(__name__)
 
 
 def known_questions() -> dict[str, Question]:
-    """Return all questions by name, those of plug-ins too; plug-ins that cannot be loaded are left
-    out and logged.
+    """Return all questions by name, including those of plug-ins. A plug-in that cannot be loaded is
+    left out and logged.
     """
     others = {}
     for name in plugins.entry_points_of(plugins.QUESTIONS):
@@ -103,7 +106,7 @@ def known_questions() -> dict[str, Question]:
 
 
 def question_of(name: str) -> Question:
-    """Return a question by name.
+    """Return the question with this name.
 
     Raises:
         InputError: there is no question of that name, or its plug-in cannot be loaded.

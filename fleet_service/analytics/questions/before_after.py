@@ -1,5 +1,5 @@
-"""`before-after`: change of grip at a moment, in the same cells, with an interval that accounts for
-biased vehicles.
+"""`before-after`: change of friction at a given time, in the same cells, with an interval that
+accounts for biased vehicles.
 
 Legend
     y    a value of mu in cell c, period p (before, after), by vehicle v
@@ -25,8 +25,8 @@ from schemas.thresholds import NS, Z_95
 
 
 def expression(t: Table, at_s: int) -> Table:
-    """Return one row: cells, vehicles, values, means of both periods, difference and its
-    standard deviation.
+    """Return a table with one row: number of cells, vehicles and values, means of both periods, and
+    the sums from which the difference and its standard deviation follow.
     """
     t = t.filter(has_value(t))
     t = t.select("cell", "sector", "vehicle", after=t.time >= at_s, y=t.mu.cast("float64"))
@@ -60,7 +60,7 @@ def expression(t: Table, at_s: int) -> Table:
 
 def find_difference(row: dict[str, Any]) -> dict[str, float]:
     """Return `difference` with its 90 % interval `lower` to `upper`, and `cells`, from the row of
-    `expression`; empty if fewer than two vehicles measured in both periods.
+    `expression`. Return an empty dictionary if fewer than two vehicles measured in both periods.
     """
     if not row["cells"] or row["vehicles"] < 2:
         return {}
@@ -75,11 +75,11 @@ def find_difference(row: dict[str, Any]) -> dict[str, float]:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return two rows, before and after: mu, its difference with interval, and the cells, vehicles
-    and values used.
+    """Return two rows, before and after: mean of mu, its difference with interval, and the number
+    of cells, vehicles and values used.
 
     Raises:
-        InputError: no moment is given, or no cell was measured in both periods.
+        InputError: no time is given, or no cell was measured in both periods.
     """
     if options.at is None:
         raise InputError(

@@ -1,8 +1,9 @@
-"""`calibration`: how often later values lay in the interval that the map had published.
+"""`calibration`: how often later values lay within the interval that the map had published.
 
-A value is compared with the snapshots of the map in the HORIZON_S before it. `held`: the value
-itself lies inside. Its own error is part of this figure, so a calibrated 90 % map stays slightly
-below 0.9. `compatible`: its interval overlaps.
+Each value is compared with the map snapshots of the preceding HORIZON_S. `held` means that the
+value itself lies inside the published interval. The value's own error is part of this figure, so a
+calibrated 90 % map stays slightly below 0.9. `compatible` means that the value's interval overlaps
+the published interval.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ _HOUR_S: Final = 3600
 
 
 def expression(t: Table, maps: Table) -> Table:
-    """Return one row per basis and hours between snapshot and value."""
+    """Return a table with one row per basis (measured, borrowed or bound) and hours between
+    snapshot and value.
+    """
     t = t.filter(has_value(t)).select(
         "cell",
         "sector",
@@ -51,5 +54,5 @@ def expression(t: Table, maps: Table) -> Table:
 
 
 def ask(engine: QueryEngine, _: Options) -> pa.Table:
-    """Return the rows of `expression`."""
+    """Return the rows of `expression` for the selected part."""
     return engine.answer(expression(engine.observations(), engine.maps()))

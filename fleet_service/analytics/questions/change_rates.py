@@ -1,19 +1,19 @@
 """`change-rates`: how fast roads become slippery or recover, by temperature and by hour, from the
 archive's values.
 
-Two successive values of a cell, by different vehicles, show whether the road was slippery at both
-times. After a time Δ
+Two successive values of a cell, from different vehicles, show whether the road was slippery at both
+times. The probability that they differ in this after a time Δ is
 
     P(unlike | Δ) = e + (m − e) (1 − exp(−λ Δ)),   m = 2 π (1 − π)
 
     λ   rate of change of the road, as in the fusion (CHANGE_S is 1/λ)                      [1/s]
     e   probability that two readings of the same road differ because of errors
-    m   probability that readings of two roads differ; π is the share of slippery ones in the class
+    m   probability that readings of two roads differ; π is the share of slippery values in the class
 
-which is the fusion's own model of change (`fleet_service/fusion/README.md`). λ and e maximise the
-likelihood over bins of Δ. Roads of a region change together, so pairs are not independent. Days
-are, and the 90 % interval is that of days drawn with replacement. With fewer than LEAST_DAYS there
-is none.
+This is the fusion's own model of change (`fleet_service/fusion/README.md`). λ and e are
+maximum-likelihood estimates over bins of Δ. Roads of a region change together, so pairs of values
+are not independent, but days are. Therefore the 90 % interval is computed by bootstrap: days are
+drawn with replacement. With fewer than LEAST_DAYS days, no interval is given.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ BANDS: Final = (
 
 
 def expression(t: Table) -> Table:
-    """Return pairs by class, day and bin of time between: `pairs`, `unlike`, `slippery` values
-    among both, `seconds`.
+    """Return counts of value pairs by class, day and bin of elapsed time: number of `pairs`, number
+    of `unlike` pairs, number of `slippery` values in them, and sum of elapsed `seconds`.
 
     Args:
         t: observations with `temperature` of the air [°C], null if unknown.
@@ -93,10 +93,10 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return one row per band of road temperature and per part of the day: rate per hour, its
-    interval, and its basis.
+    """Return one row per band of road temperature and one per part of the day: rate of change per
+    hour, its interval, and the data on which it is based.
 
-    Temperatures are those of the nearest station if `stations` is given, else those that vehicles
+    If `stations` is given, temperatures are those of the nearest station, else those that vehicles
     reported.
 
     Raises:
@@ -142,7 +142,9 @@ def _band_name(one: str | int) -> str:
 
 
 def _fit_class(counted: pa.Table) -> dict[str, float | int | None]:
-    """Return the rate of a class, with the interval of days drawn with replacement."""
+    """Return the rate of change for one class, with an interval from days drawn with
+    replacement.
+    """
     columns = {
         name: counted[name].to_numpy().astype(float)
         for name in ("pairs", "unlike", "slippery", "seconds")
@@ -183,12 +185,13 @@ BEGINS: Final = tuple(
 
 
 def fit(counts: FloatArray, begins: Sequence[tuple[float, float]] = BEGINS) -> tuple[float, float]:
-    """Return λ [1/s] and e of the largest likelihood; NaN if no pair differs, or all roads are
-    alike.
+    """Return the maximum-likelihood estimates of λ [1/s] and e. Return NaN if no pair differs, or
+    if all values are on one side of the slippery limit.
 
     Args:
-        counts: (bins, 4) pairs, unlike ones, slippery values, seconds between.
-        begins: λ and e from which the search begins; the best end is taken.
+        counts: (bins, 4): number of pairs, number of unlike pairs, number of slippery values, and
+            sum of elapsed seconds.
+        begins: pairs (λ, e) from which the search begins; the best result is taken.
     """
     counts = counts[counts[:, 0] > 0]
     pairs, unlike, slippery, seconds = counts.T

@@ -1,11 +1,14 @@
-"""`contract`: per link of a road network, whether the agreed grip was kept, and the longest breach.
+"""`contract`: for each link of a road network, whether the friction that a contract requires was
+kept, and the longest breach.
 
-A link is evaluated in pieces of PIECE_M, and is as good as its worst piece, so that ice on a tenth
-is not averaged away. Values are collected in slots of SLOT_S, per vehicle first: a car that passes
-ten times is one witness. A slot is certainly below the level if the 90 % interval of its mean lies
-below, and certainly kept if it lies above. A breach begins with a slot below and ends with the next
-one that is not. `least_s` is the time certainly below. `most_s` runs from the last slot that was
-certainly kept to the next one. Unmeasured time is unknown, and never counts as kept.
+A link is divided into pieces of PIECE_M, and the worst piece counts, so that ice on a tenth of the
+link is not averaged away. Values are collected in time slots of SLOT_S. They are averaged per
+vehicle first, so that a car that passes ten times counts once. A slot is certainly below the
+required level if the 90 % interval of its mean lies below the level. It is certainly kept if the
+interval lies above. A breach begins with a slot below the level and ends with the next slot that is
+not below. `least_s` is the time that is certainly below. `most_s` is the longest possible breach:
+from a slot that was certainly kept to the next such slot. Unmeasured time is unknown, and never
+counts as kept.
 """
 
 from __future__ import annotations
@@ -56,12 +59,12 @@ _ROW: Final[dict[str, pa.DataType]] = {
 
 
 def expression(t: Table, places: Table) -> Table:
-    """Return the mean of each vehicle's values per piece of a link and slot, with the mean of its
-    reported variances.
+    """Return the mean of each vehicle's values, per piece of a link and slot, with the mean of the
+    variances that the vehicle reported.
 
     Args:
         t: observations.
-        places: `cell`, `sector`, `link`, `direction`, `piece`.
+        places: table with `cell`, `sector`, `link`, `direction`, `piece`.
     """
     t = t.filter(has_value(t)).mutate(slot=(t.time / SLOT_S).floor().cast("int64"))
     std = (t.mu_upper.cast("float64") - t.mu_lower.cast("float64")) / INTERVAL_STD
@@ -78,8 +81,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Return one row per measured link and direction, the worst first.
 
     Raises:
-        InputError: the table of roads, the level, or the time within which it must be restored is
-            missing.
+        InputError: the table of roads, the required level, or the time within which it must be
+            restored is missing.
     """
     if options.roads is None:
         raise InputError(
@@ -102,10 +105,11 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def slot_intervals(found: pa.Table) -> dict[str, FloatArray]:
-    """Return mean and 90 % interval per slot from those of its vehicles, as columns with the slot's
-    first row.
+    """Return mean and 90 % interval of mu for each slot, computed from the values of its vehicles.
+    The column `first` is the row number of the slot's first vehicle.
 
-    The error of a mean is the larger of the vehicles' spread and their own intervals.
+    The error of a mean is the larger of two estimates: from the spread between vehicles, and from
+    the intervals that they reported.
     """
     y, variance, key = (found[name].to_numpy() for name in ("y", "variance", "key"))
     first, which, n = np.unique(key, return_index=True, return_inverse=True, return_counts=True)[1:]
@@ -129,14 +133,14 @@ def longest_breach(
     level: float,
     span: tuple[int, int],
 ) -> tuple[int, int, int, int]:
-    """Return the longest breach of one link [s]: by the means, certain, and possible; and its begin
-    (0 for none).
+    """Return four numbers [s] for one link: the longest breach according to the means, the longest
+    certain breach, the longest possible breach, and the begin of the first (0 for none).
 
     Args:
         slot: (n,) numbers of slots, ascending.
-        lower, mu, upper: (n,) interval and mean of each.
-        level: agreed grip.
-        span: begin and end [s] of all measurements; outside it nothing is known, so slots are cut
+        lower, mu, upper: (n,) interval and mean of each slot.
+        level: required friction.
+        span: begin and end [s] of all measurements. Nothing is known outside it, so slots are cut
             to it.
     """
     begins = np.maximum(slot * SLOT_S, span[0])
@@ -154,8 +158,9 @@ def longest_breach(
 
 
 def _find_runs(is_below: BoolArray, far: BoolArray | None = None) -> tuple[IntArray, IntArray]:
-    """Return the first positions of runs of true values, and the positions after their last; a run
-    ends where the next slot is far."""
+    """Return the first position of each run of true values, and the position after its last. If
+    `far` is given, a run also ends before a slot that is far from the previous one.
+    """
     number = np.cumsum(~is_below if far is None else ~is_below | far)
     at = np.flatnonzero(is_below)
     new = np.append(True, np.diff(number[at]) != 0)[: len(at)]
@@ -163,7 +168,7 @@ def _find_runs(is_below: BoolArray, far: BoolArray | None = None) -> tuple[IntAr
 
 
 class _Measured(NamedTuple):
-    """Rows of each piece of one link, and their vehicles."""
+    """Row numbers of each piece of one link, and the vehicles that measured them."""
 
     pieces: dict[int, list[int]]
     vehicles: set[str]
@@ -236,7 +241,9 @@ def _link_rows(
 
 
 def _measured_share(roads: pa.Table, seen: pa.Table) -> dict[tuple[str, str], float]:
-    """Return the share of each link's length that lies in cells with a value."""
+    """Return, for each link and direction, the share of its length that lies in cells with a
+    value.
+    """
     rows = roads.join(seen, ["cell", "sector"], join_type="inner").sort_by("from_m")
     total: dict[tuple[str, str], float] = {}
     reached: dict[tuple[str, str], float] = {}

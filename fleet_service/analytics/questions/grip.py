@@ -1,5 +1,5 @@
-"""`grip`: percentiles of mu per cell and day, and coverage: cells with values, with bounds only,
-or without visits.
+"""`grip`: percentiles of mu per cell and day, and coverage: the shares of cells with values, with
+only lower bounds, and without visits.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ PERCENTILES: Final = {"mu_p10": 0.1, "mu_p50": 0.5, "mu_p90": 0.9}
 
 
 def expression(t: Table) -> Table:
-    """Return one row per day, cell and sector. Without a value there are no percentiles: mu is at
-    least `utilised_max`."""
+    """Return a table with one row per day, cell and sector. Without a value there are no
+    percentiles; then only mu ≥ `utilised_max` is known.
+    """
     reported = ibis.ifelse(has_value(t), t.mu.cast("float64"), ibis.null("float64"))
     t = t.select(
         "day",
@@ -41,8 +42,9 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return the rows of `expression`; report the coverage of the network (every cell and sector
-    seen in these days) per day."""
+    """Return the rows of `expression`. Also report the daily coverage of the network, which is the
+    set of all cells and sectors visited in the selected time.
+    """
     found = engine.answer(expression(engine.observations()))
     for line in coverage_lines(found):
         options.report(line)
@@ -50,8 +52,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def coverage_lines(found: pa.Table) -> list[str]:
-    """Return a line per day: shares of the network with a value, with a bound only, without a
-    visit.
+    """Return one line of text per day: the shares of the network with a value, with only a lower
+    bound, and without a visit.
     """
     key = found["cell"].to_numpy() * 4 + found["sector"].to_numpy()
     network = len(np.unique(key))

@@ -1,4 +1,6 @@
-"""`replay`: the map as of any moment, replayed from the archive; or a day of it in frames."""
+"""`replay`: the map at any past moment, replayed from the archive; or a period as a sequence of
+frames.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,8 @@ REPORT_ROWS: Final = 1_000_000  # between two lines of progress
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return the cells of the map at `at`, or of each frame from the part's begin to its end;
-    `frame` is its time.
+    """Return the cells of the map at the time `at`; with `step_s`, the cells of each frame during
+    the selected period. `frame` is the time of the frame.
 
     Raises:
         InputError: the step is not valid, or makes too many frames.
@@ -69,8 +71,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def _frames_begin(engine: QueryEngine, first: int, step: int) -> int:
-    """Return the begin of the frames [ns]: that of the part, or just before the first row if the
-    part begins earlier.
+    """Return the time of the first frame [ns]: the begin of the selected part, or the time just
+    before the first row if that is later.
 
     Raises:
         InputError: there would be too many frames.

@@ -1,8 +1,10 @@
-"""`spells`: begin and duration of slippery spells, and the time until an alert of two vehicles.
+"""`spells`: begin and duration of slippery spells, and the time until a second vehicle reported
+each.
 
-A spell is a run of values below SLIPPERY_MU in one cell and sector, in order of time. It ends with
-the first value of grip, and at least `least_vehicles` reported it. The alert is the first value of
-a second vehicle, as in the service.
+A spell is a sequence of values below SLIPPERY_MU in one cell and sector, in order of time. It ends
+with the first value that is not slippery. Only spells that at least `least_vehicles` vehicles
+reported are listed. The alert time is that of the first value of a second vehicle, as in the
+service.
 """
 
 from __future__ import annotations
@@ -16,8 +18,8 @@ from schemas.thresholds import SLIPPERY_MU
 
 
 def expression(t: Table, least_vehicles: int) -> Table:
-    """Return one row per spell; if it `lasts` at the end of the data, `end` is null and
-    `duration_s` a minimum.
+    """Return a table with one row per spell. If a spell has not ended (`lasts`), `end` is null and
+    `duration_s` is a minimum.
     """
     t = t.filter(has_value(t)).select(
         "cell", "sector", "time", "vehicle", "boot", "seq", "row", "mu"
@@ -66,5 +68,5 @@ def expression(t: Table, least_vehicles: int) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return the rows of `expression`."""
+    """Return the rows of `expression` for the selected part."""
     return engine.answer(expression(engine.observations(), options.least_vehicles))

@@ -1,7 +1,8 @@
-"""`trend`: grip month by month, and its change from the month before in the same cells.
+"""`trend`: friction month by month, and the difference to the previous month in the same cells.
 
-Months have different cells, so their percentiles cannot be compared directly. The difference uses
-cells with values of both months only, with the interval of `before-after`.
+Different cells are measured in different months, so the percentiles of months cannot be compared
+directly. The difference uses only cells with values in both months, with the interval of
+`before-after`.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ TYPES: Final[dict[str, pa.DataType]] = {
 
 
 def expression(t: Table) -> Table:
-    """Return one row per month with values."""
+    """Return a table with one row per month that has values."""
     t = t.filter(has_value(t)).select(
         "cell", "sector", "vehicle", month=t.day.truncate("M"), y=t.mu.cast("float64")
     )
@@ -44,7 +45,7 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:  # noqa: ARG001 as all questions have it
-    """Return one row per month; the difference is null where no cell has values of two vehicles in
+    """Return one row per month. The difference is null if no cell has values of two vehicles in
     both months.
     """
     t = engine.observations()
@@ -63,5 +64,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:  # noqa: ARG001 as a
 
 
 def _as_date(month: date) -> date:
-    """Return a month's first day; one engine gives a date, the other a time."""
+    """Return a month's first day as a date; one engine returns a date, the other a date with
+    time.
+    """
     return month.date() if isinstance(month, datetime) else month

@@ -1,5 +1,5 @@
-"""`vehicles`: deviation of a vehicle's values from those of others in the same cell and hour;
-its sensors' health.
+"""`vehicles`: for each vehicle, the deviation of its values from those of other vehicles in the
+same cell and hour, and the health of its sensors.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ HOUR_S = 3600
 
 
 def expression(t: Table) -> Table:
-    """Return one row per vehicle; `bias` is null if it never met another one.
+    """Return a table with one row per vehicle. `bias` is null if the vehicle never measured in the
+    same cell and hour as another.
 
     `bias` is the mean of (own mean - mean of the others) over cells and hours, `bias_std` its
-    standard error, `z` the size of their ratio.
+    standard error, and `z` the absolute value of their ratio.
     """
     reported = has_value(t)
     mine = t.group_by("vehicle").aggregate(
@@ -61,5 +62,5 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, _: Options) -> pa.Table:
-    """Return the rows of `expression`."""
+    """Return the rows of `expression` for the selected part."""
     return engine.answer(expression(engine.observations()))

@@ -1,4 +1,4 @@
-"""`weather`: values of mu by the temperature that the nearest station read in that hour."""
+"""`weather`: values of mu by the temperature at the nearest weather station in the same hour."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ _BITS: Final = 22  # of a cell below its region: 2·(21 - 10)
 
 
 def nearest_readings(t: Table, path: Path) -> Table:
-    """Return observations with the `temperature` [°C] of the nearest station in that hour.
+    """Return observations with a column `temperature` [°C]: the reading of the nearest station in
+    the same hour.
 
     Raises:
         InputError: the table of stations cannot be used.
@@ -34,13 +35,13 @@ def nearest_readings(t: Table, path: Path) -> Table:
 
 
 def expression(t: Table, stations: Table, readings: Table) -> Table:
-    """Return one row per band of temperature [temperature, temperature + BAND): values,
-    percentiles, share of slippery ones.
+    """Return a table with one row per temperature band [temperature, temperature + BAND): number of
+    values, percentiles of mu, and share of slippery values.
 
     Args:
         t: observations.
-        stations: `station`, `latitude`, `longitude`.
-        readings: `station`, `hour`, `temperature` [°C].
+        stations: table with `station`, `latitude`, `longitude`.
+        readings: table with `station`, `hour`, `temperature` [°C].
     """
     t = _join_stations(t.filter(has_value(t)), stations, readings)
     t = t.mutate(y=t.mu.cast("float64"), band=(t.temperature / BAND).floor() * BAND)
@@ -73,10 +74,10 @@ def _join_stations(t: Table, stations: Table, readings: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return the rows of `expression`.
+    """Return the rows of `expression` for the selected part.
 
     Raises:
-        InputError: there is no table of stations, or it lacks a column.
+        InputError: the table of stations is missing, or lacks a column.
     """
     if options.stations is None:
         raise InputError(
@@ -91,7 +92,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def read_stations(path: Path) -> tuple[pa.Table, pa.Table]:
-    """Return stations, and mean readings per station and hour.
+    """Return two tables: the stations, and the mean readings per station and hour.
 
     Raises:
         InputError: the file cannot be read, or lacks a column.

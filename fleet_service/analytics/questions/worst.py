@@ -1,5 +1,5 @@
-"""`worst`: slippery cells, merged with their neighbours into stretches with length, exposure and
-confidence.
+"""`worst`: slippery cells, merged with their neighbours into stretches, with length, traffic and
+statistical confidence.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ SHARE: Final = 0.1
 
 
 def expression(t: Table, least_vehicles: int) -> Table:
-    """Return cells and sectors with at least SHARE slippery values from enough vehicles."""
+    """Return a table of the cells and sectors in which at least the share SHARE of the values is
+    slippery, reported by enough vehicles.
+    """
     reported = has_value(t)
     cells = t.group_by(["cell", "sector"]).aggregate(
         observations=t.count(),
@@ -42,16 +44,16 @@ def expression(t: Table, least_vehicles: int) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return stretches, the worst first: score = length times the lower bound of the share of
-    slippery values.
+    """Return slippery stretches, the worst first. The score is the length times the lower
+    confidence bound of the share of slippery values.
     """
     cells = engine.answer(expression(engine.observations(), options.least_vehicles))
     return join_stretches(cells)
 
 
 def join_stretches(cells: pa.Table) -> pa.Table:
-    """Return cells of one sector that touch as one row each; `members` are the cells, the box
-    surrounds them.
+    """Return one row per stretch: a stretch is a group of touching cells of one sector. `members`
+    are its cells, and the box encloses them.
     """
     column = {name: cells[name].to_numpy() for name in cells.schema.names}
     label = _label_components(column["cell"], column["sector"].astype(np.int64))
@@ -91,7 +93,7 @@ def join_stretches(cells: pa.Table) -> pa.Table:
 
 
 def wilson_lower(hits: FloatArray, of: FloatArray) -> FloatArray:
-    """Return the lower 95 % bound of a share (Wilson 1927), (n,)."""
+    """Return the lower 95 % confidence bound of a share (Wilson 1927), (n,)."""
     n = np.maximum(of, 1.0)
     p = hits / n
     spread = Z_95 * np.sqrt(p * (1 - p) / n + Z_95**2 / (4 * n * n))
@@ -99,7 +101,9 @@ def wilson_lower(hits: FloatArray, of: FloatArray) -> FloatArray:
 
 
 def _label_components(cell: IntArray, sector: IntArray) -> IntArray:
-    """Return the component number of each cell, among cells of its sector that touch, (n,)."""
+    """Return the number of each cell's connected component, (n,). Cells are connected if they touch
+    and have the same sector.
+    """
     key = cell * grid.SECTORS + sector
     order = np.argsort(key)
     beside = grid.neighbours(cell) * grid.SECTORS + sector[:, None]
@@ -115,7 +119,9 @@ def _label_components(cell: IntArray, sector: IntArray) -> IntArray:
 
 
 def _stretch_cells(cell: IntArray, label: IntArray, count: int) -> pa.Array[Any]:
-    """Return the cells of each stretch, so that a bent road is drawn as a road and not as a box."""
+    """Return the list of cells of each stretch, so that a bent road is drawn as such and not as a
+    box.
+    """
     order = np.lexsort((cell, label))
     ends = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=count))])
     return pa.LargeListArray.from_arrays(

@@ -1,1 +1,1 @@
-"""Links of a road network, and the assignment of the map's cells and sectors to them."""
+"""Road networks: their links, and the assignment of the map's cells and sectors to links."""

@@ -1,9 +1,9 @@
-"""Assignment of cells and sectors to links: no matching of trips, a join that is made once per
-network.
+"""Assignment of cells and sectors to road links. It is computed once per network, so trips need not
+be matched to roads.
 
-A place belongs to the link that is nearest in metres and in heading. A cell in which one link ends
-and the next begins belongs to both, because no join could separate them. `make roads-bench`
-measures how often it is right.
+A cell and sector belong to the link that is nearest in distance and heading. A cell in which one
+link ends and the next begins belongs to both links, because its observations cannot be separated.
+`make roads-bench` measures how often the assignment is correct.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ SCHEMA: Final = pa.schema(_TYPES)
 
 
 class _Marks(NamedTuple):
-    """Points every STEP_M along all links, each (n,)."""
+    """Points ("marks") every STEP_M along all links; each column is (n,)."""
 
     link: IntArray
     run: FloatArray
@@ -60,7 +60,7 @@ class _Marks(NamedTuple):
 
 
 class _Joined(NamedTuple):
-    """Cells and sectors on links, each (n,)."""
+    """Cells and sectors that are assigned to links; each column is (n,)."""
 
     cell: IntArray
     sector: IntArray
@@ -71,8 +71,9 @@ class _Joined(NamedTuple):
 
 
 def join_roads(network: RoadNetwork) -> pa.Table:
-    """Return one row per cell and sector on a link; the reference "Columns of the ten questions"
-    explains the columns."""
+    """Return a table with one row per cell and sector on a link. The reference "Columns of the ten
+    questions" explains the columns.
+    """
     lengths, marks = _link_marks(network.links)
     scale = np.cos(np.radians(marks.latitude))
     side = scale.mean() * METRES_PER_DEGREE * 360.0 / 2**grid.CELL_ZOOM
@@ -108,7 +109,7 @@ def join_roads(network: RoadNetwork) -> pa.Table:
 
 
 def _join_cells(network: RoadNetwork, marks: _Marks, scale: FloatArray, side: float) -> _Joined:
-    """Join the cells near links to the links that go the same way.
+    """Assign the cells near links to the links with a matching heading.
 
     `scale` (marks,) is the cosine of the latitude, and `side` the width of a cell [m].
     """
@@ -156,10 +157,10 @@ def _join_cells(network: RoadNetwork, marks: _Marks, scale: FloatArray, side: fl
 
 
 def read_roads(path: Path) -> pa.Table:
-    """Return a file made by `join_roads`.
+    """Return the table in a file made by `join_roads`.
 
     Raises:
-        InputError: it is not such a file.
+        InputError: the file is not such a table.
     """
     try:
         table = pq.read_table(path)
@@ -174,7 +175,7 @@ def read_roads(path: Path) -> pa.Table:
 
 
 def _link_marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
-    """Return the lengths [m] of the links, and their marks."""
+    """Return the lengths [m] of the links, and the marks along them."""
     lengths = np.empty(len(links))
     parts = []
     for k, link in enumerate(links):
@@ -202,7 +203,7 @@ def _link_marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
 
 
 def _nearby_cells(marks: _Marks, side: float) -> IntArray:
-    """Return cells that may lie on a link: those within REACH_M of a mark, and some beyond."""
+    """Return the cells that may lie on a link: at least all cells within REACH_M of a mark."""
     x, y = grid.deinterleave(np.unique(grid.cell_of(marks.latitude, marks.longitude)))
     wide = int(np.ceil(REACH_M / side))
     offsets = np.arange(-wide, wide + 1)
@@ -211,7 +212,7 @@ def _nearby_cells(marks: _Marks, side: float) -> IntArray:
 
 
 def _first_of(order: IntArray, *groups: IntArray) -> IntArray:
-    """Return the first element of each group in an order that sorts by the groups first."""
+    """Return the first element of each group; `order` must sort the elements by the groups."""
     new = np.zeros(len(order), np.bool_)
     new[:1] = True
     for group in groups:
@@ -220,16 +221,16 @@ def _first_of(order: IntArray, *groups: IntArray) -> IntArray:
 
 
 def _end_points(links: list[DirectedLink]) -> FloatArray:
-    """Return the first and last points of the links in turn, (2 n, 2) [deg], to a tenth of a
-    metre.
+    """Return the first and the last point of each link in turn, (2 n, 2) [deg], rounded to a tenth
+    of a metre.
     """
     ends = [(at.latitude[k], at.longitude[k]) for at in links for k in (0, -1)]
     return np.asarray(np.round(np.array(ends), 6), np.float64)
 
 
 def _to_mercator(latitude: FloatArray, longitude: FloatArray) -> FloatArray:
-    """Return points in Mercator's plane (n, 2) [m]: a metre is 1 / cos(latitude) of it in all
-    directions.
+    """Return points in the plane of the Mercator projection, (n, 2) [m]. A true metre is 1 /
+    cos(latitude) long in this plane.
     """
     radius = np.degrees(METRES_PER_DEGREE)
     y = np.arcsinh(np.tan(np.radians(latitude)))
@@ -241,7 +242,7 @@ def _angle_between(yaw: FloatArray, axis: float) -> FloatArray:
 
 
 def add_road_names(found: pa.Table, roads: pa.Table) -> pa.Table:
-    """Return an answer with the names of its cells' roads as column `road`; null where no named
+    """Return an answer with a column `road`: the name of the road at each cell, null if no named
     road is near. `roads` is a table of `read_roads`.
     """
     network = roads.sort_by("distance_m")

@@ -1,4 +1,4 @@
-"""Directed links of a road network: from an extract of OpenStreetMap, or from any file of lines
+"""Directed links of a road network, read from an OpenStreetMap extract or from any file of lines
 with ids.
 """
 
@@ -42,9 +42,9 @@ class DirectedLink(NamedTuple):
     """One direction of a road.
 
     Attributes:
-        id: of the road in its network; the same for both directions.
-        direction: forward, as it is drawn, or backward.
-        name, kind: of the road; empty where the network has none.
+        id: id of the road in its network; the same for both directions.
+        direction: forward (as it is drawn) or backward.
+        name, kind: name and kind of the road; empty if the network does not state them.
         latitude, longitude: (n,) [deg] in the order of travel.
     """
 
@@ -57,25 +57,25 @@ class DirectedLink(NamedTuple):
 
 
 class RoadNetwork(NamedTuple):
-    """Links of a file, with its name, digest, date and licence."""
+    """Links of a file, and information about the file: name, digest, date and licence."""
 
     links: list[DirectedLink]
     source: dict[str, str]
 
 
 def read_network(path: Path, identity: str = "id", name: str = "name") -> RoadNetwork:
-    """Return the links of an extract of OpenStreetMap (.osm.pbf, .osm), or of the lines of a file
+    """Return the links of an OpenStreetMap extract (.osm.pbf, .osm), or of the lines in a file
     (GeoPackage, GeoJSON …).
 
     Args:
-        path: of the file.
+        path: path of the file.
         identity: column of the id, for a file of lines.
-        name: column of the road's name there; optional, like `oneway` (forward, backward, yes, no)
-            and `kind`.
+        name: column of the road's name, for a file of lines; optional, like the columns `oneway`
+            (forward, backward, yes, no) and `kind`.
 
     Raises:
-        InputError: it cannot be read, has no such column, or holds no road; or a reader is not
-            installed.
+        InputError: the file cannot be read, has no such column, or contains no road; or a package
+            to read it is not installed.
     """
     if not path.is_file():
         raise InputError(
@@ -175,7 +175,7 @@ def _read_lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
 def _driven_directions(
     identity: str, name: str, kind: str, oneway: str, points: FloatArray
 ) -> list[DirectedLink]:
-    """Return the directions in which a line may be driven."""
+    """Return a link for each direction in which a line may be driven."""
     apart = np.append(True, (np.diff(points, axis=0) != 0.0).any(axis=1))
     points = points[apart[: len(points)]]
     if len(points) < 2:
