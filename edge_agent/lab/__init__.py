@@ -1,1 +1,1 @@
-"""The laboratory: simulation, evaluation and tuning. The evaluated code never imports it."""
+"""The laboratory: simulation, evaluation and tuning. The code under evaluation never imports it."""

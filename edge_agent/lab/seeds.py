@@ -1,8 +1,8 @@
-"""Ranges of random seeds: tuning and evaluation use separate seeds.
+"""Ranges of random seeds: tuning and evaluation use different seeds.
 
-Everything that is chosen (constants, memberships, rules) is chosen on seeds below FIGURES, and
-every figure that is published comes from seeds from FIGURES on: other noise, vehicle files,
-misaligned devices, roads and towns.
+All constants, memberships and rules are chosen with seeds below FIGURES. Every published figure
+comes from seeds of at least FIGURES, which give other noise, vehicle files, misaligned sensors,
+roads and towns.
 """
 
 from typing import Final

@@ -1,4 +1,4 @@
-"""Ground truth of a simulated fleet's roads: one row per true visit of a cell, for comparison with
+"""True friction of a simulated fleet's roads: one row per true visit of a cell, for comparison with
 the map.
 """
 
@@ -41,7 +41,7 @@ class _Visit:
 
 @dataclass
 class TruthRecorder:
-    """Gathers the true visits of the named vehicles, block by block."""
+    """Recorder of the true visits of the named vehicles, block by block."""
 
     names: tuple[str, ...]
     rows: list[tuple[str, _Visit]] = field(default_factory=list)
@@ -55,8 +55,8 @@ class TruthRecorder:
         mu: FloatArray,
         used: FloatArray,
     ) -> None:
-        """Add one block: time [ns], latitude, longitude [deg], yaw [rad] (T, N); mu and used share
-        per wheel (T, N, 4).
+        """Add one block: time [ns UTC], position (latitude, longitude) [deg] and yaw [rad], (T, N)
+        each; friction and used share of it per wheel, (T, N, 4).
         """
         cells = grid.cell_of(*position)
         sectors = grid.sector_of(yaw)
@@ -82,7 +82,7 @@ class TruthRecorder:
         return visit
 
     def write(self, path: Path) -> None:
-        """Write all visits as Parquet, those under way included."""
+        """Write all visits as Parquet, including those that have not ended."""
         visits = [visit for _, visit in self.rows]
         columns: dict[str, list[str] | list[int] | list[float]] = {
             "vehicle": [name for name, _ in self.rows],

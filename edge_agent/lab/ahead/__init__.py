@@ -1,3 +1,3 @@
-"""Evaluation of warnings in the car: their quality, their cost, and the benefit of the map as a
-prior.
+"""Evaluation of the look ahead in the car: quality and cost of the warnings, and benefit of the map
+as a prior.
 """

@@ -1,13 +1,16 @@
-"""Test whether cars that approach an alerted stretch are warned in time, and other cars are not:
-simulated drivers, the real warning code.
+"""Evaluation of warnings: are simulated cars that approach a slippery stretch warned in time, and
+other cars not?
 
-The link is up and the map known, within SPREAD of `known_town`. The test judges the warnings that a
-car derives from it, with the fixes of its receiver. An approach comes from road that is not
-slippery; a car that drives from snow onto ice is already on slippery road. A warning is in time
-when the car could stop before the stretch from where the warning was given, and when the warning is
-still active on arrival. Stopping takes 1.5 s of reaction, then braking with the true friction of
-the road before the stretch, with at most 3 m/s². A warning is false when nothing slippery lies
-within a lane's width of where the car then drove, because no cell is finer.
+The drivers are simulated; the warning code is that of the agent. The connection works and the map
+is known, with errors of standard deviation SPREAD (see `known_town`). The test evaluates the
+warnings that a car computes from this map, with the position errors of its receiver.
+
+An approach starts on road that is not slippery; a car that drives from snow onto ice is already on
+slippery road. A warning is in time if the car could stop before the stretch from the place of the
+warning, and if the warning is still active on arrival. Stopping takes 1.5 s of reaction, then
+braking with the true friction of the road before the stretch, at most with 3 m/s². A warning is
+false if nothing within a lane's width of the path that the car then drove is slippery, because no
+map cell is finer.
 """
 
 from __future__ import annotations
@@ -46,7 +49,7 @@ START_NS: Final = 1_800_000_000 * NS
 
 @dataclass
 class Approaches:
-    """Counts of approaches and warnings."""
+    """Counts of approaches and warnings, of all cars in all towns."""
 
     came: int = 0
     warned: int = 0
@@ -58,7 +61,9 @@ class Approaches:
 
 @dataclass
 class _Raised:
-    """One warning: the look at which it was raised, its content, and the look at which it ended."""
+    """One warning: the look ahead (second) at which it was raised, its distance and length [m], and
+    the look at which it ended.
+    """
 
     at: int
     distance: float
@@ -68,8 +73,8 @@ class _Raised:
 
 @dataclass
 class _Track:
-    """Record of one car: at each second the distance driven [m], speed [m/s], friction, and least
-    friction near the car; and its warnings by name.
+    """Record of one car for each second: distance driven [m], speed [m/s], friction, and smallest
+    friction near the car. It also has the car's warnings by name.
     """
 
     metre: list[float] = field(default_factory=list)
@@ -81,7 +86,9 @@ class _Track:
 
 
 def approach_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
-    """Return shares and rates over drawn towns, with given routes and, for comparison, without."""
+    """Return the shares of approaches warned in time and the rates of false warnings over random
+    towns, with given routes and, for comparison, without.
+    """
     found = {routed: Approaches() for routed in (True, False)}
     for seed in seeds:
         for routed, counts in found.items():
@@ -113,7 +120,7 @@ def approach_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -
 def drive_town(
     seed: int, seconds: float, vehicles: int, counts: Approaches, *, routed: bool
 ) -> None:
-    """Drive one town and add its outcomes to the counts."""
+    """Simulate one town and add its approaches and warnings to `counts`."""
     fleet = SimulatedFleet(f"hills-{seed}", vehicles, seed, RATE_HZ, rough=0.5)
     known = map_of_places(places_of(fleet.scenario, AFTER_S), START_NS)
     tracks = [_Track() for _ in range(vehicles)]
@@ -146,8 +153,8 @@ def drive_town(
 
 
 def _least_beside(fleet: SimulatedFleet, t: float) -> FloatArray:
-    """Return the least friction (N,) at time t [s] within BESIDE_M of the path that each vehicle
-    drove in the last second.
+    """Return the smallest friction (N,) within BESIDE_M of the path that each vehicle drove in the
+    second before time t [s].
     """
     true = fleet.truth
     every = round(RATE_HZ / BESIDE_HZ)
@@ -220,8 +227,8 @@ def _count_outcome(track: _Track, counts: Approaches) -> None:
 def _stopping_shortfall(
     metre: FloatArray, speed: FloatArray, mu: FloatArray, at: int, start: float
 ) -> float:
-    """Return the stopping distance minus the distance to the stretch [m] at second `at`; 0 or less
-    if the car can stop in time.
+    """Return the stopping distance at second `at` minus the distance to the stretch [m]. It is 0 or
+    less if the car can stop in time.
     """
     v = float(speed[at])
     on_the_way = (metre >= metre[at]) & (metre <= start)

@@ -1,8 +1,9 @@
-"""Cost of listening for one car and day: megabytes received in a busy city, and processor time.
+"""Cost of the look ahead for one car and day: megabytes received in a busy city, and processor
+time.
 
-The city is a grid of streets 100 m apart, every place of both directions measured, STANDING alerts
-in each tile; the car drives DAY_KM through it at city speed. The bytes are those of the answers
-that a service would send, with their keys and FRAME bytes of transport each.
+The city is a grid of streets 100 m apart. Every place is measured in both directions, and each tile
+has STANDING active alerts. The car drives DAY_KM through it at city speed. The counted bytes are
+those of the service's answers, with their keys and FRAME bytes of transport overhead each.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ CENTRE: Final = Pose(57.70, 11.97, 0.0, SPEED, 1_800_000_000 * NS)
 
 
 def street_places() -> IntArray:
-    """Return all places of the city's streets, sorted."""
+    """Return the keys (cell·4 + sector) of all places on the city's streets, sorted."""
     side = np.arange(0.0, BLOCK_M * BLOCKS, 4.0)
     line = np.arange(0.0, BLOCK_M * (BLOCKS + 1), BLOCK_M)
     found = []
@@ -53,8 +54,9 @@ def street_places() -> IntArray:
 
 
 def draw_way(rng: np.random.Generator, metres: float) -> FloatArray:
-    """Draw a route through the city, corners (n, 2) [m]: at each crossing straight on, left or
-    right, never out of the city.
+    """Draw a random route through the city; return its corners (n, 2) [m].
+
+    At each crossing the route goes straight on, left or right, and never leaves the city.
     """
     here = np.array([BLOCKS // 2, BLOCKS // 2])
     heading = 0
@@ -73,8 +75,8 @@ def draw_way(rng: np.random.Generator, metres: float) -> FloatArray:
 
 
 def cost_figures(seed: int, metres: float) -> list[Figure]:
-    """Return megabytes a day and the share of a core, with a given route and, for comparison,
-    without.
+    """Return the megabytes per day and the used share of a processor core, with a given route and,
+    for comparison, without.
     """
     known = street_places()
     out = []
@@ -95,7 +97,7 @@ def cost_figures(seed: int, metres: float) -> list[Figure]:
 def drive_way(
     rng: np.random.Generator, known: IntArray, metres: float, *, routed: bool
 ) -> tuple[float, float]:
-    """Return the megabytes received, and the processor time over the time driven."""
+    """Drive a random route; return (megabytes received, processor time over driving time)."""
     corners = draw_way(rng, metres)
     run = BLOCK_M * np.arange(len(corners))
     route = GivenRoute(*to_degrees(corners[:, 0], corners[:, 1], CENTRE))

@@ -1,11 +1,11 @@
-"""Benefit of the map as a prior: the error at entry, the delay by a wrong map, and its effect on
-published records.
+"""Benefit and risk of the map as a prior: error at the entry of a cell, delay caused by a wrong
+map, and effect on published records.
 
-One drive of the default estimator through drawn towns gives beliefs and measurements of each
-filter, ten times a second. The maps are applied afterwards, since the filter never sees one. A map
-is `known_town`'s: its errors are drawn with the stated spread. It is wrong where the scenario's
-black ice appears, because it still says dry; and, the other way round, where it says ice on an
-equally long stretch that is dry.
+The default estimator drives through random towns, and its beliefs and likelihoods are recorded ten
+times a second. The maps are applied afterwards, because the filter itself never uses a map. The
+maps come from `known_town`, with random errors of the stated standard deviation. A map is wrong in
+two places: where the scenario's black ice appears, because the old map still says dry; and on
+equally long dry stretches, where a fake map says ice.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ FAKE_M: Final = 22.0  # half of a fake stretch
 
 @dataclass
 class FilterTrace:
-    """Records of N filters at each of T blocks: place (T, N), own and visit (T, N, 32), truth (T,
-    N).
+    """Records of N filters at T blocks: place (T, N), filter belief `own` and visit likelihood
+    `visit` (T, N, 32), true friction (T, N).
     """
 
     place: IntArray
@@ -55,7 +55,9 @@ class FilterTrace:
 
 
 def entry_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
-    """Return ratios over all towns, and the largest change of a published value."""
+    """Return the figures over all towns: ratios of errors and delays with over without the map, and
+    the largest change of a published value.
+    """
     errors: list[FloatArray] = []
     delays: dict[str, list[tuple[float, float]]] = {"dry": [], "ice": []}
     nats = 0.0
@@ -97,7 +99,9 @@ def entry_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> l
 def record_beliefs(
     fleet: SimulatedFleet, seconds: float, prior: LocalMap | None = None
 ) -> FilterTrace:
-    """Drive and record the beliefs of the filters; with a `prior`, the car also hears that map."""
+    """Drive a fleet and record the beliefs of the filters. With `prior`, each car also computes its
+    belief with that map.
+    """
     vehicles = len(fleet.vehicles)
     config = AgentConfig()
     pipeline = Pipeline(bank_of(config.estimator, fleet.vehicles), vehicles, config)
@@ -124,8 +128,8 @@ def record_beliefs(
 
 
 def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
-    """Return |error| of the median within FIRST_S of entering a cell that the map knows, (n, 2):
-    with and without the map.
+    """Return the absolute error of the median friction within FIRST_S of entering a cell that the
+    map knows, (n, 2): with and without the map.
     """
     with_prior = with_map(trace, known, now)
     alone = _median_friction(np.exp(trace.own))
@@ -138,8 +142,11 @@ def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
 def arrival_times(
     trace: FilterTrace, wrong: LocalMap, right: LocalMap, now: int
 ) -> list[tuple[float, float]]:
-    """Return, for each stretch where the map is wrong, the seconds until |μ - truth| <= ARRIVED,
-    with and without the map; the duration of the stay if that is never reached.
+    """Return pairs of times [s] with and without the map, one pair per stretch where the map is
+    wrong.
+
+    A time is that from entry until |μ - truth| <= ARRIVED; if this is never reached, the time spent
+    on the stretch.
     """
     differ = _maps_differ(trace.place, wrong, right, now)
     with_prior = with_map(trace, wrong, now)
@@ -161,8 +168,8 @@ def arrival_times(
 
 
 def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) -> float:
-    """Return the largest change [nat] of a published likelihood if the cars receive a map that is
-    wrong everywhere.
+    """Return the largest change [nat] of a published likelihood that a completely wrong map causes.
+    The expected value is 0.
     """
     seed = int(fleet.scenario.name.split("-")[1])
     again = SimulatedFleet(fleet.scenario, len(fleet.vehicles), seed, RATE_HZ, rough=0.5)
@@ -182,7 +189,7 @@ def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) 
 
 
 def with_map(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
-    """Return the median of the belief with a map, (T, N)."""
+    """Return the median friction of the beliefs combined with a map, (T, N)."""
     prior = MapPrior(trace.place.shape[1])
     out = np.empty(trace.place.shape)
     for t, place in enumerate(trace.place):
@@ -209,8 +216,8 @@ def _since_entry(place: IntArray) -> IntArray:
 
 
 def _maps_differ(place: IntArray, wrong: LocalMap, right: LocalMap, now: int) -> BoolArray:
-    """Return True where exactly one of two maps is slippery and their medians differ by more than
-    0.3.
+    """Return an array (T, N) that is True where exactly one of two maps says slippery and their
+    medians differ by more than 0.3.
     """
     keys, inverse = np.unique(place, return_inverse=True)
     one, other = (known.look_up(keys, now).mu for known in (wrong, right))

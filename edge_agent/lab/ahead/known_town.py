@@ -1,5 +1,5 @@
-"""A scenario's roads as a fleet that has been everywhere would know them: every place with its
-truth.
+"""Map of a scenario's roads as a fleet that visited every place would know it, computed from the
+true friction.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ SPREAD = 0.06  # standard deviation of what the map says of a cell, and of how f
 
 
 class KnownPlaces(NamedTuple):
-    """Places that lanes lead through, each once, (n,): cell * 4 + sector, and least friction
-    there.
+    """Places that lanes lead through, each once, (n,): key (cell·4 + sector), and smallest true
+    friction.
     """
 
     key: IntArray
@@ -29,7 +29,7 @@ class KnownPlaces(NamedTuple):
 
 
 def places_of(scenario: Scenario, t: float) -> KnownPlaces:
-    """Return the places of a scenario's lanes at t [s]."""
+    """Return the places of a scenario's lanes with their friction at t [s]."""
     points = scenario.network.points
     x = points[:, LanePoint.X]
     y = points[:, LanePoint.Y]
@@ -44,8 +44,10 @@ def places_of(scenario: Scenario, t: float) -> KnownPlaces:
 def map_of_places(
     places: KnownPlaces, now: int, rng: np.random.Generator | None = None
 ) -> LocalMap:
-    """Return the local map of a car that has received all places, with their true friction or with
-    random errors.
+    """Return the local map of a car that has received all places.
+
+    The friction in the map is the true one; with `rng`, random errors of standard deviation SPREAD
+    are added.
     """
     off = np.zeros(len(places.key)) if rng is None else rng.normal(0.0, SPREAD, len(places.key))
     mu = np.clip(places.mu + off, mugrid.LOWER + 0.02, mugrid.UPPER - 0.02)

@@ -1,9 +1,9 @@
-"""Latency from publishing an alert to the warning: VEHICLES cars in one process, each with its own
-session, on a real router.
+"""Latency from the publication of an alert to the warning, for VEHICLES cars in one process, each
+with its own session on a real router.
 
-Every car stands on its own road and looks ahead each second; the service's side answers their
-questions. Alerts are published one after the other on the roads of randomly drawn cars, and the
-time until the warning is measured.
+Every car stands on its own road and looks ahead each second; a simulated service answers the cars'
+queries. Alerts are published one after the other on the roads of randomly chosen cars, and the time
+until the warning is measured.
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ ORIGIN: Final = Pose(57.70, 11.97, 0.0, SPEED, 0)
 
 @contextmanager
 def open_router() -> Iterator[ZenohSettings]:
-    """Open a router in this process, on a free port of loopback; yield the settings of its clients."""
+    """Open a Zenoh router in this process, on a free port of the loopback interface; yield the
+    settings of its clients.
+    """
     config = zenoh.Config()
     chosen = {
         "mode": "router",
@@ -62,8 +64,8 @@ def open_router() -> Iterator[ZenohSettings]:
 
 
 def latency_figures(seed: int, alerts: int, vehicles: int = VEHICLES) -> list[Figure]:
-    """Return quantiles of the time from put to warning, and the share of processor time that
-    looking ahead takes.
+    """Return figures: quantiles of the time from publication to warning, and the share of processor
+    time that looking ahead takes.
     """
     waited, share, lost = measure_alerts(np.random.default_rng(seed), alerts, vehicles)
     return [
@@ -86,8 +88,8 @@ def latency_figures(seed: int, alerts: int, vehicles: int = VEHICLES) -> list[Fi
 def measure_alerts(
     rng: np.random.Generator, alerts: int, vehicles: int
 ) -> tuple[list[float], float, int]:
-    """Return the latency of each alert [s], the share of a core per car, and the number of alerts
-    without a warning.
+    """Return (latency of each alert [s], processor share per car, number of alerts without a
+    warning).
     """
     names = [f"car-{k:04d}" for k in range(vehicles)]
     warned: dict[str, queue.Queue[tuple[float, GripWarning]]] = {

@@ -1,5 +1,5 @@
-"""A service's side for what judges listening cars: answers for the map and for standing alerts,
-puts alerts.
+"""Simulated fleet service for tests of cars that look ahead: it answers queries for the map and for
+active alerts, and publishes alerts.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from schemas.wire import Alert
 
 
 def tile_payload(key: IntArray, friction: float | FloatArray, now: int, **changes: object) -> bytes:
-    """Return the payload of a tile in the form that a service sends; `changes` replace columns."""
+    """Return the payload of a map tile in the form that a service sends; `changes` replace columns
+    of the table.
+    """
     n = len(key)
     mu = np.broadcast_to(friction, len(key))
     lower = np.maximum(mu - 0.1, 0.06)
@@ -62,11 +64,11 @@ def tile_payload(key: IntArray, friction: float | FloatArray, now: int, **change
 
 @dataclass
 class MadeUpService:
-    """Fake service with places of known friction (`mu` by cell * 4 + sector) and current alerts;
-    records the questions.
+    """Simulated service with places of known friction (`mu` by cell·4 + sector) and active alerts;
+    it records the queries.
 
-    The places were observed at `now`. With `kept` it answers with the tile as it was made then, as
-    a store of messages would.
+    The places were observed at the time `now`. With `kept` it answers with the ages at that time,
+    like a store of old messages.
     """
 
     settings: ZenohSettings
@@ -93,14 +95,14 @@ class MadeUpService:
         self.session.close()
 
     def put(self, alert: Alert) -> None:
-        """Raise or end an alert."""
+        """Publish the start or end of an alert."""
         tile = int(grid.tile_of(alert.cell))
         self.session.put(
             keys.alert_key(tile), wire.encode_alert(alert), encoding=wire.ALERT_ENCODING
         )
 
     def tile_answer(self, key: IntArray, mu: FloatArray) -> bytes:
-        """Return the answer for places of a tile."""
+        """Return the answer to a query for places of a tile with friction `mu`."""
         age = 1.0 if self.kept else 1.0 + (time.time_ns() - self.now) / NS
         return tile_payload(key, mu, self.now, age_s=np.full(len(key), age))
 

@@ -1,3 +1,3 @@
-"""`edge-agent evaluate`: the papers' manoeuvres for every estimator, as figures, a table and
-plots.
+"""Evaluation of estimators (`edge-agent evaluate`): the papers' manoeuvres for every estimator,
+with figures, a table and plots.
 """

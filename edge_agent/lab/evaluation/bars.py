@@ -1,5 +1,5 @@
-"""The figures of a campaign: those with a bar in one table, followed by every other measure for
-context.
+"""Figures of the evaluation campaign: first those with a target ("bar"), then all other measures
+for context.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ PRIOR_WIDTH: Final = 0.9 * 1.15  # of the 90 % interval of the uniform prior
 
 
 class EstimatorBar(NamedTuple):
-    """A figure by name, how it is read from the results (NaN where not measured), its unit and
-    its bar.
+    """A figure with a target: its name, the function that reads it from the results (NaN if not
+    measured), its unit and its target.
     """
 
     name: str
@@ -34,7 +34,9 @@ class EstimatorBar(NamedTuple):
 
 
 def mean_of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[Results], float]:
-    """Return a function that computes the mean over seeds of a measure with ordinary sensors."""
+    """Return a function that reads a measure from the results: its mean over all seeds, with
+    ordinary sensors.
+    """
 
     def read_mean(results: Results) -> float:
         return mean(results.real.get((scenario, estimator), {}).get(measure))
@@ -43,34 +45,34 @@ def mean_of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[
 
 
 def noise_mean(experiment: str, measure: str) -> Callable[[Results], float]:
-    """Return a function that computes the mean over seeds of a measure of paper 004's own
-    experiments.
+    """Return a function that reads a measure of paper 004's own experiments: its mean over all
+    seeds.
     """
     return lambda results: mean(results.noise.get((experiment, "paper-aco-fckf"), {}).get(measure))
 
 
 def in_the_world(name: str) -> Callable[[Results], float]:
-    """Return a function that reads a figure of the default estimator in the rough towns, or on a
-    slope.
+    """Return a function that reads a figure of the default estimator in the towns with inaccurate
+    cars, or on a slope.
     """
     return lambda results: results.world.get(DEFAULT, {}).get(name, math.nan)
 
 
 def worth_of(name: str) -> Callable[[Results], float]:
-    """Return the ratio of interval scores: with over without fuzzy sets, or the colony's vertices
-    over untuned or randomly found ones.
+    """Return a function that reads a ratio of interval scores: with over without fuzzy sets, or
+    tuned by the ant colony over untuned or tuned by random search.
     """
     return lambda results: worth.ratio(results.worth, name)
 
 
 def mean(values: FloatArray | None) -> float:
-    """Return the mean; NaN without values."""
+    """Return the mean of the values; NaN if there are no values."""
     return math.nan if values is None or not len(values) else float(np.mean(values))
 
 
 def false_per_hour(results: Results) -> float:
-    """Return the false changes per hour of the default estimator in scenarios with one constant
-    friction.
+    """Return the number of false changes per hour of the default estimator, in scenarios with
+    constant friction.
     """
     counted = [m for (_, name), m in results.real.items() if name == DEFAULT and "hours" in m]
     hours = sum(float(m["hours"].sum()) for m in counted)
@@ -78,7 +80,7 @@ def false_per_hour(results: Results) -> float:
 
 
 def both_stops(results: Results) -> float:
-    """Return the mean coverage of the anti-lock stops on dry road and on snow."""
+    """Return the mean coverage of two braking manoeuvres with ABS, on dry road and on snow."""
     return 0.5 * (
         mean_of("default.abs.dry", "coverage90")(results)
         + mean_of("default.abs.snow", "coverage90")(results)
@@ -86,12 +88,16 @@ def both_stops(results: Results) -> float:
 
 
 def on_foreign_tyres(results: Results) -> float:
-    """Return the coverage of the default over all scenarios and kinds of tyre."""
+    """Return the mean coverage of the default estimator over all scenarios with tyres that the
+    filter does not model.
+    """
     return mean(np.concatenate(list(results.foreign.values()))) if results.foreign else math.nan
 
 
 def width_ratio(results: Results) -> float:
-    """Return the width of the interval over the prior's, when driving straight at constant speed."""
+    """Return the interval width of the default estimator over the prior's width, when driving
+    straight at constant speed.
+    """
     return mean_of("default.straight", "width")(results) / PRIOR_WIDTH
 
 
@@ -204,8 +210,8 @@ def unit_of(measure: str) -> str:
 
 
 def figures(results: Results, *, quick: bool) -> list[Figure]:
-    """Return the figures with bars first (if quick, the measured ones), then
-    `KIND.SCENARIO.ESTIMATOR.MEASURE` with its spread.
+    """Return all figures: first those with targets (with `quick`, only the measured ones), then
+    `KIND.SCENARIO.ESTIMATOR.MEASURE` with its standard deviation.
     """
     barred = [Figure(bar.name, bar.read(results), bar.unit, bar.bar, bar.better) for bar in BARS]
     listed = [figure for figure in barred if not (quick and math.isnan(figure.value))]
@@ -232,7 +238,9 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
 
 
 def _consistency_figures(results: Results) -> list[Figure]:
-    """Return the bounds of NEES and NIS, and the reliability of every estimator over all scenarios."""
+    """Return the bounds of NEES and NIS, and the reliability of every estimator over all scenarios,
+    as figures.
+    """
     listed = []
     for measure in COMPONENTS if results.seeds else ():
         for end, value in zip(("lower", "upper"), bounds(measure, results.seeds), strict=True):

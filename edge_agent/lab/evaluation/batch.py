@@ -1,4 +1,4 @@
-"""Drives of one scenario, simulated together, and the estimates of an estimator for them."""
+"""Simulation of several drives of one scenario as a batch, and their estimation."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ FINE_HZ = 500.0
 
 @dataclass(frozen=True)
 class DriveSpec:
-    """A manoeuvre of a paper, or of the default estimator's bars: vehicle, speed [m/s], friction,
-    rate, length.
+    """A manoeuvre of a paper, or of the default estimator's evaluation: vehicle, speed [m/s],
+    friction, sampling rate, duration.
 
-    road, slope: relief by name and a lasting slope upon it; torque: whether it is recorded.
+    `road` is the relief by name, and `slope` a constant slope added to it. `torque` is False if
+    wheel torque is not recorded.
     """
 
     manoeuvre: str
@@ -45,7 +46,9 @@ class DriveSpec:
 
 @dataclass(frozen=True)
 class DriveSet:
-    """N drives: t (T, N) [s], signals (T, N, 18), truth by name (T, N), nominal vehicles."""
+    """N drives of T samples: t (T, N) [s], signals (T, N, 18), true values by name (T, N), nominal
+    vehicles.
+    """
 
     t: FloatArray
     signals: FloatArray
@@ -54,12 +57,12 @@ class DriveSet:
 
     @property
     def mu_wheel(self) -> FloatArray:
-        """True friction of the wheels, (T, N, 4)."""
+        """Return the true friction of the wheels, (T, N, 4)."""
         return np.stack([self.truth[name] for name in per_wheel("true_mu")], axis=-1)
 
     @property
     def mu(self) -> FloatArray:
-        """Mean friction of the four wheels, (T, N)."""
+        """Return the true mean friction of the four wheels, (T, N)."""
         return np.asarray(self.mu_wheel.mean(axis=-1))
 
     def last(self, seconds: float) -> slice:
@@ -70,13 +73,15 @@ class DriveSet:
 def realistic(
     scenario: DriveSpec, seeds: Sequence[int], sensors: str | Sensors = USUAL
 ) -> DriveSet:
-    """Simulate one drive per seed with ordinary sensors, of a vehicle known to a few per cent."""
+    """Simulate one drive per seed with ordinary sensors, and a vehicle file with errors of a few
+    per cent.
+    """
     return join_drives([_simulate_drive(scenario, seed, sensors, 1) for seed in seeds])
 
 
 def ideal(scenario: DriveSpec) -> DriveSet:
-    """Simulate one drive with error-free sensors, of a vehicle known exactly; fine time steps,
-    sampled at the rate.
+    """Simulate one drive with error-free sensors and an exact vehicle file. The simulation uses
+    fine time steps and is sampled at the scenario's rate.
     """
     step = max(1, round(FINE_HZ / scenario.rate_hz))
     return join_drives(
@@ -104,7 +109,7 @@ def _simulate_drive(
 
 
 def join_drives(drives: Sequence[tuple[pa.Table, Vehicle]]) -> DriveSet:
-    """Return drives of equal length as one set."""
+    """Return drives of equal length as one batch."""
 
     def stack_column(name: str) -> FloatArray:
         return np.stack(
@@ -122,7 +127,9 @@ def join_drives(drives: Sequence[tuple[pa.Table, Vehicle]]) -> DriveSet:
 
 
 def repeat_drive(batch: DriveSet, count: int) -> DriveSet:
-    """Return the one drive of a batch `count` times, as a base for different noise."""
+    """Return a batch with `count` copies of the one drive in `batch`, to which different noise can
+    be added.
+    """
     truth = {name: np.repeat(value, count, axis=1) for name, value in batch.truth.items()}
     return DriveSet(
         np.repeat(batch.t, count, axis=1),

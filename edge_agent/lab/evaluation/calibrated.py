@@ -1,7 +1,8 @@
-"""Calibration against the truth of simulated rough cars: its errors, and its benefit.
+"""Evaluation of the calibration with simulated inaccurate cars (ROUGH_FLEET): its errors against
+the truth, and its benefit.
 
-Errors are in units of the standard deviations that the calibration states. The benefit is the
-narrower interval of friction.
+Errors are divided by the standard deviations that the calibration states. The benefit is a narrower
+interval of friction.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ ESTIMATOR: Final = "aco-fckf"
 
 
 def true_errors(seed: int, car: int) -> dict[str, float]:
-    """Return the true device errors of a rough car."""
+    """Return the true sensor and vehicle errors of a simulated inaccurate car, by quantity of the
+    calibration.
+    """
     error = error_row(ROUGH_FLEET, GOTHENBURG, seed, car)
     mounted = error[ErrorColumn.MOUNTED :]
     offset = error[ErrorColumn.OFFSET :]
@@ -58,7 +61,7 @@ def true_errors(seed: int, car: int) -> dict[str, float]:
 
 
 def _mass_radius_ratio(seed: int, car: int) -> float:
-    """True mass times radius over those of the vehicle file."""
+    """Return the true mass times radius, divided by mass times radius of the vehicle file."""
     rng = np.random.default_rng([seed, car, VEHICLE_STREAM])
     true = one_of_a_fleet(car, "car", rng)
     file = nominal(true, rng)
@@ -66,8 +69,8 @@ def _mass_radius_ratio(seed: int, car: int) -> float:
 
 
 class Narrowed(NamedTuple):
-    """Mean width of the 90 % interval over some cars, and share of truths inside, without and with
-    calibration.
+    """Mean width of the 90 % interval over some cars, and share of true frictions inside it,
+    without and with calibration.
     """
 
     plain_width: float
@@ -77,7 +80,9 @@ class Narrowed(NamedTuple):
 
 
 def learn_and_narrow(cars: int, seed: int, judged_s: int = JUDGED_S) -> Narrowed:
-    """Let rough cars learn from DRIVES drives, and judge them on the next drive."""
+    """Learn a calibration for each inaccurate car from DRIVES drives, and evaluate it on the next
+    drive.
+    """
     fleet = SimulatedFleet("hills", cars, seed, RATE_HZ, rough=1.0)
     t, signals = _drive_fleet(fleet, DRIVES * DRIVE_S)[:2]
     size = len(t) // DRIVES
@@ -108,7 +113,9 @@ def learn_and_narrow(cars: int, seed: int, judged_s: int = JUDGED_S) -> Narrowed
 
 
 def _drive_fleet(fleet: SimulatedFleet, seconds: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return times (T, N), signals (T, N, 18), and true friction as the mean of the wheels (T, N)."""
+    """Return times (T, N), signals (T, N, 18), and the true mean friction of the wheels (T, N) of a
+    simulated drive.
+    """
     parts = []
     for _ in range(seconds):
         t, signals = fleet.step(round(RATE_HZ))
@@ -118,7 +125,9 @@ def _drive_fleet(fleet: SimulatedFleet, seconds: int) -> tuple[FloatArray, Float
 
 
 def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
-    """Return the ratio of widths with and without calibration, and both coverages."""
+    """Return figures: the ratio of interval widths with over without calibration, and the coverage
+    in both cases.
+    """
     groups = [
         learn_and_narrow(min(CARS_AT_ONCE, cars - k), seed + k, judged_s)
         for k in range(0, cars, CARS_AT_ONCE)
@@ -135,8 +144,8 @@ def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
 
 
 def figures(cars: int, seed: int) -> list[Figure]:
-    """Return the RMS of (learned − true) / standard deviation over cars, by quantity; the four
-    radii count as one.
+    """Return the RMS over cars of (learned − true) / standard deviation, by quantity. The four
+    radii count as one quantity.
     """
     away: dict[str, list[float]] = {}
     for first in range(0, cars, CARS_AT_ONCE):

@@ -1,5 +1,5 @@
-"""The campaign: every scenario for every estimator that can take part; figures and plots are
-made of its numbers.
+"""The evaluation campaign: runs every scenario with every suitable estimator. Figures and plots are
+computed from its results.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FAULTY_SEEDS = 4
 
 @dataclass(frozen=True)
 class PlottedDrive:
-    """The first drive of a scenario and its estimates, kept for plots."""
+    """The first drive of a scenario and its estimates, stored for plots."""
 
     batch: DriveSet
     reported: Estimates
@@ -44,8 +44,8 @@ class PlottedDrive:
 
 @dataclass
 class Results:
-    """Measures per drive, by (scenario, estimator): `real` with ordinary sensors, `ideal`
-    without errors.
+    """Measures per drive, by (scenario, estimator): `real` with ordinary sensors, `ideal` with
+    error-free sensors.
     """
 
     real: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
@@ -75,7 +75,7 @@ class Results:
 
 
 def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str], None]) -> Results:
-    """Run every scenario and return all measures; `log_line` receives lines of progress."""
+    """Run every scenario and return all measures; `log_line` receives lines with the progress."""
     results = Results(seeds=len(seeds))
     names = QUICK_ESTIMATORS if quick else tuple(ESTIMATORS)
     results.noise, plotted = experiments(seeds)
@@ -120,8 +120,8 @@ def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str],
 
 
 def _as_in_paper(estimator: str, batch: DriveSet) -> EstimatorBank:
-    """Return the bank for a paper's own conditions: an estimator with fixed friction gets the true
-    friction at the start.
+    """Return the bank for a paper's own conditions. An estimator without friction state is given
+    the true friction at the start.
     """
     friction = float(batch.mu[0, 0])
     if estimator == "adaptive-federated-ckf":
@@ -144,7 +144,9 @@ def _all_measures(name: str, batch: DriveSet, reported: Estimates) -> dict[str, 
 
 
 def _foreign_tyres(seeds: Sequence[int], log_line: Callable[[str], None]) -> dict[str, FloatArray]:
-    """Return the coverage of the default in all scenarios, with another kind of tyre per seed."""
+    """Return the coverage of the default estimator in all scenarios, by kind of tyre; the tyres
+    differ from the filter's model.
+    """
     found: dict[str, list[float]] = {kind: [] for kind in FOREIGN}
     kinds = list(FOREIGN)
     for scenario in (PAPERS | OTHERS).values():

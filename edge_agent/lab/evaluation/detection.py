@@ -1,25 +1,26 @@
-"""Detection judge: does the estimator find slippery road, how soon, and does it report ice where
-there is none?
+"""Detection evaluation: does the estimator find slippery road, how soon, and does it report ice
+where there is no ice?
 
-Towns are drawn by the seed; cars are rough ones (ROUGH_FLEET) or plain ones. "short" drives last
-120 s, "long" ones 900 s, because faults that silence a car only show there. All figures of one kind
-pool the samples of its towns.
+Towns are drawn randomly by seed; cars are inaccurate ("rough", ROUGH_FLEET) or accurate ("plain").
+"short" drives last 120 s, and "long" ones 900 s, because some faults that stop a car's reports
+appear only after a long time. All figures of one kind pool the samples of its towns.
 
 Legend
     slide       a stretch in which the normalised slip θ of some wheel exceeds SLIDING for at least
                 SLIDE_S
-    value       the visit's likelihood falls by VALUE_NATS or more to the upper end of the grid
+    value       the visit's likelihood falls by VALUE_NATS or more towards the upper end of the grid
     favoured    max ln L(μ < .4) - max ln L(μ >= .4) >= FAVOURED_NATS
-    on ice      of a visit: its mean friction is at most .2 and moves by less than MOVES; of a
-                sample: friction <= .2
-    excited     of a visit: some wheel uses more than EXCITED_SHARE of its grip in it
-    pass        a stretch of PASS_S or longer of one car on ice, or on snow; found: mu_upper < .4 at
-                some time of it
+    on ice      visit: its mean friction is at most .2 and changes by less than MOVES; sample:
+                friction <= .2
+    excited     visit: some wheel uses more than EXCITED_SHARE of its grip during it
+    pass        a stretch of PASS_S or longer of one car on ice, or on snow; a pass is found if
+                mu_upper < .4 at some time during it
     settled     not within SETTLED_S of snow and ice
     false event a settled stretch with mu_upper < .4 on wet or dry road; gaps up to EVENT_GAP_S do
-    not end it false grip  mu_lower more than FALSE_GRIP above the true friction
-    stood       ice or snow appeared under the standing car: judged apart, and not in any other
-                figure
+                not end it
+    false grip  mu_lower more than FALSE_GRIP above the true friction
+    stood       ice or snow appeared under the standing car; these cases are evaluated separately
+                and in no other figure
 """
 
 from __future__ import annotations
@@ -69,8 +70,8 @@ Stretches: TypeAlias = list[tuple[int, int]]
 
 @dataclass
 class DetectionTally:
-    """Sums of one town or of several: means by name, counts by name, and lists of seconds by
-    name.
+    """Sums for one town or several: sums and counts of values by name (for means), and lists of
+    times [s] by name.
     """
 
     total: dict[str, float] = field(default_factory=dict)
@@ -78,16 +79,16 @@ class DetectionTally:
     seconds: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, name: str, values: NDArray[np.generic]) -> None:
-        """Add values of which the name is the mean."""
+        """Add values to the mean called `name`."""
         self.total[name] = self.total.get(name, 0.0) + float(np.sum(values, dtype=np.float64))
         self.count[name] = self.count.get(name, 0) + int(np.size(values))
 
     def add_case(self, name: str, *, holds: bool) -> None:
-        """Add one case to a share."""
+        """Add one case (True or False) to the share called `name`."""
         self.add(name, np.array([holds]))
 
     def merge(self, other: DetectionTally) -> None:
-        """Add the counts of another town."""
+        """Add the sums and times of another tally."""
         for name, value in other.total.items():
             self.total[name] = self.total.get(name, 0.0) + value
             self.count[name] = self.count.get(name, 0) + other.count[name]
@@ -95,17 +96,19 @@ class DetectionTally:
             self.seconds.setdefault(name, []).extend(times)
 
     def mean(self, name: str) -> float:
-        """Return the mean by name; NaN of nothing."""
+        """Return the mean of the values called `name`; NaN without values."""
         return self.total[name] / self.count[name] if self.count.get(name) else float("nan")
 
     def rate(self, over: str, under: str) -> float:
-        """Return the sum of one name over that of another; NaN without the other."""
+        """Return the sum called `over` divided by the sum called `under`; NaN if the latter is zero
+        or missing.
+        """
         return (
             self.total.get(over, 0.0) / self.total[under] if self.total.get(under) else float("nan")
         )
 
     def quantile(self, name: str, share: float) -> float:
-        """Return a quantile of the seconds by name; NaN of nothing."""
+        """Return the quantile `share` of the times called `name` [s]; NaN without times."""
         return (
             float(np.quantile(self.seconds[name], share))
             if self.seconds.get(name)
@@ -114,13 +117,13 @@ class DetectionTally:
 
 
 def runs_of(on: NDArray[np.bool_]) -> Stretches:
-    """Return first and one past the last index of each stretch where `on` (T,) holds."""
+    """Return (first index, last index + 1) of each stretch where `on` (T,) is True."""
     edge = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in zip(edge[::2], edge[1::2], strict=True)]
 
 
 def bridge_gaps(on: NDArray[np.bool_], seconds: float) -> NDArray[np.bool_]:
-    """Return `on` (T,) with gaps up to `seconds` filled."""
+    """Return `on` (T,) with gaps of at most `seconds` filled."""
     out = on.copy()
     most = round(seconds * RATE_HZ)
     for first, end in runs_of(~on):
@@ -130,14 +133,16 @@ def bridge_gaps(on: NDArray[np.bool_], seconds: float) -> NDArray[np.bool_]:
 
 
 def slides_of(theta: NDArray[np.floating], seconds: float = SLIDE_S) -> Stretches:
-    """Return the slides of a car in θ (T, 4): some wheel beyond SLIDING for `seconds` or longer."""
+    """Return the slides of a car: stretches where θ (T, 4) of some wheel exceeds SLIDING for at
+    least `seconds`.
+    """
     some = bridge_gaps(np.asarray((theta > SLIDING).any(axis=1)), BRIDGED_S)
     least = round(seconds * RATE_HZ)
     return [(first, end) for first, end in runs_of(some) if end - first >= least]
 
 
 def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
-    """Return by which of ACTIVITIES a slide was caused: the larger acceleration, and its sign."""
+    """Return the cause of a slide (one of ACTIVITIES), from the larger acceleration and its sign."""
     along = float(drive.ax[first:end, n].mean())
     across = float(drive.ay[first:end, n].mean())
     if abs(across) > abs(along):
@@ -146,7 +151,9 @@ def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
 
 
 def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTally:
-    """Return all results of one town; `oracle`: ask the oracle about excited visits to ice too."""
+    """Return the tally of one town. With `oracle`, excited visits to ice are also evaluated by an
+    oracle.
+    """
     tally = DetectionTally()
     _judge_samples(tally, drive)
     for n in range(drive.mu.shape[1]):
@@ -160,7 +167,7 @@ def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTall
 
 
 def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
-    """Return coverage, false ice, false grip and interval score over samples."""
+    """Add coverage, false ice, false grip and interval score over all samples to the tally."""
     mu = drive.mu
     apart = ~drive.stood
     inside = (drive.lower <= mu) & (mu <= drive.upper)
@@ -189,7 +196,9 @@ def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
 
 
 def passes_of(drive: DetectionDrive, n: int, kind: str) -> Stretches:
-    """Return stretches of PASS_S or longer of car n on ice, or on snow up to SLIPPERY_MU."""
+    """Return the stretches of at least PASS_S in which car n is on ice, or on snow with friction up
+    to SLIPPERY_MU.
+    """
     mu = drive.mu[:, n]
     on = mu <= ICE_MU if kind == "ice" else (mu > ICE_MU) & (mu <= SLIPPERY_MU)
     return [(first, end) for first, end in runs_of(on) if end - first >= round(PASS_S * RATE_HZ)]
@@ -230,14 +239,16 @@ def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
 
 
 def _add_seconds(tally: DetectionTally, key: str, activity: str, wait: float) -> None:
-    """Add a time to detection [s], over all activities and for its own."""
+    """Add a time until detection [s] to the list for all activities, and to the list of its own
+    activity.
+    """
     tally.seconds.setdefault(key, []).append(wait)
     tally.seconds.setdefault(f"{key}.{activity}", []).append(wait)
 
 
 def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
-    """Judge slides on slippery road: does the estimator report the road at most TOLD_AFTER_S after
-    the slide?
+    """Evaluate slides on slippery road: does the estimator report slippery road until at most
+    TOLD_AFTER_S after the slide?
     """
     beyond = drive.theta[:, n] > SLIDING
     for first, end in slides_of(drive.theta[:, n], TOLD_SLIDE_S):
@@ -253,8 +264,8 @@ def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
 def _judge_contradictions(
     tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches
 ) -> None:
-    """Count onsets of CONTRADICTION in slides on slippery road and elsewhere, and the seconds of
-    each without it.
+    """Count the onsets of CONTRADICTION during slides on slippery road and elsewhere, and the
+    seconds of each without it.
     """
     sliding = np.zeros(len(drive.mu), np.bool_)
     extended = np.zeros(len(drive.mu), np.bool_)
@@ -343,7 +354,7 @@ class TownTally(NamedTuple):
 
 @dataclass
 class DetectionResults:
-    """Tallies of towns by (length, kind)."""
+    """Tallies of towns by (length, kind): length "short" or "long", kind "rough" or "plain"."""
 
     towns: dict[tuple[str, str], list[TownTally]] = field(default_factory=dict)
 
@@ -354,7 +365,9 @@ class DetectionResults:
     def pool_towns(
         self, lengths: Sequence[str], kind: str, *, winter: bool | None = None
     ) -> DetectionTally:
-        """Return all towns of a kind together, or the winter towns, or the others."""
+        """Return the pooled tally of towns of one kind: all of them, or with `winter` only those
+        with or without winter.
+        """
         found = DetectionTally()
         for length in lengths:
             for town in self.towns.get((length, kind), []):

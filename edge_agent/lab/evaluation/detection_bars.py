@@ -1,5 +1,5 @@
-"""Figures of the detection judge: how each is read from a tally, its unit, and its bars for
-rough and plain cars.
+"""Figures of the detection evaluation: how each one is read from a tally, its unit, and its targets
+("bars") for rough and plain cars.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ SHARE: Final = "1"
 
 
 class DetectionBar(NamedTuple):
-    """A figure of the detection judge: its drives, the function that reads it, its unit, and the
-    bars for both KINDS.
+    """A figure of the detection evaluation: its drives, the function that reads it from a tally,
+    its unit, and its targets for both KINDS.
 
     `length`: one of LENGTHS, or "" for both together.
     """
@@ -41,17 +41,21 @@ class DetectionBar(NamedTuple):
 
 
 def mean_of(name: str) -> Callable[[DetectionTally], float]:
-    """Read a mean of the tally."""
+    """Return a function that reads the mean called `name` from a tally."""
     return lambda tally: tally.mean(name)
 
 
 def seconds_of(name: str, share: float) -> Callable[[DetectionTally], float]:
-    """Read a quantile of the tally's seconds."""
+    """Return a function that reads the quantile `share` of the times called `name` [s] from a
+    tally.
+    """
     return lambda tally: tally.quantile(name, share)
 
 
 def rate_of(over: str, under: str) -> Callable[[DetectionTally], float]:
-    """Read 1000 times the sum of one name over that of another."""
+    """Return a function that reads 1000 times the sum called `over` divided by the sum called
+    `under`.
+    """
     return lambda tally: 1e3 * tally.rate(over, under)
 
 
@@ -201,11 +205,11 @@ DETECTION: Final = (
 
 
 def detection_figures(results: DetectionResults) -> list[Figure]:
-    """List `NAME.KIND` for every DETECTION, those with a bar first, with the standard error over
-    towns.
+    """Return the figure `NAME.KIND` for every entry of DETECTION, first those with a target, with
+    the standard error over towns.
 
-    `NAME.KIND.winter` and `NAME.KIND.other`: the same in the winter towns and in the others, where
-    both were driven.
+    `NAME.KIND.winter` and `NAME.KIND.other` are the same figure for the winter towns and the other
+    towns, if there are both.
     """
     listed = []
     for bar in sorted(DETECTION, key=lambda bar: bar.bars is None):

@@ -1,12 +1,13 @@
-"""Detection campaign: towns of rough and of plain cars, short and long, judged one after the other.
+"""Detection campaign: towns with rough (inaccurate) and plain (accurate) cars, short and long
+drives, evaluated one after the other.
 
-Half of the towns are winter towns, in which all cars have winter equipment. Chosen towns, with a
-table:
+Half of the towns are winter towns, in which all cars have winter equipment. To evaluate chosen
+towns and print a table:
 
     python -m edge_agent.lab.evaluation.detection_campaign 50001:rough 50002:plain:900
     50003:rough:120:winter
 
-Each is SEED, SEED:KIND, SEED:KIND:SECONDS or SEED:KIND:SECONDS:winter.
+Each town is SEED, SEED:KIND, SEED:KIND:SECONDS or SEED:KIND:SECONDS:winter.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ DEFAULT: Final = "aco-fckf"
 
 
 class DetectionTown(NamedTuple):
-    """A town to judge: its seed, "rough" or "plain" cars, length [s], how many cars, and whether
-    it is winter there.
+    """A town to evaluate: its seed, "rough" or "plain" cars, duration [s], number of cars, and True
+    if it is winter there.
     """
 
     seed: int
@@ -59,13 +60,13 @@ class DetectionTown(NamedTuple):
 
     @property
     def length(self) -> str:
-        """Return "short" or "long"."""
+        """Return the class of the duration, "short" or "long"."""
         return "long" if self.seconds >= LONGER_THAN_SHORT_S else "short"
 
 
 def towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
-    """Return the towns of the campaign: short and long ones have seeds of their own, both kinds the
-    same ones.
+    """Return the towns of the campaign. Short and long towns have different seeds; both kinds of
+    cars have the same seeds.
 
     Towns with an odd seed are winter towns.
     """
@@ -85,7 +86,7 @@ def towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
 
 
 def drive_town(town: DetectionTown, make_bank: BankMaker) -> DetectionDrive:
-    """Drive and estimate a town."""
+    """Simulate the cars of a town, and estimate their motion and friction."""
     scenario = winter(town.seed) if town.winter else drawn_town(town.seed)
     rough = float(town.kind == "rough")
     fleet = SimulatedFleet(
@@ -101,8 +102,8 @@ def judge_towns(
     *,
     oracle: bool = True,
 ) -> DetectionResults:
-    """Drive and judge towns. With `oracle`, also run the oracle in short towns. `log_line` receives
-    one line per town.
+    """Simulate and evaluate towns. With `oracle`, also run the oracle in short towns. `log_line`
+    receives one line per town.
     """
     results = DetectionResults()
     for town in chosen:
@@ -121,17 +122,17 @@ def judge_towns(
 def campaign(
     seeds: Sequence[int], log_line: Callable[[str], None], *, quick: bool, estimator: str = DEFAULT
 ) -> DetectionResults:
-    """Judge an estimator in all towns."""
+    """Evaluate an estimator in all towns of the campaign."""
     return judge_towns(
         towns(seeds, quick=quick), lambda vehicles: bank_of(estimator, vehicles), log_line
     )
 
 
 def town_named(text: str) -> DetectionTown:
-    """Return the town of SEED[:KIND[:SECONDS[:winter]]].
+    """Return the town described by SEED[:KIND[:SECONDS[:winter]]].
 
     Raises:
-        InputError: it is not one.
+        InputError: the text does not have this form.
     """
     usual = ("", "rough", "120", "")
     given = text.split(":")
@@ -150,7 +151,7 @@ def town_named(text: str) -> DetectionTown:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Judge the named towns and print a table."""
+    """Evaluate the towns given on the command line, and print a table."""
     parse = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

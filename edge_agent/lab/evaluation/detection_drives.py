@@ -1,8 +1,8 @@
-"""Drives through drawn towns for the detection judge: truth, estimates, visits with their evidence,
-the slip flag.
+"""Drives through random towns for the detection evaluation: true values, estimates, visits with
+their evidence, and the slip flag.
 
-Cars are those of `SimulatedFleet`; visits and evidence are made by the agent's own pipeline
-(`observe`). A drive is made in chunks, so that fifteen minutes of sixteen cars fit in memory.
+The cars are those of `SimulatedFleet`; the agent's own pipeline (`observe`) computes visits and
+evidence. A drive is computed in chunks, so that fifteen minutes of sixteen cars fit in memory.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ Samples: TypeAlias = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class DetectionVisits:
-    """Published visits: vehicle (V,), first and last sample (V,), ln L on the friction grid (V,
-    32).
+    """Published visits: index of the vehicle (V,), first and last sample (V,), ln L on the friction
+    grid (V, 32).
     """
 
     vehicle: IntArray
@@ -50,19 +50,19 @@ class DetectionVisits:
 
 @dataclass(frozen=True)
 class DetectionDrive:
-    """Truth and estimates of one town's cars; (T, N), and (T, N, 4) per wheel.
+    """True values and estimates of one town's cars; shape (T, N), or (T, N, 4) per wheel.
 
     Attributes:
-        speed, ax, ay: true motion [m/s, m/s^2]
-        mu: mean true friction of the four wheels
-        mu_wheel, theta, used: friction, normalised slip and share of the grip that is used, per
-            wheel
-        lower, median, upper, health: estimates
-        favoured: ln of the best belief below SLIPPERY_MU over the best above; NaN where the
-            estimator has no belief
-        flagged: friction that the slip flag reports, infinite where none is up
-        controlled: ABS, traction control or ESC works, of cars with winter equipment
-        stood: ice or snow appeared under the car while it stood, and it has not left it since
+        speed, ax, ay: true motion [m/s, m/s^2].
+        mu: true mean friction of the four wheels.
+        mu_wheel, theta, used: friction, normalised slip and used share of the grip, per wheel.
+        lower, median, upper, health: estimates.
+        favoured: ln of the largest belief below SLIPPERY_MU over the largest above; NaN where the
+            estimator has no belief.
+        flagged: friction that the slip flag reports, infinite without a flag.
+        controlled: True while ABS, traction control or ESC acts, for cars with winter equipment.
+        stood: True where ice or snow appeared under the standing car, until the car leaves it.
+        visits: the published visits.
     """
 
     speed: Samples
@@ -84,7 +84,7 @@ class DetectionDrive:
 
 
 def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> DetectionDrive:
-    """Drive a fleet for `seconds` and estimate with the bank."""
+    """Simulate a fleet for `seconds` and estimate its signals with the bank."""
     vehicles = fleet.vehicles
     config = AgentConfig()
     tracks = new_tracks(len(vehicles))
@@ -136,10 +136,11 @@ def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> D
 def stood_where_it_appeared(
     mu: NDArray[np.floating], speed: NDArray[np.floating], starts: Sequence[float]
 ) -> BoolArray:
-    """Return where a car is still on ice or snow that appeared under it while it stood, (T, N).
+    """Return an array (T, N) that is True where a car is still on ice or snow that appeared under
+    it while it stood.
 
     Args:
-        mu: (T, N) mean true friction of the wheels.
+        mu: (T, N) true mean friction of the wheels.
         speed: (T, N) [m/s].
         starts: times [s] at which patches appear.
     """
@@ -158,7 +159,9 @@ def stood_where_it_appeared(
 def _estimate_chunk(
     bank: EstimatorBank, t: FloatArray, signals: FloatArray, closes: BoolArray
 ) -> tuple[Estimates, FloatArray]:
-    """Return the estimates of a chunk with evidence, and the favour of slippery road (T, N)."""
+    """Return the estimates of a chunk with evidence, and (T, N) how much the belief favours
+    slippery road [nat].
+    """
     if bank.beliefs() is None:
         return bank.advance(t, signals, closes), np.full(t.shape, np.nan)
     parts = []
@@ -177,7 +180,7 @@ def _estimate_chunk(
 
 
 def slippery_favoured(log_likelihood: FloatArray) -> FloatArray:
-    """Return max ln L(μ < SLIPPERY_MU) - max ln L(μ >= SLIPPERY_MU) of (…, 32)."""
+    """Return max ln L(μ < SLIPPERY_MU) - max ln L(μ >= SLIPPERY_MU) for log-likelihoods (…, 32)."""
     low = mugrid.CENTRES < SLIPPERY_MU
     return np.asarray(
         log_likelihood[..., low].max(axis=-1) - log_likelihood[..., ~low].max(axis=-1)
@@ -206,7 +209,9 @@ def _samples_of(
 
 
 def _bytes_of(column: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Return the likelihood bytes of visits, (V, 32); flat if the estimator reports no evidence."""
+    """Return the encoded likelihoods of visits, (V, 32) bytes; flat likelihoods if the estimator
+    has no evidence.
+    """
     found = np.asarray(column, dtype=np.uint8)
     return found if found.shape[1] else np.zeros((len(found), mugrid.BINS), np.uint8)
 

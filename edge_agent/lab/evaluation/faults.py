@@ -1,7 +1,8 @@
-"""Sensor faults: each fault, its expected effect, and the response of every estimator.
+"""Evaluation with sensor faults: each fault, its expected effect, and the response of every
+estimator.
 
-The drives are ordinary ones; a fault begins at BEGINS. `told` is 1 if health reports the flag in
-every drive.
+The drives are ordinary ones; a fault begins at BEGINS. The measure `told` is the share of drives in
+which health reports the expected flag.
 """
 
 from __future__ import annotations
@@ -36,20 +37,20 @@ DRIVES: Final = {
 
 
 def in_order(t: FloatArray) -> FloatArray:
-    """Return the clock unchanged."""
+    """Return the clock t (T, N) unchanged."""
     return t
 
 
 def kept_samples(t: FloatArray) -> FloatArray:
-    """Return the samples that remain after three seconds without samples: a drive with a hole in
-    it.
+    """Return the clock t (T, N) with a gap of three seconds at BEGINS, as if the samples of that
+    time were missing.
     """
     return np.where(t < BEGINS, t, t + 3.0)
 
 
 def late_samples(t: FloatArray) -> FloatArray:
-    """Return a clock on which, from BEGINS to ENDS, every tenth sample carries a time that is fifty
-    milliseconds old.
+    """Return the clock t (T, N) on which, from BEGINS to ENDS, every tenth sample has a time stamp
+    that is 50 ms too old.
     """
     number = np.arange(len(t))[:, None]
     return np.where((t >= BEGINS) & (t < ENDS) & (number % 10 == 0), t - 0.05, t)
@@ -57,8 +58,8 @@ def late_samples(t: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the table of faults: `flag` is the flag that health must carry, OK where no
-    sensor can tell.
+    """One row of the table of faults. `flag` is the health flag that must be reported, or OK if no
+    sensor can detect the fault.
     """
 
     faults: tuple[Fault, ...]
@@ -68,7 +69,7 @@ class Case:
 
 
 def fault_on(kind: str, *channels: str, size: float = 0.0) -> tuple[Fault, ...]:
-    """Return a fault of each of some channels from BEGINS to ENDS."""
+    """Return a fault of the given kind for each of the channels, from BEGINS to ENDS."""
     return tuple(Fault(kind, channel, BEGINS, ENDS, size) for channel in channels)
 
 
@@ -141,7 +142,7 @@ CASES: Final = {
 
 
 def apply_fault(batch: DriveSet, case: Case) -> DriveSet:
-    """Return the drives with the fault in their signals and clock."""
+    """Return the drives with the fault applied to their signals and clock."""
     each = [
         apply_faults(batch.t[:, n], batch.signals[:, n], case.faults)
         for n in range(batch.t.shape[1])
@@ -150,8 +151,8 @@ def apply_fault(batch: DriveSet, case: Case) -> DriveSet:
 
 
 def case_measures(batch: DriveSet, reported: Estimates, case: Case) -> dict[str, FloatArray]:
-    """Return the measures of a case, per drive: `finite`, `told` (1 or 0), coverage and width from
-    BEGINS on, RMSE.
+    """Return the measures of a case, per drive: `finite` and `told` (1 or 0), coverage and width
+    from BEGINS on, and RMSE.
     """
     after = batch.t[:, 0] >= BEGINS
     whole = np.isfinite(reported.values).all(axis=-1)

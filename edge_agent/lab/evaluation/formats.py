@@ -1,5 +1,5 @@
-"""One drive on a bus in every format that is read, written by the libraries that others write
-them with.
+"""Writers of one drive in every supported bus log format, with the libraries that usually write
+them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from schemas.thresholds import NS
 
 
 def as_log(path: Path, messages: Sequence[Any]) -> Path:
-    """Write a CAN log by python-can; the suffix of the path selects the format."""
+    """Write CAN messages as a log with python-can; the suffix of the path selects the format.
+    Return the path.
+    """
     with import_optional("can").Logger(str(path)) as writer:
         for message in messages:
             writer(message)
@@ -29,7 +31,9 @@ def as_log(path: Path, messages: Sequence[Any]) -> Path:
 
 
 def as_mf4(path: Path, messages: Sequence[Any]) -> Path:
-    """Write CAN messages as an MDF 4 file in the bus-logging layout of ASAM, with asammdf."""
+    """Write CAN messages with asammdf as an MDF 4 file, in the bus-logging layout of ASAM. Return
+    the path.
+    """
     asammdf = import_optional("asammdf")
     types = np.dtype(
         [
@@ -63,7 +67,7 @@ def as_mf4(path: Path, messages: Sequence[Any]) -> Path:
 
 
 def as_bag(folder: Path, messages: Sequence[Any], storage: str = "mcap") -> Path:
-    """Write a bag of can_msgs/Frame by rosbags."""
+    """Write CAN messages with rosbags as a bag of can_msgs/Frame. Return the folder."""
     rosbag2 = import_optional("rosbags.rosbag2")
     typesys = import_optional("rosbags.typesys")
     types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
@@ -84,7 +88,7 @@ def as_bag(folder: Path, messages: Sequence[Any], storage: str = "mcap") -> Path
 
 
 def as_csv(path: Path, log: Path, *, mark: str = ",") -> Path:
-    """Write a signal log as CSV, to the last digit."""
+    """Write a signal log as CSV with full precision; `mark` is the delimiter. Return the path."""
     table = pq.read_table(log)
     names = table.column_names
     t = np.array(table["timestamp"].cast(pa.int64()))

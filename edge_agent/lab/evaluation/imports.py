@@ -1,5 +1,5 @@
-"""Evaluation of file import: frames decoded as by cantools, a minute of a bus at once, one drive
-equal in all formats.
+"""Evaluation of file import: decoding compared with cantools, time to import a minute of a bus, and
+equality of a drive over all formats.
 """
 
 from __future__ import annotations
@@ -36,11 +36,10 @@ START_S: Final = 1_700_000_000
 
 
 def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
-    """Return the number of values that differ from those of cantools, and the number of compared
-    values.
+    """Return (number of values that differ from those of cantools, number of compared values).
 
-    Made frames of random bytes for every shipped profile with a database; and those of a recorded
-    log, by the database of the profile that it has frames of.
+    The frames have random bytes, for every shipped profile with a database. Frames of a recorded
+    log are added, if there is one.
     """
     wrong = compared = 0
     rng = np.random.default_rng(seed)
@@ -91,8 +90,8 @@ def _compare_decoders(ours: Database, message: Any, frames: Sequence[bytes]) -> 
 
 
 def on_a_bus(drive: Recorded) -> list[Any]:
-    """Return a drive as CAN frames: four messages per sample, and, if a minute has room for them,
-    frames that the import does not need.
+    """Return a drive as CAN frames. Each frame has two channels of a sample; pairs with a missing
+    reading are left out.
     """
     frames = []
     columns = drive.signals[:, [ALL.index(name) for name in CHANNELS]]
@@ -112,8 +111,8 @@ def _make_frame(t: float, identifier: int, data: bytes) -> Any:  # noqa: ANN401 
 
 
 def a_minute(path: Path) -> Path:
-    """Write one minute of a bus with MINUTE_FRAMES frames: four wanted messages at 100 Hz, and
-    OTHERS unwanted ones.
+    """Write a log of one minute with MINUTE_FRAMES frames: four wanted messages at 100 Hz, and
+    OTHERS unwanted messages. Return the path.
     """
     rng = np.random.default_rng(1)
     others = rng.choice(np.arange(512, 512 + OTHERS), MINUTE_FRAMES - 24_000)
@@ -126,7 +125,7 @@ def a_minute(path: Path) -> Path:
 
 
 def import_file(path: Path, profile: Profile, out: Path) -> Path:
-    """Import a source as a signal log like `edge-agent import`."""
+    """Import a source as a signal log, like `edge-agent import`; return the path of the log."""
     database = parse_dbc(DBC) if path.suffix != ".csv" else None
     merged = merge_recordings([read_source(path, profile, database)], profile)
     write_log(out, merged, profile, [path.name])
@@ -134,7 +133,7 @@ def import_file(path: Path, profile: Profile, out: Path) -> Path:
 
 
 def import_s(folder: Path) -> float:
-    """Return the seconds that importing a minute of a bus takes, the best of TRIES."""
+    """Return the time [s] to import one minute of a bus, the shortest of TRIES runs."""
     path = a_minute(folder / "minute.blf")
     profile = profile_of("can")
     spent = []
@@ -154,8 +153,8 @@ def estimates_of(log: Path, drive: Recorded) -> FloatArray:
 
 
 def same_estimates(folder: Path, seed: int, seconds: int = DRIVE_S) -> tuple[float, int]:
-    """Return the largest difference between the estimates of one drive over its formats, and the
-    number of formats.
+    """Return (largest difference between the estimates of one drive over its formats, number of
+    formats).
     """
     (drive,) = drives(1, seed, rough=True, seconds=seconds)
     frames = on_a_bus(drive)
@@ -178,7 +177,7 @@ def _largest_difference(one: FloatArray, other: FloatArray) -> float:
 
 
 def figures(folder: Path, seed: int, recorded: Path | None, seconds: int = DRIVE_S) -> list[Figure]:
-    """Return the three rows, and the data they were measured on."""
+    """Return the figures of file import, with the numbers of values and formats they are based on."""
     wrong, compared = decode_errors(recorded, seed)
     largest, formats = same_estimates(folder, seed, seconds)
     return [

@@ -1,9 +1,9 @@
-"""Measures of estimates against truth; every measure gives one number per drive, (N,).
+"""Measures of estimates against the true values; every measure is one number per drive, (N,).
 
-Legend: NEES squared error of (v_x, v_y) over its stated variance, per component [1], 1 where the
-stated spread is right; NIS squared innovation over its stated variance, per row [1]. Their mean
-over N drives at one instant has 95 % of its values within chi-squared bounds if the filter is right
-(Bar-Shalom, Li, Kirubarajan 2001, 5.4).
+Legend: NEES squared error of (v_x, v_y) over its stated variance, per component [1], 1 if the
+stated standard deviation is right; NIS squared innovation over its stated variance, per row [1]. If
+the filter is consistent, the mean over N drives at one instant lies within chi-squared bounds in 95
+% of all cases (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ COMPONENTS = {
 
 
 def errors(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Return the errors (T, N) of the motion: vx, vy [m/s], yaw_rate [rad/s], beta [rad]."""
+    """Return the errors (T, N) of the motion: vx, vy [m/s], yaw_rate [rad/s], beta (sideslip)
+    [rad].
+    """
     truth = batch.truth
     beta = np.arctan2(truth["true_vy"], np.maximum(truth["true_vx"], SLOWEST_M_S))
     return {
@@ -37,12 +39,14 @@ def errors(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def is_covered(batch: DriveSet, reported: Estimates) -> BoolArray:
-    """Return True where the 90 % interval contains the mean friction of the wheels, (T, N)."""
+    """Return an array (T, N) that is True where the 90 % interval contains the mean friction of the
+    wheels.
+    """
     return np.asarray((reported.mu_lower <= batch.mu) & (batch.mu <= reported.mu_upper))
 
 
 def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Return all measures that every drive has."""
+    """Return the measures that are defined for every drive, by name, (N,) each."""
     end = batch.last(LAST_S)
     found: dict[str, FloatArray] = {}
     for name, error in errors(batch, reported).items():
@@ -60,7 +64,9 @@ def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def nees(batch: DriveSet, reported: Estimates) -> FloatArray:
-    """Return the squared error of (v_x, v_y) over its stated variance, per component, (T, N)."""
+    """Return the NEES: the squared error of (v_x, v_y) over its stated variance, per component, (T,
+    N).
+    """
     off = errors(batch, reported)
     return np.asarray(
         0.5 * ((off["vx"] / reported.vx_std) ** 2 + (off["vy"] / reported.vy_std) ** 2)
@@ -68,8 +74,8 @@ def nees(batch: DriveSet, reported: Estimates) -> FloatArray:
 
 
 def bounds(measure: str, drives: int) -> tuple[float, float]:
-    """Return the 95 % interval of the mean of "nees" or "nis" over so many drives if the filter is
-    consistent.
+    """Return the 95 % bounds for the mean of "nees" or "nis" over this number of drives, for a
+    consistent filter.
     """
     from scipy.stats import chi2
 
@@ -78,8 +84,8 @@ def bounds(measure: str, drives: int) -> tuple[float, float]:
 
 
 def consistency(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Return the share of instants at which the mean NEES, and NIS, over the drives lies within its
-    bounds, (1,) each.
+    """Return the share of instants at which the mean NEES, and the mean NIS, over all drives lies
+    within its bounds, (1,) each.
     """
     found = {}
     for name, value in (("nees", nees(batch, reported)), ("nis", reported.innovation_nis)):
@@ -90,8 +96,8 @@ def consistency(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Return for split friction, in the last second, the error of the lower side and the coverage
-    of the higher.
+    """Return, for split friction, the error on the lower side and the coverage on the higher side,
+    in the last second.
     """
     end = batch.last(LAST_S)
     truth = batch.mu_wheel
@@ -109,8 +115,8 @@ def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def arrival(batch: DriveSet, reported: Estimates) -> FloatArray:
-    """Return the seconds from the change of friction until mu is within NEAR of it; the time to the
-    end if it never is.
+    """Return the time [s] from the change of friction until mu is within NEAR of the new value; if
+    this never happens, the time to the end.
     """
     changed = batch.mu == batch.mu[-1]
     seconds = np.empty(batch.t.shape[1])
@@ -123,8 +129,8 @@ def arrival(batch: DriveSet, reported: Estimates) -> FloatArray:
 
 
 def false_changes(batch: DriveSet, reported: Estimates) -> FloatArray:
-    """Count per drive how often the interval lies more than NEAR away from an unchanged friction
-    for HOLD_S or longer.
+    """Return, per drive, how often the interval lies more than NEAR away from an unchanged friction
+    for at least HOLD_S.
     """
     wrong = (reported.mu_upper < batch.mu - NEAR) | (reported.mu_lower > batch.mu + NEAR)
     hold = max(1, round(HOLD_S / float(batch.t[1, 0] - batch.t[0, 0])))

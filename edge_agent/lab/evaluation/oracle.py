@@ -1,26 +1,27 @@
-"""Best possible accuracy with these sensors: two bars of the papers, and an oracle that knows
-nearly everything.
+"""Best possible accuracy with these sensors for two targets of the papers, computed by an oracle
+that knows almost everything.
 
-An oracle is a Bayesian estimator that gets the same noisy readings, and the truth of everything
-that is not listed as unknown. Its unknowns are those that vehicle file and data sheet leave open.
-Everything is linear about the truth, so its estimate is that of least squares with a Gaussian
-prior.
+An oracle is a Bayesian estimator that gets the same noisy readings, and the true value of
+everything that is not listed as unknown. Its unknowns are those that the vehicle file and the data
+sheet leave open. Everything is linearised around the true values, so its estimate is least squares
+with a Gaussian prior.
 
-`speed`: v_x of an accelerating sine. It gets the wheels without noise: W = (1 + ρ) v.
+`speed`: v_x of an accelerating sine. The oracle gets the wheel speeds without noise: W = (1 + ρ) v.
 
-    a_y − v_y' = (1 − ρ) W r + κ_y a_l + τ a_l' + c (v_y − l_r r)' + b_y     a_l: part that the rolling
-                                                                             body has followed
-    ΔW (1 − ρ) = ∫(a_x + r v_y − κ_x a_p − c r (v_y − l_r r) − b_x)          over stretches of
-                                                                             STRETCH_S
-    unknown: ρ radius of the file, c ln of cornering stiffness, κ and τ how the body rolls and
-    pitches, b offsets
+    a_y − v_y' = (1 − ρ) W r + κ_y a_l + τ a_l' + c (v_y − l_r r)' + b_y
+    ΔW (1 − ρ) = ∫(a_x + r v_y − κ_x a_p − c r (v_y − l_r r) − b_x)      over stretches of STRETCH_S
+    a_l, a_p   part of the acceleration that the body's roll and pitch have followed
+    unknown    ρ error of the radius, c ln of cornering stiffness, κ and τ roll and pitch of the
+               body, b offsets
 
-`friction`: μ under .6 g, at the end of the drive. It gets the mean of four wheels, knows the force
-of every tyre, and the speed except offset and leak of a_x.
+`friction`: μ under .6 g, at the end of the drive. The oracle gets the mean of four wheels, and
+knows the force of every tyre, and the speed except for offset and gravity leak of a_x.
 
-    R ω = (1 + ρ)(v + b t + κ (v − v(0)) + v_0)(1 + s e^{−k} g(μ, shape))    s true slip
-    g    slip that the forces take at μ and with that shape of the tyre's curve, over the true one
-    unknown: μ (uniform), shape (as the fleet's), k ln of stiffness, ρ, b, κ, v_0
+    R ω = (1 + ρ)(v + b t + κ (v − v(0)) + v_0)(1 + s e^{−k} g(μ, shape))
+    s          true slip
+    g          slip that the forces cause at μ and with that shape of the tyre curve, over the true
+               slip
+    unknown    μ (uniform), shape (distributed as in the fleet), k ln of stiffness, ρ, b, κ, v_0
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ LEAST: Final = 1e-3  # normalised slip below which a wheel rolls freely
 
 
 class OracleSignals(NamedTuple):
-    """A drive of 002.sine: the values given to the oracle, and the roll and pitch terms of the
-    accelerometers, (T,) each.
+    """A drive of scenario 002.sine: the values given to the oracle, and the roll and pitch terms of
+    the accelerometers, (T,) each.
     """
 
     batch: DriveSet
@@ -78,8 +79,10 @@ def speed(seeds: Sequence[int]) -> FloatArray:
 
 
 def _speed(heard: OracleSignals, n: int, rho: float) -> float:
-    """Return the speed: each second ρ is estimated again from all earlier readings, and the wheels
-    are corrected by it.
+    """Return the RMSE of the oracle's speed for drive n [m/s].
+
+    Each second, ρ is estimated again from all earlier readings, and the wheel speeds are corrected
+    by it.
     """
     batch = heard.batch
     car = PAPERS["002.sine"].vehicle
@@ -128,7 +131,7 @@ def _speed(heard: OracleSignals, n: int, rho: float) -> float:
 
 
 def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-    """Return |μ − truth| at the end of 003.accel, and the oracle's expected error, one per seed
+    """Return (|μ − truth| at the end of 003.accel, the oracle's expected error), one value per seed
     each.
     """
     scenario = PAPERS["003.accel"]
@@ -164,7 +167,7 @@ def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
 
 def _theta(force: FloatArray, shape: float, curvature: float) -> FloatArray:
     """Return the normalised slip on the rising branch at which the tyre uses the share `force` of
-    the grip.
+    its grip.
     """
     curve = _curve(shape, curvature)
     return np.interp(force, curve, THETA[: len(curve)])
@@ -172,7 +175,7 @@ def _theta(force: FloatArray, shape: float, curvature: float) -> FloatArray:
 
 @cache
 def _curve(shape: float, curvature: float) -> FloatArray:
-    """Return the tyre's force curve at THETA up to its peak."""
+    """Return the tyre's force over peak force at the normalised slips THETA, up to the peak."""
     curve = np.array([magic_formula(x, shape, curvature) for x in THETA])
     return curve[: int(np.argmax(curve)) + 1]
 
@@ -180,8 +183,8 @@ def _curve(shape: float, curvature: float) -> FloatArray:
 def _cost(
     measured: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stiff: float
 ) -> float:
-    """Return −ln of the likelihood of a friction and a shape; the other unknowns are fitted and
-    integrated out (Laplace).
+    """Return −ln of the likelihood of a friction and a curve shape. The other unknowns are
+    integrated out by Laplace's method.
     """
     t = np.arange(len(v)) / 100.0
     std = np.array(

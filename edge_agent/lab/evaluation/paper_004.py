@@ -1,10 +1,11 @@
-"""The two experiments of paper 004, as it did them: noise on a_x, a_y, r only, exact inputs, start
-at the truth.
+"""The two experiments of paper 004 under its conditions: noise only on a_x, a_y and r, exact
+inputs, start at the true state.
 
-They show that the filter is implemented as meant. They show nothing about estimating friction,
-which is known at the start: the bars and the printed tables are for v_x, v_y and the yaw rate. The
-plant's curve is a Magic Formula, and the variable noise is on all three channels;
-`papers.reproduction_004` has Dugoff tyres and the paper's noise on a_y alone.
+They show that the implementation is correct. They do not show that the filter can estimate
+friction, because friction is known at the start. Therefore the targets and the printed tables are
+for v_x, v_y and the yaw rate. The simulated tyre curve is a Magic Formula, and the variable noise
+is on all three channels; `papers.reproduction_004` has Dugoff tyres, and the paper's noise on a_y
+alone.
 """
 
 from __future__ import annotations
@@ -53,12 +54,13 @@ def variances(t: FloatArray, experiment: str) -> FloatArray:
 def experiments(
     seeds: Sequence[int],
 ) -> tuple[dict[tuple[str, str], dict[str, FloatArray]], dict[str, tuple[DriveSet, Estimates]]]:
-    """Return the measures per drive by experiment and filter, and the drives for plots by
+    """Return the measures per drive by (experiment, filter), and the drives for plots by
     experiment.
 
-    "sedan" and "van" are "constant" with the simulator's own plants, and with ".variable" the
-    other. The filters are the paper's, and its controls: untuned (paper-fckf), without adaptation
-    (paper-ckf). Only a_x, a_y and r are noisy; the names of S are in that order.
+    "sedan" and "van" are the experiment "constant" with the simulator's own vehicles; with the
+    suffix ".variable" they are the experiment "variable". The filters are the paper's, and two for
+    comparison: untuned (paper-fckf) and without adaptation (paper-ckf). Only a_x, a_y and r are
+    noisy, in the channel order of S.
     """
     found = {}
     drives = {}

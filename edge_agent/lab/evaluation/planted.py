@@ -1,8 +1,9 @@
-"""Mistakes of recordings, planted into simulated drives, that the signal doctor has to find and
-name.
+"""Test of the signal doctor: recording faults are added to simulated drives, and the doctor must
+find and name them.
 
-Sizes are those seen in imported third-party logs: units, signs, offsets, a clock .4 s off, status
-bits in a wheel speed, exchanged columns, and a vehicle file with another tyre.
+The sizes of the faults are those seen in imported third-party logs: units, signs, offsets, a clock
+.4 s off, status bits in a wheel speed, exchanged columns, and a vehicle file with another tyre
+radius.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ PLACE = [S.LATITUDE, S.LONGITUDE, S.YAW]
 
 
 class Recorded(NamedTuple):
-    """A drive: t (T,), signals (T, 18), and the vehicle file."""
+    """A recorded drive: times t (T,) [s], signals (T, 18), and the vehicle file."""
 
     t: FloatArray
     signals: FloatArray
@@ -48,7 +49,7 @@ Spoil: TypeAlias = Callable[[Recorded], Recorded]
 
 
 class Planted(NamedTuple):
-    """A mistake, and the finding that names it: channel and kind."""
+    """A fault, and the finding (channel and kind) that must name it."""
 
     spoil: Spoil
     channel: str
@@ -56,7 +57,9 @@ class Planted(NamedTuple):
 
 
 def scale_columns(columns: Sequence[int], factor: float | Callable[[float], float]) -> Spoil:
-    """Return a fault that multiplies columns by a factor, which may depend on the wheel's radius."""
+    """Return a function that multiplies columns of a drive by a factor, which may depend on the
+    wheel radius.
+    """
 
     def scale_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
@@ -67,7 +70,7 @@ def scale_columns(columns: Sequence[int], factor: float | Callable[[float], floa
 
 
 def offset_columns(columns: Sequence[int], offset: float) -> Spoil:
-    """Return a fault that adds an offset to columns."""
+    """Return a function that adds an offset to columns of a drive."""
 
     def offset_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
@@ -78,7 +81,7 @@ def offset_columns(columns: Sequence[int], offset: float) -> Spoil:
 
 
 def delay_columns(columns: Sequence[int]) -> Spoil:
-    """Return a fault that delays columns by LATE samples."""
+    """Return a function that delays columns of a drive by LATE samples."""
 
     def delay_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
@@ -90,7 +93,7 @@ def delay_columns(columns: Sequence[int]) -> Spoil:
 
 
 def swap_columns(one: Sequence[int], other: Sequence[int]) -> Spoil:
-    """Return a fault that exchanges two groups of columns."""
+    """Return a function that exchanges two groups of columns of a drive."""
 
     def swap_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
@@ -101,7 +104,7 @@ def swap_columns(one: Sequence[int], other: Sequence[int]) -> Spoil:
 
 
 def status_bits(drive: Recorded) -> Recorded:
-    """Set a status bit above the number of a wheel speed, in two of seven readings."""
+    """Return the drive with a status bit added to a wheel speed in two of seven readings."""
     signals = drive.signals.copy()
     signals[np.arange(len(signals)) % 7 < 2, S.OMEGA] += STATUS / drive.vehicle.wheel_radius
     return drive._replace(signals=signals)
@@ -121,7 +124,9 @@ def other_tyre(drive: Recorded) -> Recorded:
 
 
 def rim_speed_factor(unit: str) -> Callable[[float], float]:
-    """Return the drive with wheel speeds given as speeds at the rim."""
+    """Return a function of the wheel radius: the factor from wheel speed [rad/s] to speed at the
+    rim in `unit`.
+    """
     return lambda radius: radius / SPEED[unit]
 
 
@@ -184,9 +189,10 @@ RADII_ALIKE: Final = (
 def drives(
     count: int, seed: int, *, rough: bool, winter: bool = False, seconds: int = DRIVE_S
 ) -> list[Recorded]:
-    """Drive through the demonstration's town; rough: on its hills, with the devices of real cars.
+    """Return simulated drives through the demonstration town. With `rough`, the town has hills and
+    the cars have inaccurate sensors.
 
-    winter: in a winter town that the seed draws, with winter equipment.
+    With `winter`, the drives are in a winter town drawn by the seed, with winter equipment.
     """
     scenario = f"winter-{seed}" if winter else "hills" if rough else "demo"
     fleet = SimulatedFleet(scenario, count, seed, RATE_HZ, rough=float(rough), winter=float(winter))
@@ -196,8 +202,8 @@ def drives(
 
 
 def winter_drives(count: int, seed: int, *, seconds: int = DRIVE_S) -> list[Recorded]:
-    """Return drives through the town in winter: ice where it was wet or snow, snow elsewhere but
-    in one quarter.
+    """Return simulated drives through the hilly town in winter: wet road in general, snow where the
+    town is usually wet, ice where it usually has snow.
     """
     usual = scenario_named("hills")
     worse = {WET: SNOW, SNOW: ICE}
@@ -210,7 +216,9 @@ def winter_drives(count: int, seed: int, *, seconds: int = DRIVE_S) -> list[Reco
 
 
 def doctor_verdict(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
-    """Return two truth values: the doctor names the mistake, and the doctor accepts the drive."""
+    """Return two booleans: True if the doctor names the fault, and True if the doctor passes the
+    drive.
+    """
     diagnosis = diagnose(*planted.spoil(drive))
     found = {(finding.channel, finding.kind) for finding in diagnosis.findings}
     same = next((kinds for kinds in RADII_ALIKE if planted.kind in kinds), {planted.kind})
@@ -218,10 +226,10 @@ def doctor_verdict(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
 
 
 def figures(count: int, seed: int) -> list[Figure]:
-    """Return shares over all mistakes and drives, smooth and rough; the drives without a mistake
-    are the control.
+    """Return the shares of faults found and of drives passed, over all faults and drives with
+    accurate and inaccurate cars.
 
-    In winter, smooth and rough cars drive in a winter town.
+    Drives without a fault show the false alarms. The same shares are measured in a winter town.
     """
     cars = [*drives(count, seed, rough=False), *drives(count, seed + 1, rough=True)]
     cold = [
@@ -262,7 +270,7 @@ def _share_of(held: Iterable[bool]) -> float:
 
 
 def _accused_share(clean: Sequence[Diagnosis]) -> float:
-    """Return the share of channels of sound drives that the doctor accuses."""
+    """Return the share of all channels of faultless drives in which the doctor reports a fault."""
     channels = sum(
         len(diagnosis.sound) + len(diagnosis.unknown) + len(diagnosis.findings)
         for diagnosis in clean

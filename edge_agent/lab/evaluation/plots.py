@@ -1,5 +1,5 @@
-"""Plots as in the papers, of the first seed: motion against truth, friction with its band,
-adaptation, fuzzy sets.
+"""Plots of the evaluation, as in the papers, for the first seed: motion against truth, friction
+with its interval, adaptation, fuzzy sets.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ FORMS: Final = ("png", "svg", "pdf")
 def draw(
     results: Results, figures: Sequence[Figure], folder: Path, *, seed: int = 0, form: str = "png"
 ) -> list[Path]:
-    """Write the plots into `folder`; returns their paths. `seed`: of the drive that is shown;
-    `form`: one of FORMS.
+    """Draw all plots and write them into `folder`; return the paths of the files.
+
+    `seed` is the seed of the displayed drive, for the title; `form` is one of FORMS.
     """
     import matplotlib as mpl
 
@@ -101,7 +102,7 @@ def _scenario(scenario: str, drives: dict[str, PlottedDrive], seed: int, path: P
 
 
 def title(scenario: str, drive: PlottedDrive, seed: int) -> str:
-    """Return the title of a drive: scenario, manoeuvre, speed, friction, vehicle and seed."""
+    """Return the title of a drive's plot: scenario, manoeuvre, speed, friction, vehicle and seed."""
     spec = SCENARIOS.get(scenario)
     batch = drive.batch
     mu = batch.mu[:, 0]
@@ -125,8 +126,8 @@ def _true() -> dict[str, Any]:
 
 
 def _rough(world: RealWorldResults, path: Path) -> Path:
-    """Plot one rough car in a hilly town: speed and that of the wheels, slope, friction with the
-    default's interval, health.
+    """Plot one inaccurate car in a hilly town: speed and wheel speed, slope, friction with the
+    default estimator's interval, health.
     """
     from matplotlib import pyplot as plt
 
@@ -171,7 +172,9 @@ def _rough(world: RealWorldResults, path: Path) -> Path:
 
 
 def _surfaces(figures: Sequence[Figure], path: Path) -> Path:
-    """Plot the coverage of the 90 % interval by surface, for every estimator in the rough world."""
+    """Plot the coverage of the 90 % interval by surface, for every estimator in the towns with
+    inaccurate cars.
+    """
     from matplotlib import pyplot as plt
 
     values = {figure.name: figure.value for figure in figures if figure.name.startswith("world.")}
@@ -272,7 +275,7 @@ def _triangles(axis: Axes, peaks: tuple[float, ...], title: str, name: str) -> N
 
 
 def _reliability(figures: Sequence[Figure], path: Path) -> Path:
-    """Plot the share of truths below each stated quantile, over all scenarios."""
+    """Plot the share of true frictions below each stated quantile, over all scenarios."""
     from matplotlib import pyplot as plt
 
     found: dict[str, dict[float, float]] = {}
@@ -299,8 +302,8 @@ def _reliability(figures: Sequence[Figure], path: Path) -> Path:
 
 
 def draw_detection(figures: Sequence[Figure], path: Path) -> Path:
-    """Write the ROC plot: passes found against settled false events, estimator, slip flag and
-    oracle.
+    """Write the ROC plot: share of slippery passes found against the number of settled false
+    events, for estimator, slip flag and oracle.
     """
     import matplotlib as mpl
 

@@ -1,5 +1,5 @@
-"""Figures printed in the papers, compared with ours, and the reasons why some cannot be
-reproduced.
+"""Figures printed in the papers, compared with our figures, and the reasons why some figures cannot
+be reproduced.
 """
 
 from __future__ import annotations
@@ -8,7 +8,9 @@ from typing import Final, NamedTuple
 
 
 class Printed(NamedTuple):
-    """A number that a paper prints: place, quantity, value, and our figures for comparison."""
+    """A number that a paper prints: paper, quantity, printed value, and the names of our figures
+    for comparison.
+    """
 
     paper: str
     what: str
@@ -37,7 +39,7 @@ PRINTED_002: Final = {"sine": (".1008", ".0779"), "jturn": (".0825", ".0117")}
 def printed_row(
     paper: str, scenario: str, estimator: str, measure: str, what: str, value: str
 ) -> Printed:
-    """Return a row whose own figure is measured with error-free sensors."""
+    """Return a row whose comparison figure is measured with error-free sensors."""
     same = f"ideal.{scenario}.{estimator}.{measure}"
     real = f"real.{scenario}.ESTIMATOR.{measure}"
     return Printed(paper, what, value, same, real)
@@ -129,7 +131,9 @@ DEFAULT: Final = "aco-fckf"
 
 
 def names() -> list[str]:
-    """Return the names of our figures that are compared with the papers, with their spreads."""
+    """Return the names of our figures that are compared with the papers, and of their standard
+    deviations.
+    """
     found = [
         name.replace("ESTIMATOR", estimator)
         for row in PRINTED

@@ -1,17 +1,18 @@
-"""Judgement of the estimator on recorded drives of real cars, for owners of such logs.
+"""Evaluation of the estimator on recorded drives of real cars, for owners of such logs.
 
-A folder holds LOG.parquet with its vehicle file LOG.json, and optionally LOG.truth.parquet (t, vx,
-vy, mu, as far as they were measured) and LOG.meta.json (`mu_known`: friction that the surface
-surely had). Of the time in which a car moves, from the third second on:
+A folder contains LOG.parquet with its vehicle file LOG.json. Optional files are LOG.truth.parquet
+(columns t, vx, vy, mu, as far as they were measured) and LOG.meta.json (`mu_known`: known friction
+of the surface). The figures cover the time in which the car moves, from the third second on:
 
-    informative    share with an interval narrower than INFORMATIVE of the prior's
-    right          of that, share whose interval agrees with the known friction: the true one,
-                   else at least the grip in use
+    informative    share with an interval narrower than INFORMATIVE times the prior's
+    right          share of the informative time in which the interval agrees with the known
+                   friction: the true one, else at least the grip in use
     ice            share with P(slippery) > ICE although the road was not slippery
     contradicted   share with the health flag CONTRADICTION
-    urgent         observations per hour that would be sent at once, of logs with a position
+    urgent         observations per hour that would be sent immediately, for logs with a position
     used           99th percentile of mu_utilised
-    vx, vy, slip   root mean square errors [m/s, m/s, deg] where there is truth
+    vx, vy, slip   root mean square errors of v_x, v_y [m/s] and sideslip [deg], where the true
+                   values were measured
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ HEAD: Final = (
 
 @dataclass(frozen=True)
 class LogFigures:
-    """Figures of one log; NaN where the log does not tell."""
+    """Figures of one log; NaN where the log does not determine a figure."""
 
     name: str
     seconds: float
@@ -88,7 +89,7 @@ class LogFigures:
 def judge_folder(
     folder: Path, log_line: Callable[[str], None] = lambda _: None
 ) -> list[LogFigures]:
-    """Judge every log of a folder that has a vehicle file.
+    """Evaluate every log of a folder that has a vehicle file.
 
     Raises:
         InputError: the folder has no such log, or a log cannot be read.
@@ -112,7 +113,7 @@ def judge_folder(
 
 
 def judge_log(path: Path) -> LogFigures:
-    """Replay one log and judge its estimates."""
+    """Replay one log and evaluate its estimates."""
     adopted = prepare_log(read_log(path), load_vehicle(path.with_suffix(".json")))
     values, slippery, urgent = replay_log(adopted.log, adopted.vehicle)
     truth = read_truth(path, adopted.log.t)
@@ -124,7 +125,7 @@ def judge_log(path: Path) -> LogFigures:
 def replay_log(log: SignalLog, vehicle: Vehicle) -> tuple[FloatArray, FloatArray, int | None]:
     """Return estimates (T, columns), P(slippery) (T,), and the number of urgent observations.
 
-    The number is None where the log has no position.
+    The number is None if the log has no position.
     """
     pipeline = Pipeline(bank_of(ESTIMATOR, [vehicle]), 1, AgentConfig())
     rows = max(1, round(LOOK_S / float(np.median(np.diff(log.t)))))
@@ -149,7 +150,7 @@ def replay_log(log: SignalLog, vehicle: Vehicle) -> tuple[FloatArray, FloatArray
 
 
 def read_truth(path: Path, t: FloatArray) -> dict[str, FloatArray]:
-    """Return the measured truth by column at the times of the log; NaN where it was not
+    """Return the measured true values by column at the times of the log; NaN where they were not
     measured.
     """
     file = path.with_suffix(".truth.parquet")
@@ -180,8 +181,8 @@ def judge_estimates(
     known: float | None,
     urgent: int | None,
 ) -> LogFigures:
-    """Return the figures of one log by its estimates (T, columns) with P(slippery) (T,), and the
-    known truth.
+    """Return the figures of one log from its estimates (T, columns) with P(slippery) (T,), and the
+    true values.
     """
     t = adopted.log.t
     signals = adopted.log.signals
@@ -232,8 +233,8 @@ def judge_estimates(
 def known_friction(
     t: FloatArray, signals: FloatArray, moving: BoolArray, known: float | None
 ) -> float:
-    """Return the least friction of a log's surface: the known value, or the grip that the car
-    used.
+    """Return a lower limit of the friction of a log's surface: CERTAIN times the known value, or
+    the grip that the car used, if it is larger.
     """
     at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
     along, across = (
@@ -247,19 +248,23 @@ def known_friction(
 
 
 def share_of(what: BoolArray, among: BoolArray) -> float:
-    """Return the share of `among` (T,) in which `what` (T,) holds; NaN where there is none."""
+    """Return the share of the samples in `among` (T,) in which `what` (T,) is True; NaN if `among`
+    is empty.
+    """
     return float(np.mean(what[among])) if among.any() else math.nan
 
 
 def root_mean_square(error: FloatArray, among: BoolArray) -> float:
-    """Return the root mean square of errors (T,) over `among` (T,); NaN where nothing is known."""
+    """Return the root mean square of errors (T,) over the samples in `among` (T,); NaN if no error
+    is known there.
+    """
     some = among & np.isfinite(error)
     return float(np.sqrt(np.mean(np.square(error[some])))) if some.any() else math.nan
 
 
 def summarise(found: Sequence[LogFigures]) -> list[Figure]:
-    """Return figures over all logs: means weighted by time, and the worst log where one log is
-    too many.
+    """Return the figures over all logs: means weighted by time, and the worst log where even one
+    bad log matters.
     """
     seconds = np.array([log.seconds for log in found])
 

@@ -1,24 +1,25 @@
-"""The world as it is: rough cars in hilly towns, and a car that stands on a slope; what every
-estimator makes of it.
+"""Evaluation under realistic conditions: inaccurate cars in hilly towns, and cars that stand on a
+slope, for every estimator.
 
-Towns (friction, hills), cars, sensors and clocks are drawn by the seed, half of the cars without
-torque. All figures are over samples, so that a minute on dry road weighs a minute.
+Towns (friction, hills), cars, sensors and clocks are drawn randomly by the seed; half of the cars
+have no torque signal. All figures are means over samples, so that each minute has the same weight
+on any road.
 
 Legend
-    surface       by the mean friction of the four wheels: ice to .2, snow to .45, wet to .75, dry
-                  above
-    missed ice    share of the samples on ice where excited whose upper end is not below SLIPPERY_MU
+    surface       class of the mean friction of the four wheels: ice up to .2, snow up to .45, wet
+                  up to .75, dry above
+    missed ice    share of the excited samples on ice whose upper end is not below SLIPPERY_MU
     false grip    share of the samples on ice whose lower end lies FALSE_GRIP or more above the
-                  truth
+                  true friction
     false ice     share of the samples on wet and dry road whose whole interval lies below
-                  SLIPPERY_MU; "settled": of those that left snow and ice SETTLED_S ago, or never
-                  met any: who drives off the ice learns of it when he uses the grip; "of_all":
-                  share of all samples that are such on a road above SURE_GRIP
+                  SLIPPERY_MU. "settled": only samples at least SETTLED_S after snow and ice,
+                  because a driver notices the end of the ice only by using the grip. "of_all":
+                  share of all samples that are false ice on a road above SURE_GRIP
     below         share of all samples whose upper end lies below the grip in use: certainly wrong
     excited       some wheel used EXCITED_SHARE of its grip within the last second
-    contradiction share of the samples in which the estimator says that no friction explains its
-    data (health)
-    lost          share of the samples whose speed is off by more than LOST_M_S
+    contradiction share of the samples with the health flag CONTRADICTION: no friction explains the
+                  data
+    lost          share of the samples with a speed error above LOST_M_S
 """
 
 from __future__ import annotations
@@ -66,21 +67,24 @@ STANDING_SLOPES: Final = (0.05, 0.08)
 
 @dataclass
 class Tally:
-    """Sums over samples by name: `add` counts, `means` divides."""
+    """Sums and counts over samples by name: `add` adds values, `means` returns their means."""
 
     total: dict[str, float] = field(default_factory=dict)
     count: dict[str, int] = field(default_factory=dict)
 
     def add(self, name: str, value: FloatArray | BoolArray, among: BoolArray | None = None) -> None:
-        """Count the values (T, N) `among` which the name is a mean; NaN are left out."""
+        """Add the values (T, N), or only those `among` which is True, to the mean called `name`;
+        NaN are left out.
+        """
         taken = np.asarray(value, dtype=np.float64)[slice(None) if among is None else among]
         taken = taken[np.isfinite(taken)]
         self.total[name] = self.total.get(name, 0.0) + float(taken.sum())
         self.count[name] = self.count.get(name, 0) + taken.size
 
     def means(self) -> dict[str, float]:
-        """Return the mean by name; NaN without values. A name that ends in "_squared" is reported
-        as its root, without that suffix.
+        """Return the mean by name; NaN without values.
+
+        A name that ends in "_squared" is returned as the root of its mean, without that suffix.
         """
         found = {
             name: total / self.count[name] if self.count[name] else np.nan
@@ -95,13 +99,13 @@ class Tally:
 
 
 def in_winter(seed: int) -> bool:
-    """Return True if the town of a seed is a winter town: half of them are."""
+    """Return True if the town with this seed is a winter town; half of the seeds have one."""
     return seed % 2 == 1
 
 
 def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
-    """Simulate rough cars in a town drawn from the seed; return their drives and the largest share
-    of the grip that they use (T, N).
+    """Simulate inaccurate cars in a town drawn by the seed; return their drives, and the largest
+    share of the grip used by any wheel (T, N).
 
     In winter towns all cars have winter equipment.
     """
@@ -125,7 +129,7 @@ def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
 
 
 def in_use(batch: DriveSet) -> FloatArray:
-    """Return the grip that the car as a whole uses, smoothed and reduced by the noise, (T, N)."""
+    """Return the grip that the car as a whole uses, smoothed and reduced by the noise, (T, N) [1]."""
     used = np.hypot(batch.truth["true_ax"], batch.truth["true_ay"]) / GRAVITY
     width = max(1, round(SMOOTH_S * RATE_HZ))
     summed = np.cumsum(np.concatenate([np.zeros((width, used.shape[1])), used]), axis=0)
@@ -133,7 +137,7 @@ def in_use(batch: DriveSet) -> FloatArray:
 
 
 def recent_maximum(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDOW_S) -> FloatArray:
-    """Return the largest value of the last `seconds`, (T, N)."""
+    """Return, for each sample, the largest value within the last `seconds`, (T, N)."""
     samples = round(seconds * RATE_HZ)
     padded = np.concatenate([np.zeros((samples - 1, used.shape[1])), used])
     return np.asarray(
@@ -142,8 +146,8 @@ def recent_maximum(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDO
 
 
 def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
-    """Return the width plus MISS times the distance of the truth from the interval. It rewards
-    narrow intervals that hold the truth.
+    """Return the interval score: width plus MISS times the distance of the truth from the interval.
+    It rewards narrow intervals that contain the truth.
     """
     return np.asarray(
         upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0))
@@ -151,7 +155,7 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
 
 
 def tally_town(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) -> None:
-    """Add one town to the tally of an estimator."""
+    """Add the results of one town to the tally of an estimator."""
     mu = batch.mu
     inside = is_covered(batch, reported)
     width = reported.mu_upper - reported.mu_lower
@@ -192,7 +196,9 @@ def tally_town(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatAr
 
 
 def baseline(tally: Tally, batch: DriveSet) -> None:
-    """Record the score of the prior, and the v_x error of the mean of four wheels."""
+    """Add two baselines to the tally: the score of the prior, and the v_x error of the mean of four
+    wheels.
+    """
     radius = np.array([vehicle.wheel_radius for vehicle in batch.vehicles])
     off = (
         radius * np.nanmean(batch.signals[:, :, S.OMEGA : S.OMEGA + 4], axis=-1)
@@ -205,8 +211,8 @@ def baseline(tally: Tally, batch: DriveSet) -> None:
 
 
 def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSet]:
-    """Simulate cars that stand on a slope, one slope per seed: with ordinary sensors, and with
-    rough ones without torque.
+    """Simulate cars that stand on a slope, divided among the vehicle presets: with ordinary
+    sensors, and with inaccurate ones without torque.
     """
     batches = []
     for sensors in (USUAL, "rough"):
@@ -220,7 +226,7 @@ def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSe
 
 def fastest(estimator: str, batches: Sequence[DriveSet]) -> float:
     """Return the largest speed [m/s], in any direction, that the estimator reports for any of the
-    cars.
+    standing cars.
     """
     reported = [estimates(bank_of(estimator, batch.vehicles), batch) for batch in batches]
     return max(float(np.hypot(each.vx, each.vy).max()) for each in reported)
@@ -228,8 +234,8 @@ def fastest(estimator: str, batches: Sequence[DriveSet]) -> float:
 
 @dataclass
 class RealWorldResults:
-    """Figures by estimator, and "baseline" (the wheels' speed, the prior's interval), then by
-    name; a drive to plot.
+    """Figures by estimator and name, with "baseline" (the wheels' speed, the prior's interval) as
+    one of the estimators; and a drive to plot.
     """
 
     found: dict[str, dict[str, float]]
@@ -238,8 +244,8 @@ class RealWorldResults:
 
 
 def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) -> RealWorldResults:
-    """Run towns of rough cars, and cars that stand on slopes, for every estimator; keep the first
-    town for plots.
+    """Run towns with inaccurate cars, and cars that stand on slopes, for every estimator. The first
+    town is stored for plots.
     """
     cars, seconds, towns = (4, 15.0, 1) if quick else (TOWN_CARS, TOWN_S, TOWNS)
     tallies = {name: Tally() for name in (*estimators, "baseline")}

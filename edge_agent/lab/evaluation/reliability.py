@@ -1,9 +1,10 @@
-"""Reliability: how often the truth lies below each stated quantile of friction, at LEVELS.
+"""Reliability: how often the true friction lies below each stated quantile, at LEVELS.
 
 An estimates file contains three quantiles. An estimator that reports the evidence of a visit gives
-more: a visit that has lasted since the start begins at the uniform prior, so its likelihood on the
-friction grid is the whole posterior. It is taken from a copy of the bank, so that the drive itself
-is not affected. Other estimators are Gaussian between their quantiles, or report the prior.
+more: a visit that began with the drive starts from the uniform prior, so its likelihood on the
+friction grid is the whole posterior. The likelihood is taken from a copy of the bank, so that the
+drive itself is not affected. For other estimators, a Gaussian is assumed between the quantiles, or
+a uniform distribution if they report the prior.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ EDGES: Final = np.linspace(LOWER, UPPER, BINS + 1)
 
 
 def estimate_with_ranks(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates, FloatArray]:
-    """Return the bank's estimates of the drives, and the rank of the truth in its posterior once
-    every EVERY_S, (K, N).
+    """Return the bank's estimates of the drives, and the rank of the true friction in its posterior
+    once every EVERY_S, (K, N).
     """
     samples = len(batch.t)
     step = max(1, round(EVERY_S / float(batch.t[1, 0] - batch.t[0, 0])))
@@ -41,14 +42,16 @@ def estimate_with_ranks(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates
 
 
 def join_estimates(parts: list[Estimates]) -> Estimates:
-    """Return the estimates of successive stretches of one drive as one; evidence is left out."""
+    """Return the estimates of successive parts of one drive as one; the evidence is left out."""
     return Estimates(np.concatenate([part.values for part in parts]))
 
 
 def _rank_of_truth(
     bank: EstimatorBank, batch: DriveSet, now: int, reported: Estimates
 ) -> FloatArray:
-    """Return the share of the posterior below the true friction of the sample before `now`, (N,)."""
+    """Return the share of the posterior that lies below the true friction of the sample before
+    `now`, (N,).
+    """
     truth = batch.mu[now - 1]
     closes = np.ones((1, len(truth)), np.bool_)
     likelihood = (
@@ -64,8 +67,8 @@ def _rank_of_truth(
 
 
 def on_the_grid(truth: FloatArray, log_likelihood: FloatArray) -> FloatArray:
-    """Return the probability below the truth (N,) of posteriors with log-likelihoods (N, 32) and a
-    uniform prior, (N,).
+    """Return the probability (N,) that posteriors with log-likelihoods (N, 32) and a uniform prior
+    assign to friction below the truth (N,).
     """
     weight = np.exp(log_likelihood)
     below = np.cumsum(weight / weight.sum(axis=1, keepdims=True), axis=1)
@@ -77,8 +80,10 @@ def on_the_grid(truth: FloatArray, log_likelihood: FloatArray) -> FloatArray:
 def between_quantiles(
     truth: FloatArray, lower: FloatArray, mu: FloatArray, upper: FloatArray
 ) -> FloatArray:
-    """Return the probability below the truth (N,) of Gaussians with these 5, 50 and 95 % quantiles,
-    one of which may be cut off; an interval as wide as the prior's counts as uniform.
+    """Return the probability (N,) below the truth for Gaussians with these 5, 50 and 95 %
+    quantiles.
+
+    One of the outer quantiles may be clipped. An interval as wide as the prior's counts as uniform.
     """
     from scipy.stats import norm
 
@@ -88,5 +93,5 @@ def between_quantiles(
 
 
 def shares(ranks: FloatArray) -> FloatArray:
-    """Return the share of ranks at or below each of LEVELS."""
+    """Return the share of ranks at or below each of LEVELS, (L,)."""
     return np.asarray((ranks.ravel()[:, None] <= np.array(LEVELS)).mean(axis=0))

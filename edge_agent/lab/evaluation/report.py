@@ -1,4 +1,4 @@
-"""Markdown report, generated from the figures alone."""
+"""Markdown report of the evaluation, generated only from the figures."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ SHOWN_LEVELS: Final = LEVELS[::2]
 
 
 def report(figures: Sequence[Figure], *, seeds: int) -> str:
-    """Return the complete report."""
+    """Return the complete evaluation report as Markdown."""
     by_name = {figure.name: figure.value for figure in figures}
     barred = [figure for figure in figures if figure.bar is not None]
     held = sum(figure.holds for figure in barred)
@@ -130,7 +130,7 @@ def report(figures: Sequence[Figure], *, seeds: int) -> str:
 
 
 def table(values: dict[str, float]) -> str:
-    """Return a table of the figures printed in the papers next to those measured here."""
+    """Return a Markdown table of the figures printed in the papers with the figures measured here."""
     rows = []
     for row in PRINTED:
         cells = (
@@ -143,12 +143,14 @@ def table(values: dict[str, float]) -> str:
 
 
 def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table."""
+    """Return a Markdown table with the given head and rows."""
     return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows))
 
 
 def number(values: dict[str, float], name: str, *, spread: bool = True) -> str:
-    """Return a mean, with ± sd if wanted and known, as text; a dash if it was not measured."""
+    """Return a mean as text, with ± standard deviation if `spread` is True and it is known; a dash
+    if it was not measured.
+    """
     value = values.get(name, math.nan)
     sd = values.get(f"{name}.sd")
     return (
@@ -159,7 +161,9 @@ def number(values: dict[str, float], name: str, *, spread: bool = True) -> str:
 
 
 def own_plants(barred: Sequence[Figure], values: dict[str, float]) -> str:
-    """Return a table: the bars of paper 004, and the same figures on the simulator's own plants."""
+    """Return a Markdown table of paper 004's targets and the same figures on the simulator's own
+    vehicle models ("plants").
+    """
     rows = []
     for bar in (figure for figure in barred if figure.name.startswith("papers.004.")):
         _, _, noise, measure = bar.name.split(".")
@@ -174,7 +178,9 @@ def own_plants(barred: Sequence[Figure], values: dict[str, float]) -> str:
 
 
 def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
-    """Return a table of the bars that have an oracle: bar, default estimator, oracle."""
+    """Return a Markdown table of the targets that have an oracle: target, default estimator,
+    oracle.
+    """
     rows = []
     for bar in barred:
         name = f"oracle.{bar.name.removeprefix('papers.')}"
@@ -184,7 +190,7 @@ def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
 
 
 def world(values: dict[str, float]) -> str:
-    """Return a table with one row per estimator in the rough world."""
+    """Return a Markdown table with one row per estimator, for the towns with inaccurate cars."""
     shown = {
         "coverage90": "coverage",
         "coverage90.ice": "on ice",
@@ -209,7 +215,7 @@ def world(values: dict[str, float]) -> str:
 
 
 def estimators(values: dict[str, float], prefix: str, suffix: str) -> list[str]:
-    """Return the part of each figure's name between a prefix and a suffix, each once, in order."""
+    """Return the part of each figure's name between `prefix` and `suffix`, each once, in order."""
     found = [
         name[len(prefix) : -len(suffix)]
         for name in values
@@ -219,7 +225,7 @@ def estimators(values: dict[str, float], prefix: str, suffix: str) -> list[str]:
 
 
 def scenarios(values: dict[str, float], prefix: str, measures: Sequence[str]) -> str:
-    """Return a table with one row per scenario and estimator."""
+    """Return a Markdown table of the given measures with one row per scenario and estimator."""
     rows = []
     for found in estimators(values, prefix, ".rmse_vx"):
         scenario, _, estimator = found.rpartition(".")
@@ -229,7 +235,7 @@ def scenarios(values: dict[str, float], prefix: str, measures: Sequence[str]) ->
 
 
 def faults(values: dict[str, float]) -> str:
-    """Return a table with one row per sensor fault."""
+    """Return a Markdown table with one row per sensor fault."""
     shown = ("coverage90", "width", "rmse_vx", "rmse_vy")
     rows = []
     for name, case in CASES.items():
@@ -271,15 +277,13 @@ def faults(values: dict[str, float]) -> str:
 
 
 def verdict(shares: Sequence[float]) -> str:
-    """Return "yes" if all shares are 1, "NO" with the smallest one otherwise, a dash if there are
-    none.
-    """
+    """Return "yes" if all shares are 1, else "NO" with the smallest share; a dash without shares."""
     return "–" if not shares else "yes" if min(shares) == 1.0 else f"NO ({min(shares):.2g})"
 
 
 def consistency(values: dict[str, float]) -> str:
-    """Return a table with one row per estimator: NEES and NIS over all scenarios, and the share of
-    values within their bounds.
+    """Return a Markdown table with one row per estimator: NEES and NIS over all scenarios, and the
+    share of values within their bounds.
     """
     names = estimators(values, "reliability.", ".below_05")
     rows = []
@@ -308,7 +312,9 @@ def consistency(values: dict[str, float]) -> str:
 
 
 def reliability(values: dict[str, float]) -> str:
-    """Return a table with one row per estimator: share of truths below each stated quantile."""
+    """Return a Markdown table with one row per estimator: the share of true frictions below each
+    stated quantile.
+    """
     rows = [
         [
             name,
@@ -323,13 +329,13 @@ def reliability(values: dict[str, float]) -> str:
 
 
 def detection_report(figures: Sequence[Figure]) -> str:
-    """Return the report of the detection judge."""
+    """Return the Markdown report of the detection evaluation."""
     return f"{DETECTION_HEAD}\n\n{detection_table(figures)}\n"
 
 
 def detection_table(figures: Sequence[Figure]) -> str:
-    """Return one row per figure of the detection judge: rough and plain cars with standard
-    errors, and the bars.
+    """Return a Markdown table with one row per figure of the detection evaluation: rough and plain
+    cars with standard errors, and the targets.
     """
     by_name = {figure.name: figure for figure in figures}
     names = dict.fromkeys(

@@ -1,8 +1,8 @@
-"""The scenarios: the papers' manoeuvres with the papers' vehicles, those of the default's bars, and
-other vehicles.
+"""The scenarios of the evaluation: the papers' manoeuvres with the papers' vehicles, those for the
+default estimator's targets, and other vehicles.
 
 Data that a paper does not give (tyres, wheel inertia, the vehicle of 003) are those of the
-simulator's sedan or of an ordinary car; all four wheels drive, as in the papers.
+simulator's sedan or of an ordinary car. All four wheels are driven, as in the papers.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ def steered_behind(speed: float) -> TrueVehicle:
     """Return the vehicle of 000 and 001 with the rear wheels steered for zero sideslip in a steady
     turn at `speed` [m/s].
 
-    Paper 001, equation 53: (K*m*a*v^2 - b) / (K*m*b*v^2 + a), K = 1/(axle stiffness*wheelbase),
-    alike at both axles.
+    Paper 001, equation 53: (K*m*a*v^2 - b) / (K*m*b*v^2 + a), K = 1/(axle stiffness*wheelbase), the
+    same for both axles.
     """
     light = LIGHT.vehicle
     a = light.cg_to_front_axle
@@ -188,5 +188,7 @@ FOREIGN: Final = {
 
 
 def foreign(scenario: DriveSpec, kind: str) -> DriveSpec:
-    """Return the scenario with tyres of a kind of FOREIGN."""
+    """Return the scenario with tyres of the given kind (a key of FOREIGN), which the estimators do
+    not model.
+    """
     return replace(scenario, vehicle=replace(scenario.vehicle, **FOREIGN[kind]))  # type: ignore[arg-type]

@@ -1,19 +1,20 @@
-"""Oracle for visits: the evidence of an observer that knows the motion and the force of every
-tyre, up to noise.
+"""Oracle for visits: the evidence of an observer that knows the motion and the force of every tyre,
+except for noise.
 
-It does not know the stiffness of the tyre and the shape of its force curve. Its evidence bounds the
-information that any estimator can gain from a visit.
+The oracle does not know the stiffness of the tyre and the shape of its force curve. Its evidence is
+an upper limit of the information that any estimator can gain from a visit.
 
-    f    |F| / F_z, known with noise FORCE_STD          q    slip times stiffness per load, known with the wheels' noise
-    f = μ F(k q / μ; c, e)                              c, e shape and curvature of the Magic
-                                                        Formula, k ln-normal
+    f    |F| / F_z, known with noise FORCE_STD
+    q    slip times stiffness per load, known with the wheels' noise σ_q
+    f = μ F(k q / μ; c, e)     c, e shape and curvature of the Magic Formula, k stiffness factor,
+                               log-normal
 
     ln L(μ) = ln mean over tyres of Π over wheels and samples N(f; μ F(k q/μ), FORCE_STD² + (slope ·
     σ_q)²) · p(q)
 
-p(q) is the prior of the slip. Drivers demand a force, and all forces are equally likely, so the
-density of the slip is the slope of the force curve, at least LEAST_SLOPE. Only every EACH-th sample
-is used, because the errors of successive samples are correlated.
+p(q) is the prior of the slip. Drivers demand a force, and all forces are assumed equally likely, so
+the density of the slip is the slope of the force curve, at least LEAST_SLOPE. Only every EACH-th
+sample is used, because the errors of successive samples are correlated.
 """
 
 from __future__ import annotations
@@ -54,13 +55,13 @@ def tyres_drawn() -> FloatArray:
 def visit_evidence(
     force: FloatArray, slip: FloatArray, speed: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return ln L (BINS,) of a visit, with maximum 0.
+    """Return ln L (BINS,) of a visit on the friction grid, with maximum 0.
 
     Args:
         force: true f (T, 4) [1].
         slip: true q (T, 4) [1].
         speed: (T,) [m/s].
-        rng: draws the noise.
+        rng: random generator of the noise.
     """
     picked = slice(None, None, EACH)
     noise = STIFF * SPEED_STD / np.maximum(speed[picked], SLOWEST)
@@ -78,8 +79,8 @@ def visit_evidence(
 def _evidence(
     force: FloatArray, slip: FloatArray, noise: FloatArray, tyres: FloatArray
 ) -> FloatArray:
-    """Return ln L (TYRES, BINS) for each of `tyres`; `noise` (T,) is the standard deviation of
-    q.
+    """Return ln L (TYRES, BINS) for each of `tyres` (TYRES, 3). `noise` (T,) is the standard
+    deviation of q.
     """
     out = np.zeros((tyres.shape[0], BINS))
     for j in range(tyres.shape[0]):

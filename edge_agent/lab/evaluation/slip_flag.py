@@ -1,17 +1,17 @@
-"""Slip flag: the friction that ordinary ABS, traction control and ESC logic reports, without any
-estimator.
+"""Slip flag: the friction that ordinary ABS, traction control and ESC logic would report without
+any estimator.
 
-Baseline for detection. It uses the recorded wheel speeds, accelerometers, yaw rate and steering,
-and the vehicle file.
+It is the baseline for detection. It uses the recorded wheel speeds, accelerometers, yaw rate and
+steering, and the vehicle file.
 
     reference speed  fastest wheel while braking, slowest while driving, else the median; it changes
                      at most by the accelerometer's reading plus FREE; once all wheels have agreed
                      for AGREE_S it is their speed
-    slip flag        |R ω − v_i| > SLIP max(v_i, SLOWEST) at a wheel for longer than SLIP_S; v_i
-                     includes the yaw rate; wheels and cars slower than SLOWEST do not slip
+    slip flag        |R ω − v_i| > SLIP max(v_i, SLOWEST) at a wheel for longer than SLIP_S; v_i is
+                     the reference speed at wheel i, including the yaw rate; no slip below SLOWEST
     yaw flag         |r − v tan δ / l| > YAW_OFF + YAW_SHARE |r| for longer than YAW_S
-    friction         |a| / g while a flag is up; while driving, over the share of the load on the
-                     driven axle
+    friction         |a| / g while a flag is set; while driving, divided by the driven axle's share
+                     of the load
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ FLAGGED_MU: Final = 0.35  # below it the flag calls the road slippery
 
 
 def friction_flagged(t: FloatArray, signals: FloatArray, vehicles: list[Vehicle]) -> FloatArray:
-    """Return the friction that the flag reports, (T, N); infinite where no flag is up.
+    """Return the friction that the flag reports, (T, N); infinite where no flag is set.
 
     Args:
         t: (T, N) [s].
@@ -73,12 +73,12 @@ def _median(values: FloatArray, count: int) -> float:
 
 @compiled
 def _follow(signals: FloatArray, car: FloatArray, period: float) -> FloatArray:
-    """Return the friction (T,) that the flags of one car report; infinite where no flag is up.
+    """Return the friction (T,) that the flags of one car report; infinite where no flag is set.
 
     Args:
         signals: (T, channels).
-        car: wheel radius, wheelbase and half of the track [m], and the share of the load on the
-            driven axle.
+        car: wheel radius, wheelbase and half of the track [m], and the driven axle's share of the
+            load.
         period: sampling interval [s].
     """
     out = np.full(signals.shape[0], np.inf)

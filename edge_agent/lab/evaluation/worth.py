@@ -1,18 +1,18 @@
-"""Benefit of the fuzzy sets and of the ant colony: interval scores on rough drives that were not used
-for tuning.
+"""Benefit of the fuzzy sets and of the ant colony: interval scores on drives with inaccurate cars
+that were not used for tuning.
 
-Legend, all scores less is better
-    fuzzy        the default as it comes, with all of its rules and the shipped vertices
-    sets_off     no fuzzy set: a product of ramps takes the share of evidence, R is not adapted;
-                 strain and the consistency test as in the default
-    none         without any rule, without strain and the consistency test (`ckf`)
+Legend of the filter variants (for all scores, less is better)
+    fuzzy        the default estimator with all its rules and the shipped vertices
+    sets_off     no fuzzy sets: a product of ramps decides the share of evidence, and R is not
+                 adapted; strain and the consistency test as in the default
+    none         without any rule, strain and consistency test (`ckf`)
     default      all rules with untuned vertices
-    random       mean over what each random search found; colony: the same of the colony, equal
-                 budget
+    random       all rules with the vertices found by random search, mean over the searches
+    colony       the same for the ant colony, with equal budget
 
-Each seed is a town of rough cars and a set of rough manoeuvres on hills, with friction and vehicles
-of its own. A ratio is that of the means over the seeds. Its `.difference` is the mean of the
-differences, paired by seed, and `.difference.se` the standard error of that.
+Each seed gives a town with inaccurate cars and a set of manoeuvres on hills, with its own friction
+and vehicles. A ratio is the ratio of the means over the seeds. Its `.difference` is the mean of the
+differences, paired by seed, and `.difference.se` the standard error of that mean.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def campaign(
     quick: bool,
     log_line: Callable[[str], None] = lambda _line: None,
 ) -> Scores:
-    """Return interval scores by way, surface and seed."""
+    """Return the interval scores by filter variant and surface, one number per seed."""
     cars, seconds, count = (2, 5.0, 1) if quick else (CARS, TOWN_S, SEEDS)
     chosen = [seeds[0]] if quick else list(seeds[:count])
     found = ways()
@@ -95,7 +95,7 @@ def campaign(
 
 
 def ways() -> dict[str, list[MixtureDesign]]:
-    """Return the filters of each way."""
+    """Return the filters of each variant; a variant with several searches has several filters."""
     untuned = Memberships()
     found = {
         "fuzzy": [design_of(shipped_memberships(ESTIMATOR), adaptive=True)],
@@ -109,7 +109,9 @@ def ways() -> dict[str, list[MixtureDesign]]:
 
 
 def without_sets() -> MixtureDesign:
-    """Return the default filter without fuzzy sets, with strain and the consistency test."""
+    """Return the tables of the default filter without fuzzy sets, with strain and the consistency
+    test.
+    """
     design = design_of(Memberships(), adaptive=True)
     c = design.constants
     rules = plain_rules(c.demand_half, c.demand_power, c.steady_share)
@@ -117,7 +119,7 @@ def without_sets() -> MixtureDesign:
 
 
 def manoeuvres(seed: int, seconds: float) -> DriveSet:
-    """Simulate one drive of each manoeuvre with misaligned devices; the seed determines vehicle,
+    """Simulate one drive of each manoeuvre with misaligned sensors. The seed determines vehicle,
     friction and road.
     """
     rng = np.random.default_rng([seed, 17])
@@ -139,8 +141,8 @@ def manoeuvres(seed: int, seconds: float) -> DriveSet:
 
 
 def _score_drives(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[str, float]:
-    """Return the mean interval score over the drives, and over all samples of each surface (NaN if
-    a surface does not occur).
+    """Return the mean interval score over the drives ("all"), and over all samples of each surface
+    (NaN if a surface does not occur).
     """
     drives = []
     samples = []
@@ -160,16 +162,17 @@ def _score_drives(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[st
 
 
 def ratio(scores: Scores, name: str) -> float:
-    """Return the mean interval score of one variant over that of another, over all seeds; NaN if
-    one was not measured.
+    """Return the mean interval score of one variant divided by that of another, over all seeds; NaN
+    if either was not measured.
     """
     over, under = (scores.get(way) for way in RATIOS[name])
     return float(over["all"].mean() / under["all"].mean()) if over and under else math.nan
 
 
 def figures(scores: Scores) -> list[Figure]:
-    """Return the spread of each ratio, the paired differences and the ratios per surface; then
-    every score."""
+    """Return figures: the standard deviation of each ratio, the paired differences and the ratios
+    per surface, then every score.
+    """
     listed = []
     for name, (over, under) in RATIOS.items():
         if not {over, under} <= set(scores):
@@ -197,7 +200,7 @@ def figures(scores: Scores) -> list[Figure]:
 
 
 def barred_figures(scores: Scores) -> list[Figure]:
-    """Return the ratios with their bars, then all others, as a campaign of its own reports them."""
+    """Return the ratios with their targets first, then all other figures."""
     barred = [Figure(name, ratio(scores, name), "1", bar, "less") for name, bar in BARS.items()]
     plain = [
         Figure(name, ratio(scores, name), "1")
@@ -208,7 +211,7 @@ def barred_figures(scores: Scores) -> list[Figure]:
 
 
 def comparison_table(values: dict[str, float]) -> str:
-    """Return the ratios as a Markdown table, from figures by name."""
+    """Return the ratios as a Markdown table, from the values of the figures by name."""
     lines = [
         "| figure | compares | ratio | paired difference ± standard error | share of seeds better |",
         "|---|---|---|---|---|",

@@ -1,3 +1,3 @@
-"""Peers of the live sources: a bus, a ROS node, a databroker and a receiver, each a process of
-its own.
+"""Test senders ("peers") for the live sources: a CAN bus, a ROS node, a databroker and a position
+receiver, each in a separate process.
 """

@@ -1,9 +1,8 @@
-"""Fake databroker: the interface kuksa.val.v2 over gRPC, with GetValue, Subscribe and PublishValue
-as specified.
+"""Simulated databroker: the interface kuksa.val.v2 over gRPC, with GetValue, Subscribe and
+PublishValue as specified.
 
-Unknown paths are NOT_FOUND. A subscription answers at once with all known values, and then with
-each update. Updates for a slow subscriber are buffered up to its `buffer_size`; then the oldest are
-dropped.
+Unknown paths give NOT_FOUND. A subscription first sends all known values, and then each update.
+Updates for a slow subscriber are buffered up to its `buffer_size`; then the oldest are dropped.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ LONGEST_BUFFER = 1000
 
 
 class Databroker:
-    """A server at host:port with some paths, without a value at first."""
+    """gRPC server at the address host:port with the given paths, at first without values."""
 
     def __init__(self, address: str, paths: Sequence[str]) -> None:
         self._grpc = import_optional("grpc")
@@ -66,16 +65,16 @@ class Databroker:
 
     @property
     def subscribers(self) -> int:
-        """Return the number of subscribers."""
+        """Return the number of current subscribers."""
         return len(self._subscribers)
 
     def value(self, path: str) -> Any:  # noqa: ANN401
-        """Return the data point of a path."""
+        """Return the data point (value and time stamp) of a path."""
         with self._changed:
             return self._values[path]
 
     def publish(self, values: Mapping[str, float], time_ns: int) -> None:
-        """Publish new values with one time stamp."""
+        """Publish new values by path, all with the time stamp `time_ns` [ns UTC]."""
         update = {}
         for path, value in values.items():
             point = messages.Datapoint(value=messages.Value(double=value))

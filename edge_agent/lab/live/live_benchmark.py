@@ -1,5 +1,5 @@
-"""Benchmark of live sources: lost samples at 100 Hz over a minute, and the agent itself when a
-source is killed.
+"""Benchmark of live sources: number of samples lost at 100 Hz in a minute, and behaviour of the
+agent when a source is killed.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ KILLS: Final = 3  # of each source while an agent drives
 
 @dataclass
 class Peer:
-    """A running peer."""
+    """A running test sender in its process."""
 
     process: subprocess.Popen[str]
 
     def wait_for(self, word: str) -> None:
-        """Wait for a line."""
+        """Wait until the sender prints the line `word`."""
         for line in _read_lines(self.process.stdout):
             if line == word:
                 return
@@ -51,13 +51,13 @@ class Peer:
         raise RuntimeError(f"the peer ended with code {code} before it printed {word!r}")
 
     def send_go(self) -> None:
-        """Send the peer the signal to begin or to end."""
+        """Send the sender the line that makes it begin or end."""
         assert self.process.stdin is not None
         self.process.stdin.write("\n")
         self.process.stdin.flush()
 
     def kill(self) -> None:
-        """End it as a lost battery does."""
+        """Kill the process immediately, like a device that loses its power."""
         self.process.kill()
         self.process.wait()
 
@@ -70,7 +70,7 @@ def _read_lines(stream: IO[str] | None) -> Iterator[str]:
 
 @contextmanager
 def run_peer(kind: str, address: str, samples: int, rate: float = RATE_HZ) -> Iterator[Peer]:
-    """Run a peer in a process of its own until the block ends."""
+    """Run a test sender in a separate process for the duration of the `with` block."""
     words = [
         sys.executable,
         "-m",
@@ -92,7 +92,7 @@ def run_peer(kind: str, address: str, samples: int, rate: float = RATE_HZ) -> It
 
 
 def peer_addresses(kind: str) -> tuple[str, str]:
-    """Return the address of the peer, and the name of the source that listens to it."""
+    """Return (address of the sender, source name under which the agent listens to it)."""
     (port,) = free_ports(1)
     if kind == "can":
         return f"udp_multicast/{MULTICAST}/{port}", f"can:udp_multicast/{MULTICAST}?port={port}"
@@ -102,7 +102,9 @@ def peer_addresses(kind: str) -> tuple[str, str]:
 
 
 def write_profile(kind: str, folder: Path) -> tuple[str, Path | None]:
-    """Write the peer's profile and database; return their paths."""
+    """Write the profile and the CAN database for a sender; return their paths (or the name of a
+    shipped profile, and None).
+    """
     if kind == "vss":
         return "vss", None
     profile = folder / f"{kind}.json"
@@ -113,10 +115,10 @@ def write_profile(kind: str, folder: Path) -> tuple[str, Path | None]:
 
 
 def count_lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
-    """Return the number of samples lost between a source and the rows, and the number of samples
-    sent.
+    """Return (number of samples lost between a source and the rows, number of samples sent).
 
-    A sample is lost if its message was not received, or if its reading came after its row.
+    A sample is lost if its message was not received, or if its reading arrived after its row had
+    been built.
     """
     samples = round(seconds * RATE_HZ)
     place, source = peer_addresses(kind)
@@ -159,8 +161,10 @@ def count_lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
 
 
 def count_crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
-    """Return the reasons of agents that did not notice a loss or a return of their source, or did
-    not end correctly, and the number of losses.
+    """Kill the source of running agents; return (reasons of agents that failed, number of kills).
+
+    An agent fails if it does not report the loss or the return of its source, or does not end
+    correctly.
     """
     vehicle = folder / "car.json"
     vehicle.write_text(
@@ -233,7 +237,9 @@ def _shows_silence(
     silent: bool,
     patience_s: float = PATIENCE_S,
 ) -> bool:
-    """Return True if the health of a running agent begins, or ceases, to report a source as silent."""
+    """Wait until the health of a running agent reports a source as silent (or, if `silent` is
+    False, no longer does). Return False if this does not happen in time.
+    """
     deadline = time.monotonic() + patience_s
     while agent.poll() is None and time.monotonic() < deadline:
         troubles = _health_problems(port)
@@ -248,7 +254,7 @@ def _shows_silence(
 
 
 def _health_problems(port: int) -> list[str]:
-    """Return the problems in an agent's `/healthz`; none while it does not answer."""
+    """Return the problems in an agent's `/healthz`; an empty list while the agent does not answer."""
     try:
         with urllib.request.urlopen(
             f"http://127.0.0.1:{port}/healthz", timeout=PATIENCE_S

@@ -1,7 +1,7 @@
-"""Senders for live sources, as processes: `python -m edge_agent.lab.live.peers KIND ADDRESS SAMPLES
-RATE`.
+"""Test senders ("peers") for live sources, run as processes: `python -m edge_agent.lab.live.peers
+KIND ADDRESS SAMPLES RATE`.
 
-A peer prints `ready`, waits for a line on its input, sends SAMPLES samples at RATE a second and
+A peer prints `ready`, waits for a line on its input, sends SAMPLES samples at RATE per second and
 prints the number of messages. It ends when its input ends, so it can be killed and restarted at the
 same address. The databroker peer implements the published interface kuksa.val.v2; it is not the
 broker itself.
@@ -46,7 +46,7 @@ HASH: Final = "RIHS01_" + "0" * 64
 
 
 def drive_at(t: float) -> dict[str, float]:
-    """Return the readings of the channels at time t [s] of a gentle slalom."""
+    """Return the readings of the channels at time t [s] during a slow slalom."""
     rate = 0.2 * np.sin(1.5 * t)
     return {
         "ax": 0.0,
@@ -58,7 +58,7 @@ def drive_at(t: float) -> dict[str, float]:
 
 
 def profile_of(kind: str) -> Profile:
-    """Return the profile of a peer; for a databroker the shipped one."""
+    """Return the profile for a peer. For a databroker it is the shipped profile."""
     if kind == "can":
         return Profile(
             name=kind,
@@ -77,7 +77,7 @@ def profile_of(kind: str) -> Profile:
 
 
 def pace_samples(samples: int, rate: float) -> Iterator[float]:
-    """Yield the times of samples [s], each when it is due."""
+    """Yield the time of each sample [s] when the sample is due."""
     began = time.monotonic()
     for k in range(samples):
         time.sleep(max(0.0, began + k / rate - time.monotonic()))
@@ -85,7 +85,9 @@ def pace_samples(samples: int, rate: float) -> Iterator[float]:
 
 
 def send_can(address: str, samples: int, rate: float) -> int:
-    """Send four messages per sample on a CAN bus; the address is interface/channel/port."""
+    """Send four messages per sample on a CAN bus; the address is interface/channel/port. Return the
+    number of messages.
+    """
     interface, channel, port = address.split("/")
     made = import_optional("can")
     with made.Bus(interface=interface, channel=channel, port=int(port)) as bus:
@@ -99,8 +101,8 @@ def send_can(address: str, samples: int, rate: float) -> int:
 
 
 def send_ros2(address: str, samples: int, rate: float) -> int:
-    """Send an Imu and a JointState per sample, as rmw_zenoh publishes them; a router is opened at
-    the address.
+    """Send an Imu and a JointState message per sample in the form of rmw_zenoh; a Zenoh router is
+    opened at the address. Return the number of messages.
     """
     session = open_session(
         ZenohSettings(connect=[], config={"mode": "router", "listen/endpoints": [address]})
@@ -155,7 +157,9 @@ def send_ros2(address: str, samples: int, rate: float) -> int:
 
 
 def send_vss(address: str, samples: int, rate: float) -> int:
-    """Run a databroker and its provider; the address is host:port."""
+    """Run a simulated databroker and publish the samples on it; the address is host:port. Return
+    the number of values.
+    """
     from edge_agent.inputs.live.sources import VSS_PROFILE
     from edge_agent.inputs.profile import load_profile
 
@@ -177,7 +181,9 @@ def send_vss(address: str, samples: int, rate: float) -> int:
 
 
 def send_gpsd(address: str, samples: int, rate: float) -> int:
-    """Send fixes of a car that drives east; the address is host:port."""
+    """Send position fixes of a car that drives east, as gpsd does; the address is host:port. Return
+    the number of fixes.
+    """
     import socket
 
     host, port = address.split(":")
@@ -200,7 +206,7 @@ def send_gpsd(address: str, samples: int, rate: float) -> int:
 
 
 def report_ready() -> None:
-    """Print `ready`, and wait for the signal to begin."""
+    """Print `ready`, and wait for the line that starts the sending."""
     print("ready", flush=True)
     wait_for_line()
 
@@ -219,7 +225,7 @@ PEERS: Final[dict[str, Callable[[str, int, float], int]]] = {
 
 
 def main(words: Any) -> None:  # noqa: ANN401
-    """Run a peer and print how many messages it sent."""
+    """Run a peer with the given command-line arguments, and print the number of messages sent."""
     kind, address, samples, rate = words
     print(json.dumps({"sent": PEERS[kind](address, int(samples), float(rate))}), flush=True)
     wait_for_line()

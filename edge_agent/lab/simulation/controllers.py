@@ -1,18 +1,18 @@
-"""Controllers of a vehicle with modulated slip control: ABS, traction control, drag torque control
-and ESC.
+"""Simulated controllers of a vehicle: ABS, traction control (TCS), drag torque control and ESC.
 
-They act in steps of the plant and know the slip exactly: only their action is modelled, not their
-sensors.
+They act in each integration step of the vehicle model and know the slip exactly: their action is
+modelled, not their sensors.
 
-    ABS    a wheel beyond its slip limit loses brake torque by DUMP, keeps it until the slip is half
-           of the limit, and gets it back, fast up to NEARLY of the torque at which it let go, then
-           slowly: 6 to 10 cycles per second; the rear wheels share the lower torque
-    TCS    the engine's torque is cut while a driven wheel spins, and the brake holds a wheel that
-           spins much; the same cut ends the drag of engine or generator at lift-off, and while ABS
-           works
-    ESC    where the yaw rate is off what steering asks for, one wheel is braked: the outer front
-           wheel of a car that turns too much, the inner rear wheel of one that turns too little;
-           the engine's torque is cut
+    ABS    If a wheel exceeds its slip limit, its brake torque is reduced at the rate DUMP, then
+           held until the slip is half of the limit. It is then increased again: fast up to NEARLY
+           times the torque at which the reduction began, then slowly. This gives 6 to 10 cycles
+           per second. Both rear wheels get the lower of their two torques.
+    TCS    The engine torque is cut while a driven wheel spins, and the brake holds a wheel that
+           spins much. The same cut ends the drag torque of engine or generator when the driver
+           releases the accelerator, and while ABS acts.
+    ESC    If the yaw rate differs from the value expected from steering, one wheel is braked: the
+           outer front wheel of a car that turns too much, the inner rear wheel of a car that turns
+           too little. The engine torque is cut.
 """
 
 from __future__ import annotations
@@ -59,13 +59,15 @@ HELD_RATE: Final = 2.0  # of these, per second
 
 @compiled
 def slip_limit(p: FloatArray, i: int) -> float:
-    """Return the slip at which the control of wheel `i` begins to release the brake."""
+    """Return the slip limit of wheel `i` at which ABS begins to release the brake."""
     return float(p[TrueParameter.SLIP_LIMIT] if i < 2 else REAR_LIMIT * p[TrueParameter.SLIP_LIMIT])
 
 
 @compiled
 def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float) -> None:
-    """Advance all controllers in `x` by `dt` [s], from the slips in `w` and the inputs `u`."""
+    """Advance the state of all controllers in `x` by `dt` [s], from the wheel slips in `w` and the
+    inputs `u`.
+    """
     x[Motion.ABS_LEFT] = max(x[Motion.ABS_LEFT] - dt, 0.0)
     x[Motion.TCS_LEFT] = max(x[Motion.TCS_LEFT] - dt, 0.0)
     x[Motion.ESC_LEFT] = max(x[Motion.ESC_LEFT] - dt, 0.0)
@@ -88,7 +90,7 @@ def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt:
 
 @compiled
 def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int, dt: float) -> None:
-    """Advance the brake torque that ABS allows at wheel `i` by `dt` [s]."""
+    """Advance the brake torque limit of ABS at wheel `i` by `dt` [s]."""
     asked = u[Control.BRAKE, i] + x[Motion.HELD + i]
     limit = slip_limit(p, i)
     slip = w[Wheel.SLIP, i]
@@ -111,7 +113,7 @@ def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int,
 
 @compiled
 def spin_excess(x: FloatArray, p: FloatArray, w: FloatArray, i: int) -> float:
-    """Return the drive slip of wheel `i` as a multiple of the limit of traction control."""
+    """Return the drive slip of wheel `i` divided by the slip limit of traction control."""
     along = w[Wheel.SPEED, i]
     faster = p[Parameter.RADIUS] * x[Motion.OMEGA + i] - along
     return float(faster / (p[TrueParameter.SLIP_LIMIT] * max(abs(along), TCS_SLOWEST)))
@@ -119,8 +121,10 @@ def spin_excess(x: FloatArray, p: FloatArray, w: FloatArray, i: int) -> float:
 
 @compiled
 def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float) -> bool:
-    """Cut or restore the engine's torque; return True if a driven wheel spins now, or is dragged to
-    a slip.
+    """Cut or restore the engine torque over `dt` [s].
+
+    Return True if the slip of a wheel now exceeds the limit, because it spins or because drag
+    torque slows it.
     """
     acts = drags = False
     for i in range(4):
@@ -141,7 +145,7 @@ def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: fl
 
 @compiled
 def stabilise(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> tuple[int, float]:
-    """Return the wheel that ESC brakes (-1: none) and the torque, over weight times radius."""
+    """Return (wheel that ESC brakes, or -1; its brake torque divided by weight times radius)."""
     vx = x[Motion.VX]
     r = x[Motion.YAW_RATE]
     if p[TrueParameter.ESC] <= 0.0 or vx < ESC_SLOWEST:

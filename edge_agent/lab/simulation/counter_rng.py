@@ -1,10 +1,10 @@
 """Stateless random numbers: each number is a hash of (key, counter).
 
-A stateful generator would make a vehicle's noise depend on the number of vehicles and on the way a
-drive is cut into blocks. A counter-based generator (Salmon et al., "Parallel random numbers: as
-easy as 1, 2, 3", SC 2011) does not: sample k of channel c of a vehicle is the same number in
-whatever order numbers are requested. The hash is the finaliser of SplitMix64 (Steele, Lea, Flood,
-OOPSLA 2014).
+With a stateful generator, a vehicle's noise would depend on the number of vehicles and on the
+division of a drive into blocks. With a counter-based generator (Salmon et al., "Parallel random
+numbers: as easy as 1, 2, 3", SC 2011) it does not: sample k of channel c of a vehicle is the same
+number in any order of requests. The hash is the finaliser of SplitMix64 (Steele, Lea, Flood, OOPSLA
+2014).
 
 Counters must be non-negative.
 """
@@ -33,7 +33,7 @@ def checked_seed(seed: int) -> int:
     """Return the seed if it is valid.
 
     Raises:
-        InputError: it is negative.
+        InputError: the seed is negative.
     """
     if seed < 0:
         raise InputError("seed", f"{seed} is negative", "give a whole number of at least 0")
@@ -41,15 +41,15 @@ def checked_seed(seed: int) -> int:
 
 
 def key_of(*seeds: int) -> np.uint64:
-    """Return a key from non-negative integers, e.g. (seed, vehicle number): different lists give
-    unrelated streams.
+    """Return a key computed from non-negative integers, e.g. (seed, vehicle number). Different
+    integers give unrelated streams.
     """
     return np.uint64(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0])
 
 
 @compiled
 def mix_bits(key: np.uint64, counter: np.uint64) -> np.uint64:
-    """Return 64 random bits of `counter` in the stream `key`."""
+    """Return 64 random bits for `counter` in the stream `key`."""
     z = key + (counter + ONE) * STEP
     z = (z ^ (z >> SHIFTS[0])) * MULTIPLY_1
     z = (z ^ (z >> SHIFTS[1])) * MULTIPLY_2
@@ -58,14 +58,16 @@ def mix_bits(key: np.uint64, counter: np.uint64) -> np.uint64:
 
 @compiled
 def uniform(key: np.uint64, counter: int) -> float:
-    """Return a number strictly between 0 and 1."""
+    """Return a uniform random number strictly between 0 and 1, for `counter` in the stream `key`."""
     return (float(mix_bits(key, np.uint64(counter)) >> DROP) + 0.5) * UNIT
 
 
 @compiled
 def normal(key: np.uint64, counter: int) -> float:
-    """Return a standard normal number (Box and Muller, 1958); uses the hashes 2·counter and
-    2·counter + 1 of the stream.
+    """Return a standard normal random number for `counter` in the stream `key` (Box and Muller,
+    1958).
+
+    It uses the hashes with the counters 2·counter and 2·counter + 1.
     """
     first = TWO * np.uint64(counter)
     u = (float(mix_bits(key, first) >> DROP) + 0.5) * UNIT

@@ -1,11 +1,12 @@
-"""The driver of a simulated vehicle: follows a route without end, brakes before junctions, and is
+"""The driver of a simulated vehicle: follows an endless route, brakes before junctions, and is
 surprised by black ice.
 
-The driver aims at a point ahead on the lane (pure pursuit), and at a speed from the lane's profile
-and the budget q. The budget is the share of the *believed* grip that the driver likes to use, at
-most a comfortable value. The belief follows the looks of the road ahead, falls fast when wheels
-slide, and recovers slowly. From time to time traffic ahead makes the driver brake. Other vehicles
-are not seen: each drives as if alone, so that a drive does not depend on their number.
+The driver steers to a point ahead on the lane (pure pursuit). The target speed follows from the
+lane's speed profile and the budget q. The budget is the share of the *believed* grip that the
+driver uses, limited to a comfortable acceleration. The believed grip follows the appearance of the
+road ahead, falls fast when wheels slide, and recovers slowly. At random times, traffic ahead makes
+the driver brake. Other vehicles are not seen: each vehicle drives as if it were alone, so that a
+drive does not depend on the number of vehicles.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ KeyArray: TypeAlias = NDArray[np.uint64]
 
 
 class Driver(IntEnum):
-    """State of one driver (float64)."""
+    """Index of a state variable of one driver (float64)."""
 
     STEER = 0  # [rad] mean road-wheel angle, as the arms have followed so far
     FORCE = 1  # [N] longitudinal, as the foot has followed so far
@@ -55,7 +56,7 @@ class Driver(IntEnum):
 
 
 class Route(IntEnum):
-    """Position of one driver on the route (int64)."""
+    """Index of a variable of one driver's position on the route (int64)."""
 
     LANE = 0
     POINT = 1  # the next point of the lane
@@ -102,7 +103,7 @@ STOP_DRAW: Final = (
 
 @compiled
 def ways_of(ways: IntArray, lane: int) -> int:
-    """Return the number of ways that lead on from a lane."""
+    """Return the number of lanes that continue from the end of a lane."""
     count = 0
     while count < ways.shape[1] and ways[lane, count] >= 0:
         count += 1
@@ -111,8 +112,8 @@ def ways_of(ways: IntArray, lane: int) -> int:
 
 @compiled
 def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
-    """Advance the route state `g` to the vehicle's position; at the end of a lane choose the next
-    turn at random.
+    """Advance the route state `g` to the vehicle's position. At the end of a lane, choose the next
+    lane at random.
 
     Return the distance to the next point [m], at most the distance between points.
     """
@@ -136,10 +137,10 @@ def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
 
 @compiled
 def place_ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[int, float]:
-    """Return the place `distance` [m] further along the route: the row of a point, and metres
-    beyond it.
+    """Return the position `distance` [m] further along the route, as (row of a point, metres beyond
+    that point).
 
-    Beyond the next lane the route takes the first way.
+    After the next lane, the route takes the first continuation of each lane.
     """
     _, first, size, spacing, ways = lanes
     lane = g[Route.LANE]
@@ -157,7 +158,9 @@ def place_ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tu
 
 @compiled
 def budget(d: FloatArray) -> float:
-    """Return q [m/s^2], the acceleration that the driver is ready to demand from the tyres."""
+    """Return the budget q: the acceleration [m/s^2] that the driver is ready to demand from the
+    tyres.
+    """
     style = d[Driver.STYLE] * (
         CAREFUL if heeds_warning(d) and d[Driver.WARNED_START] <= 0.0 else 1.0
     )
@@ -166,13 +169,17 @@ def budget(d: FloatArray) -> float:
 
 @compiled
 def cruise(d: FloatArray) -> float:
-    """Return the speed on an open road [m/s]: lower where the driver believes it slippery."""
+    """Return the driver's speed on an open road [m/s]; it is lower where the driver believes that
+    the road is slippery.
+    """
     return float(d[Driver.CRUISE] * math.sqrt(min(1.0, 0.25 + 1.1 * d[Driver.BELIEF])))
 
 
 @compiled
 def update_belief(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None:
-    """Update the driver's belief with the looks of the road ahead, and with sliding wheels."""
+    """Update the grip that the driver believes in, from the appearance of the road ahead and from
+    sliding wheels.
+    """
     lag = WORSE_S if looks < d[Driver.BELIEF] else BETTER_S
     d[Driver.BELIEF] += (looks - d[Driver.BELIEF]) * -math.expm1(-dt / lag)
     for i in range(4):
@@ -184,7 +191,7 @@ def update_belief(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None
 
 @compiled
 def advance_warning(d: FloatArray, vx: float, dt: float) -> None:
-    """Advance the warned stretch: it comes nearer, and is passed."""
+    """Advance the stretch of which the driver was warned: its distance decreases by `vx` * `dt`."""
     if d[Driver.WARNED_END] > 0.0:
         d[Driver.WARNED_IN] -= dt
         d[Driver.WARNED_START] -= vx * dt
@@ -193,7 +200,7 @@ def advance_warning(d: FloatArray, vx: float, dt: float) -> None:
 
 @compiled
 def heeds_warning(d: FloatArray) -> bool:
-    """Return True if the driver acts on a warning now."""
+    """Return True if the driver takes a warning into account now, after the reaction time."""
     return bool(d[Driver.WARNED_END] > 0.0 and d[Driver.WARNED_IN] <= 0.0)
 
 
@@ -210,8 +217,9 @@ def traffic_braking(t: float, key: Key) -> float:
 
 @compiled
 def is_stopping(t: float, share: float, key: Key) -> bool:
-    """Return True if the driver is stopping or waiting now, which is so in this share of the
-    ALERT_S.
+    """Return True if the driver is stopping or waiting now.
+
+    The driver stops in the given share of the time windows of length ALERT_S.
     """
     window = int(t / ALERT_S)
     return bool(
@@ -223,11 +231,11 @@ def is_stopping(t: float, share: float, key: Key) -> bool:
 
 @compiled
 def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
-    """Return the square of the speed [m^2/s^2] that the driver aims for at the start of a warned
-    stretch.
+    """Return the square of the driver's target speed [m^2/s^2] at the start of a stretch of which
+    the driver was warned.
 
-    It is the advised speed, limited so that later points of the route need no more braking on the
-    stretch than its expected grip allows.
+    It is the advised speed, limited so that later points of the route require no more braking on
+    the stretch than its expected grip allows.
     """
     row, _ = place_ahead(d, g, lanes, max(d[Driver.WARNED_START], 0.0))
     lane = g[Route.LANE]
@@ -244,7 +252,7 @@ def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
 def wished_acceleration(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float, key: Key
 ) -> float:
-    """Return the longitudinal acceleration [m/s^2] that the driver demands."""
+    """Return the longitudinal acceleration [m/s^2] that the driver demands now."""
     vx = x[Motion.VX]
     q = budget(d)
     reach = max(2.0, 0.5 * vx)
@@ -293,8 +301,8 @@ def wished_acceleration(
 def wished_force(
     p: FloatArray, d: FloatArray, vx: float, acceleration: float, along: float
 ) -> float:
-    """Return the force [N] for an acceleration while gravity pulls with `along` [m/s^2], within the
-    limits of tyres and engine.
+    """Return the longitudinal force [N] that gives an acceleration while gravity acts with `along`
+    [m/s^2] along the road, limited by tyres and engine.
     """
     driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
     most = min(
@@ -308,8 +316,8 @@ def wished_force(
 def wished_steer(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float
 ) -> float:
-    """Return the mean road-wheel angle [rad] of the circle through a point ahead, within the range
-    that the front tyres can follow.
+    """Return the mean road-wheel angle [rad] for the circle through a point ahead, limited to the
+    range that the front tyres can follow.
     """
     vx = max(x[Motion.VX], SLOWEST)
     base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
@@ -340,12 +348,12 @@ def drive(
     now: tuple[float, float, float],
     keys: tuple[Key, Key],
 ) -> None:
-    """Advance a driver (d, g) and the route by one sample: afterwards d[STEER], d[FORCE] are the
+    """Advance a driver (d, g) and the route by one sample. Afterwards d[STEER] and d[FORCE] are the
     actual controls.
 
-    world: lanes and friction; `w` holds the wheels at the last sample; now: time [s], length of the
-    sample [s] and the acceleration by gravity [m/s^2]; keys are those of the route and of the
-    alerts.
+    `world` contains lanes and friction table; `w` the wheels at the last sample; `now` time [s],
+    length of the sample [s] and acceleration by gravity along the road [m/s^2]; `keys` the random
+    keys of route and traffic.
     """
     d, g = driver
     lanes, friction = world

@@ -1,4 +1,4 @@
-"""Sensor faults as one table: kind -> effect on a channel of a drive."""
+"""Sensor faults as a table: kind of fault -> function that applies it to a channel."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from schemas.signals import CHANNELS
 
 @dataclass(frozen=True)
 class Fault:
-    """`kind` of FAULTS on one channel (or all whose name begins so: "omega") for `start` <= t <
-    `end` [s].
+    """Fault of a `kind` in FAULTS on one channel for `start` <= t < `end` [s].
 
-    `size` is in the channel's unit; only spikes and bias steps have one.
+    A channel name without wheel, such as "omega", means all wheels. `size` is in the channel's
+    unit; only the kinds "spike" and "bias" use it.
     """
 
     kind: str
@@ -42,7 +42,7 @@ class Fault:
 
     @property
     def indices(self) -> list[int]:
-        """Return the channels of a block that the fault affects."""
+        """Return the indices of the channels that the fault affects."""
         if self.channel in CHANNELS:  # "yaw" is a channel of its own, and not the yaw rate
             return [CHANNELS.index(self.channel)]
         return [i for i, name in enumerate(CHANNELS) if name.startswith(self.channel + "_")]
@@ -53,24 +53,24 @@ Effect = Callable[[FloatArray, BoolArray, float], None]
 
 
 def drop_readings(values: FloatArray, when: BoolArray, _size: float) -> None:
-    """Replace the readings at `when` with NaN."""
+    """Replace the readings where `when` (T,) is True with NaN."""
     values[when] = np.nan
 
 
 def hold_reading(values: FloatArray, when: BoolArray, _size: float) -> None:
-    """Repeat the last reading before the fault."""
+    """Replace the readings where `when` (T,) is True with the last reading before the fault."""
     if when.any():
         first = int(np.argmax(when))
         values[when] = values[max(first - 1, 0)]
 
 
 def add_spikes(values: FloatArray, when: BoolArray, size: float) -> None:
-    """Add `size` to every tenth reading."""
+    """Add `size` to every tenth reading where `when` (T,) is True."""
     values[np.flatnonzero(when)[::10]] += size
 
 
 def add_bias(values: FloatArray, when: BoolArray, size: float) -> None:
-    """Add a step of `size` to the offset."""
+    """Add the constant `size` to the readings where `when` (T,) is True."""
     values[when] += size
 
 
@@ -84,8 +84,8 @@ FAULTS: Final[dict[str, Effect]] = {
 
 
 def apply_faults(t: FloatArray, signals: FloatArray, faults: tuple[Fault, ...]) -> FloatArray:
-    """Return a copy of the signals (T, 18) at times t (T,) with the faults applied in their
-    order.
+    """Return a copy of the signals (T, 18) at times t (T,) with the faults applied one after the
+    other.
     """
     faulty = signals.copy()
     for fault in faults:

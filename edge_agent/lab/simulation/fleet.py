@@ -1,4 +1,4 @@
-"""A fleet of vehicles that drive on a road network without end, in one compiled kernel."""
+"""Simulation of a fleet of vehicles that drive endlessly on a road network, in one compiled kernel."""
 
 from __future__ import annotations
 
@@ -63,13 +63,13 @@ GOLDEN = (
 
 @dataclass(frozen=True)
 class Truth:
-    """Ground truth of a block, (T, N) or (T, N, 4): pose [m, m, rad], speed [m/s], friction,
-    |F|/(μ F_z).
+    """True values of a block, shapes (T, N) or (T, N, 4).
 
-    ax, ay: acceleration that an accelerometer measures [m/s^2]; slope: rise of the road per metre
-    ahead. theta: normalised slip of each wheel; a wheel slides beyond about 2.6. abs, tcs, esc:
-    while the controller works, of vehicles with winter equipment, else False. air_temperature:
-    outside [degrees Celsius].
+    x, y, yaw: pose [m, m, rad]; vx, vy: velocity [m/s]; mu_wheel: friction; utilisation: |F|/(μ
+    F_z); yaw_rate [rad/s]; ax, ay: acceleration that an accelerometer measures [m/s^2]; slope: rise
+    of the road per metre ahead; theta: normalised slip of each wheel (a wheel slides beyond about
+    2.6); abs, tcs, esc: True while the controller acts, in vehicles with winter equipment;
+    air_temperature: outside temperature [degrees Celsius].
     """
 
     x: FloatArray
@@ -102,9 +102,9 @@ def run(
 ) -> FloatArray:
     """Return records (T, N, RECORD) of the next `steps` samples; the states are advanced in place.
 
-    states: vehicles (N, 12), drivers (N, 10), routes (N, 4), wheels (N, 8, 4); ground: lanes,
-    tables of friction and of relief; keys: of routes and of alerts (N,); timing: sample period [s]
-    and plant steps in it; `first` is the number of the first sample.
+    states: vehicles (N, STATES), drivers (N, len(Driver)), routes (N, 4), wheels (N, 8, 4); ground:
+    lanes, tables of friction and of relief; keys: random keys of routes and of traffic (N,);
+    `first`: number of the first sample; timing: sample period [s] and integration steps per sample.
     """
     vehicles, drivers, routes, wheels = states
     lanes, friction, relief = ground
@@ -143,19 +143,19 @@ def run(
 
 
 class SimulatedFleet:
-    """N vehicles on the roads of a scenario, deterministic in (scenario, seed, rate) and the
-    vehicle's number alone.
+    """N vehicles on the roads of a scenario. A vehicle's drive depends only on scenario, seed, rate
+    and the vehicle's number.
 
     Args:
         scenario: a key of SCENARIOS, or a Scenario.
-        vehicles: how many; vehicle k drives the same whatever their number.
+        vehicles: number of vehicles; the drive of vehicle k does not depend on it.
         seed: non-negative.
-        rate_hz: of the samples.
+        rate_hz: sampling rate [Hz].
         sensors: a key of SENSORS.
-        rough: share of the vehicles that are as real cars are: ROUGH_FLEET sensors, and drivers who
+        rough: share of the vehicles with realistic errors: ROUGH_FLEET sensors, and drivers who
             stop now and then.
-        winter: share of the vehicles with `winter_equipped` tyres and controllers; half of them are
-            rough if half are.
+        winter: share of the vehicles with `winter_equipped` tyres and controllers. If half of all
+            vehicles are rough, so are half of these.
 
     Raises:
         InputError: an argument is out of range or unknown.
@@ -224,8 +224,8 @@ class SimulatedFleet:
         self.truth = _truth(np.empty((0, vehicles, RECORD)), self.scenario.air_temperature)
 
     def step(self, steps: int) -> tuple[FloatArray, FloatArray]:
-        """Simulate the next `steps` samples: t (T, N) [s] from 0 and signals (T, N, 18); `truth` is
-        then that of this block.
+        """Simulate the next `steps` samples; return t (T, N) [s] from 0 and signals (T, N, 18).
+        Afterwards `truth` has the true values of this block.
         """
         if steps < 1:
             raise InputError(
@@ -254,8 +254,8 @@ class SimulatedFleet:
         return t, signals
 
     def route_ahead(self, k: int, length: float) -> tuple[FloatArray, FloatArray]:
-        """Return where vehicle k will drive, (latitude, longitude) [deg] of points a metre apart,
-        over `length` [m] or more.
+        """Return the path that vehicle k will drive: (latitude, longitude) [deg] of points about a
+        metre apart, over at least `length` [m].
         """
         network = self.scenario.network
         key = self._keys[0][k]
@@ -274,8 +274,10 @@ class SimulatedFleet:
         return self.scenario.to_latlon(line[:, 0], line[:, 1])
 
     def warn(self, k: int, stretch: tuple[float, float], speed: float, mu: float) -> None:
-        """Warn the driver of vehicle k of a slippery stretch, from and to a distance ahead [m]; (0,
-        0) cancels the warning.
+        """Warn the driver of vehicle k of a slippery stretch.
+
+        `stretch` is its begin and end as distances ahead [m]; (0, 0) cancels the warning. `speed`
+        [m/s] is the advised speed and `mu` the friction to expect.
         """
         d = self._states[1][k]
         if d[Driver.WARNED_END] <= 0.0:
@@ -285,18 +287,18 @@ class SimulatedFleet:
 
 
 def rough_ones(vehicles: int, share: float) -> BoolArray:
-    """Return True for rough vehicles, (N,), evenly spread; the value for vehicle k does not depend
-    on the number of vehicles.
+    """Return an array (N,) that is True for rough (inaccurate) vehicles, evenly distributed. The
+    value for vehicle k does not depend on the number of vehicles.
     """
     number = np.arange(vehicles)
     return np.asarray(np.floor((number + 1) * share) > np.floor(number * share))
 
 
 def winter_ones(vehicles: int, share: float) -> BoolArray:
-    """Return True for vehicles with winter equipment, (N,).
+    """Return an array (N,) that is True for vehicles with winter equipment.
 
-    Pairs of successive vehicles have the same equipment, so that half of them are rough if half of
-    all vehicles are.
+    Pairs of successive vehicles have the same equipment. Therefore half of the winter vehicles are
+    rough if half of all vehicles are.
     """
     return np.repeat(rough_ones((vehicles + 1) // 2, share), 2)[:vehicles]
 
@@ -335,7 +337,9 @@ def _truth(records: FloatArray, air_temperature: float) -> Truth:
 def _start(
     network: Network, parameters: FloatArray, rngs: list[np.random.Generator]
 ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
-    """Place vehicles at the network's starts, rolling at walking pace, each with its own driver."""
+    """Return the initial states of the vehicles: each starts at a start point of the network at
+    walking pace, with its own driver.
+    """
     count = len(rngs)
     vehicles = np.zeros((count, STATES))
     wheels = np.zeros((count, len(Wheel), 4))

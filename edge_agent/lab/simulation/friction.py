@@ -1,9 +1,9 @@
-"""Friction of the road as a field over position and time: a background with oriented rectangles on
-top.
+"""Friction of the road as a function of position and time: a background value with oriented
+rectangles on top.
 
-A later patch lies on top of an earlier one. Each patch has its true grip (`mu`) and the grip that a
-driver expects from its appearance (`looks`). Black ice looks like the road around it, which is why
-drivers respond late.
+If patches overlap, the last one in the list counts. Each patch has its true friction (`mu`) and the
+friction that a driver expects from its appearance (`looks`). Black ice looks like the road around
+it, so drivers respond late.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ICE = 0.18
 
 @dataclass(frozen=True)
 class Patch:
-    """A rectangle of road surface.
+    """A rectangular patch of road surface.
 
     `x, y` centre [m]; `length` along the direction `angle` [rad, counter-clockwise from x] and
     `width` across [m]; `mu` its friction; `looks` the friction that a driver expects from its
@@ -75,8 +75,8 @@ class PatchColumn(IntEnum):
 
 
 def friction_table(background: float, patches: tuple[Patch, ...]) -> FloatArray:
-    """Return rows for `look_up`, shape (1 + patches, 10); the background is the first, endless
-    patch.
+    """Return the table for `look_up`, shape (1 + patches, 10). Its first row is the background, an
+    infinite patch.
     """
     everywhere = Patch("background", 0.0, 0.0, math.inf, math.inf, background, looks=background)
     table = np.empty((1 + len(patches), len(PatchColumn)))
@@ -89,8 +89,8 @@ def friction_table(background: float, patches: tuple[Patch, ...]) -> FloatArray:
 
 @compiled
 def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> float:
-    """Return column F.MU or F.LOOKS of the topmost patch at (x, y) [m] and t [s] that defines
-    it.
+    """Return column MU or LOOKS of the topmost patch at (x, y) [m] and t [s] for which that column
+    is defined.
     """
     for i in range(table.shape[0] - 1, 0, -1):
         row = table[i]
@@ -112,7 +112,7 @@ def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> flo
 def look_up_many(
     table: FloatArray, column: int, t: FloatArray, x: FloatArray, y: FloatArray
 ) -> FloatArray:
-    """Return `look_up` for arrays of one length."""
+    """Return the values of `look_up` for arrays t, x, y of equal length."""
     values = np.empty(x.size)
     for i in range(x.size):
         values[i] = look_up(table, column, t[i], x[i], y[i])

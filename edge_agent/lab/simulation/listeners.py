@@ -1,5 +1,5 @@
-"""Simulated drivers who receive warnings and slow down for them; their routes and the warnings they
-hear.
+"""Simulated drivers who receive warnings and slow down: their routes, and the warnings passed to
+them.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ EVERY: Final = 10  # blocks between two looks at the route
 
 
 def warned_ones(vehicles: int, share: float) -> BoolArray:
-    """Return True for drivers that are warned, (N,), spread evenly over those of smooth and of
-    rough vehicles.
+    """Return an array (N,) that is True for drivers who are warned, evenly distributed over
+    accurate and rough vehicles.
 
     Raises:
         InputError: the share is not between 0 and 1.
@@ -36,11 +36,12 @@ def warned_ones(vehicles: int, share: float) -> BoolArray:
 
 
 class WarnedDrivers:
-    """The share of a fleet's drivers who are warned.
+    """The drivers of a fleet who are warned.
 
     Args:
         fleet: the vehicles.
-        share: of them, from 0 to 1; the choice of vehicle k does not depend on their number.
+        share: share of the drivers who are warned, from 0 to 1; the choice of vehicle k does not
+            depend on the number of vehicles.
 
     Raises:
         InputError: the share is not between 0 and 1.
@@ -54,24 +55,26 @@ class WarnedDrivers:
         self._warnings: queue.SimpleQueue[tuple[int, GripWarning]] = queue.SimpleQueue()
 
     def listens(self, k: int) -> bool:
-        """Return True if vehicle k is warned."""
+        """Return True if the driver of vehicle k is warned."""
         return bool(self.warned[k])
 
     def route_of(self, k: int) -> GivenRoute | None:
-        """Return where vehicle k will drive."""
+        """Return the route ahead of vehicle k; None before its first update."""
         return self._routes.get(k)
 
     def hear(self, name: str, warning: GripWarning) -> None:
-        """Store a warning for a driver; may be called from any thread. The driver acts on it from
-        the next block on, after the reaction time.
+        """Store a warning for a driver. The driver responds after the reaction time, which starts
+        with the next block.
+
+        The method may be called from any thread.
         """
         self._warnings.put((self._number[name], warning))
 
     def heeding(
         self, blocks: Iterator[Block], hear: Callable[[], None] = lambda: None
     ) -> Iterator[Block]:
-        """Yield the blocks; between them hand the drivers their warnings. `hear` is called before
-        each block.
+        """Yield the blocks. After each block, call `hear` and pass the stored warnings to the
+        drivers.
         """
         for number, block in enumerate(blocks):
             if number % EVERY == 0:
@@ -81,12 +84,12 @@ class WarnedDrivers:
             self.act()
 
     def refresh(self) -> None:
-        """Update the routes of the drivers."""
+        """Update the routes of the warned drivers."""
         for k in self.warned.nonzero()[0].tolist():
             self._routes[k] = GivenRoute(*self._fleet.route_ahead(k, ROUTE_M))
 
     def act(self) -> None:
-        """Hand the stored warnings to their drivers."""
+        """Pass the stored warnings to their drivers."""
         while not self._warnings.empty():
             k, warning = self._warnings.get()
             if warning.state != "ended":  # one that is passed he leaves behind by himself

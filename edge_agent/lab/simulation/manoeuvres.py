@@ -1,7 +1,7 @@
-"""The manoeuvres of a test-track driver, as one table of name -> manoeuvre.
+"""The manoeuvres of a driver on a test track, as a table of name -> manoeuvre.
 
-A manoeuvre is a function of the moment that returns the mean road-wheel angle [rad] and the
-demanded longitudinal acceleration [m/s^2]. The test track starts at the origin and leads along x.
+A manoeuvre is a function of the momentary state. It returns the mean road-wheel angle [rad] and the
+demanded longitudinal acceleration [m/s^2]. The test track starts at the origin and runs along x.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ LARGEST_STEER: Final = 0.5  # [rad at the road wheel]
 
 @dataclass(frozen=True)
 class Moment:
-    """Information of a driver at an instant: time [s], pose [m, m, rad], speed [m/s], and demanded
-    speed [m/s].
+    """State that a driver knows at an instant: time [s], pose [m, m, rad], speed [m/s], and
+    demanded speed [m/s].
 
-    Speed control by hub motors also uses `lost` [m], the integral of the error of speed, and `gain`
+    Speed control by hub motors also uses `lost` [m], the integral of the speed error, and `gain`
     [m/s^2], the acceleration.
     """
 
@@ -43,14 +43,14 @@ Control = Callable[[Moment], tuple[float, float]]
 
 
 class TimedFriction(NamedTuple):
-    """Friction that changes over time, under all wheels at once (paper 003, section 4.2.4)."""
+    """Friction that changes at a time, under all wheels simultaneously (paper 003, section 4.2.4)."""
 
     before: float
     after: float
     at_s: float
 
     def value(self, t: float) -> float:
-        """Return the friction at `t` [s]."""
+        """Return the friction at time `t` [s]."""
         return self.before if t < self.at_s else self.after
 
 
@@ -62,7 +62,7 @@ wheel, or a function of time.
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """One row of the table; `friction` and `speed` are defaults that may be replaced."""
+    """One row of the table of manoeuvres; `friction` and `speed` are defaults that may be replaced."""
 
     control: Control
     speed: float  # [m/s] at the start, and to be held unless the control does otherwise
@@ -72,17 +72,23 @@ class Manoeuvre:
 
 
 def jump(before: float, after: float, at: float) -> Callable[[float, float], float]:
-    """Return a friction that changes at `at` [m] along the track."""
+    """Return a friction function with value `before` up to `at` [m] along the track, and `after`
+    beyond.
+    """
     return lambda x, _y: before if x < at else after
 
 
 def split(left: float, right: float) -> Callable[[float, float], float]:
-    """Return a friction that differs between the left and the right of the track."""
+    """Return a friction function with value `left` on the left side of the track and `right` on the
+    right side.
+    """
     return lambda _x, y: left if y > 0.0 else right
 
 
 def hold(now: Moment, speed: float | None = None) -> float:
-    """Return the acceleration that brings the vehicle back to `speed`, or to the demanded speed."""
+    """Return the acceleration [m/s^2] that restores the speed `speed`, by default the demanded
+    speed.
+    """
     error = (now.speed if speed is None else speed) - now.vx
     if now.motors is not None:
         return speed_demand(now.motors, error, now.lost if speed is None else 0.0, now.gain)
@@ -90,8 +96,8 @@ def hold(now: Moment, speed: float | None = None) -> float:
 
 
 def steer_to(now: Moment, target_x: float, target_y: float) -> float:
-    """Return the steering of the circle through a point ahead by pure pursuit (Coulter,
-    CMU-RI-TR-92-01).
+    """Return the road-wheel angle [rad] of the circle through a point ahead, by pure pursuit
+    (Coulter, CMU-RI-TR-92-01).
     """
     dx = target_x - now.x
     dy = target_y - now.y
@@ -102,19 +108,19 @@ def steer_to(now: Moment, target_x: float, target_y: float) -> float:
 
 
 def preview(now: Moment) -> float:
-    """Return the preview distance of a driver [m]."""
+    """Return the distance [m] ahead of the car at which the driver looks."""
     return max(4.0, 0.6 * now.vx)
 
 
 def smooth_step(u: float) -> float:
-    """Return 0 before u = 0, 1 after u = 1, and 3u² − 2u³ between them, which has no kink."""
+    """Return 0 for u < 0, 1 for u > 1, and 3u² − 2u³ between, a transition without a kink."""
     u = min(max(u, 0.0), 1.0)
     return u * u * (3.0 - 2.0 * u)
 
 
 def lane_change_path(s: float) -> float:
-    """Return the lateral position [m] of a double lane change at distance s: gates like those of
-    ISO 3888-1, 3.5 m over.
+    """Return the lateral position [m] of a double lane change at distance s [m]: gates similar to
+    ISO 3888-1, with an offset of 3.5 m.
     """
     return 3.5 * (smooth_step((s - 20.0) / 30.0) - smooth_step((s - 75.0) / 25.0))
 
@@ -134,8 +140,8 @@ def slalom(now: Moment) -> tuple[float, float]:
 
 
 def sine(now: Moment) -> tuple[float, float]:
-    """Steer to and fro at half a hertz, with the amplitude for 4 m/s^2 of a bicycle model without
-    slip.
+    """Steer sinusoidally at half a hertz, with the amplitude that gives 4 m/s^2 in a bicycle model
+    without slip.
     """
     amplitude = min(WHEELBASE * 4.0 / now.speed**2, 0.15)
     return amplitude * math.sin(math.pi * max(now.t - 1.0, 0.0)), hold(now)
@@ -154,7 +160,9 @@ def braking(now: Moment) -> tuple[float, float]:
 
 
 def split_braking(now: Moment) -> tuple[float, float]:
-    """Brake in the same way; the driver keeps the car straight while one side pulls."""
+    """Brake as in `braking`; the driver keeps the car straight on a road with different friction on
+    both sides.
+    """
     return steer_to(now, now.x + preview(now), 0.0), braking(now)[1]
 
 
@@ -166,7 +174,7 @@ def gentle_braking(now: Moment) -> tuple[float, float]:
 
 
 def constant_radius(now: Moment) -> tuple[float, float]:
-    """Drive a circle of 40 m radius to the left, entered straight (ISO 4138)."""
+    """Drive a circle of 40 m radius to the left after a straight entry (ISO 4138)."""
     radius = 40.0
     look = preview(now)
     angle = math.atan2(now.x, radius - now.y) + look / radius
@@ -174,17 +182,17 @@ def constant_radius(now: Moment) -> tuple[float, float]:
 
 
 def straight(now: Moment) -> tuple[float, float]:
-    """Drive straight on at constant speed, which carries no information on the road."""
+    """Drive straight at constant speed, which gives no information about the road."""
     return steer_to(now, now.x + preview(now), 0.0), hold(now)
 
 
 def j_turn(now: Moment) -> tuple[float, float]:
-    """Step the steering after one second and hold it (ISO 7401)."""
+    """Turn the steering to a constant angle after one second and hold it (ISO 7401)."""
     return 0.06 * smooth_step((now.t - 1.0) / 0.3), hold(now)
 
 
 def two_lane_changes(now: Moment) -> tuple[float, float]:
-    """Drive a double lane change, and another from 110 m on."""
+    """Drive a double lane change, and a second one from 110 m on."""
     ahead = now.x + preview(now)
     return steer_to(now, ahead, lane_change_path(ahead) + lane_change_path(ahead - 110.0)), hold(
         now
@@ -192,7 +200,7 @@ def two_lane_changes(now: Moment) -> tuple[float, float]:
 
 
 def accelerating_sine(now: Moment) -> tuple[float, float]:
-    """Steer in a sine, from six seconds on 5 m/s faster."""
+    """Steer sinusoidally, and increase the speed by 5 m/s after six seconds."""
     return sine(now)[0], min(hold(now, now.speed + 5.0 * smooth_step((now.t - 6.0) / 4.0)), 2.0)
 
 
@@ -209,8 +217,8 @@ def gaining_slalom(now: Moment) -> tuple[float, float]:
 
 
 def low_turn(now: Moment) -> tuple[float, float]:
-    """Turn the steering wheel by 60 degrees within .3 s and hold it; the road wheel turns by one
-    sixteenth of that.
+    """Turn the steering wheel by 60 degrees within .3 s and hold it. The road wheels turn by one
+    sixteenth of that angle.
     """
     return math.radians(60.0) / 16.0 * smooth_step(now.t / 0.3), hold(now)
 
@@ -221,7 +229,7 @@ def firm_acceleration(now: Moment) -> tuple[float, float]:
 
 
 def brisk_acceleration(now: Moment) -> tuple[float, float]:
-    """Accelerate with 0.45 g after one second, straight on."""
+    """Accelerate straight with 0.45 g after one second."""
     return steer_to(now, now.x + preview(now), 0.0), 0.45 * GRAVITY if now.t >= 1.0 else hold(now)
 
 
@@ -233,7 +241,9 @@ def moderate_braking(now: Moment) -> tuple[float, float]:
 
 
 def pulses(now: Moment) -> tuple[float, float]:
-    """Alternate two seconds of throttle and two of brakes in a gentle weave, like town traffic."""
+    """Alternate two seconds of throttle and two seconds of braking while weaving slightly, as in
+    town traffic.
+    """
     wanted = 2.5 if now.t % 4.0 < 2.0 else -2.5
     return 0.03 * math.sin(
         2.0 * now.t
@@ -246,22 +256,22 @@ def standing(_now: Moment) -> tuple[float, float]:
 
 
 def stop_and_go(now: Moment) -> tuple[float, float]:
-    """Repeat: drive straight for eight seconds, stop with 2.5 m/s^2, rest for six seconds, as at
-    traffic lights.
+    """Repeat: drive straight for eight seconds, stop with 2.5 m/s^2 and wait for the rest of six
+    seconds, as at traffic lights.
     """
     go = now.t % 14.0 < 8.0
     return steer_to(now, now.x + preview(now), 0.0), min(hold(now), 2.0) if go else -2.5
 
 
 def throttle(_now: Moment) -> tuple[float, float]:
-    """Accelerate with 3 m/s^2 from the first sample on, wheels straight: "throttle opening of 0.3"
-    of paper 003.
+    """Accelerate with 3 m/s^2 from the first sample on, with straight wheels: the "throttle opening
+    of 0.3" of paper 003.
     """
     return 0.0, 3.0
 
 
 def kmh(speed: float) -> float:
-    """Convert a speed from km/h to m/s."""
+    """Return a speed in m/s, converted from km/h."""
     return speed / 3.6
 
 

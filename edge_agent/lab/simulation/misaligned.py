@@ -1,21 +1,22 @@
-"""Errors of devices mounted in real cars: tilted mounts, steering offset, unequal wheels, coarse
-counters, clock offsets.
+"""Sensor errors of real cars: tilted mounts, steering offset, unequal wheels, coarse wheel speed
+counters, clock delays.
 
-Legend (drawn once per vehicle, each number a hash of (seed, vehicle, its place), so that none moves
-another)
+The errors are drawn once per vehicle. Each number is a hash of (seed, vehicle, its index), so that
+the numbers do not influence each other.
+
+Legend
     θ, φ, ψ  pitch, roll and yaw of the inertial unit's mount [rad], to first order:
              a_x' = a_x + g θ + ψ a_y,  a_y' = a_y + g φ − ψ a_x
-    δ        front wheel's angle: δ' = δ_0 + δ (1 + γ + β |δ|/WIDE), offset, gain, and a map that
-             depends on angle
+    δ        front wheel angle: δ' = δ_0 + δ (1 + γ + β |δ|/WIDE), with offset, gain, and a gain
+             error that depends on the angle
     ε        of each wheel: ω' = ω (1 + ε), as of a radius smaller by ε
-    Δω       wheel speeds come in steps of it; a wheel that stands reads zero, since teeth are
-             counted
-    τ        each device reports the moment τ ago
+    Δω       step width of wheel speeds; a wheel that stands reads zero, because teeth are counted
+    τ        each device reports the state of τ ago
 
-Sizes are those met in eleven public logs of real cars: offsets of a_x .22 to .96 and of a_y .07 to
-.54 m/s^2, steering 1 to 17 mrad, gains of steering off by 3 % at speed and 5 to 15 % at .3 to .5
-rad, radii .15 to 1.6 % apart, wheel speeds in steps of up to 1 km/h, clocks .02 to .4 s apart, and
-torque in hardly any.
+The sizes are those found in eleven public logs of real cars: offsets of a_x .22 to .96 and of a_y
+.07 to .54 m/s^2, steering offsets of 1 to 17 mrad, steering gain errors of 3 % at speed and 5 to 15
+% at .3 to .5 rad, radii that differ by .15 to 1.6 %, wheel speeds in steps of up to 1 km/h, clock
+differences of .02 to .4 s, and torque in hardly any log.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ DEVICE_OF: Final = np.array([0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 
 
 @dataclass(frozen=True)
 class Misalignment:
-    """Sizes of the misalignments of a fleet: standard deviations, or the largest size where the
+    """Sizes of the sensor errors of a fleet: standard deviations, or the largest value where the
     comment says so.
     """
 
@@ -68,7 +69,7 @@ MISALIGNED: Final = {
 
 
 class Misaligned(IntEnum):
-    """Columns of a vehicle's misalignment."""
+    """Index of a column in a vehicle's row of sensor errors."""
 
     ROUGH = 0  # whether there is any
     AX = 1  # [m/s^2] g θ
@@ -84,7 +85,9 @@ class Misaligned(IntEnum):
 
 
 def misalignment_row(size: Misalignment, seed: int, index: int) -> FloatArray:
-    """Return the misalignment of vehicle `index`, shape (COLUMNS,), columns `Misaligned`."""
+    """Return the sensor errors of vehicle `index`, shape (COLUMNS,), with the columns of
+    `Misaligned`.
+    """
     key = key_of(seed, index, MOUNT_STREAM)
     row = np.zeros(COLUMNS)
     row[Misaligned.ROUGH] = float(size != ALIGNED)
@@ -107,8 +110,8 @@ COLUMNS: Final = int(Misaligned.TORQUELESS) + 1
 
 
 def memory_of(rows: FloatArray, rate_hz: float) -> int:
-    """Return the largest delay of any clock in the rows (N, COLUMNS), in samples, plus one; 0
-    without delay.
+    """Return the largest clock delay in the rows (N, COLUMNS), in samples, plus one; 0 without a
+    delay.
     """
     lag = float(rows[:, Misaligned.LAG : Misaligned.LAG + DEVICES].max())
     return math.ceil(lag * rate_hz) + 1 if lag > 0.0 else 0
@@ -116,8 +119,10 @@ def memory_of(rows: FloatArray, rate_hz: float) -> int:
 
 @compiled
 def delayed_record(records: FloatArray, now: int, samples: float, record: FloatArray) -> None:
-    """Fill `record` from the records (T, 32) `samples` before row `now`, linear between them;
-    earlier times get the first record.
+    """Fill `record` with the record (T, 32) of the time `samples` before row `now`, interpolated
+    linearly.
+
+    For times before the first record, the first record is used.
     """
     whole = math.floor(samples)
     share = samples - whole
@@ -129,7 +134,7 @@ def delayed_record(records: FloatArray, now: int, samples: float, record: FloatA
 
 @compiled
 def misalign(mounted: FloatArray, signals: FloatArray) -> None:
-    """Turn true readings (18,) into those of misaligned devices, in place."""
+    """Convert true readings (18,) to those of misaligned sensors, in place."""
     ax = signals[S.AX]
     ay = signals[S.AY]
     signals[S.AX] = ax + mounted[Misaligned.AX] + mounted[Misaligned.TURN] * ay
@@ -145,8 +150,8 @@ def misalign(mounted: FloatArray, signals: FloatArray) -> None:
 
 @compiled
 def quantise_speeds(record: FloatArray, mounted: FloatArray, signals: FloatArray) -> None:
-    """Quantise wheel speeds into steps, with zero for a wheel that stands; remove torque where the
-    car has none.
+    """Round the wheel speeds to steps, with zero for a wheel that stands. Remove the torque
+    readings if the car has no torque signal.
     """
     step = mounted[Misaligned.STEP]
     for i in range(4):

@@ -2,19 +2,21 @@
 (section 4.1).
 
 Legend, in the rotor's d-q axes
-    u, i        voltage [V] and current [A] of an axis           L, R   inductance [H], resistance
-    [ohm] of the stator
-    psi         flux of the magnets [Wb]                         p      pole pairs
-    omega_e     electrical speed p*omega_m [rad/s]               G      gear from motor to wheel
+    u, i        voltage [V] and current [A] of an axis
+    L, R        inductance [H] and resistance [ohm] of the stator
+    psi         flux of the magnets [Wb]
+    p           pole pairs
+    omega_e     electrical speed p*omega_m [rad/s]
+    G           gear ratio from motor to wheel
 
     L_d*i_d' = u_d - R*i_d + omega_e*L_q*i_q                     voltage of the d axis
     L_q*i_q' = u_q - R*i_q - omega_e*(L_d*i_d + psi)             voltage of the q axis
     T = 1.5*p*(psi*i_q + (L_d - L_q)*i_d*i_q)                    torque
 
-The inverter's current control is proportional-integral with the motor's own terms fed forward, i_d
-is kept at zero, and the voltage is limited. The paper gives no constants: these are of an ordinary
-hub motor. The equation of mechanical motion is the wheel's own in `plant`, whose inertia holds the
-rotor; viscous friction is left out, because the filters take the torque at the wheel.
+The inverter's current control is proportional-integral with feed-forward of the motor's own terms.
+The target of i_d is zero, and the voltage is limited. The paper gives no constants; these are of an
+ordinary hub motor. The equation of mechanical motion is the wheel's own in `plant`, whose inertia
+includes the rotor. Viscous friction is left out, because the filters use the torque at the wheel.
 """
 
 from __future__ import annotations
@@ -52,18 +54,18 @@ class Pmsm(NamedTuple):
 
 
 def speed_demand(motor: Pmsm, error: float, summed: float, acceleration: float) -> float:
-    """Return the acceleration [m/s^2] that the PID demands.
+    """Return the acceleration [m/s^2] that the PID controller demands.
 
     Args:
-        error: demanded speed minus the true one [m/s].
-        summed: its integral over time [m].
-        acceleration: true one [m/s^2]; it replaces the derivative of the error.
+        error: demanded minus true speed [m/s].
+        summed: integral of the error over time [m].
+        acceleration: true acceleration [m/s^2]; it replaces the derivative of the error.
     """
     return motor.proportional * error + motor.integral * summed - motor.derivative * acceleration
 
 
 def at_rest() -> FloatArray:
-    """Return the state (4, 4) of four motors without current."""
+    """Return the initial state (4, 4) of four motors without current."""
     return np.zeros((4, 4))
 
 

@@ -1,4 +1,6 @@
-"""Metres on a plane that touches the earth at an origin: x to the east, y to the north."""
+"""Conversion between positions on earth and coordinates in metres: x to the east, y to the north of
+an origin.
+"""
 
 from __future__ import annotations
 

@@ -1,36 +1,41 @@
-"""The simulated vehicle: a planar body on four wheels with Magic Formula tyres.
+"""The simulated vehicle ("plant"): a planar body on four wheels with Magic Formula tyres.
 
-It shares its equations with `edge_agent.dynamics` but is not the estimator's model: its tyres have
-another shape, their stiffness grows less than the load, its loads follow the accelerations with a
-lag, it rolls, drags and resists rolling.
+It shares equations with `edge_agent.dynamics`, but it is not the estimator's model: its tyre curve
+has another shape, tyre stiffness grows less than the load, the wheel loads follow the accelerations
+with a lag, the body rolls, and there are air drag and rolling resistance.
 
-    m (dv_x/dt − r v_y) = ΣX − D v_x|v_x| + m g_x    v_x, v_y  speed of the centre of gravity in the
-                                                     body [m/s]
-    m (dv_y/dt + r v_x) = ΣY + m g_y             r         yaw rate [rad/s]
-    I_z dr/dt = Σ (x_i Y_i − y_i X_i)            X, Y      wheel forces in the body's axes [N]
-    J dω/dt = T − R F_x − k_r R F_z              ω, T      wheel speed [rad/s], torque at the wheel [N·m]
+    m (dv_x/dt − r v_y) = ΣX − D v_x|v_x| + m g_x
+    m (dv_y/dt + r v_x) = ΣY + m g_y
+    I_z dr/dt = Σ (x_i Y_i − y_i X_i)
+    J dω/dt = T − R F_x − k_r R F_z
 
-    θ = K s / (μ F_z),  F = μ F_z f(|θ|) θ/|θ|   s         slip (longitudinal, lateral), K its stiffness
-    K = κ F_z (1 − ε (F_z/F_0 − 1))              F_0       static load, ε how degressive the tyre is
+    v_x, v_y   velocity of the centre of gravity in the body's axes [m/s]
+    r          yaw rate [rad/s]
+    X, Y       wheel forces in the body's axes [N]
+    ω, T       wheel speed [rad/s], torque at the wheel [N·m]
+
+    θ = K s / (μ F_z),  F = μ F_z f(|θ|) θ/|θ|   s    slip (longitudinal, lateral), K its stiffness
+    K = κ F_z (1 − ε (F_z/F_0 − 1))              F_0  static load, ε degression of the stiffness
 
     g_x, g_y = −g (h_x, h_y)/√(1 + h_x² + h_y²)  h_x, h_y  rise of the road per metre ahead and to
-    the left
+                                                           the left
 
-An accelerometer feels all forces but gravity: (dv_x/dt − r v_y − g_x), so g sin(slope) where the
-vehicle stands. The load transfer follows the felt acceleration, and the loads add up to the
-weight's part that is normal to the road.
+An accelerometer measures all forces except gravity: (dv_x/dt − r v_y − g_x), so g sin(slope) where
+the vehicle stands. The load transfer follows the measured acceleration, and the sum of the loads is
+the part of the weight normal to the road.
 
 K does not depend on μ, unless the tyre softens: friction acts by similarity (Pacejka, Tyre and
 Vehicle Dynamics, 3rd ed., §4.2), and |F| ≤ μ F_z.
 
-A vehicle may have tyres with a relaxation length (RELAXATION: four fifths of the slip builds up
-over that length) and controllers that work in cycles and report it (ABS_HZ: `controllers.py`).
-Without them slip control is smooth.
+A vehicle may have tyres with a relaxation length (RELAXATION: four fifths of the slip build up over
+that length), and controllers that work in cycles and report their activity (ABS_HZ:
+`controllers.py`). Without them slip control is smooth.
 
-Explicit Euler for the body and linearly implicit Euler for the wheels, whose slip is stiff: with
-the secant slope of the tyre in the denominator a wheel step is stable at any speed. The tyre's
-force is taken at the step's end, where the ground has changed its speed too; without that term a
-wheel would seem to have twice its inertia. Wheel order fl, fr, rl, rr; ISO 8855 signs.
+Integration: explicit Euler for the body, and linearly implicit Euler for the wheels, because their
+slip is stiff. With the secant slope of the tyre in the denominator a wheel step is stable at any
+speed. The tyre's force is that at the end of the step, when the speed of the ground under the wheel
+has changed too; without that term a wheel would seem to have twice its inertia. Wheel order fl, fr,
+rl, rr; ISO 8855 signs.
 """
 
 from __future__ import annotations
@@ -67,8 +72,8 @@ STILL: Final = 0.02
 
 @compiled
 def gravity(u: FloatArray) -> tuple[float, float, float]:
-    """Return (g_x, g_y) in the body's axes [m/s^2], and the share of gravity that presses on the
-    road.
+    """Return (g_x, g_y) in the body's axes [m/s^2], and the share of gravity that acts normal to
+    the road.
     """
     ahead = u[Control.TILT, 0]
     left = u[Control.TILT, 1]
@@ -78,14 +83,14 @@ def gravity(u: FloatArray) -> tuple[float, float, float]:
 
 @compiled
 def stiffness_per_load(slope: float, degression: float, load: float, at_rest: float) -> float:
-    """Return K/F_z of a wheel under `load` [N] that carries `at_rest` [N] when standing."""
+    """Return the stiffness K/F_z of a wheel under `load` [N] whose static load is `at_rest` [N]."""
     return slope * max(1.0 - degression * (load / at_rest - 1.0), SOFTEST)
 
 
 @compiled
 def allowed_share(slip: float, limit: float) -> float:
-    """Return the share of the torque that slip control allows: all up to `limit`, nothing from
-    twice the limit.
+    """Return the share of the torque that slip control allows: 1 up to the slip `limit`, decreasing
+    to 0 at twice the limit.
     """
     return min(max(2.0 - abs(slip) / limit, 0.0), 1.0)
 
@@ -94,8 +99,8 @@ def allowed_share(slip: float, limit: float) -> float:
 def wheel_torques(
     x: FloatArray, p: FloatArray, u: FloatArray, i: int, slip: float
 ) -> tuple[float, float]:
-    """Return the driving and the braking torque [N·m] that controllers leave to wheel `i` at its
-    slip.
+    """Return the driving and the braking torque [N·m] at wheel `i` after the action of the
+    controllers at this slip.
     """
     drive = u[Control.DRIVE, i]
     brake = u[Control.BRAKE, i]
@@ -118,8 +123,8 @@ def wheel_torques(
 
 @compiled
 def relax_slip(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
-    """Let the slip of the tyres build up for `dt` [s] over their relaxation length, after the
-    wheels have turned.
+    """Advance the slip of the tyres by `dt` [s] over their relaxation length, after the wheel
+    speeds have been updated.
     """
     for i in range(4):
         along, across = wheel_velocity(
@@ -134,7 +139,9 @@ def relax_slip(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
 
 @compiled
 def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> None:
-    """Fill `w` (8, 4) for the state `x`, parameters `p` and inputs `u` (5, 4)."""
+    """Write loads, forces, slips and torques of the wheels to `w` (8, 4), for the state `x`,
+    parameters `p` and inputs `u` (5, 4).
+    """
     loads = wheel_loads(body_of(p), x[Motion.AX_LAGGED], x[Motion.AY_LAGGED])
     at_rest = wheel_loads(body_of(p), 0.0, 0.0)
     _, _, share = gravity(u)
@@ -187,10 +194,10 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
 def body_accelerations(
     x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray
 ) -> tuple[float, float, float]:
-    """Return (a_x, a_y) that an accelerometer at the centre of gravity feels [m/s^2], and the yaw
-    acceleration [rad/s^2].
+    """Return (a_x, a_y) that an accelerometer at the centre of gravity measures [m/s^2], and the
+    yaw acceleration [rad/s^2].
 
-    `w` is filled.
+    `w` must contain the wheel forces.
     """
     ax, ay, yaw_acceleration = planar_accelerations(p, w[Wheel.FX], w[Wheel.FY], u[Control.STEER])
     return (
@@ -210,11 +217,11 @@ def turn_wheels(
     gain: float,
     yaw_acceleration: float,
 ) -> None:
-    """Apply one linearly implicit Euler step to the wheel speeds in `x`: every torque that falls
-    with ω damps it.
+    """Apply one linearly implicit Euler step of `dt` [s] to the wheel speeds in `x`: every torque
+    that decreases with ω acts as damping.
 
-    gain is dv_x/dt [m/s^2], yaw_acceleration in rad/s^2: the change of the ground's speed under the
-    wheels.
+    `gain` is dv_x/dt [m/s^2], and `yaw_acceleration` is in rad/s^2. They give the change of the
+    ground's speed under the wheels.
     """
     radius = p[Parameter.RADIUS]
     for i in range(4):
@@ -243,8 +250,8 @@ def turn_wheels(
 
 @compiled
 def is_held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
-    """Return True if the brakes hold a vehicle that stands: brakes and tyres are stronger than
-    engine and slope.
+    """Return True if the brakes hold a standing vehicle: brakes and tyres are stronger than engine
+    and slope.
     """
     if abs(x[Motion.VX]) > STILL or abs(x[Motion.VY]) > STILL or abs(x[Motion.YAW_RATE]) > STILL:
         return False
@@ -262,8 +269,8 @@ def is_held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
 
 @compiled
 def settle_standing(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
-    """Apply one step to a vehicle for which `is_held`: only the suspension still moves, to its
-    balance on the slope.
+    """Apply one step to a vehicle that is held by its brakes: only the suspension moves, towards
+    its equilibrium on the slope.
     """
     along, across, _ = gravity(u)
     x[Motion.VX] = x[Motion.VY] = x[Motion.YAW_RATE] = 0.0
@@ -278,7 +285,7 @@ def settle_standing(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> N
 def advance(
     x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float, substeps: int
 ) -> None:
-    """Advance the state `x` by `substeps` steps of `dt` [s] with constant inputs `u`; `w` is
+    """Advance the state `x` by `substeps` steps of `dt` [s] with constant inputs `u`; `w` (8, 4) is
     scratch.
     """
     along, across, _ = gravity(u)
@@ -314,9 +321,9 @@ def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
     """Fill STEER, DRIVE and BRAKE of `u` from a mean road-wheel angle [rad] and a longitudinal
     force [N].
 
-    The steered wheels follow Ackermann: they point at one centre on the line of the rear axle.
-    Where the rear wheels steer too, `steer` is the angle of a car without that on the same circle:
-    the front wheels turn more, or less.
+    The steered wheels follow Ackermann geometry: their axes meet at one point on the line of the
+    rear axle. If the rear wheels steer too, `steer` is the angle of a car without rear steering on
+    the same circle, and the front wheels turn more or less than that.
     """
     base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
     curvature = math.tan(steer) / base
@@ -337,8 +344,8 @@ def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
 
 @compiled
 def regenerate(x: FloatArray, p: FloatArray, u: FloatArray) -> None:
-    """Let engine or generator give the first part of the braking in `u`, at the driven wheels
-    alone.
+    """Replace the first part of the braking in `u` by drag torque of engine or generator, at the
+    driven wheels only.
     """
     total = 0.0
     for i in range(4):
@@ -355,8 +362,8 @@ def regenerate(x: FloatArray, p: FloatArray, u: FloatArray) -> None:
 
 @compiled
 def start_at(x: FloatArray, p: FloatArray, place: tuple[float, float, float], speed: float) -> None:
-    """Set the state `x` to rolling straight on at `speed` [m/s] from place (x [m], y [m], yaw
-    [rad]).
+    """Set the state `x` to straight rolling at `speed` [m/s], starting at `place` (x [m], y [m],
+    yaw [rad]).
     """
     x[:] = 0.0
     x[Motion.VX] = speed
@@ -365,7 +372,7 @@ def start_at(x: FloatArray, p: FloatArray, place: tuple[float, float, float], sp
 
 
 def substeps_of(rate_hz: float) -> int:
-    """Return the number of equal plant steps of at most LONGEST_SUBSTEP in one sample."""
+    """Return the number of equal integration steps, of at most LONGEST_SUBSTEP each, in one sample."""
     return max(1, math.ceil(round(1.0 / (rate_hz * LONGEST_SUBSTEP), 9)))
 
 

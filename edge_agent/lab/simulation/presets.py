@@ -1,5 +1,5 @@
-"""The vehicles of the simulator: their true parameters, and the vehicle files that describe
-them.
+"""The vehicles of the simulator: their true parameters, and the (inexact) vehicle files that
+describe them.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class TrueVehicle:
     """True parameters of a vehicle, including those that no vehicle file contains.
 
     The tyre's shape c and curvature e give peaks between θ = 2.3 (c 1.6, e -.4) and 3.5 (c 1.4, e
-    .1) and a falling branch. An estimator with the textbook shape is wrong about it by 5 to 15 % of
-    the force in between.
+    .1) and a falling branch. An estimator that assumes the textbook shape has force errors of 5 to
+    15 % there.
     """
 
     vehicle: Vehicle
@@ -120,8 +120,8 @@ def car(
     radius: float,
     drive_front: float,
 ) -> Vehicle:
-    """Return a vehicle whose tyres have the usual stiffness for its load: 20 per unit slip and 17
-    per radian.
+    """Return a vehicle whose tyres have the usual stiffness for their load: 20 per unit of
+    longitudinal slip, and 17 per radian of slip angle.
     """
     load = mass * GRAVITY / 4.0
     return Vehicle(
@@ -202,7 +202,8 @@ KNOWN: Final = {
 
 
 def true_vehicle(vehicle: str | Vehicle | TrueVehicle) -> TrueVehicle:
-    """Return a preset by name, or a vehicle with ordinary tyres from its parameters.
+    """Return a preset by name, or a true vehicle with ordinary tyres from the parameters of a
+    vehicle file.
 
     Raises:
         InputError: there is no preset of that name.
@@ -221,10 +222,10 @@ def true_vehicle(vehicle: str | Vehicle | TrueVehicle) -> TrueVehicle:
 
 
 def matched_to_papers(vehicle: TrueVehicle) -> TrueVehicle:
-    """Return the vehicle without effects that the papers' model leaves out: drag, rolling
-    resistance, lagging loads, degressive tyres.
+    """Return the vehicle without the effects that the papers' model leaves out: drag, rolling
+    resistance, lag of the loads, degressive tyres.
 
-    The tyre's curve is a Magic Formula as steep in the middle as Dugoff's.
+    The tyre curve is a Magic Formula that is as steep as Dugoff's in its middle part.
     """
     return replace(
         vehicle, shape=1.5, curvature=-1.0, degression=0.0, lag=1e-3, drag=0.0, rolling=0.0
@@ -232,7 +233,7 @@ def matched_to_papers(vehicle: TrueVehicle) -> TrueVehicle:
 
 
 def as_printed(vehicle: TrueVehicle, *, proportional: bool = False) -> TrueVehicle:
-    """Return the `matched_to_papers` vehicle with Dugoff tyres; proportional: stiffness is
+    """Return the `matched_to_papers` vehicle with Dugoff tyres. With `proportional`, stiffness is
     proportional to friction.
     """
     stiffness = "proportional-to-friction" if proportional else "similarity"
@@ -240,8 +241,8 @@ def as_printed(vehicle: TrueVehicle, *, proportional: bool = False) -> TrueVehic
 
 
 def nominal(truth: TrueVehicle, rng: np.random.Generator) -> Vehicle:
-    """Return the content of the vehicle file: the true parameters, each with a normal error of the
-    size in KNOWN.
+    """Return the content of the vehicle file: the true parameters, each with a random normal error
+    of the size in KNOWN.
     """
     file_values = {
         name: getattr(truth.vehicle, name) * (1.0 + rng.normal(0.0, std))
@@ -251,8 +252,8 @@ def nominal(truth: TrueVehicle, rng: np.random.Generator) -> Vehicle:
 
 
 def one_of_a_fleet(index: int, name: str, rng: np.random.Generator) -> TrueVehicle:
-    """Return vehicle number `index` of a fleet: the presets in turn, each with its own load, tyres
-    and suspension.
+    """Return vehicle number `index` of a fleet. The presets are used in turn, each with random
+    load, tyres and suspension.
     """
     base = list(PRESETS.values())[index % len(PRESETS)]
     extra = rng.uniform(0.0, 0.12)  # passengers and luggage
@@ -274,10 +275,11 @@ def one_of_a_fleet(index: int, name: str, rng: np.random.Generator) -> TrueVehic
 
 
 def winter_equipped(truth: TrueVehicle, rng: np.random.Generator) -> TrueVehicle:
-    """Return the vehicle with relaxing tyres, ABS in cycles, mostly traction control and ESC, and
-    drag at lift-off.
+    """Return the vehicle with winter equipment: tyres with relaxation length, ABS that works in
+    cycles, in most cases traction control and ESC, and drag torque when the accelerator is
+    released.
 
-    A third of the vehicles regenerate as electric cars do; the others have the drag of an engine.
+    A third of the vehicles regenerate like electric cars; the others have the drag of an engine.
     """
     electric = rng.uniform() < 1.0 / 3.0
     return replace(

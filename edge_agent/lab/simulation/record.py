@@ -1,5 +1,5 @@
-"""Records: the truth of one sample of one vehicle, from which sensors are simulated and estimates
-are judged.
+"""Records with the true values of one sample of one vehicle. Sensors are simulated from them, and
+estimates are compared with them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from schemas.thresholds import GRAVITY
 
 
 class RecordColumn(IntEnum):
-    """Columns of a record: the truth of one sample of one vehicle."""
+    """Index of a column of a record."""
 
     AX = 0  # [m/s^2] that an accelerometer at the centre of gravity feels, as the road lies
     AY = 1
@@ -47,8 +47,8 @@ RECORD: Final = 39
 
 @compiled
 def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: FloatArray) -> None:
-    """Fill `record` (RECORD,) with the truth of this instant under the inputs `u`; fills `w`
-    too.
+    """Fill `record` (RECORD,) with the true values at this instant under the inputs `u`. The
+    function also fills `w`.
     """
     wheel_forces(x, p, u, w)
     ax, ay, _ = body_accelerations(x, p, u, w)
@@ -90,7 +90,7 @@ def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: 
 
 @compiled
 def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArray) -> None:
-    """Fill the record of a vehicle that is held: brakes and tyres balance the slope."""
+    """Fill the record of a standing vehicle that is held: brakes and tyres balance the slope."""
     along, across, share = gravity(u)
     record[RecordColumn.AX], record[RecordColumn.AY] = -along, -across
     record[RecordColumn.AX_FELT] = -along + p[TrueParameter.PITCH_LEAK] * x[Motion.AX_LAGGED]

@@ -1,17 +1,17 @@
-"""Relief: the slope of the road as the gradient of one height over the plane, and the crossfall of
+"""Relief: the slope of the road as the gradient of a height over the plane, and the crossfall of
 its lanes.
 
 Legend
     h       height [m] over x (east) and y (north) [m]
-    ∇h      rise per metre east and north [1]; a wave of steepest slope a and length λ towards the
-            unit vector e gives a cos(2π s/λ + φ) e, with s = (x, y)·e; its limit of infinite length
-            is one slope everywhere
-    c, b    crossfall to the right of a lane [1], and bank per curvature [m], which lowers the
-            inside of a bend
+    ∇h      rise per metre east and north [1]; a wave with steepest slope a and length λ in the
+            direction of the unit vector e gives a cos(2π s/λ + φ) e, with s = (x, y)·e; with
+            infinite length it is one constant slope
+    c, b    crossfall to the right of a lane [1], and banking per curvature [m], which lowers the
+            inner side of a bend
 
-Slopes add up and are cut at STEEPEST. Positions are measured along the road, so that a metre on 8 %
-is a metre here and .997 m on a map. Sizes are those of real roads: standard deviation 3 %, hardly
-ever beyond 8 %, crossfall 2.5 %.
+Slopes add up and are limited to STEEPEST. Positions are measured along the road, so that a metre on
+a slope of 8 % is a metre here and .997 m on a map. The sizes are those of real roads: standard
+deviation 3 %, hardly ever more than 8 %, crossfall 2.5 %.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ RELIEF_STREAM: Final = 20
 
 @dataclass(frozen=True)
 class Wave:
-    """A slope that swings between -peak and peak along the direction `towards` [rad,
+    """A slope that varies between -peak and peak along the direction `towards` [rad,
     counter-clockwise from x].
     """
 
@@ -54,8 +54,8 @@ class Wave:
 
 @dataclass(frozen=True)
 class Relief:
-    """Shape of the ground: `waves` that add up, `crossfall` of every lane [1], `banking` per
-    curvature [m].
+    """Shape of the ground: the sum of `waves`, the `crossfall` of every lane [1], and the `banking`
+    per curvature [m].
     """
 
     waves: tuple[Wave, ...] = ()
@@ -64,8 +64,8 @@ class Relief:
 
     @property
     def table(self) -> FloatArray:
-        """Return rows for `gradient`, shape (1 + waves, 6): crossfall and banking, then the waves
-        with columns A.
+        """Return the table for `gradient`, shape (1 + waves, 6): crossfall and banking in the first
+        row, then one row per wave (`WaveColumn`).
         """
         table = np.zeros((1 + len(self.waves), len(WaveColumn)))
         table[0, :2] = self.crossfall, self.banking
@@ -83,7 +83,7 @@ class Relief:
 
 
 class WaveColumn(IntEnum):
-    """Columns of a wave."""
+    """Index of a column in the table row of a wave."""
 
     PEAK = 0
     EAST = 1
@@ -95,8 +95,10 @@ class WaveColumn(IntEnum):
 
 @compiled
 def cross_slope(table: FloatArray, curvature: float) -> float:
-    """Return the cross slope of a lane of this `curvature` [1/m], positive if it rises to the left
-    [1]: the crossfall, and less in a bend to the left.
+    """Return the cross slope [1] of a lane with this `curvature` [1/m], positive if the road rises
+    to the left.
+
+    It is the crossfall minus the banking, so it is smaller in a bend to the left.
     """
     return float(table[0, 0] - table[0, 1] * curvature)
 
@@ -105,8 +107,8 @@ def cross_slope(table: FloatArray, curvature: float) -> float:
 def gradient(
     table: FloatArray, place: tuple[float, float], heading: tuple[float, float], left: float
 ) -> tuple[float, float]:
-    """Return ∇h (east, north) at `place` (x, y) [m] of a road that rises by `left` [1] to the left
-    of `heading` (cos, sin).
+    """Return ∇h (east, north) at `place` (x, y) [m], for a road that rises by `left` [1] to the
+    left of the direction `heading` (cos, sin).
     """
     east = -left * heading[1]
     north = left * heading[0]
@@ -127,7 +129,7 @@ def gradient(
 
 @compiled
 def slope_in_body(east: float, north: float, yaw: float) -> tuple[float, float]:
-    """Return the rise per metre ahead of a vehicle of that heading [rad], and to its left."""
+    """Return the rise per metre ahead of a vehicle with the heading `yaw` [rad], and to its left."""
     c = math.cos(yaw)
     s = math.sin(yaw)
     return c * east + s * north, c * north - s * east
@@ -142,7 +144,7 @@ def level_relief(_seed: int) -> Relief:
 
 
 def rolling_relief(seed: int) -> Relief:
-    """Return waves of 3 % along the road, 300 and 120 m long."""
+    """Return waves of 3 % slope along the road, 300 and 120 m long."""
     key = key_of(seed, RELIEF_STREAM)
     return Relief(
         tuple(
@@ -152,7 +154,7 @@ def rolling_relief(seed: int) -> Relief:
 
 
 def stepped_relief(seed: int) -> Relief:
-    """Return slopes of 4 % up and down in turn, 60 m each, with kinks between."""
+    """Return slopes of alternately +4 % and -4 %, 60 m long each, with kinks between them."""
     return Relief(
         (Wave(0.04, 120.0, 0.0, _random_turn(key_of(seed, RELIEF_STREAM), 0), stepped=True),)
     )
@@ -164,8 +166,8 @@ def banked_relief(_seed: int) -> Relief:
 
 
 def hilly_relief(seed: int) -> Relief:
-    """Return everything at once, each drawn: a lasting slope (2 %), waves (to 3 %) that also lean,
-    steps, crossfall.
+    """Return a random combination: a constant slope (2 %), waves (up to 3 %) that also tilt the
+    road sideways, steps, and crossfall.
     """
     key = key_of(seed, RELIEF_STREAM)
     waves = [
@@ -188,10 +190,10 @@ ROADS: Final[dict[str, Callable[[int], Relief]]] = {
 
 
 def road_named(name: str | Relief, seed: int, slope: float = 0.0) -> Relief:
-    """Return the relief of that name with a lasting `slope` [1] along the track added.
+    """Return the relief with that name, with a constant `slope` [1] along the track added.
 
     Raises:
-        InputError: there is none of that name, or the slope is too steep.
+        InputError: there is no relief with that name, or the slope is too steep.
     """
     if isinstance(name, str):
         if name not in ROADS:

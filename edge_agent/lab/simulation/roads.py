@@ -1,10 +1,11 @@
-"""Roads as lanes: centre lines of straights and arcs, one lane each way on the right, and
+"""Roads as lanes: centre lines of straights and arcs, one lane per direction on the right, and
 connectors through junctions.
 
-lane a directed polyline, points about a metre apart, with heading and curvature connector a lane
-through a junction, from the end of one lane to the start of one of another road profile v²/q at
-each point [m]: the squared speed of a driver who allows q m/s^2 across and BRAKING·q along and
-knows the coming turns; it scales with q, so one profile serves all
+    lane       a directed polyline, points about a metre apart, with heading and curvature
+    connector  a lane through a junction, from the end of one lane to the start of another road's
+    profile    v²/q at each point [m]: the squared speed, over q, of a driver who accepts lateral
+               accelerations of q m/s^2 and braking of BRAKING·q and knows the next turns; because
+               v² is proportional to q, one profile serves all drivers
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ HANDLE: Final = 0.39  # of the chord: a cubic Bezier curve of 90 degrees is then
 
 
 class LanePoint(IntEnum):
-    """Columns of a lane point."""
+    """Index of a column in the table of lane points."""
 
     X = 0  # [m]
     Y = 1
@@ -46,7 +47,7 @@ MOST_WAYS: Final = 3
 
 @dataclass(frozen=True)
 class Road:
-    """A road between two junctions, straight from bend to bend, each bend an arc of `radius`
+    """A road between two junctions: straight between its bends, and each bend is an arc of `radius`
     [m].
     """
 
@@ -58,13 +59,13 @@ class Road:
 
 @dataclass(frozen=True)
 class Network:
-    """Lanes in one table of points, columns L (points, 8); lane k has `size[k]` points from
-    `first[k]` on.
+    """Lanes in one table of points, with the columns of LanePoint (points, 8). Lane k has `size[k]`
+    points from row `first[k]` on.
 
-    `ways[k]` (MOST_WAYS,) are the lanes that follow lane k, -1 where there are fewer; `spacing[k]`
-    [m] between points. Lanes before number `roads` are roads, the others connectors. `starts`
-    (vehicles,) are the lanes at whose beginnings vehicles start; None: they are spread over the
-    roads.
+    `ways[k]` (MOST_WAYS,) are the lanes that continue from lane k, -1 in unused places;
+    `spacing[k]` [m] is the distance between its points. The first `roads` lanes are roads, the
+    others connectors. `starts` (vehicles,) are the lanes at whose beginnings vehicles start; None:
+    the vehicles are distributed over the roads.
     """
 
     points: FloatArray
@@ -81,11 +82,12 @@ class Network:
 
 
 def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, ...]) -> Network:
-    """Return lanes and connectors of the roads between `junctions` (name -> (x, y) [m]).
+    """Return the network of lanes and connectors for the roads between `junctions` (name -> (x, y)
+    [m]).
 
     Raises:
-        InputError: a road leads to an unknown junction, or a junction leaves a lane without a way
-            on or with too many.
+        InputError: a road leads to an unknown junction, or a junction gives a lane no continuation
+            or too many.
     """
     lanes: list[FloatArray] = []
     leaves: list[tuple[str, int]] = []  # junction where the lane begins, and its road
@@ -127,8 +129,8 @@ def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, 
 
 
 def round_corners(corners: list[tuple[float, float]], radius: float) -> FloatArray:
-    """Return a line through the corners whose inner ones are arcs of `radius`, points a quarter of
-    a metre apart, (n, 2).
+    """Return a line through the corners, with arcs of `radius` [m] at the inner corners; points a
+    quarter of a metre apart, (n, 2).
     """
     line = [np.array(corners[0])]
     for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
@@ -154,8 +156,8 @@ def round_corners(corners: list[tuple[float, float]], radius: float) -> FloatArr
 
 
 def resample_line(line: FloatArray, spacing: float = SPACING_M) -> FloatArray:
-    """Return the same line with equally spaced points, about `spacing` [m] apart, with its ends
-    kept.
+    """Return the same line with equally spaced points, about `spacing` [m] apart, and the same
+    ends.
     """
     run = _distance_along(line)
     even = np.linspace(0.0, run[-1], max(2, round(run[-1] / spacing) + 1))
@@ -163,15 +165,15 @@ def resample_line(line: FloatArray, spacing: float = SPACING_M) -> FloatArray:
 
 
 def shifted_right(line: FloatArray, offset: float) -> FloatArray:
-    """Return the line moved to its right by `offset` [m]."""
+    """Return the line shifted to its right by `offset` [m]."""
     direction = np.gradient(line, axis=0)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return line + offset * np.column_stack([direction[:, 1], -direction[:, 0]])
 
 
 def connect_lanes(arriving: FloatArray, leaving: FloatArray) -> FloatArray:
-    """Return the way through a junction: a cubic Bezier curve that leaves one lane and joins the
-    other without a kink.
+    """Return the line through a junction: a cubic Bezier curve from the end of one lane to the
+    start of the other, without a kink.
     """
     p0 = arriving[-1]
     p3 = leaving[0]
@@ -190,7 +192,7 @@ def _unit_vectors(v: FloatArray) -> FloatArray:
 
 
 def _distance_along(line: FloatArray) -> FloatArray:
-    """Return the distance along a line at each of its points."""
+    """Return the distance along a line [m] at each of its points."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
 
 
@@ -206,14 +208,15 @@ def network_of(
     roads: int,
     allowed: list[FloatArray] | None = None,
 ) -> Network:
-    """Return a network of lanes with headings, curvatures and profiles.
+    """Return a network of lanes with headings, curvatures and speed profiles.
 
     Args:
-        lanes: equally spaced points of each, (n, 2) [m]; the first `roads` of them are roads, the
-            others connectors.
-        ways: lanes that follow each lane; none where all drives end before it does.
-        allowed: v²/q [m] that traffic leaves at each point of each lane, (n,); None: as bends and
-            junctions allow.
+        lanes: equally spaced points of each lane, (n, 2) [m]; the first `roads` lanes are roads,
+            the others connectors.
+        ways: lanes that continue from each lane; an empty list if every drive ends on the lane.
+        roads: number of lanes that are roads.
+        allowed: v²/q [m] that traffic permits at each point of each lane, (n,); None: only bends
+            and junctions limit the speed.
     """
     size = np.array([len(lane) for lane in lanes])
     spacing = np.array([_distance_along(lane)[-1] / (len(lane) - 1) for lane in lanes])
@@ -233,8 +236,8 @@ def network_of(
 
 
 def _lane_table(lane: FloatArray) -> FloatArray:
-    """Return the points of one lane with heading and smoothed curvature; the profile is still
-    empty.
+    """Return the table of the points of one lane, with heading and smoothed curvature. The profile
+    is not yet limited.
     """
     step = np.gradient(lane, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
@@ -248,9 +251,9 @@ def _lane_table(lane: FloatArray) -> FloatArray:
 def _plan_speeds(
     tables: list[FloatArray], limits: list[FloatArray], ways: list[list[int]], spacing: FloatArray
 ) -> None:
-    """Fill the profiles from their ends backwards until nothing changes.
+    """Compute the profiles backwards from the lanes' ends, repeatedly until nothing changes.
 
-    No point may need more braking than the part of the budget that the cornering there leaves.
+    The braking that a point requires is at most the part of the budget that cornering leaves there.
     """
     while True:
         before = [table[0, LanePoint.PROFILE :].copy() for table in tables]

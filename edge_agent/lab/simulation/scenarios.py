@@ -1,6 +1,4 @@
-"""Scenarios as one table: a road network, the friction on it over time, and its position on
-earth.
-"""
+"""Scenarios as a table: each has a road network, its friction over time, and its position on earth."""
 
 from __future__ import annotations
 
@@ -47,8 +45,8 @@ DRAWN_STREAM: Final = 21
 
 @dataclass(frozen=True)
 class Scenario:
-    """A place to drive. `junctions` name -> (x, y) [m]; `patches` lie upon `background`
-    friction, later ones on top.
+    """A simulated area. `junctions` are name -> (x, y) [m]; `patches` lie on a road of `background`
+    friction, and the last of overlapping patches counts.
     """
 
     name: str
@@ -63,17 +61,17 @@ class Scenario:
 
     @cached_property
     def network(self) -> Network:
-        """Return the lanes of the roads."""
+        """Return the network of lanes for the roads."""
         return build_network(self.junctions, self.roads)
 
     @cached_property
     def table(self) -> FloatArray:
-        """Return the patches for `friction.look_up`."""
+        """Return the friction table of background and patches, for `friction.look_up`."""
         return friction_table(self.background, self.patches)
 
     @property
     def events(self) -> tuple[Patch, ...]:
-        """Return the patches that appear during the drive, in the order of time."""
+        """Return the patches that appear during the drive, sorted by start time."""
         return tuple(
             sorted((p for p in self.patches if math.isfinite(p.start)), key=lambda p: p.start)
         )
@@ -88,7 +86,7 @@ class Scenario:
         ).reshape(x.shape)
 
     def to_latlon(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (latitude, longitude) [deg]."""
+        """Return (latitude, longitude) [deg] of points with local coordinates (x, y) [m]."""
         return self.origin.to_latlon(x, y)
 
     def from_latlon(
@@ -99,11 +97,11 @@ class Scenario:
 
 
 def demo() -> Scenario:
-    """Return the demonstration: four streets from a crossing to a winding ring, with dry road in
-    the north-east, wet, snow and ice, and slush along one street.
+    """Return the demonstration scenario: four streets from a crossing to a winding ring road. The
+    road is dry in the north-east, elsewhere wet, snowy or icy, with slush along one street.
 
-    At 70 s black ice appears on the eastern street where drivers brake before the crossing and
-    accelerate out of it.
+    At 70 s black ice appears on the eastern street, where drivers brake before the crossing and
+    accelerate after it.
     """
     return Scenario(
         name="demo",
@@ -156,10 +154,9 @@ def demo() -> Scenario:
 
 
 def hills() -> Scenario:
-    """Return the demonstration's town on hills: one height over the plane, crossfall, and banked
-    bends.
+    """Return the demonstration town with hills: slopes, crossfall, and banked bends.
 
-    Slopes reach 8 %; on ice they are gentle, because otherwise no car could climb them.
+    Slopes reach 8 %. They are small on ice, because otherwise no car could climb them.
     """
     relief = Relief(
         (Wave(0.05, 620.0, 0.6, 1.2), Wave(0.04, 290.0, 2.2, 0.4), Wave(0.03, 150.0, -0.5, 2.0)),
@@ -175,10 +172,10 @@ def hills() -> Scenario:
 
 
 def frost() -> Scenario:
-    """Return the town on hills in the first frost: at 35 s black ice appears at five places of its
+    """Return the hilly town in the first frost: at 35 s black ice appears at five places in its
     eastern half.
 
-    Used by the demonstration: every driver meets the new ice several times, so that warned and
+    The demonstration uses it. Every driver meets the new ice several times, so that warned and
     unwarned drivers can be compared.
     """
     town = hills()
@@ -203,11 +200,11 @@ def frost() -> Scenario:
 
 
 def drawn_town(seed: int) -> Scenario:
-    """Return the demonstration's town with other frictions and other hills, drawn by the seed, for
+    """Return the demonstration town with friction and hills drawn randomly by the seed, for
     evaluations.
 
-    Dry, wet, snowy and icy places have a friction anywhere in the usual range of their kind. No
-    road of it was used for tuning, and black ice appears at 30 s.
+    The friction of dry, wet, snowy and icy places lies anywhere in the usual range of its kind.
+    None of these roads was used for tuning. Black ice appears at 30 s.
     """
     key = key_of(checked_seed(seed), DRAWN_STREAM)
     usual = demo()
@@ -243,11 +240,11 @@ def drawn_town(seed: int) -> Scenario:
 
 
 def winter(seed: int) -> Scenario:
-    """Return the `drawn_town` of the seed with winter on its lanes.
+    """Return the `drawn_town` with this seed, with winter conditions on its lanes.
 
     Each lane has one of these: black ice where drivers brake before a junction, or in a bend; ice
-    under the left or under the right wheels alone; two ruts of slush; or nothing. Drivers do not
-    see ice; slush looks wet.
+    only under the left or the right wheels; two ruts of slush; or nothing. Drivers do not see ice;
+    slush looks wet.
     """
     town = drawn_town(seed)
     key = key_of(checked_seed(seed), WINTER_STREAM)
@@ -271,8 +268,8 @@ def winter(seed: int) -> Scenario:
 
 
 def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[float]) -> list[Patch]:
-    """Return the patches of a kind on the points of a lane; three numbers in [0, 1) draw place,
-    length and friction.
+    """Return the patches of one kind on the points of a lane. `numbers` are three random numbers in
+    [0, 1) that determine position, length and friction.
     """
     place, size, grip = numbers
     ice = 0.10 + 0.095 * grip
@@ -311,8 +308,8 @@ def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[flo
 def _lay_patch(
     name: str, points: FloatArray, row: int, size: tuple[float, float], mu: float, left: float = 0.0
 ) -> Patch:
-    """Return a patch of (length, width) [m] along a lane at the point `row`, `left` [m] of its
-    centre.
+    """Return a patch of `size` (length, width) [m] in the direction of a lane at the point `row`,
+    `left` [m] to the left of its centre.
     """
     point = points[min(max(row, 0), len(points) - 1)]
     x = float(point[LanePoint.X] - left * point[LanePoint.SIN])
@@ -342,11 +339,11 @@ SCENARIOS: Final = {scenario.name: scenario for scenario in (demo(), hills(), fr
 
 
 def scenario_named(name: str | Scenario) -> Scenario:
-    """Return the scenario of that name; "hills-7" is the `drawn_town` of the seed 7, "winter-7" the
-    same in winter.
+    """Return the scenario with that name. "hills-7" is the `drawn_town` with seed 7, and "winter-7"
+    the same town in winter.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such scenario.
     """
     if isinstance(name, Scenario):
         return name

@@ -1,10 +1,10 @@
-"""Sensor model: readings of a true record with white noise, constant offsets, gains, a wandering
-position and missing readings.
+"""Sensor model: computes readings from a true record, with white noise, constant offsets, gains, a
+slowly varying position error and missing readings.
 
-The sets that begin with "rough" are those of real cars: `misaligned.py` describes their further
-errors and the sources. Every random number is a hash of (vehicle key, sample number, channel), so a
-reading depends neither on how a drive is cut into blocks nor on the other vehicles. Only the
-satellite receiver's wander is carried from block to block.
+Sensor sets whose name begins with "rough" have the errors of real cars; `misaligned.py` describes
+these further errors and their sources. Every random number is a hash of (vehicle key, sample
+number, channel). Therefore a reading depends neither on the division of a drive into blocks nor on
+the other vehicles. Only the slow error of the position receiver is kept between blocks.
 """
 
 from __future__ import annotations
@@ -130,8 +130,8 @@ GROUP_OF: Final = np.array([0, 0, 0, 1, 1, 1, 1, 2, 3, 4, 5, 6, 6, 6, 6, 7, 7, 7
 
 
 class ErrorColumn(IntEnum):
-    """Columns of a vehicle's sensor errors: white std, then offset and gain, of every channel; then
-    the rest.
+    """Index of a column in a vehicle's row of sensor errors: white noise std, offset and gain of
+    every channel, then the other errors.
     """
 
     WHITE = 0
@@ -147,10 +147,10 @@ ERRORS: Final = int(ErrorColumn.MOUNTED) + COLUMNS
 
 
 def sensors_named(name: str | Sensors) -> Sensors:
-    """Return the set of that name.
+    """Return the sensor set with that name.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such set.
     """
     if isinstance(name, Sensors):
         return name
@@ -162,8 +162,8 @@ def sensors_named(name: str | Sensors) -> Sensors:
 
 
 def error_row(sensors: Sensors, origin: Origin, seed: int, index: int) -> FloatArray:
-    """Return the errors of the sensors of vehicle `index`, shape (ERRORS,), columns E; offsets and
-    gain are drawn here.
+    """Return the sensor errors of vehicle `index`, shape (ERRORS,), with the columns of
+    ErrorColumn. Offsets and gain are drawn here.
     """
     north, east = origin.per_metre
     white = np.zeros(len(CHANNELS))
@@ -192,14 +192,16 @@ def error_row(sensors: Sensors, origin: Origin, seed: int, index: int) -> FloatA
 
 
 def noise_keys(seed: int, index: int) -> tuple[np.uint64, np.uint64]:
-    """Return the keys of the white noise and of the dropouts of vehicle `index`."""
+    """Return the random keys of the white noise and of the dropouts of vehicle `index`."""
     return key_of(seed, index, WHITE_STREAM), key_of(seed, index, SILENCE_STREAM)
 
 
 @compiled
 def read_out(record: FloatArray, error: FloatArray, place: FloatArray, signals: FloatArray) -> None:
-    """Fill `signals` (18,) with the truth of `record`; place = (lat0, lon0, deg per m north, deg
-    per m east).
+    """Fill `signals` (18,) with the true values of `record`.
+
+    `place` is (latitude and longitude of the origin [deg], degrees per metre north, degrees per
+    metre east).
     """
     felt = error[ErrorColumn.LEAK] > 0.0
     signals[S.AX] = record[RecordColumn.AX_FELT] if felt else record[RecordColumn.AX]
@@ -223,8 +225,8 @@ def read_late(
     rate_hz: float,
     signals: FloatArray,
 ) -> None:
-    """Fill `signals` (18,) with the delayed readings of each device; records (T, 32), of which row
-    `lead` is now.
+    """Fill `signals` (18,) with the delayed readings of each device. In the records (T, 32), row
+    `lead` is the present sample.
     """
     record = np.empty(records.shape[1])
     readings = np.empty(signals.size)
@@ -241,8 +243,8 @@ def read_late(
 
 @compiled
 def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int) -> None:
-    """Advance the receiver's slow errors `wander` (3,) to the next fix; the first has their
-    long-run spread.
+    """Advance the slow errors `wander` (3,) of the position receiver to the next fix. The first
+    errors have the stationary standard deviation.
     """
     keep = 0.0 if sample == 0 else math.exp(-FIX_S / WANDER_S)
     for i in range(3):
@@ -252,8 +254,8 @@ def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int
 
 @compiled
 def drop_out(share: float, key: np.uint64, window: int, row: FloatArray) -> None:
-    """Remove the readings of each device from `row` (18,) with probability `share`; all samples of
-    a window have the same devices silent.
+    """Replace the readings of each device in `row` (18,) with NaN with probability `share`. The
+    same devices are silent in all samples of a time window.
     """
     for c in range(len(CHANNELS)):
         if uniform(key, window * len(GROUPS) + GROUP_OF[c]) < share:
@@ -269,11 +271,11 @@ def sense(
     keys: tuple[KeyArray, KeyArray],
     clock: tuple[int, float, int],
 ) -> FloatArray:
-    """Return signals (T, N, 18) of the records (lead + T, N, 32), of which the first `lead` were
-    read before.
+    """Return signals (T, N, 18) for the records (lead + T, N, 32). The first `lead` records only
+    serve delayed readings.
 
-    `wander` (N, 3) is advanced; keys: two uint64 arrays (N,), of the noise and of the dropouts;
-    clock: number of the first sample that is read, rate [Hz] and `lead`.
+    `wander` (N, 3) is advanced. `keys` are two uint64 arrays (N,), for the noise and for the
+    dropouts; `clock` is (number of the first sample, rate [Hz], `lead`).
     """
     white, silence = keys
     first, rate_hz, lead = clock

@@ -1,5 +1,5 @@
-"""Simulation of one manoeuvre of one vehicle: a signal log with ground truth, and the vehicle file
-that belongs to it.
+"""Simulation of one manoeuvre of one vehicle: a signal log with the true values, and the vehicle
+file of the vehicle.
 """
 
 from __future__ import annotations
@@ -93,21 +93,26 @@ def simulate_manoeuvre(
     slope: float = 0.0,
     origin: Origin = GOTHENBURG,
 ) -> tuple[pa.Table, Vehicle]:
-    """Drive a manoeuvre and return (log, vehicle file).
+    """Simulate a manoeuvre and return (log, vehicle file).
 
-    The log has a row per sample: `t` [s], the CHANNELS of `schemas.signals` (null where missing),
-    and the truth (`true_vx`, `true_mu_fl`, `true_utilisation_fl`, … in the units of the signals).
-    The vehicle file is nominal: the true vehicle differs from it by the errors in `presets.KNOWN`,
-    except with sensors "ideal", where it is exact.
+    The log has one row per sample: `t` [s], the CHANNELS of `schemas.signals` (null where missing),
+    and the true values (`true_vx`, `true_mu_fl`, `true_utilisation_fl`, … in the units of the
+    signals). The vehicle file is nominal: the true vehicle differs from it by the errors in
+    `presets.KNOWN`. With sensors "ideal" the vehicle file is exact.
 
     Args:
         name: a key of MANOEUVRES.
-        mu: friction; the manoeuvre's usual one if not given.
-        speed: [m/s]; also the manoeuvre's usual one if not given.
-        duration_s: [s]; also the manoeuvre's usual one if not given.
+        mu: friction; by default that of the manoeuvre.
+        speed: initial speed [m/s]; by default that of the manoeuvre.
+        seed: seed of all random numbers, not negative.
+        rate_hz: sampling rate [Hz].
+        duration_s: duration [s]; by default that of the manoeuvre.
         vehicle: a key of PRESETS, or the true vehicle itself.
+        sensors: a key of SENSORS, or a sensor set.
+        faults: sensor faults that are applied to the readings.
         road: a key of ROADS, drawn by the seed, or a relief.
-        slope: rise per metre along the track [1] that is added to it.
+        slope: rise per metre along the track [1] that is added to the road.
+        origin: position of the start on earth.
 
     Raises:
         InputError: an argument is out of range or unknown.
@@ -162,7 +167,9 @@ def _friction_field(mu: Friction) -> Callable[[float, float, float], float]:
 
 
 class ProvingGround(NamedTuple):
-    """The test track: friction at t [s] and (x, y) [m], and the table of its relief."""
+    """The test track: a function for the friction at t [s] and (x, y) [m], and the table of the
+    relief.
+    """
 
     friction: Callable[[float, float, float], float]
     relief: FloatArray
@@ -176,8 +183,8 @@ def _drive_manoeuvre(
     rate_hz: float,
     samples: int,
 ) -> FloatArray:
-    """Return the true records (T, RECORD) of the drive; the driver adds the throttle that a slope
-    needs.
+    """Return the true records (T, RECORD) of the drive. The driver adds the force that a slope
+    requires.
     """
     p = truth.row()
     x = np.zeros(STATES)
@@ -232,7 +239,7 @@ def _moment_of(t: float, x: FloatArray, speed: float) -> Moment:
 def _sense_records(
     records: FloatArray, sensors: Sensors, origin: Origin, seed: int, rate_hz: float
 ) -> FloatArray:
-    """Return the signals (T, 18) of the records of one vehicle."""
+    """Return the sensor readings (T, 18) for the true records (T, RECORD) of one vehicle."""
     errors = error_row(sensors, origin, seed, 0)[None]
     place = np.array([origin.latitude, origin.longitude, *origin.per_metre])
     keys = tuple(np.array([key]) for key in noise_keys(seed, 0))
@@ -242,7 +249,7 @@ def _sense_records(
 
 
 def _log_table(t: FloatArray, signals: FloatArray, records: FloatArray) -> pa.Table:
-    """Return the log: NaN readings become nulls, truth has none."""
+    """Return the log as a table; NaN readings become null, and true values are never null."""
     columns = {"t": pa.array(t)}
     columns |= {name: pa.array(signals[:, i], from_pandas=True) for i, name in enumerate(CHANNELS)}
     return pa.table(columns | {name: pa.array(records[:, column]) for name, column in TRUTH})

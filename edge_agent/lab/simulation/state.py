@@ -1,4 +1,4 @@
-"""Columns of the plant's arrays: state, parameters, inputs, wheels."""
+"""Index names for the arrays of the simulated vehicle: state, parameters, inputs, wheels."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from edge_agent.dynamics.parameters import Parameter
 
 
 class Motion(IntEnum):
-    """State of one vehicle."""
+    """Index of a state variable of one vehicle."""
 
     VX = 0  # [m/s]
     VY = 1
@@ -40,8 +40,8 @@ STATES: Final = 38
 
 
 class TrueParameter(IntEnum):
-    """Parameters that only the true vehicle has; they continue the row of
-    `edge_agent.dynamics.parameters.P`.
+    """Index of a parameter that only the true vehicle has. They continue the row of
+    `edge_agent.dynamics.parameters.Parameter`.
     """
 
     SHAPE = len(Parameter)  # c and e of the tyre curve
@@ -81,7 +81,9 @@ PARAMETERS: Final = len(Parameter) + len(TrueParameter)
 
 
 class Control(IntEnum):
-    """Rows of inputs to the four wheels, and of the road under the vehicle, shape (5, 4)."""
+    """Index of a row of inputs, shape (5, 4): four inputs of the wheels, and the slope of the road
+    under the vehicle.
+    """
 
     STEER = 0  # [rad at the road wheel]
     DRIVE = 1  # [N·m] asked for; slip control may allow less
@@ -95,7 +97,7 @@ INPUTS: Final = len(Control)
 
 
 class Wheel(IntEnum):
-    """Rows of the four wheels' forces and motion at an instant, shape (8, 4)."""
+    """Index of a row of the wheels' forces and motion at an instant, shape (8, 4)."""
 
     FX = 0  # [N] in the wheel's axes
     FY = 1

@@ -1,7 +1,7 @@
-"""The noise of paper 004's experiments: white, on a_x, a_y and the yaw rate only.
+"""White noise of paper 004's experiments, on a_x, a_y and the yaw rate only.
 
-Constant noise has one variance on all three. Variable noise follows table 2 on a_y alone, as the
-paper says.
+Constant noise has the same variance on all three. Variable noise follows the paper's table 2 on a_y
+alone, as the paper states.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ SCHEDULE_S: Final = 2.0  # each for two seconds: a period of six
 
 
 def scheduled_variance(t: FloatArray) -> FloatArray:
-    """Return the variance at the times t (T,) [s] by the SCHEDULE."""
+    """Return the noise variance at the times t (T,) [s] according to SCHEDULE."""
     return np.asarray(np.array(SCHEDULE)[(t / SCHEDULE_S).astype(int) % len(SCHEDULE)])
 
 
 def on_ay(t: FloatArray, others: float) -> FloatArray:
-    """Return variances (T, 3) of a_x, a_y and yaw rate [SI]: a_y by the SCHEDULE, the others
-    constant.
+    """Return noise variances (T, 3) of a_x, a_y and yaw rate [SI units squared]: SCHEDULE for a_y,
+    and the constant `others` for the other two.
     """
     variance = np.full((len(t), 3), others)
     variance[:, 1] = scheduled_variance(t)
@@ -32,8 +32,8 @@ def on_ay(t: FloatArray, others: float) -> FloatArray:
 
 
 def add_white(signals: FloatArray, variance: FloatArray, rng: np.random.Generator) -> None:
-    """Add noise of variance (T,), or (T, 3) by channel, to the signals (T, 18) of one drive, in
-    place.
+    """Add white noise to a_x, a_y and yaw rate in the signals (T, 18) of one drive, in place.
+    `variance` is (T,), or (T, 3) by channel.
     """
     by_channel = variance[:, None] if variance.ndim == 1 else variance
     white = rng.normal(size=(len(variance), 3))

@@ -1,3 +1,3 @@
-"""Tuning of the fuzzy memberships: ant colony, random control, objective, tuned files with
-provenance.
+"""Tuning of the fuzzy memberships: ant colony, random search for comparison, objectives, and tuned
+files with their origin.
 """

@@ -1,8 +1,10 @@
-"""Ant colony over a graph of positions (paper 004, III.C), pure: randomness and objective come in.
+"""Ant colony on a graph of positions (paper 004, III.C). The module is pure; random generator and
+objective are arguments.
 
-An ant walks from vertex to vertex and takes one position at each; its path is one vector of values.
+Each variable ("vertex") has a list of possible values ("positions"). An ant goes from vertex to
+vertex and chooses one position at each; its path is one vector of values.
 
-    M_vj = τ_vj^α · η_vj^θ₀ / Σ_{r ∈ A} τ_vr^α · η_vr^θ₀        (31)
+    M_vj = τ_vj^α · η_vj^θ₀ / Σ_{r ∈ A} τ_vr^α · η_vr^θ₀        (31) probability of a position
     τ_vj ← (1 − ρ)·τ_vj + Δτ_vj,   Δτ = Σ over depositing ants   (32)
 
     symbol  name                                        shape    unit
@@ -12,12 +14,13 @@ An ant walks from vertex to vertex and takes one position at each; its path is o
     A       positions that exist at the vertex          (V, K)   -
     ρ       evaporation per iteration                            -
 
-Departures from the print. The paper calls ρ the residual and uses it as evaporation in (32); here
-(32) stands, and its .284 is read as what remains, so that ρ = .716: with few iterations the colony
-must learn fast. Pheromone lies on (vertex, position), not on edges: the objective depends on
-positions, not on their succession. Deposits go by rank and to the best path so far, and pheromone
-stays inside bounds, so that the scale of the objective does not matter and the colony cannot
-stagnate (rank-based, elitist and max-min ant systems).
+Departures from the paper. The paper calls ρ the residual and uses it as evaporation in (32). Here
+(32) is used, and the paper's .284 is the part that remains, so that ρ = .716: with few iterations
+the colony must learn fast. Pheromone belongs to (vertex, position), not to edges, because the
+objective depends on positions and not on their sequence. Deposits depend on the rank of an ant, and
+the best path so far also receives a deposit. Pheromone stays within bounds. Therefore the scale of
+the objective does not matter, and the colony cannot stagnate (rank-based, elitist and max-min ant
+systems).
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +38,11 @@ HIGHEST = 1.0
 
 @dataclass(frozen=True)
 class Habits:
-    """Parameters of the ants' behaviour; InputError where one leaves its range."""
+    """Parameters of the ants' behaviour.
+
+    Raises:
+        InputError: a parameter is out of its range.
+    """
 
     alpha: float = 1.0  # weight of pheromone, α
     theta: float = 1.0  # weight of visibility, θ₀
@@ -47,7 +54,7 @@ class Habits:
     trace: Callable[[FloatArray], None] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse habits for which (31) or (32) lose their meaning."""
+        """Reject parameters for which (31) or (32) are meaningless."""
         for name in ("evaporation", "elite", "memory", "retrace"):
             value = getattr(self, name)
             if not 0.0 < value < 1.0:
@@ -67,8 +74,8 @@ def transition_probabilities(
     alpha: float,
     theta: float,
 ) -> FloatArray:
-    """Return the probabilities of equation (31) for all vertices, (V, K): zero outside A, each row
-    sums to one.
+    """Return the probabilities of equation (31) for all vertices, (V, K). They are zero outside A,
+    and each row sums to one.
     """
     attraction = np.where(reachable, pheromone**alpha * visibility**theta, 0.0)
     probabilities: FloatArray = attraction / attraction.sum(axis=1, keepdims=True)
@@ -76,11 +83,11 @@ def transition_probabilities(
 
 
 def lowest_pheromone(reachable: BoolArray, retrace: float) -> FloatArray:
-    """Lower bound (V, 1) for which a converged colony repeats its best path with probability
-    `retrace`.
+    """Return the lower pheromone bound τ_min (V, 1) with which a converged colony repeats its best
+    path with probability `retrace`.
 
-    Per vertex the best position then has p = retrace^(1/V) = τ_max / (τ_max + (K − 1)·τ_min),
-    solved for τ_min.
+    The best position of each vertex then has p = retrace^(1/V) = τ_max / (τ_max + (K − 1)·τ_min);
+    this is solved for τ_min.
     """
     vertices = len(reachable)
     p = retrace ** (1.0 / vertices)
@@ -90,8 +97,8 @@ def lowest_pheromone(reachable: BoolArray, retrace: float) -> FloatArray:
 
 
 def deposit(paths: IntArray, weights: FloatArray, reachable: BoolArray) -> FloatArray:
-    """Return the pheromone Δτ (V, K) of paths (P, V) with weights (P,); every vertex receives Σ
-    weights.
+    """Return the deposited pheromone Δτ (V, K) of paths (P, V) with weights (P,). Each vertex
+    receives the sum of the weights.
     """
     laid = np.zeros(reachable.shape)
     vertices = np.arange(reachable.shape[0])
@@ -108,8 +115,8 @@ def renew(
     evaporation: float,
     retrace: float,
 ) -> FloatArray:
-    """Return the pheromone after equation (32), limited to [τ_min, 1]; zero where there is no
-    position.
+    """Return the pheromone after equation (32), limited to [τ_min, 1]; zero where no position
+    exists.
     """
     renewed = (1.0 - evaporation) * pheromone + laid
     return np.where(reachable, np.clip(renewed, lowest_pheromone(reachable, retrace), HIGHEST), 0.0)
@@ -124,8 +131,8 @@ def _walk_ant(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
 
 
 def _rank_weights(ants: int, habits: Habits) -> FloatArray:
-    """Return the deposits (P,) of the best ants of an iteration by rank; with that of the best path
-    so far they sum to ρ.
+    """Return the deposits (P,) of the best ants of an iteration, by rank. Together with the deposit
+    of the best path so far they sum to ρ.
     """
     count = max(1, round(habits.elite * ants))
     ranks = np.arange(count, 0, -1, dtype=np.float64)
@@ -143,11 +150,13 @@ def optimise(
     visibility: Sequence[FloatArray] | None = None,
     habits: Habits | None = None,
 ) -> Result:
-    """Search the vector with the largest objective.
+    """Search for the vector with the largest objective.
 
-    visibility: per vertex the preference η > 0 of each position, all alike if absent. The objective
-    is called at most ants·iterations times, once per vector. Raises InputError for empty choices,
-    no ants or no iterations.
+    `visibility` is, per vertex, the preference η > 0 of each position; without it all positions are
+    equal. The objective is called at most ants·iterations times, once per vector.
+
+    Raises:
+        InputError: there are empty choices, no ants or no iterations.
     """
     habits = habits or Habits()
     graph = Graph.from_choices(problem.choices)
@@ -185,8 +194,8 @@ def optimise(
 def _laid_pheromone(
     paths: list[IntArray], values: list[float], weights: FloatArray, ledger: Ledger, habits: Habits
 ) -> FloatArray:
-    """Return the pheromone Δτ of one iteration: that of its best ants by rank, and of the best path
-    so far.
+    """Return the pheromone Δτ (V, K) deposited in one iteration: by its best ants according to
+    rank, and by the best path so far.
     """
     order = np.argsort(-np.asarray(values), kind="stable")[: len(weights)]
     best = ledger.best_path if ledger.best_path is not None else paths[0]

@@ -1,16 +1,17 @@
-"""Ant colony over continuous variables, ACO_R (Socha and Dorigo, European J. of Operational
-Research 2008), pure.
+"""Ant colony for continuous variables, ACO_R (Socha and Dorigo, European J. of Operational Research
+2008). The module is pure.
 
-The graph of `colony` gives each vertex a short list of positions. Vertices of fuzzy sets are
-continuous, so here an archive of the k best vectors stands for the pheromone. An ant takes vector
-l of the archive with a weight that falls with its rank, and draws each variable from a normal
-distribution about it.
+The graph of `colony` gives each vertex a short list of positions. The vertices of fuzzy sets are
+continuous, so here an archive of the k best vectors takes the place of the pheromone. An ant
+chooses vector l of the archive with a weight that decreases with its rank. It then draws each
+variable from a normal distribution around that vector.
 
 Legend
     l           rank in the archive, 1 is best
     w_l         weight exp(-(l - 1)^2/(2*q^2*k^2))
-    sigma_v     xi times the mean distance of the archive's variable v to that of the chosen vector
-    q, xi       how greedy the choice is, and how slowly the spread shrinks
+    sigma_v     standard deviation of variable v: xi times the mean distance between the archive's
+                vectors and the chosen vector
+    q, xi       q: smaller values prefer the best vectors; xi: larger values keep the spread longer
 """
 
 from __future__ import annotations
@@ -31,7 +32,11 @@ REDRAWS: Final = 32  # of a vector that is not admissible
 
 @dataclass(frozen=True)
 class ArchiveHabits:
-    """Constants of the colony."""
+    """Constants of the colony with an archive.
+
+    Raises:
+        InputError: a constant is out of range.
+    """
 
     archive: int = 10  # k
     greed: float = 0.3  # q
@@ -48,12 +53,14 @@ class ArchiveHabits:
 
 
 class SearchTally:
-    """Number of evaluated vectors, the best vector, and the history; for searches over continuous
-    variables.
-    """
+    """Tally of a search over continuous variables: number of evaluations, best vector, and history."""
 
     def __init__(self, problem: Problem) -> None:
-        """Begin without any evaluation."""
+        """Create the tally before the first evaluation.
+
+        Raises:
+            InputError: a variable has no choices.
+        """
         if not problem.choices or any(len(choice) == 0 for choice in problem.choices):
             raise InputError(
                 "choices", "a vertex has no position", "give every vertex at least one"
@@ -67,7 +74,9 @@ class SearchTally:
         self.history: list[Iteration] = []
 
     def evaluate(self, vector: FloatArray) -> float:
-        """Return the objective at a vector; a value that is not a number counts as the worst."""
+        """Return the objective at a vector, and count the evaluation. A value that is not finite
+        counts as the worst.
+        """
         value = float(self.problem.objective(vector))
         value = value if np.isfinite(value) else -np.inf
         self.count += 1
@@ -77,14 +86,14 @@ class SearchTally:
         return value
 
     def fit(self, vector: FloatArray) -> FloatArray:
-        """Return the vector within the ranges of the variables."""
+        """Return the vector limited to the ranges of the variables."""
         return np.asarray(np.clip(vector, self.lower, self.upper))
 
     def uniform(self, rng: np.random.Generator) -> FloatArray:
-        """Return an admissible vector from the whole range.
+        """Return an admissible random vector from the whole range.
 
         Raises:
-            InputError: none of the drawn vectors is admissible.
+            InputError: no vector out of REDRAWS draws is admissible.
         """
         for _ in range(REDRAWS):
             vector = np.asarray(rng.uniform(self.lower, self.upper))
@@ -95,7 +104,7 @@ class SearchTally:
         )
 
     def record(self, values: list[float], progress: Progress | None) -> None:
-        """Close an iteration: append it to the history and report it."""
+        """Append an iteration to the history and report it to `progress`."""
         finite = [value for value in values if np.isfinite(value)]
         mean = float(np.mean(finite)) if finite else -np.inf
         self.history.append(Iteration(len(self.history) + 1, self.value, mean, self.count))
@@ -103,7 +112,11 @@ class SearchTally:
             progress(self.history[-1])
 
     def result(self) -> Result:
-        """Return the best vector; InputError before the first evaluation."""
+        """Return the best vector, its value and the history.
+
+        Raises:
+            InputError: nothing was evaluated.
+        """
         if self.count == 0:
             raise InputError(
                 "ants, iterations", "nothing was evaluated", "use at least one of each"
@@ -120,10 +133,10 @@ def optimise(
     progress: Progress | None = None,
     habits: ArchiveHabits | None = None,
 ) -> Result:
-    """Search the vector with the largest objective, with ants·iterations evaluations.
+    """Search for the vector with the largest objective, with ants·iterations evaluations.
 
-    The archive is filled first, from the whole range and the start. Variables range over their
-    choices.
+    The archive is filled first, with the start vector and random vectors from the whole range. The
+    range of a variable is that of its choices.
     """
     habits = habits or ArchiveHabits()
     tally = SearchTally(problem)
@@ -152,8 +165,8 @@ def _next_vector(
     rng: np.random.Generator,
     habits: ArchiveHabits,
 ) -> FloatArray:
-    """Return the next vector: first the start, then random ones until the archive is full, then one
-    near a vector of the archive.
+    """Return the next vector to evaluate: first the start vector, then random vectors until the
+    archive is full, then vectors near one of the archive.
     """
     if tally.count == 0 and tally.problem.start is not None:
         return tally.fit(np.asarray(tally.problem.start, float))

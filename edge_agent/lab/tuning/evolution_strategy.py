@@ -1,5 +1,6 @@
-"""(1+1) evolution strategy with the one-fifth rule (Rechenberg 1973), pure: a control of the ant
-colonies."""
+"""(1+1) evolution strategy with the one-fifth rule (Rechenberg 1973), for comparison with the ant
+colonies. The module is pure.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +24,9 @@ def optimise(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> Result:
-    """Search with ants·iterations evaluations, one after the other; arguments and result as those
-    of the colonies."""
+    """Search for the vector with the largest objective, with ants·iterations evaluations one after
+    the other. Arguments and result are the same as for the colonies.
+    """
     tally = SearchTally(problem)
     begin = tally.uniform(rng) if problem.start is None else np.asarray(problem.start, float)
     parent = tally.fit(begin)
@@ -49,7 +51,7 @@ def optimise(
 def _mutate_vector(
     tally: SearchTally, parent: FloatArray, step: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Return an admissible child; the parent if none is found."""
+    """Return an admissible random variation of the parent; the parent itself if none is found."""
     for _ in range(REDRAWS):
         child = tally.fit(rng.normal(parent, step * (tally.upper - tally.lower)))
         if tally.problem.admissible(child):

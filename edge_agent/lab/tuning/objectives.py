@@ -7,14 +7,16 @@ Legend
     l_v         -1/2 (v' S^-1 v + ln det 2 pi S), summed over updates, per second of driving [nat/s]
     NIS         v' S^-1 v over its expectation [1]
 
-The first two are proper scores: in expectation nothing beats stating the truth, so none is won by
-inflating R, as paper 004's equation 33 (variance mismatch) and errors against truth are. IS is the
-score of Gneiting and Raftery (JASA 2007). The innovations need no truth, but they look one update
-ahead and are blind to errors that last: R shrinks to white noise, and friction intervals become too
-narrow; `predictive` charges them for that by how far NIS is from its expectation. README has
-figures. Drives are rough: misaligned devices, slopes, clocks apart, half of the towns' cars without
-torque. Drives that a search sees and drives that judge it share no seed, no vehicle file and no
-pair of manoeuvre and vehicle.
+IS and l_v are proper scores: in expectation, stating the true distribution gives the best score.
+Inflating R does not improve them, in contrast to paper 004's equation 33 (variance mismatch) and
+errors against the truth. IS is the score of Gneiting and Raftery (JASA 2007). The innovations need
+no true friction. However, they look only one update ahead and do not show persistent errors: R
+shrinks to white noise, and friction intervals become too narrow. Therefore the objective
+`predictive` adds a cost for the deviation of NIS from its expectation. README has figures.
+
+The simulated cars are inaccurate: misaligned sensors, slopes, clock delays, and in towns half of
+the cars have no torque. The drives of a search and the held-out drives share no seed, no vehicle
+file and no pair of manoeuvre and vehicle.
 """
 
 from __future__ import annotations
@@ -99,7 +101,7 @@ FELT_SHARE: Final = 0.9  # of the friction in use, from which a slippery road is
 
 @dataclass(frozen=True)
 class TuningSet:
-    """Drives of equal length side by side, as one bank takes them."""
+    """Drives of equal length in one set, in the form that a bank requires."""
 
     vehicles: tuple[Vehicle, ...]
     t: FloatArray  # (T, N) [s]
@@ -128,8 +130,8 @@ class TuningScores:
 
 
 def detection_cost(scores: TuningScores) -> float:
-    """Return the interval score with prices on false and on missed ice: neither may be bought
-    with the other.
+    """Return the interval score plus costs for false and for missed ice, so that one cannot be
+    improved at the expense of the other.
     """
     false_ice = max(scores.false_ice - MOST_FALSE_ICE, 0.0)
     return scores.surface_score + FALSE_ICE_PRICE * false_ice + MISSED_ICE_PRICE * scores.missed_ice
@@ -146,7 +148,7 @@ OBJECTIVES: Final[dict[str, Callable[[TuningScores], float]]] = {
 
 
 def record(drives: Sequence[TuningDrive], duration_s: float) -> TuningSet:
-    """Simulate the drives, each `duration_s` [s] long."""
+    """Simulate the drives, each `duration_s` [s] long, and return them as a set."""
     signals = []
     truth = []
     used = []
@@ -197,7 +199,9 @@ def record_all(name: str, duration_s: float) -> TuningSet:
 
 
 def record_town(seed: int, cars: int, duration_s: float) -> TuningSet:
-    """Simulate cars in a town drawn from the seed, from WARM_S on; a share of them is rough."""
+    """Simulate cars in a town drawn by the seed, starting after WARM_S; return their drives. A
+    share of the cars is inaccurate.
+    """
     fleet = SimulatedFleet(drawn_town(seed), cars, seed, RATE_HZ, rough=ROUGH_SHARE)
     fleet.step(round(WARM_S * RATE_HZ))
     t, signals = fleet.step(round(duration_s * RATE_HZ))
@@ -212,7 +216,7 @@ def record_town(seed: int, cars: int, duration_s: float) -> TuningSet:
 
 
 def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
-    """Return the interval score of 90 % intervals, elementwise [unit of the truth]."""
+    """Return the interval score of 90 % intervals, elementwise [unit of `truth`]."""
     score: FloatArray = (
         upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0))
     )
@@ -220,7 +224,7 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
 
 
 def scores_of(memberships: Memberships, drives: TuningSet, estimator: str) -> TuningScores:
-    """Run the estimator over the drives and score its output after the first second."""
+    """Run the estimator on the drives, and return the scores of its output after the first second."""
     estimates = create(estimator, drives.vehicles, memberships=memberships).advance(
         drives.t, drives.signals, threads=2
     )
@@ -246,8 +250,9 @@ def scores_of(memberships: Memberships, drives: TuningSet, estimator: str) -> Tu
 def detection_scores(
     lower: FloatArray, upper: FloatArray, truth: FloatArray, used: FloatArray
 ) -> dict[str, float]:
-    """Return `surface_score`, `false_ice` and `missed_ice` of intervals (T, N); NaN where no
-    sample decides.
+    """Return `surface_score`, `false_ice` and `missed_ice` of intervals (T, N).
+
+    `surface_score` is NaN if no surface class occurs.
     """
     score = interval_score(lower, upper, truth)
     surfaces = [(truth > above) & (truth <= most) for above, most in SURFACES.values()]
@@ -267,10 +272,11 @@ def _share(of: BoolArray, among: BoolArray) -> float:
 
 
 def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
-    """Return an objective over membership vectors; an invalid vector has the worst value.
+    """Return an objective as a function of a membership vector. An invalid vector has the worst
+    value.
 
     Raises:
-        InputError: there is no objective of that name.
+        InputError: there is no objective with that name.
     """
     if name not in OBJECTIVES:
         raise InputError(
@@ -288,8 +294,8 @@ def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
 
 
 def choices(positions: int) -> tuple[FloatArray, ...]:
-    """Return candidate positions of every vertex and noise scale: evenly over the bounds, and the
-    default.
+    """Return the candidate values of every vertex and noise scale: evenly spaced within the bounds,
+    and including the default.
     """
     default = Memberships().to_vector()
     found = []

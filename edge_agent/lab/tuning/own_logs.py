@@ -1,5 +1,5 @@
-"""Recorded drives as input of a search: there is no ground truth, so only the next measurements can
-judge.
+"""Recorded drives as input of a search. They have no true friction, so memberships are scored only
+by the prediction of the next measurements.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ HELD_OUT: Final = 3  # the last of so many parts of the recordings judge
 def own_drives(
     logs: Sequence[tuple[SignalLog, Vehicle]], duration_s: float
 ) -> tuple[TuningSet, TuningSet]:
-    """Return recordings cut into parts of `duration_s` [s]: parts to search on, and the last third
-    of the parts to judge by.
+    """Return (parts for the search, held-out parts) of recordings that are cut into parts of
+    `duration_s` [s].
 
-    Recordings may have any rate; parts have as many samples as the slowest gives in that time.
+    The last third of the parts is held out. Recordings may have any sampling rate; all parts have
+    as many samples as the slowest recording has in that time.
 
     Raises:
-        InputError: they are too short.
+        InputError: the recordings are too short.
     """
     samples = min(round(duration_s / float(np.median(np.diff(log.t)))) for log, _ in logs)
     parts = [

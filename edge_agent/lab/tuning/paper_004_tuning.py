@@ -1,15 +1,15 @@
-"""The tuning of paper 004 as the paper did it: sixteen lower vertices, three noise levels, its
-objective as a choice.
+"""The tuning of paper 004 as in the paper: sixteen lower vertices, three noise levels, and a choice
+of objectives.
 
-The double lane change at 80 km/h on the printed tyre, P_0 = .2*I, Q = .1*T^2; noise variance and R
-are .1, .05 and .01 in turn (section IV.A). Objectives, larger is better:
+The drive is the double lane change at 80 km/h on the printed tyre, with P_0 = .2*I, Q = .1*T^2.
+Noise variance and R are .1, .05 and .01 in turn (section IV.A). Objectives, larger is better:
 
-    mismatch     1/(1 + |e|), e the mean difference of actual and theoretical innovation variance
-                 (33)
-    likelihood   mean log-likelihood of the innovations [nat per sample], which no inflation of R
-                 wins
-    error        less the mean of RMSE over the printed one, of v_x, v_y, yaw rate and mu: it needs
-                 the truth
+    mismatch     1/(1 + |e|), e the mean difference between actual and theoretical innovation
+                 variance (33)
+    likelihood   mean log-likelihood of the innovations [nat per sample]; inflating R does not
+                 increase it
+    error        minus the mean over v_x, v_y, yaw rate and mu of the RMSE divided by the printed
+                 RMSE; it requires the true values
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ Sets = Memberships | LowerVertices
 
 @dataclass(frozen=True)
 class LevelDrive:
-    """The drive at one noise level, one copy per seed, and the setting whose R is right for it."""
+    """The drive at one noise level, one copy per seed, and the filter setting whose R matches the
+    noise.
+    """
 
     batch: DriveSet
     setting: Setting
@@ -53,7 +55,9 @@ class LevelDrive:
 def record_levels(
     spec: DriveSpec, seeds: Sequence[int], setting: Setting = AS_PRINTED
 ) -> list[LevelDrive]:
-    """Drive without error, and add the noise of every level."""
+    """Simulate a drive without errors, and return one copy for each noise level with its noise
+    added.
+    """
     exact = ideal(spec)
     levels = []
     for level in LEVELS:
@@ -66,7 +70,7 @@ def record_levels(
 
 
 def likelihood(sets: Sets, drive: LevelDrive) -> float:
-    """Return the mean log-likelihood of the innovations [nat per sample]."""
+    """Return the mean log-likelihood of the innovations [nat per sample] with the fuzzy sets."""
     reported = _run_filter(sets, drive)
     value = np.nan_to_num(
         reported.innovation_log_likelihood[1:], nan=WORST, neginf=WORST, posinf=WORST
@@ -75,7 +79,7 @@ def likelihood(sets: Sets, drive: LevelDrive) -> float:
 
 
 def mismatch(sets: Sets, drive: LevelDrive) -> float:
-    """Return the variance mismatch of equation (33) with |e|."""
+    """Return the objective of equation (33), with the absolute mismatch |e|."""
     batch = drive.batch
     filters = make_bank(batch.vehicles, sets, drive.setting)
     differences = []
@@ -87,7 +91,9 @@ def mismatch(sets: Sets, drive: LevelDrive) -> float:
 
 
 def accuracy(sets: Sets, drive: LevelDrive) -> float:
-    """Return minus the mean ratio of the RMSE to the printed RMSE."""
+    """Return minus the mean, over the estimated quantities, of the RMSE divided by the printed
+    RMSE.
+    """
     reported = _run_filter(sets, drive)
     batch = drive.batch
     truth = {name: batch.truth[f"true_{name}"] for name in ("vx", "vy", "yaw_rate")} | {
@@ -114,15 +120,18 @@ def _run_filter(sets: Sets, drive: LevelDrive) -> Estimates:
 
 
 def visibility() -> list[FloatArray]:
-    """Return eta of every position at every vertex: positions near the untuned one are preferred
-    (31)."""
+    """Return the visibility eta of every position at every vertex (31). Positions near the untuned
+    one are preferred.
+    """
     preferred = np.exp(-0.5 * ((POSITIONS - 1.0) / PREFERENCE) ** 2)
     return [preferred] * len(LowerVertices().to_vector())
 
 
 @dataclass(frozen=True)
 class PaperTuning:
-    """The tuned sets, how the search came there, and the pheromone at its end (16, 7)."""
+    """Result of the tuning: the tuned fuzzy sets, the history of the search, and the final
+    pheromone (16, 7).
+    """
 
     sets: LowerVertices
     result: Result
@@ -138,7 +147,7 @@ def tune(
     seed: int,
     habits: Habits | None = None,
 ) -> PaperTuning:
-    """Tune the lower vertices with the colony, over all levels."""
+    """Tune the lower vertices with the ant colony; the objective is averaged over all noise levels."""
     score = OBJECTIVES[objective]
     laid: list[FloatArray] = []
 

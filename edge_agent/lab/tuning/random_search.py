@@ -1,4 +1,6 @@
-"""The control of the ant colony: uniform draws from the same positions with the same budget."""
+"""Random search, for comparison with the ant colony: uniform draws from the same positions with the
+same budget.
+"""
 
 import numpy as np
 
@@ -14,8 +16,8 @@ def optimise(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> Result:
-    """Return the best of `ants`·`iterations` uniform draws; arguments and result as those of the
-    colony.
+    """Return the best of `ants`·`iterations` uniform draws. Arguments and result are the same as
+    for the ant colony.
     """
     graph = Graph.from_choices(problem.choices)
     ledger = Ledger(problem.objective, graph, problem.admissible)

@@ -1,8 +1,8 @@
-"""Parts that the two searches share: a graph of positions, a result, a history.
+"""Parts that the searches share: a graph of positions, a result, a history.
 
-A search looks for the best vector of one value per vertex, each from its own short list of
-positions. It does not depend on filters: the objective is any function of that vector, and larger
-is better.
+A search looks for the best vector, with one value per vertex (variable). Each vertex has its own
+short list of possible values, its positions. A search does not depend on filters: the objective is
+any function of the vector, and larger is better.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ Admissible = Callable[[FloatArray], bool]
 
 
 def is_always_allowed(_vector: FloatArray) -> bool:
-    """Return True: an admissible set without limits."""
+    """Return True for any vector: the default for `Problem.admissible`, which excludes no vector."""
     return True
 
 
@@ -29,7 +29,7 @@ REDRAWS = 32
 
 @dataclass(frozen=True)
 class Iteration:
-    """One line of a search's history: values of the objective, larger is better."""
+    """One entry of a search's history: values of the objective, larger is better."""
 
     iteration: int
     best: float  # best value so far
@@ -44,9 +44,9 @@ Progress = Callable[[Iteration], None]
 class Problem:
     """The objective to maximise, and the vectors to search.
 
-    objective: value of a vector (V,). choices: per vertex its positions, ascending. start (V,): the
-    first vector evaluated, so that the result is never worse than it. admissible: vectors that may
-    be evaluated; others are drawn again.
+    objective: value of a vector (V,). choices: per vertex its positions, in ascending order. start
+    (V,): the vector that is evaluated first, so that the result is never worse than it. admissible:
+    returns True for vectors that may be evaluated; others are replaced by new draws.
     """
 
     objective: Objective
@@ -57,7 +57,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Result:
-    """The best vector (V,) of a search, its value, and how the search came there."""
+    """The best vector (V,) of a search, its value, and the history of the search."""
 
     best: FloatArray
     value: float
@@ -65,14 +65,14 @@ class Result:
 
     @property
     def evaluations(self) -> int:
-        """Number of distinct vectors for which the objective was evaluated."""
+        """Return the number of distinct vectors for which the objective was evaluated."""
         return self.history[-1].evaluations
 
 
 @dataclass(frozen=True)
 class Graph:
-    """V vertices with up to K positions each, as rectangles: `positions` (V, K) and `reachable`
-    (V, K).
+    """V vertices with up to K positions each, as arrays: `positions` (V, K), and `reachable` (V,
+    K), which is True where a position exists.
     """
 
     positions: FloatArray
@@ -80,8 +80,10 @@ class Graph:
 
     @classmethod
     def from_choices(cls, choices: Sequence[FloatArray]) -> "Graph":
-        """Build from one array of positions per vertex; raises InputError where a vertex has
-        none.
+        """Return the graph for one array of positions per vertex.
+
+        Raises:
+            InputError: a vertex has no position.
         """
         if not choices or any(len(choice) == 0 for choice in choices):
             raise InputError(
@@ -94,15 +96,13 @@ class Graph:
         return cls(positions, np.isfinite(positions))
 
     def vector(self, path: IntArray) -> FloatArray:
-        """Return the values (V,) at a path of position indices (V,)."""
+        """Return the values (V,) that belong to a path, which is an array of position indices (V,)."""
         return self.positions[np.arange(len(path)), path]
 
 
 @dataclass
 class Ledger:
-    """Remembers every walked path, so that no evaluation is spent twice and the best is never
-    lost.
-    """
+    """Ledger of all evaluated paths, so that no path is evaluated twice and the best one is kept."""
 
     objective: Objective
     graph: Graph
@@ -113,10 +113,11 @@ class Ledger:
     history: list[Iteration] = field(default_factory=list)
 
     def draw(self, sample: Callable[[], IntArray]) -> IntArray:
-        """Draw an admissible path from `sample`, if possible a new one.
+        """Return an admissible path drawn by `sample`, if possible one that was not evaluated
+        before.
 
         Raises:
-            InputError: none of the drawn paths is admissible.
+            InputError: no drawn path is admissible.
         """
         fallback: IntArray | None = None
         for _ in range(REDRAWS):
@@ -132,8 +133,8 @@ class Ledger:
         return fallback
 
     def evaluate(self, path: IntArray) -> float:
-        """Return the objective at a path, computed once per path; a value that is not finite counts
-        as the worst.
+        """Return the objective at a path, which is computed once per path. A value that is not
+        finite counts as the worst.
         """
         key = path.tobytes()
         if key not in self.values:
@@ -145,7 +146,7 @@ class Ledger:
         return self.values[key]
 
     def record(self, values: Sequence[float], progress: Progress | None) -> None:
-        """Close an iteration: append it to the history and tell `progress`."""
+        """Append an iteration to the history and report it to `progress`."""
         finite = [value for value in values if np.isfinite(value)]
         mean = float(np.mean(finite)) if finite else -np.inf
         self.history.append(
@@ -155,7 +156,11 @@ class Ledger:
             progress(self.history[-1])
 
     def result(self) -> Result:
-        """Return the result of the search; raise InputError before the first evaluation."""
+        """Return the result of the search.
+
+        Raises:
+            InputError: nothing was evaluated.
+        """
         if self.best_path is None:
             raise InputError(
                 "ants, iterations", "nothing was evaluated", "use at least one of each"

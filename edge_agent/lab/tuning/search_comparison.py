@@ -1,4 +1,4 @@
-"""Comparison of searches with equal budgets on the filter of paper 004.
+"""Comparison of search methods with equal budgets on the filter of paper 004.
 
     random       uniform over the graph's positions             (`random_search`)
     uniform      uniform over the whole range
@@ -6,10 +6,11 @@
     aco_r        ants over continuous variables                 (`continuous_colony`)
     evolution    (1+1) evolution strategy                       (`evolution_strategy`)
 
-Objective: mean log-likelihood of the innovations over four conditions of R [nat/s] (`study`), on
-four drives. Each seed is one search of each kind, and one set of held-out drives with noise of its
-own on which all are judged, with the untuned sets and without sets for comparison. Differences are
-paired by seed; `.se` is the standard error over seeds.
+The objective is the mean log-likelihood of the innovations over four conditions of R [nat/s]
+(`study`), on four drives. Each seed gives one search of each kind, and one set of held-out drives
+with its own noise. The results of all searches are scored on these drives, together with the
+untuned sets and a constant R for comparison. Differences are paired by seed; `.se` is the standard
+error over seeds.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def uniform_search(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> Result:
-    """Return the best of ants·iterations uniform draws from the whole range."""
+    """Return the best of ants·iterations uniform draws from the whole range of the variables."""
     tally = SearchTally(problem)
     for _ in range(iterations):
         found = []
@@ -84,8 +85,9 @@ def compare_searches(
     quick: bool = False,
     log_line: Callable[[str], None] = lambda _line: None,
 ) -> list[Figure]:
-    """Search with every seed in every way, judge on held-out noise, and return means with standard
-    errors."""
+    """Run every search method with every seed, score the results on held-out noise, and return
+    means with standard errors.
+    """
     ants, iterations, duration = (3, 2, 1.0) if quick else (ANTS, ITERATIONS, study.DURATION_S)
     train = study.record(study.TRAIN, duration)
     searched: dict[str, list[float]] = {}
@@ -140,7 +142,7 @@ def _mean(name: str, values: Sequence[float]) -> list[Figure]:
 
 
 def comparison_markdown(figures: Sequence[Figure]) -> str:
-    """Return the report as Markdown, from the figures alone."""
+    """Return the report as Markdown, from the figures only."""
     return (
         "# Search methods with equal budgets on the filter of paper 004\n\n"
         "Mean log-likelihood of the innovations [nat/s] ± standard error over seeds; more is "
@@ -149,7 +151,7 @@ def comparison_markdown(figures: Sequence[Figure]) -> str:
 
 
 def comparison_tables(figures: Sequence[Figure]) -> str:
-    """Return the two tables of the report: means, and paired differences."""
+    """Return the two Markdown tables of the report: means, and paired differences."""
     values = {figure.name: figure.value for figure in figures}
 
     def cell(name: str) -> str:

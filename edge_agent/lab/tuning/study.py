@@ -1,11 +1,11 @@
-"""The study of paper 004's tuning: its filter, its noise, R right and wrong; untuned, random
-search, ant colony.
+"""Study of paper 004's tuning with its own filter and noise, for correct and wrong R: untuned sets,
+random search, ant colony.
 
-The filter is `paper-aco-fckf` as in the paper's experiments: white noise on a_x, a_y and r alone,
-exact inputs, start at the truth, so that R is a number that can be right, ten times too small or
-ten times too large. The objective is the mean log-likelihood of the innovations over all conditions
-[nat/s], which no inflation of R wins; the paper's own (33) is won by it. Drives that judge share
-neither seed nor manoeuvre with those that are searched on.
+The filter is `paper-aco-fckf` as in the paper's experiments: white noise only on a_x, a_y and r,
+exact inputs, start at the true state. R can therefore be exactly right, ten times too small or ten
+times too large. The objective is the mean log-likelihood of the innovations over all conditions
+[nat/s]. Inflating R does not improve it, in contrast to the paper's own objective (33). Held-out
+drives share neither seed nor manoeuvre with the drives of the search.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ WAYS: Final[dict[str, Callable[..., Result]]] = {
 
 
 class Condition(NamedTuple):
-    """Ratio of R to the noise: the filter's R over VARIANCE, and whether the noise follows the
-    paper's schedule.
+    """Condition of R: the filter's R divided by VARIANCE, and True if the noise follows the paper's
+    schedule.
     """
 
     scale: float
@@ -60,7 +60,7 @@ CONDITIONS: Final = {
 
 
 class StudyDrive(NamedTuple):
-    """One drive on a road of friction MU."""
+    """One drive of the study, on a road with friction MU."""
 
     manoeuvre: str
     vehicle: str
@@ -86,8 +86,8 @@ HELD_OUT: Final = (
 
 @dataclass(frozen=True)
 class StudySet:
-    """Drives side by side: t (T, N) [s], signals (T, N, 18) by condition, truth (T, N, 3) of
-    v_x, v_y, yaw rate.
+    """N drives of equal length: t (T, N) [s], signals (T, N, 18) by condition, true v_x, v_y and
+    yaw rate (T, N, 3).
     """
 
     vehicles: tuple[Vehicle, ...]
@@ -97,7 +97,7 @@ class StudySet:
 
 
 class StudyScores(NamedTuple):
-    """Scores of memberships under one condition, mean over the drives."""
+    """Scores of memberships under one condition, averaged over the drives."""
 
     log_likelihood: float  # of the innovations, more is better [nat/s]
     nis: float  # per row; near 1 where the stated covariance is right [1]
@@ -107,7 +107,7 @@ class StudyScores(NamedTuple):
 
 
 def record(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> StudySet:
-    """Simulate the drives, each `duration_s` [s] long, with the noise of every condition."""
+    """Simulate the drives, each `duration_s` [s] long, and add the noise of every condition."""
     exact = []
     truth = []
     vehicles = []
@@ -141,7 +141,7 @@ def record(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> Stud
 def _noisy(
     exact: FloatArray, t: FloatArray, seeds: Sequence[int], condition: Condition
 ) -> FloatArray:
-    """Return a copy with white noise on a_x, a_y and r."""
+    """Return a copy of the signals `exact` (T, N, 18) with white noise on a_x, a_y and r."""
     variance = scheduled_variance(t) if condition.schedule else np.full(len(t), VARIANCE)
     noisy = exact.copy()
     for n, seed in enumerate(seeds):
@@ -150,12 +150,12 @@ def _noisy(
 
 
 def setting(condition: Condition) -> Setting:
-    """Return the filter's setting under a condition."""
+    """Return the filter's setting for a condition."""
     return AT_THE_TRUTH._replace(noise=(condition.scale * VARIANCE,) * 3)
 
 
 def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudyScores:
-    """Run the filter over the drives under the condition of that name."""
+    """Return the scores of memberships on the drives under the condition called `name`."""
     filters = make_bank(drives.vehicles, memberships, setting(CONDITIONS[name]))
     reported = filters.advance(drives.t, drives.signals[name])
     log_likelihoods = np.nan_to_num(
@@ -171,7 +171,9 @@ def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudySco
 
 
 def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[float, float]:
-    """Return interval score and coverage of the 90 % friction interval under a condition."""
+    """Return (interval score, coverage) of the 90 % friction interval under the condition called
+    `name`.
+    """
     reported = make_bank(drives.vehicles, memberships, setting(CONDITIONS[name])).advance(
         drives.t, drives.signals[name]
     )
@@ -183,21 +185,21 @@ def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[flo
 
 
 def overall(memberships: Memberships, drives: StudySet) -> float:
-    """Return the mean log-likelihood over the conditions [nat/s], the objective of the search."""
+    """Return the objective of the search: the mean log-likelihood over the conditions [nat/s]."""
     return float(
         np.mean([scores_of(memberships, drives, name).log_likelihood for name in CONDITIONS])
     )
 
 
 def memberships_of(vector: FloatArray) -> Memberships:
-    """Return the memberships of the ten vertices. This filter has no noise scales to tune, because
-    its R is given.
+    """Return the memberships with the ten vertices in `vector`. This filter has no noise scales to
+    tune, because its R is given.
     """
     return Memberships.from_vector(np.append(vector, np.zeros(CHANNELS)))
 
 
 def objective_on(drives: StudySet) -> Objective:
-    """Return the objective over vectors of ten vertices."""
+    """Return the objective as a function of a vector of ten vertices."""
     return lambda vector: overall(memberships_of(vector), drives)
 
 
@@ -211,7 +213,7 @@ def search(
     seed: int,
     progress: Progress | None = None,
 ) -> Result:
-    """Search the vertices in one of WAYS; both begin at the untuned ones."""
+    """Search for the best vertices with one of WAYS. Every search starts at the untuned vertices."""
     return WAYS[way](
         Problem(
             objective_on(drives),

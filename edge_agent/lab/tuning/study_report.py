@@ -1,5 +1,5 @@
-"""The study as figures, a table, a plot and a tuned file: several searches each way, all judged
-on held-out drives.
+"""Report of the study as figures, a table, a plot and a file of tuned memberships: several searches
+of each kind, all scored on held-out drives.
 """
 
 from __future__ import annotations
@@ -50,22 +50,22 @@ SHOWN: Final = (*GIVEN, *WAYS)
 
 @dataclass
 class Study:
-    """Results of every repeat of every way, and the scores of the found memberships on held-out
-    drives.
-    """
+    """Results of all searches of each kind, and the drives used for search and scoring."""
 
     train: StudySet
     held_out: StudySet
     found: dict[str, list[Result]] = field(default_factory=dict)
 
     def memberships(self, way: str) -> list[Memberships]:
-        """Return the memberships that each repeat found, or the given ones."""
+        """Return the memberships found by each search of a kind, or the given memberships."""
         if way in GIVEN:
             return [GIVEN[way]]
         return [memberships_of(result.best) for result in self.found[way]]
 
     def best(self, way: str) -> Memberships:
-        """Return the memberships of the repeat with the best objective on its training drives."""
+        """Return the memberships of the search with the best objective on the drives of the search,
+        or the given memberships.
+        """
         if way in GIVEN:
             return GIVEN[way]
         return memberships_of(max(self.found[way], key=lambda result: result.value).best)
@@ -80,8 +80,8 @@ def run(
     duration_s: float,
     reporter: Callable[[str], Progress],
 ) -> Study:
-    """Search with every seed in every way; `reporter` makes the progress of a search from its
-    name.
+    """Run every search with every seed and return the study. `reporter` returns the progress
+    function of a search, given its name.
     """
     done = Study(study.record(study.TRAIN, duration_s), study.record(study.HELD_OUT, duration_s))
     for seed in seeds:
@@ -100,8 +100,8 @@ def run(
 
 
 def figures(done: Study) -> list[Figure]:
-    """Return, per way of tuning, the score under each condition on held-out drives, the objective
-    on both sets, and the progress of the searches.
+    """Return figures per kind of search: the scores under each condition on held-out drives, the
+    objective on both sets of drives, and the progress of the searches.
     """
     listed = []
     overalls: dict[str, list[float]] = {}
@@ -148,8 +148,8 @@ def _mean_sd(name: str, values: Sequence[float], unit: str) -> list[Figure]:
 
 
 def markdown(listed: Sequence[Figure]) -> str:
-    """Return the table with a row per condition and measure and a column per way, from the figures
-    alone.
+    """Return a Markdown table with a row per condition and measure and a column per kind of search,
+    from the figures only.
     """
     values = {figure.name: figure.value for figure in listed}
 
@@ -174,8 +174,8 @@ def markdown(listed: Sequence[Figure]) -> str:
 
 
 def scores(done: Study, way: str) -> dict[str, Score]:
-    """Return the scores of a way in the file of tuned memberships: over all conditions, on both
-    sets of drives.
+    """Return the scores of a kind of search for the file of tuned memberships: over all conditions,
+    on both sets of drives.
     """
     found = {}
     for drives, recorded in (("train", done.train), ("held_out", done.held_out)):
@@ -191,8 +191,8 @@ def scores(done: Study, way: str) -> dict[str, Score]:
 
 
 def draw(listed: Sequence[Figure], per_iteration: int, path: Path) -> None:
-    """Plot the best value so far over evaluations, mean and one standard deviation over the
-    searches.
+    """Plot the best value so far over the number of evaluations: mean and one standard deviation
+    over the searches.
     """
     import matplotlib as mpl
 

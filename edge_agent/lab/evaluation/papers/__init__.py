@@ -1,2 +1,1 @@
-"""Reproduction of the five papers: each paper's conditions, figures and tables, one paper at a
-time."""
+"""Reproduction of the five papers: conditions, figures and tables of each paper."""

@@ -1,5 +1,6 @@
-"""Columns of the papers' tables: the same drive matched, on the simulator's own plant, and with
-realistic sensors."""
+"""Columns of the papers' tables, for the same drive: under the paper's conditions ("matched"), with
+the simulator's own vehicle model ("own plant"), and with realistic sensors.
+"""
 
 from __future__ import annotations
 
@@ -21,19 +22,20 @@ BankMaker: TypeAlias = Callable[[Sequence[Vehicle]], EstimatorBank]
 
 
 def means(batch: DriveSet, reported: Estimates) -> Values:
-    """Return all measures of an estimator, mean over the drives."""
+    """Return all measures of an estimator, averaged over the drives."""
     return {name: float(np.mean(value)) for name, value in measures(batch, reported).items()}
 
 
 def without_noise(spec: DriveSpec, make: BankMaker) -> tuple[DriveSet, Estimates]:
-    """Drive with perfect sensors, and let an estimator read them."""
+    """Simulate a drive with error-free sensors and estimate it; return the drive and the estimates."""
     batch = ideal(spec)
     return batch, estimates(make(batch.vehicles), batch)
 
 
 def with_sensors(name: str, estimator: str, seeds: Sequence[int]) -> tuple[Values, Values]:
-    """Return the measures of a paper's estimator and of the default, on drives with ordinary
-    sensors."""
+    """Return the measures of the paper's estimator and those of the default estimator, on drives
+    with ordinary sensors.
+    """
     batch = realistic(PAPERS[name], seeds)
     found = [
         means(batch, estimates(bank_of(each, batch.vehicles), batch))

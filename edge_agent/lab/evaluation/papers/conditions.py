@@ -1,7 +1,8 @@
-"""The papers' conditions: plants with the papers' tyres and without drag, and their drives.
+"""The papers' conditions: vehicle models with the papers' tyres and without drag, and their drives.
 
-"Matched" is a plant that is the filter's model. Constant-speed drives keep drag and rolling
-resistance, known to the filter, because without a longitudinal force no tyre tells anything.
+"Matched" is a simulated vehicle ("plant") that equals the filter's model. Drives at constant speed
+keep drag and rolling resistance, which are known to the filter: without a longitudinal force the
+tyres give no information on friction.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ INERTIA_002: Final = 7.143  # J of wheel and motor [kg m^2]
 
 
 def with_losses(vehicle: TrueVehicle) -> TrueVehicle:
-    """Return the vehicle with drag and rolling resistance."""
+    """Return the vehicle with drag and rolling resistance added."""
     return replace(vehicle, drag=DRAG, rolling=ROLLING)
 
 
 def _in_wheel() -> tuple[TrueVehicle, TyreOption]:
-    """Return the vehicle of 002 with C_f, C_r and J of table 1, and the tyre that its filter needs
-    for it.
+    """Return the vehicle of paper 002 with C_f, C_r and J of its table 1, and the tyre option that
+    its filter needs for this vehicle.
     """
     row = parameter_row(SMALL.vehicle)
     base = row[Parameter.TO_FRONT] + row[Parameter.TO_REAR]
@@ -105,7 +106,9 @@ MATCHED: Final[dict[str, DriveSpec]] = {
 
 
 def given_motion(batch: DriveSet, vehicle: TrueVehicle) -> GivenMotion:
-    """Return the first drive of the batch with its true motion, as the literal filters take it."""
+    """Return the first drive of the batch with its true motion, in the form that the literal
+    filters require.
+    """
     truth = batch.truth
     return GivenMotion(
         batch.vehicles[0],

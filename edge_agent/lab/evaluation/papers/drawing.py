@@ -1,4 +1,4 @@
-"""Plots of a reproduction as PNG and SVG."""
+"""Drawing of the plots of a reproduction with matplotlib, as PNG and SVG files."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Figures of paper 004: path, motor torques, states with both filters, fuzzy sets, search and
-pheromone."""
+"""Plots for paper 004: path, motor torques, states estimated by both filters, fuzzy sets, search
+and pheromone.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ FILTERS: Final = {"FCKF": "comparator", "ACOFCKF": "improved"}
 def plots(
     constant: NoisyRun, variable: NoisyRun, tuned: Memberships, tuning: PaperTuning
 ) -> list[PaperPlot]:
-    """Return all figures, of the first noise seed."""
+    """Return all plots, drawn from the drive of the first noise seed."""
     return [
         _path_plot(constant),
         _torque_plot(constant),
@@ -147,7 +148,9 @@ def _lower_vertices(tuned: LowerVertices) -> PaperPlot:
 
 
 def _shoulder_values(k: int) -> FloatArray:
-    """Return the memberships at left foot, peak and right foot of an outer set."""
+    """Return the memberships at the left foot, peak and right foot of the first (k = 0) or last
+    fuzzy set.
+    """
     return np.array([1.0, 1.0, 0.0]) if k == 0 else np.array([0.0, 1.0, 1.0])
 
 
@@ -163,7 +166,7 @@ def _search_plot(tuning: PaperTuning) -> PaperPlot:
 
 
 def pheromone_plot(tuning: PaperTuning) -> PaperPlot:
-    """Return the map of the pheromone, vertices by positions."""
+    """Return the plot of the pheromone as a colour map: vertices by positions."""
     count = len(tuning.pheromone)
     ticks = tuple(f"{'e' if k < count // 2 else 'n'} {k % (count // 2) + 1}" for k in range(count))
     label = "position of the vertex: " + ", ".join(f"{value:g}" for value in POSITIONS)

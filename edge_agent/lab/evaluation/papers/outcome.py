@@ -1,5 +1,4 @@
-"""Records of a paper's reproduction: table rows, curves of plots, and everything that a report
-needs."""
+"""Records of a paper's reproduction: table rows, plot curves, and all other parts of a report."""
 
 from __future__ import annotations
 
@@ -18,20 +17,20 @@ Table = dict[str, Values]  # column -> measures
 
 
 class PaperRow(NamedTuple):
-    """One number of a paper's table, next to ours.
+    """One number of a paper's table, with our numbers for comparison.
 
     Attributes:
-        name: of the figure, below `papers.NUMBER.`.
+        name: name of the figure, below `papers.NUMBER.`.
         what: the number in words, with its unit in brackets.
-        printed: the printed number, or NaN where the paper prints none.
-        matched: the paper's filter under the paper's conditions.
-        own: the same filter on the simulator's own plant.
-        realistic: the paper's estimator with ordinary sensors, a vehicle known to a few per cent.
-        default: the default estimator on the same drives.
-        bar: limit of `matched`; the printed number where it is None and one is printed; NaN for no
-        bar.
-        better: side of the bar.
-        shown: printed number as text, where it is more than a number.
+        printed: the printed number, or NaN if the paper prints none.
+        matched: result of the paper's filter under the paper's conditions.
+        own: result of the same filter with the simulator's own vehicle model.
+        realistic: result of the paper's estimator with ordinary sensors and a vehicle file with
+            errors of a few per cent.
+        default: result of the default estimator on the same drives.
+        bar: target for `matched`. None: the printed number, if there is one. NaN: no target.
+        better: "less" or "more": the side of the target on which `matched` must lie.
+        shown: text for the printed number, if it is more than a number.
     """
 
     name: str
@@ -47,28 +46,28 @@ class PaperRow(NamedTuple):
 
     @property
     def limit(self) -> float | None:
-        """The bar of the matched figure; None if it is only shown."""
+        """Return the target for the matched number; None if there is no target."""
         bar = self.printed if self.bar is None else self.bar
         return None if math.isnan(bar) else bar
 
     @property
     def unit(self) -> str:
-        """Unit of the row."""
+        """Return the unit of the row."""
         _, _, unit = self.what.rpartition("[")
         return unit.removesuffix("]") if "[" in self.what else "1"
 
     @property
     def holds(self) -> bool:
-        """True if the matched number keeps its bar, or has none."""
+        """Return True if the matched number meets its target, or has no target."""
         return self.limit is None or self.figure("papers").holds
 
     def figure(self, prefix: str) -> Figure:
-        """Return the matched number as a figure with its bar."""
+        """Return the matched number as a figure with its target."""
         return Figure(f"{prefix}.{self.name}", self.matched, self.unit, self.limit, self.better)
 
 
 class Curve(NamedTuple):
-    """One line of a panel."""
+    """One curve in a panel."""
 
     name: str
     x: FloatArray
@@ -77,7 +76,7 @@ class Curve(NamedTuple):
 
 
 class PlotPanel(NamedTuple):
-    """One pair of axes."""
+    """One panel of a plot: a pair of axes with its curves."""
 
     title: str
     x: str
@@ -88,7 +87,7 @@ class PlotPanel(NamedTuple):
 
 
 class Heat(NamedTuple):
-    """A map of numbers: rows by columns."""
+    """One panel with a colour map of numbers, rows by columns."""
 
     title: str
     x: str
@@ -99,7 +98,7 @@ class Heat(NamedTuple):
 
 
 class PaperPlot(NamedTuple):
-    """One figure: panels in a grid."""
+    """One plot: panels arranged in a grid."""
 
     name: str
     title: str
@@ -129,16 +128,16 @@ class Reproduction:
 
     @property
     def rows(self) -> list[PaperRow]:
-        """All rows of all tables."""
+        """Return all rows of all tables."""
         return [row for table in self.tables for row in table.rows]
 
     @property
     def missed_rows(self) -> list[str]:
-        """Names of the matched rows that miss their bars."""
+        """Return the names of the rows whose matched number misses its target."""
         return [row.name for row in self.rows if not row.holds]
 
     def all_figures(self) -> list[Figure]:
-        """Return the figures of the tables, then the others, then elements without a reason."""
+        """Return all figures: those of the tables first, then the additional ones."""
         listed = []
         for row in self.rows:
             listed.append(row.figure(f"papers.{self.paper}"))

@@ -1,5 +1,6 @@
-"""The report of one paper: one HTML page without scripts, and Markdown of its tables and
-elements."""
+"""The report of one paper as an HTML page without scripts, and as Markdown with its tables and
+elements.
+"""
 
 from __future__ import annotations
 
@@ -31,26 +32,27 @@ LEGEND: Final = (
 
 
 def number(value: float) -> str:
-    """Return a number as text with three digits; a dash where there is none."""
+    """Return a number as text with three digits; a dash for NaN."""
     return "–" if math.isnan(value) else f"{value:.3g}"
 
 
 def cells(row: PaperRow) -> list[str]:
-    """Return the cells of a row: printed, matched, own plant, realistic sensors, default
-    estimator."""
+    """Return the cells of a row as text: printed, matched, own plant, realistic sensors, default
+    estimator.
+    """
     shown = row.shown or number(row.printed)
     return [shown, *(number(value) for value in (row.matched, row.own, row.realistic, row.default))]
 
 
 def limit_text(row: PaperRow) -> str:
-    """Return the bar of the matched number, or nothing."""
+    """Return the target of the matched number as text, for example "≤ 0.02"; "" without a target."""
     if row.limit is None:
         return ""
     return f"{'≤' if row.better == 'less' else '≥'} {row.limit:g}"
 
 
 def summary(done: Reproduction) -> str:
-    """Return one sentence about the bars."""
+    """Return one sentence about how many matched numbers meet their target."""
     barred = [row for row in done.rows if row.limit is not None]
     text = f"{len(barred) - len(done.missed_rows)} of {len(barred)} matched numbers meet their bar."
     return text if not done.missed_rows else f"{text} Missed: {', '.join(done.missed_rows)}."
@@ -82,7 +84,7 @@ def markdown_elements(elements: Sequence[Element]) -> str:
 
 
 def report_markdown(done: Reproduction) -> str:
-    """Return the whole report as Markdown."""
+    """Return the complete report as Markdown."""
     notes = "\n".join(f"- {note}" for note in done.notes)
     parts = (
         f"# Paper {done.paper}: {done.title}",
@@ -95,8 +97,9 @@ def report_markdown(done: Reproduction) -> str:
 
 
 def report_html(done: Reproduction, seconds: float) -> str:
-    """Return the report as one HTML page that shows the SVG files of its folder; `seconds` it
-    took."""
+    """Return the report as one HTML page that shows the SVG files in the same folder. `seconds` is
+    the computing time to state.
+    """
     counts = ", ".join(
         f"{sum(element.verdict == verdict for element in done.elements)} {verdict}"
         for verdict in VERDICTS

@@ -1,5 +1,6 @@
-"""Paper 000: joint federated filters; two lane changes from .5 to .3, friction filter as
-printed."""
+"""Reproduction of paper 000: joint federated filters on two lane changes with friction .5, then .3;
+the friction filter is as printed.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +34,9 @@ NEAR: Final = 0.1
 
 
 def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
-    """Return seconds until the mean friction (T,) is within NEAR, from the start and from the
-    change."""
+    """Return two times [s] until the mean friction (T,) is within NEAR of the true value: from the
+    start, and from the change of friction.
+    """
     t = batch.t[:, 0]
     truth = batch.mu[:, 0]
     near = np.abs(mu - truth) <= NEAR
@@ -48,15 +50,15 @@ def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
 
 
 def _run_friction(spec: DriveSpec, setting: FederatedSetting) -> tuple[DriveSet, FloatArray]:
-    """Return the drive, and the friction of the wheels (T, 4) by the printed filter with given
-    motion.
+    """Return the drive, and the friction of the wheels (T, 4) estimated by the printed filter with
+    given motion.
     """
     batch = ideal(spec)
     return batch, estimate(given_motion(batch, spec.vehicle), setting).mu
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
-    """Run the experiment of the paper; `seeds`: of the drives with ordinary sensors."""
+    """Run the experiment of the paper. `seeds` are the seeds of the drives with ordinary sensors."""
     done = Reproduction(
         "000", "Joint federated cubature filters for motion and friction", federated_ckf.ELEMENTS
     )

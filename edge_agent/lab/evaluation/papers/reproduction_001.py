@@ -1,4 +1,6 @@
-"""Paper 001: adaptive fuzzy federated filter and its comparator FKF, on the paper's five drives."""
+"""Reproduction of paper 001: the adaptive fuzzy federated filter, and the filter FKF that the paper
+compares it with, on the paper's five drives.
+"""
 
 from __future__ import annotations
 
@@ -46,18 +48,18 @@ QUADRATIC: Final = 0.15  # e of the stiffness polynomial (14), as degressive as 
 
 @dataclass(frozen=True)
 class MotionRun:
-    """One drive with perfect sensors with the estimates of the improved filter and of FKF."""
+    """One drive with error-free sensors, and the estimates of the improved filter and of FKF."""
 
     batch: DriveSet
     reported: dict[str, Estimates]
 
     def values(self, name: str) -> Values:
-        """Return the measures of one of the filters."""
+        """Return the measures of the filter called `name`."""
         return means(self.batch, self.reported[name])
 
 
 def run_drive(spec: DriveSpec, settings: dict[str, AdaptiveSetting]) -> MotionRun:
-    """Drive, and run the filters with the true friction of the start."""
+    """Simulate a drive and run the filters with the true friction at the start."""
     batch = ideal(spec)
     friction = float(batch.mu[0, 0])
     reported = {
@@ -71,7 +73,7 @@ BOTH: Final = {"improved": AdaptiveSetting(), "FKF": FKF}
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
-    """Run all drives of the paper; `seeds`: of the drives with ordinary sensors."""
+    """Run all drives of the paper. `seeds` are the seeds of the drives with ordinary sensors."""
     done = Reproduction(
         "001", "Adaptive fuzzy federated cubature filter", adaptive_federated_ckf.ELEMENTS
     )

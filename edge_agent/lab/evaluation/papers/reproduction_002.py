@@ -1,4 +1,6 @@
-"""Paper 002: WCKF-A, tyre-force compensation and WCKF-B on the sine and the J-turn."""
+"""Reproduction of paper 002: filter WCKF-A, tyre-force compensation (TFC) and filter WCKF-B, on the
+sine and the J-turn.
+"""
 
 from __future__ import annotations
 
@@ -81,7 +83,7 @@ REAL_KEYS: Final = {"v_x": "rmse_vx", "v_y": "rmse_vy", "β": "rmse_beta"}
 
 @dataclass(frozen=True)
 class ForceRun:
-    """One drive: truth and both stages of the filter by quantity, (T,) each."""
+    """One drive: true values and the results of both filters by quantity, (T,) each."""
 
     batch: DriveSet
     truth: dict[str, FloatArray]
@@ -89,7 +91,7 @@ class ForceRun:
     second: dict[str, FloatArray]  # forces compensated (TFC), motion of WCKF-B
 
     def erms(self, stage: str) -> Values:
-        """Return the root of the mean squared error (38)."""
+        """Return the root mean square error of each quantity (equation 38), for stage "A" or "B"."""
         found = self.first if stage == "A" else self.second
         return {
             name: float(np.sqrt(np.mean((found[name] - true) ** 2)))
@@ -97,8 +99,8 @@ class ForceRun:
         }
 
     def pre(self, stage: str) -> Values:
-        """Return the relative error of the peak (37), as a share; a peak is the value of largest
-        magnitude.
+        """Return the relative error of the peak of each quantity (equation 37) [1], for stage "A"
+        or "B". The peak is the value of largest magnitude.
         """
         found = self.first if stage == "A" else self.second
         values = {}
@@ -110,7 +112,9 @@ class ForceRun:
 
 
 def run_drive(spec: DriveSpec, tyre: TyreOption | None) -> ForceRun:
-    """Drive with perfect sensors; read WCKF-A and the compensated forces after every sample."""
+    """Simulate a drive with error-free sensors; store the states of WCKF-A and the compensated
+    forces after every sample.
+    """
     batch = ideal(spec)
     bank = compensated_wckf.make_bank(batch.vehicles, float(batch.mu[0, 0]), tyre)
     fused = []
@@ -141,7 +145,7 @@ def run_drive(spec: DriveSpec, tyre: TyreOption | None) -> ForceRun:
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
-    """Run both drives; `seeds`: of the drives with ordinary sensors."""
+    """Run both drives of the paper. `seeds` are the seeds of the drives with ordinary sensors."""
     done = Reproduction(
         "002", "Weighted cubature filters with tyre-force compensation", compensated_wckf.ELEMENTS
     )

@@ -1,5 +1,6 @@
-"""Paper 003: four-wheel friction by the square-root filter, its comparator UKF, under the paper's
-conditions."""
+"""Reproduction of paper 003: four-wheel friction by the square-root filter and by the UKF that the
+paper compares it with, under the paper's conditions.
+"""
 
 from __future__ import annotations
 
@@ -44,8 +45,9 @@ WHEEL_SPEED_NOISE: Final = 0.003  # [rad/s]
 
 @dataclass(frozen=True)
 class FrictionCase:
-    """One experiment: the printed errors of SR-UKF and UKF, and seconds to convergence as
-    printed."""
+    """One experiment: the printed errors of SR-UKF and UKF, and the printed time until convergence
+    [s].
+    """
 
     name: str
     what: str
@@ -82,18 +84,20 @@ FILTERS: Final[dict[str, UnscentedSetting]] = {
 
 @dataclass(frozen=True)
 class CaseRuns:
-    """The drive of one experiment and the results of each filter."""
+    """The drive of one experiment, and the results of each filter."""
 
     batch: DriveSet
     runs: dict[str, FrictionRun]
 
     def error(self, name: str) -> float:
-        """Return the mean absolute error over all wheels and samples, convergence included."""
+        """Return the mean absolute error of friction over all wheels and samples, including the
+        time before convergence.
+        """
         return float(np.abs(self.runs[name].mu - self.batch.mu_wheel[:, 0]).mean())
 
     def arrival(self, name: str) -> float:
-        """Return the seconds from the start, or from the change of friction, until all wheels are
-        within NEAR.
+        """Return the time [s] from the start, or from the change of friction, until all wheels are
+        within NEAR of the true value.
         """
         truth = self.batch.mu_wheel[:, 0]
         changes = np.flatnonzero(np.abs(np.diff(truth, axis=0)).max(axis=1) > NEAR)
@@ -105,14 +109,14 @@ class CaseRuns:
 
 
 def run_case(spec: DriveSpec, filters: dict[str, UnscentedSetting]) -> CaseRuns:
-    """Drive an experiment with perfect sensors and given motion, and run the filters."""
+    """Simulate an experiment with error-free sensors and given motion, and run the filters."""
     batch = ideal(spec)
     given = given_motion(batch, spec.vehicle)
     return CaseRuns(batch, {name: estimate(given, setting) for name, setting in filters.items()})
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
-    """Run all experiments of the paper; `seeds`: of the drives with ordinary sensors."""
+    """Run all experiments of the paper. `seeds` are the seeds of the drives with ordinary sensors."""
     done = Reproduction(
         "003", "Square-root unscented filter for the friction of four wheels", sr_ukf.ELEMENTS
     )
@@ -306,7 +310,7 @@ def _sensor_errors() -> tuple[PaperRow, ...]:
 
 
 def _add_noise(signals: FloatArray) -> FloatArray:
-    """Return the signals with white noise on the wheel speeds."""
+    """Return the signals with white noise added to the wheel speeds."""
     changed = signals.copy()
     shape = changed[:, S.OMEGA : S.OMEGA + 4].shape
     changed[:, S.OMEGA : S.OMEGA + 4] += WHEEL_SPEED_NOISE * np.random.default_rng(3).normal(
@@ -316,14 +320,18 @@ def _add_noise(signals: FloatArray) -> FloatArray:
 
 
 def _scale_radius(signals: FloatArray) -> FloatArray:
-    """Return the signals of wheels whose radius is larger than the filter's."""
+    """Return the signals of a car whose wheel radius is larger than the filter assumes, by the
+    share WHEEL_RADIUS_ERROR.
+    """
     changed = signals.copy()
     changed[:, S.OMEGA : S.OMEGA + 4] /= 1.0 + WHEEL_RADIUS_ERROR
     return changed
 
 
 def friction_plot(case: FrictionCase, runs: CaseRuns) -> PaperPlot:
-    """Return the friction of the four wheels by SR-UKF and by UKF in single precision."""
+    """Return a plot of the friction of the four wheels, estimated by SR-UKF and by UKF in single
+    precision.
+    """
     t = runs.batch.t[:, 0]
     panels = []
     for wheel, place in enumerate(per_wheel("")):

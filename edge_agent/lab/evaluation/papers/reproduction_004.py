@@ -1,5 +1,6 @@
-"""Paper 004: fuzzy cubature filter before and after the ant colony, under constant and variable
-noise."""
+"""Reproduction of paper 004: the fuzzy cubature filter before and after tuning by the ant colony,
+with constant and variable noise.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +54,7 @@ ITERATIONS: Final = 12
 
 @dataclass(frozen=True)
 class NoisyRun:
-    """One experiment: the drives of all noise seeds, and the results of each filter."""
+    """One experiment: the drives with all noise seeds, and the results of each filter."""
 
     batch: DriveSet
     reported: dict[str, Estimates]
@@ -77,7 +78,7 @@ class NoisyRun:
 
 
 def noise_of(t: FloatArray, noise: str) -> FloatArray:
-    """Return the variances (T, 3) of a_x, a_y and yaw rate [SI]."""
+    """Return the noise variances (T, 3) of a_x, a_y and yaw rate [SI units squared]."""
     return np.full((len(t), 3), VARIANCE) if noise == "constant" else on_ay(t, VARIANCE)
 
 
@@ -87,7 +88,7 @@ def run_noise(
     filters: Mapping[str, tuple[Memberships | LowerVertices, Setting]],
     seeds: Sequence[int],
 ) -> NoisyRun:
-    """Drive without error, add one noise per seed, and run the filters."""
+    """Simulate a drive without errors, add noise with each seed, and run the filters."""
     batch = repeat_drive(ideal(spec), len(seeds))
     variance = noise_of(batch.t[:, 0], noise)
     for n, seed in enumerate(seeds):
@@ -100,7 +101,9 @@ def run_noise(
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
-    """Run both experiments; `seeds`: of the noise, and of the drives with ordinary sensors."""
+    """Run both experiments. `seeds` are the seeds of the noise, and of the drives with ordinary
+    sensors.
+    """
     done = Reproduction(
         "004", "Fuzzy cubature filter tuned by an ant colony", paper_aco_fckf.ELEMENTS
     )
@@ -243,7 +246,9 @@ def _option_rows(seeds: Sequence[int]) -> tuple[PaperRow, ...]:
 
 
 def _tuning_rows(seeds: Sequence[int]) -> tuple[PaperTuning, tuple[PaperRow, ...]]:
-    """Tune on the three noise levels, and judge on the noise of the other seeds."""
+    """Tune the fuzzy sets on the three noise levels, and evaluate them on noise with other seeds.
+    Return the tuning with the objective "likelihood", and the rows of the table.
+    """
     setting = AS_PRINTED._replace(tyre=PROPORTIONAL)
     spec = MATCHED["004.dlc.proportional"]
     drives = record_levels(spec, TUNING_SEEDS, setting)

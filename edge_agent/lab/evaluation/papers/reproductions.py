@@ -1,4 +1,4 @@
-"""The reproductions by paper, and everything that `edge-agent evaluate --paper` writes."""
+"""The reproduction functions by paper, and the output of `edge-agent evaluate --paper`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ LONGEST_S: Final = 90.0  # of one paper on two cores
 def write_paper(
     paper: str, seeds: Sequence[int], folder: Path, *, plots: bool = True
 ) -> Reproduction:
-    """Reproduce a paper and write figures.json, report.md, and index.html with its plots."""
+    """Reproduce a paper; write figures.json, report.md, and index.html with its plots, and return
+    the reproduction.
+    """
     began = time.monotonic()
     done = REPRODUCTIONS[paper](seeds)
     if plots:
