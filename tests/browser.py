@@ -1,7 +1,8 @@
-"""Pages in a real browser: headless Chromium of the system, driven by Playwright.
+"""Helpers for tests of pages in a real browser: headless Chromium of the system, driven by
+Playwright.
 
-Debian and Ubuntu: apt install chromium; CI does. Where there is none, or no Playwright, the tests
-of pages are skipped and say so.
+On Debian and Ubuntu install it with `apt install chromium`, as CI does. Without Chromium or
+Playwright the tests of pages are skipped, and the reason is reported.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ DESK: Final = {"width": 1280, "height": 900}
 
 
 def find_chromium() -> str | None:
-    """Return the path of Chromium."""
+    """Return the path of the system's Chromium, or None if it is not installed."""
     return next((found for name in NAMES if (found := shutil.which(name))), None)
 
 
 class Opened:
-    """An opened page, its errors, and its network requests."""
+    """Page that was opened in the browser, with its errors and its network requests."""
 
     def __init__(self, page: Page) -> None:
         self.page = page
@@ -47,7 +48,9 @@ class Opened:
         return int(self.page.evaluate("document.body.dataset.drawn || 0"))
 
     def count_colours(self, panel: int = 0) -> dict[str, int]:
-        """Return the opaque colours of a canvas with the number of pixels of each."""
+        """Return the number of pixels per opaque colour (#rrggbb) of the canvas with
+        index `panel`.
+        """
         found: dict[str, int] = self.page.evaluate(_COLOURS, panel)
         return found
 
@@ -56,9 +59,13 @@ class Opened:
 def open_page(
     path: Path | str, *, phone: bool = False, ratio: float = 1.0, unbound: bool = False
 ) -> Iterator[Opened]:
-    """A file of this machine, or an address, in the browser; skips the test where there is none.
+    """Yield a file or an address, opened in the browser. Skip the test if there is no browser.
 
-    `unbound`: as many pictures a second as it can paint, not as many as a screen shows.
+    Args:
+        path: file of this machine, or address.
+        phone: True for the screen of a phone.
+        ratio: device pixels per CSS pixel.
+        unbound: True to paint as many frames per second as possible, without the screen's limit.
     """
     program = find_chromium()
     if program is None:

@@ -1,4 +1,4 @@
-"""A real S3 server in a process of its own that a test can stop, freeze and restart."""
+"""Real S3 server in a separate process, which a test can stop, freeze and restart."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SECRET = "not-to-be-read"
 
 
 class BucketServer:
-    """An S3 server that keeps its objects in a folder, so that they outlive it."""
+    """S3 server that stores its objects in a folder, so that they remain after a restart."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -42,7 +42,7 @@ class BucketServer:
         return {"copy": self.url, "store": self.store}
 
     def start(self) -> None:
-        """Start the server, and return when it serves."""
+        """Start the server, and return when it accepts connections."""
         words = ["-m", "localbucket", str(self._folder), "--port", str(self._port)]
         quiet = subprocess.DEVNULL
         self._process = subprocess.Popen([sys.executable, *words], stdout=quiet, stderr=quiet)
@@ -56,7 +56,9 @@ class BucketServer:
             self._process = None
 
     def take_away(self, how: str) -> None:
-        """Be "stopped", or "frozen": take connections and answer nothing."""
+        """Make the server unavailable: `how` is "stopped", or "frozen" (it accepts connections but
+        does not answer).
+        """
         if how == "stopped":
             self.stop()
         else:
@@ -64,7 +66,7 @@ class BucketServer:
             self._process.send_signal(signal.SIGSTOP)
 
     def bring_back(self, how: str) -> None:
-        """Continue after `take_away`."""
+        """Make the server available again after `take_away` with the same `how`."""
         if how == "stopped":
             self.start()
         else:
@@ -72,7 +74,7 @@ class BucketServer:
             self._process.send_signal(signal.SIGCONT)
 
     def read_objects(self) -> dict[str, bytes]:
-        """Return all objects."""
+        """Return the content of all objects of the bucket by name."""
         base = self._folder / BUCKET / PREFIX
         found = [
             path for path in base.rglob("*") if path.is_file() and not path.name.startswith(".")
@@ -80,7 +82,7 @@ class BucketServer:
         return {path.relative_to(base).as_posix(): path.read_bytes() for path in found}
 
     def path_of(self, name: str) -> Path:
-        """Return the path of an object's file."""
+        """Return the path of the file that stores an object."""
         return self._folder / BUCKET / PREFIX / name
 
     def _is_up(self) -> bool:
@@ -93,7 +95,7 @@ class BucketServer:
 
 @contextmanager
 def bucket_server(folder: Path) -> Iterator[BucketServer]:
-    """Yield a server for the block."""
+    """Yield a running server for the duration of the `with` block."""
     made = BucketServer(folder)
     made.start()
     try:
@@ -103,7 +105,9 @@ def bucket_server(folder: Path) -> Iterator[BucketServer]:
 
 
 def list_copied_files(root: Path) -> dict[str, bytes]:
-    """Return the files of an archive that must be in its copy."""
+    """Return the content of those files of an archive that its bucket copy must
+    contain, by path.
+    """
     from fleet_service.replication.replica import FOLDERS
 
     paths = [path for name in FOLDERS for path in (root / name).rglob("*") if path.is_file()]

@@ -1,5 +1,5 @@
-"""Distances of colours for four kinds of sight: simulated dichromats (Machado et al. 2009) and
-CIEDE2000.
+"""Distances between colours (CIEDE2000) for four kinds of colour vision: normal, and three
+simulated dichromats (Machado et al. 2009).
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ _WHITE: Final = _XYZ.sum(axis=1)
 
 
 def to_lab(colour: str, sight: str = "normal") -> FloatArray:
-    """CIELAB of a colour #rrggbb as a kind of sight has it, (3,)."""
+    """Return the CIELAB coordinates (3,) of a colour #rrggbb as seen with a kind of
+    colour vision.
+    """
     rgb = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     seen = np.clip(SIGHTS[sight] @ linear, 0.0, 1.0)
@@ -53,7 +55,9 @@ def to_lab(colour: str, sight: str = "normal") -> FloatArray:
 
 
 def colour_difference(first: FloatArray, second: FloatArray) -> float:
-    """CIEDE2000 of two colours in CIELAB (Sharma, Wu and Dalal 2005, eqs. 2 to 22)."""
+    """Return the CIEDE2000 difference of two CIELAB colours (Sharma, Wu and Dalal 2005, eqs. 2 to
+    22).
+    """
     (l1, a1, b1) = first
     (l2, a2, b2) = second
     seven = (np.hypot(a1, b1) + np.hypot(a2, b2)) ** 7 / 2.0**7

@@ -1,4 +1,4 @@
-"""Settings of all tests: property tests draw the same examples every time."""
+"""Settings of all tests: property tests draw the same examples in every run."""
 
 from __future__ import annotations
 

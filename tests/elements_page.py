@@ -1,4 +1,6 @@
-"""The reference page of all elements of the papers, from the lists in the estimators' modules."""
+"""Reference page that lists every equation, table and figure of the papers, from the lists in the
+estimators' modules.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The tutorial's first drive: a real minute of a dry motorway, imported, checked and published
-under three names.
+"""The first drive of the tutorial: a recorded minute on a dry motorway, imported, checked and
+published under three vehicle names.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Cells: TypeAlias = list[dict[str, object]]
 
 
 def read_commands() -> list[str]:
-    """Return the commands of the tutorial's first drive."""
+    """Return the commands of the tutorial's section "A real minute"."""
     text = (ROOT / "deploy" / "docs" / "tutorials" / "first-drive.md").read_text(encoding="utf-8")
     block = re.search(r"## A real minute\n.*?```\n(.*?)```", text, re.DOTALL)
     assert block
@@ -31,8 +31,8 @@ def read_commands() -> list[str]:
 
 
 def map_first_drive(folder: Path) -> tuple[Cells, list[str]]:
-    """Publish the minute under all names to a new router and service, and return the cells of the
-    map and the keys of alerts.
+    """Publish the minute under all names to a new router and service. Return the cells of the map
+    and the keys of the alerts.
     """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     with router:
@@ -44,7 +44,9 @@ def map_first_drive(folder: Path) -> tuple[Cells, list[str]]:
 
 
 def _publish_drive(system: System, log: Path) -> tuple[Cells, list[str]]:
-    """Import, check and replay the minute, and publish it under each name."""
+    """Import, check and replay the minute, and publish it under each name. Return the cells of the
+    map and the keys of the alerts.
+    """
     car = ["--vehicle", str(VEHICLE)]
     out = str(log.with_suffix(".csv"))
     alerts = list[str]()

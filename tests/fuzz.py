@@ -1,11 +1,12 @@
-"""Coverage-guided fuzzing of parsers: an input that runs new lines is kept and changed further.
+"""Coverage-guided fuzzing of parsers: an input that runs new lines of code is stored and mutated
+further.
 
     python -m tests.fuzz [--seconds 45] [--only NAME …] [--seed N] [--out .fuzz]
 
-Each parser has seeds in `tests/data/fuzz/NAME/`, which are kept, and a corpus in the folder
-`--out`. A crash is any exception that the parser does not document; a hang is more than SLOW_S for
-one input. Inputs that crash or hang are written next to the corpus. Add useful inputs that it finds
-to `tests/data/fuzz`.
+Each parser has committed seeds in `tests/data/fuzz/NAME/`, and a corpus in the folder `--out`. A
+crash is any exception that the parser does not document; a hang is more than SLOW_S for one input.
+Inputs that crash or hang are written next to the corpus. Copy useful new inputs to
+`tests/data/fuzz`.
 """
 
 from __future__ import annotations
@@ -66,14 +67,14 @@ WORDS: Final = (
 
 
 class Parser(NamedTuple):
-    """Parser with the exceptions that it documents."""
+    """Parser to be fuzzed, with the exceptions that it documents."""
 
     parse: Callable[[bytes], object]
     allowed: tuple[type[Exception], ...] = (InputError,)
 
 
 class Result(NamedTuple):
-    """Result of fuzzing one parser."""
+    """Counts of a fuzzing run of one parser."""
 
     executions: int
     corpus: int
@@ -104,17 +105,17 @@ def _load_manifest(data: bytes) -> object:
 
 
 class _OneFence:
-    """Bucket with one fence object."""
+    """Simulated bucket that contains one fence object."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content
 
     def list_names(self, _: str) -> list[str]:
-        """Return the name of the object."""
+        """Return the name of the only object."""
         return ["fence/0000000001-000001.json.gz"]
 
     def get(self, _: str) -> bytes:
-        """Return the content."""
+        """Return the content of the only object."""
         return self._content
 
 
@@ -147,10 +148,10 @@ class Fuzzer:
     """Fuzzer of one parser.
 
     Args:
-        parser: to be fuzzed.
-        inputs: to begin with.
-        seed: of the changes.
-        keep: called with kind and content of each input that is kept: corpus, crash or hang.
+        parser: the parser to fuzz.
+        inputs: initial corpus.
+        seed: seed of the random mutations.
+        keep: function that stores an input; called with its kind (corpus, crash or hang) and content.
     """
 
     def __init__(
@@ -166,7 +167,7 @@ class Fuzzer:
             self._run_input(one, always=True)
 
     def run(self, seconds: float = float("inf"), executions: float = float("inf")) -> Result:
-        """Fuzz for a time or a number of executions."""
+        """Fuzz for a time [s] or a number of executions, and return the counts."""
         end = time.monotonic() + seconds
         while self._executions < executions and time.monotonic() < end:
             self._run_input(self._mutate_input(self._random.choice(self._corpus)))
@@ -234,12 +235,12 @@ class Fuzzer:
 
 
 def seeds_of(name: str) -> list[bytes]:
-    """Return the kept seeds of a parser."""
+    """Return the committed seeds of a parser."""
     return [path.read_bytes() for path in sorted((SEEDS / name).glob("*"))]
 
 
 def make_keeper(folder: Path) -> Callable[[str, bytes], None]:
-    """Return a function that writes inputs to a folder, each once."""
+    """Return a function that writes each distinct input once into a folder."""
 
     def write_input(kind: str, data: bytes) -> None:
         path = folder / kind / hashlib.sha256(data).hexdigest()[:16]
@@ -250,7 +251,7 @@ def make_keeper(folder: Path) -> Callable[[str, bytes], None]:
 
 
 def main() -> int:
-    """Fuzz all parsers, or some; 1 if anything crashed or hung."""
+    """Fuzz all parsers, or those of `--only`. Return 1 if an input crashed or hung, otherwise 0."""
     parser = argparse.ArgumentParser(
         prog="tests.fuzz", description="Coverage-guided fuzzing of parsers."
     )

@@ -1,10 +1,9 @@
-"""`make image`: the steps of deploy/Dockerfile as a script, below a folder of their own; no
-container engine is needed.
+"""`make image`: runs the steps of deploy/Dockerfile as a script, without a container engine.
 
-Python is this machine's interpreter of the version that FROM names, in a fresh environment; folders
-of the image lie below another root. Then the content of the image is started: a router, and a
-service that is ready without compiling anything. Users cannot be changed here: the user of USER is
-only checked.
+Folders of the image become folders below another root. Python is this machine's interpreter of the
+version that FROM names, in a fresh environment. Then a router and a service of the image are
+started; the service must be ready without compiling anything. The user cannot be changed here, so
+the user of the USER instruction is only checked.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ START_S: Final = 60.0
 
 
 def parse_steps(text: str) -> list[tuple[str, str]]:
-    """An instruction of the Dockerfile and its words."""
+    """Return (instruction, arguments) for each step of a Dockerfile."""
     lines = [line for line in text.splitlines() if not line.lstrip().startswith("#")]
     joined = re.sub(r"\\\n", " ", "\n".join(lines))
     parted = [line.partition(" ") for line in joined.splitlines() if line.strip()]
@@ -52,7 +51,9 @@ def parse_steps(text: str) -> list[tuple[str, str]]:
 
 
 class Image:
-    """Result of the steps below `root`."""
+    """State of the image after the steps that were run: its folders below `root`, working folder
+    and environment.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -62,13 +63,15 @@ class Image:
         self.environment = {**kept, "HOME": str(root / "home"), "LANG": "C.UTF-8"}
 
     def localize_paths(self, text: str) -> str:
-        """A text with the folders of the image below the root, and this user for its owner."""
+        """Return a text with the folders of the image replaced by folders below `root`, and the
+        owner by this user.
+        """
         for place in PLACES:
             text = re.sub(rf"(?<![\w.]){re.escape(place)}\b", str(self.root) + place, text)
         return re.sub(r"chown (-R )?\d+:\d+", rf"chown \g<1>{os.getuid()}:{os.getgid()}", text)
 
     def run_step(self, name: str, words: str) -> None:
-        """Carry out one instruction."""
+        """Run one instruction of the Dockerfile."""
         if name == "FROM":
             self._start_from(words)
         elif name == "WORKDIR":
@@ -89,7 +92,7 @@ class Image:
             raise SystemExit(f"error: {name}: is no step that is known here")
 
     def run_command(self, *words: str) -> None:
-        """Run a command of the image; an end that is not 0 ends this."""
+        """Run a command of the image. Raise CalledProcessError if its exit code is not 0."""
         subprocess.run(words, cwd=self.folder, env=self.environment, check=True)
 
     def _start_from(self, base: str) -> None:
@@ -115,7 +118,9 @@ class Image:
 
 
 def time_start(image: Image) -> float:
-    """Return the seconds until a service of the image is ready. It must not compile anything."""
+    """Return the time [s] until a service of the image is ready. The service must not compile
+    anything.
+    """
     port = "127.0.0.1:0"
     with subprocess.Popen(
         ["python", "-m", "deploy.router", "--listen", f"tcp/{port}"],
@@ -153,7 +158,7 @@ def time_start(image: Image) -> float:
 
 
 def main() -> int:
-    """Build the image, and start its processes."""
+    """Build the image, start its processes, and return the exit code."""
     with tempfile.TemporaryDirectory() as folder:
         image = Image(Path(folder))
         (image.root / "home").mkdir()

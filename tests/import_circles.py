@@ -1,4 +1,4 @@
-"""Circles of modules that import each other."""
+"""Search for circular imports between modules."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from pathlib import Path
 
 
 def circles_of(modules: Mapping[Path, ast.Module]) -> list[str]:
-    """Return the circles among modules, given by path below the root; imports inside functions
-    count.
+    """Return one text per group of modules that import each other in a circle; imports inside
+    functions count.
+
+    Args:
+        modules: syntax trees by path below the root.
     """
     names = {_module_name(path): tree for path, tree in modules.items()}
     graph: dict[str, set[str]] = {name: set() for name in names}
@@ -31,7 +34,7 @@ def _module_name(path: Path) -> str:
 
 
 def _run_time_nodes(tree: ast.Module) -> list[ast.AST]:
-    """Return the nodes of a tree without the blocks that only the type checker reads."""
+    """Return the nodes of a syntax tree, without blocks that only the type checker reads."""
     found: list[ast.AST] = []
     waiting: list[ast.AST] = [tree]
     while waiting:
@@ -44,7 +47,7 @@ def _run_time_nodes(tree: ast.Module) -> list[ast.AST]:
 
 
 def _find_components(graph: dict[str, set[str]]) -> list[set[str]]:
-    """Return the strongly connected components of a graph (Kosaraju)."""
+    """Return the strongly connected components of a directed graph (Kosaraju's algorithm)."""
     order: list[str] = []
     seen: set[str] = set()
     for start in graph:

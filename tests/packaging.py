@@ -1,9 +1,9 @@
-"""`make package`: builds sdist and wheel, tries the wheel in a fresh environment, outside the
+"""`make package`: build sdist and wheel, and try the wheel in a fresh environment outside the
 source tree.
 
-The wheel is built from the sdist, so that a file missing in the one is missed in the other. It is
-tried with each Python of VERSIONS that this machine has, on the PATH or among pyenv's; for the
-others it prints a line. `--python` names more.
+The wheel is built from the sdist, so that a file missing in the sdist is noticed. The wheel is
+tried with each Python version of VERSIONS that this machine has, on the PATH or in pyenv. For a
+missing version a line is printed. `--python` adds interpreters.
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ WORKS = "import ensurepip, sys, venv; print('%d.%d' % sys.version_info[:2])"
 
 
 def find_interpreters() -> list[str]:
-    """Commands of the VERSIONS that work here; says which are left out, and why."""
+    """Return the commands of the Python versions in VERSIONS that work here. Print the versions
+    left out, and why.
+    """
     found = []
     for version in VERSIONS:
         why = "no such command on this machine"
@@ -58,8 +60,8 @@ def find_interpreters() -> list[str]:
 
 
 def list_candidates(version: str) -> list[str]:
-    """Where a Python of a version may be: this one, the command of that name, and what pyenv has
-    installed.
+    """Return possible commands of a Python version: this interpreter, the command of that name, and
+    the versions installed by pyenv.
     """
     this = sys.executable if version == ".".join(map(str, sys.version_info[:2])) else None
     kept = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
@@ -71,7 +73,9 @@ def list_candidates(version: str) -> list[str]:
 
 
 def main() -> int:
-    """Build the packages, install them and use them. Return 1 and print the reason if a step fails."""
+    """Build the packages, install the wheel and use it. Return 1 and print the reason if a step
+    fails.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m tests.packaging", description=(__doc__ or "").splitlines()[0]
     )
@@ -93,7 +97,9 @@ def main() -> int:
 
 
 def install_and_use(python: str, wheel: Path, folder: Path) -> None:
-    """Install the wheel for an interpreter and do the first steps of a new user in an empty folder."""
+    """Install the wheel for an interpreter, and run the first steps of a new user in an empty
+    folder.
+    """
     folder.mkdir()
     run_command([python, "-m", "venv", folder / "venv"], folder)
     scripts = folder / "venv" / "bin"
@@ -146,8 +152,8 @@ def install_and_use(python: str, wheel: Path, folder: Path) -> None:
 
 
 def run_command(command: list[str | Path], folder: Path) -> None:
-    """Run a command in a folder, with the seconds it took; SystemExit with its output where it
-    fails.
+    """Run a command in a folder and print its duration. Raise SystemExit with the command's output
+    if it fails.
     """
     began = time.monotonic()
     done = subprocess.run(

@@ -1,8 +1,8 @@
 """Reference pages of the documentation site, generated from the code: commands, settings, tables,
-metrics, elements of the papers.
+metrics, and the elements of the papers (equations, tables, figures).
 
-`deploy/docs/conf.py` writes them when the site is built, so they cannot lag behind the code. They
-are not committed.
+`deploy/docs/conf.py` writes these pages when the site is built, so they always agree with the code.
+The pages are not committed.
 
     python -m tests.reference_pages FOLDER
 """
@@ -60,7 +60,7 @@ def command_actions(program: str) -> Iterator[tuple[Any, list[argparse.Action]]]
 
 
 def command_page(program: str) -> str:
-    """Return the page of a program's commands and options."""
+    """Return the Markdown page of a program's commands and options."""
     parts = [f"# `{program}`: commands\n\nEvery command also accepts `-h`, `-v` and `-q`.\n"]
     for command, actions in command_actions(program):
         parts.append(f"\n## `{command.name}`\n\n{command.help}\n\n```\n{command.example}\n```\n")
@@ -110,7 +110,7 @@ def settings_rows(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[st
 
 
 def settings_page() -> str:
-    """Return the page of all settings."""
+    """Return the Markdown page of all settings."""
     parts = [
         (
             "# Configuration\n\nSettings are a JSON file, given with `--config`. Unknown names are "
@@ -127,7 +127,7 @@ def settings_page() -> str:
 
 
 def tables_page() -> str:
-    """Return the page of all tables of the contract."""
+    """Return the Markdown page of all tables of the contract."""
     parts = ["# Tables\n\nNames, types, units and meanings come from `schemas/tables.py`.\n"]
     for title, fields in TABLES.items():
         parts.append(f"\n## {title}\n\n| column | type | unit | meaning |\n|---|---|---|---|\n")
@@ -139,7 +139,7 @@ def tables_page() -> str:
 
 
 def all_metrics(root: Path) -> Shown:
-    """Return all metrics of a service with a new archive in `root`, and of an agent."""
+    """Return all metrics of an agent and of a service with a new archive in `root`."""
     config = ServiceConfig()
     engine = Engine(config, root)
     try:
@@ -173,12 +173,12 @@ def all_metrics(root: Path) -> Shown:
 
 
 def stored_name(metric: Metric) -> str:
-    """Return a metric's name in Prometheus."""
+    """Return the name under which Prometheus stores a metric."""
     return f"{PREFIX}{metric.name}{'_total' if metric.kind == 'counter' else ''}"
 
 
 def metrics_page(found: Shown) -> str:
-    """Return the page of all metrics."""
+    """Return the Markdown page of all metrics."""
     parts = [
         (
             "# Metrics\n\nNames as Prometheus stores them.\n\n| metric | of | kind | "

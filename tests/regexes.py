@@ -39,8 +39,8 @@ Characters = frozenset[int]
 
 
 class Part(NamedTuple):
-    """Part of a sequence: characters it can match, whether it may be empty, and whether it
-    repeats without bound.
+    """Part of a sequence in a pattern: the characters that it can match, whether it may be empty,
+    and whether it repeats without bound.
     """
 
     characters: Characters
@@ -49,19 +49,21 @@ class Part(NamedTuple):
 
 
 class Found(NamedTuple):
-    """A suspicious pattern and its place."""
+    """Suspicious pattern with its file and line."""
 
     place: str
     pattern: str
 
 
 def is_superlinear(pattern: str) -> bool:
-    """Return True if matching may take more than linear time."""
+    """Return True if matching a pattern may take more than linear time."""
     return any(_is_ambiguous(sequence) for sequence in _find_sequences(parser.parse(pattern)))
 
 
 def _is_ambiguous(sequence: list[Any]) -> bool:
-    """Return True if an unbounded repeat meets another one of the same characters, or holds one."""
+    """Return True if an unbounded repeat contains another repeat, or meets one of the same
+    characters.
+    """
     parts = [_describe_part(item) for item in sequence]
     for k, part in enumerate(parts):
         if not part.is_unbounded:
@@ -80,7 +82,9 @@ def _is_ambiguous(sequence: list[Any]) -> bool:
 
 
 def _never_fails(parts: list[Part], start: int) -> bool:
-    """Return True if everything after a repeat is optional, so that nothing is tried again."""
+    """Return True if everything after a repeat is optional, so that the matcher never backtracks
+    into the repeat.
+    """
     return all(part.is_optional for part in parts[start + 1 :])
 
 
@@ -105,7 +109,9 @@ def _holds_repeat(item: Any) -> bool:  # noqa: ANN401 the parser's own tuples
 
 
 def _find_sequences(parsed: Any) -> Iterator[list[Any]]:  # noqa: ANN401
-    """Yield every sequence of a pattern, with groups without a repeat opened."""
+    """Yield every sequence of a parsed pattern, with the content of unrepeated groups merged into
+    it.
+    """
     yield _open_groups(parsed)
     for name, value in parsed:
         for inner in _inner_patterns(name, value):
@@ -140,7 +146,7 @@ def _describe_part(item: Any) -> Part:  # noqa: ANN401
 
 
 def _match_characters(items: Any) -> Characters:  # noqa: ANN401
-    """Return the ASCII characters that items can match anywhere."""
+    """Return the ASCII characters that any of the items can match."""
     out: Characters = frozenset()
     for name, value in items:
         if name is sre.LITERAL:
@@ -187,7 +193,7 @@ _CATEGORIES: Final = {
 
 
 def find_patterns(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield line and text of the literal patterns in a file."""
+    """Yield line number and text of the literal patterns in a file."""
     for node in ast.walk(parse(path)):
         if (
             isinstance(node, ast.Call)
@@ -202,7 +208,7 @@ def find_patterns(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def find_all() -> list[Found]:
-    """Return the suspicious patterns of the product."""
+    """Return the suspicious patterns of the product's code."""
     return [
         Found(f"{path.relative_to(ROOT)}:{line}", pattern)
         for folder in PRODUCT
@@ -213,7 +219,7 @@ def find_all() -> list[Found]:
 
 
 def main() -> int:
-    """Print them; 1 if there are any."""
+    """Print all suspicious patterns. Return 1 if there are any, otherwise 0."""
     found = find_all()
     for one in found:
         print(f"{one.place}: {one.pattern}")

@@ -3,8 +3,8 @@ licences in `dist/`.
 
     python -m tests.release 0.2.0
 
-It changes `pyproject.toml` and `CITATION.cff`, and commits and tags nothing. `CHANGELOG.md` must
-have a section `## 0.2.0` with text: rename "Unreleased" first.
+The program changes `pyproject.toml` and `CITATION.cff`, but makes no commit and no tag.
+`CHANGELOG.md` must have a section `## 0.2.0` with text: rename "Unreleased" first.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def changelog_section(text: str, version: str) -> str:
     """Return the changelog's section of a version.
 
     Raises:
-        InputError: it is missing or empty.
+        InputError: the section is missing or empty.
     """
     found = re.search(
         rf"^## {re.escape(version)}\b[^\n]*\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL
@@ -40,12 +40,12 @@ def changelog_section(text: str, version: str) -> str:
 
 
 def with_version(text: str, pattern: str, version: str) -> str:
-    """Return a file's text with the version that a pattern finds replaced.
+    """Return a file's text with its version number replaced.
 
     Args:
-        text: of the file.
+        text: content of the file.
         pattern: regular expression with one group, the text before the version.
-        version: the new one.
+        version: the new version.
 
     Raises:
         InputError: the pattern does not match exactly once.
@@ -71,7 +71,9 @@ def set_version(root: Path, version: str, day: str) -> None:
 
 
 def list_licences() -> str:
-    """Return a line per installed package: name, version, licence."""
+    """Return a text with name, version and licence of each installed package, one
+    package per line.
+    """
     lines = []
     for package in distributions():
         about = package.metadata
@@ -85,7 +87,7 @@ def list_licences() -> str:
 
 
 def main() -> int:
-    """Run all steps; print what remains to be done by hand."""
+    """Run all steps, print the remaining manual steps, and return the exit code."""
     version = next(iter(sys.argv[1:]), "")
     if not VERSION.fullmatch(version):
         print("error: version: must be like 0.2.0; make release VERSION=0.2.0", file=sys.stderr)

@@ -1,14 +1,13 @@
-"""Results: keep the figures that campaigns measured, and write the pages that show them.
+"""Results: store the figures that campaigns measured, and write the pages that show them.
 
 Each campaign writes one `figures.json`. `make figures` copies the figures into `deploy/figures/`,
 each with the commit it was measured on, and then writes `deploy/docs/results.md` and the results
-block of the root README. `make results` writes the pages only. `tests/test_results.py` fails when a
-page is not current.
+block of the root README. `make results` only writes the pages. `tests/test_results.py` fails if a
+page is out of date.
 
     python -m tests.results [--pages-only] [NAME=FILE ...]
 
-NAME=FILE takes the figures of a campaign from FILE instead of the folder where its command leaves
-them.
+NAME=FILE reads the figures of campaign NAME from FILE instead of the campaign's own output folder.
 """
 
 from __future__ import annotations
@@ -45,12 +44,12 @@ Row = dict[str, Any]
 
 
 class Campaign(NamedTuple):
-    """A command that measures figures.
+    """Command that measures figures.
 
     Attributes:
-        command: the command that a person types.
-        output: folder in which it leaves `figures.json`.
-        title: name of a complete run in the header of that file; a quick run has another.
+        command: the command as typed in a shell.
+        output: folder in which the command writes `figures.json`.
+        title: name of a complete run in the header of that file; a quick run has another name.
     """
 
     command: str
@@ -122,12 +121,12 @@ CAMPAIGNS: Final = {
 
 
 class Table(NamedTuple):
-    """A table with one row per group of figures.
+    """Table with one row per group of figures.
 
     Attributes:
         campaign: key in CAMPAIGNS.
         title: heading on the page.
-        names: pattern of the names of the figures that the table is made from.
+        names: pattern of the names of the table's figures.
         render: function from values by name to Markdown.
     """
 
@@ -149,8 +148,8 @@ def _render_searches(values: dict[str, float]) -> str:
 
 
 def _format_fading(values: dict[str, float]) -> str:
-    """Return a table of the lower end, and of the deceleration [m/s²] that it allows, by weather
-    and time.
+    """Return a Markdown table of the interval's lower end and of the deceleration [m/s²] that it
+    allows, by weather and time.
     """
     times = [
         f"{minutes} min" if minutes < 60 else f"{minutes // 60} h" for minutes in fading.AFTER_MIN
@@ -216,7 +215,7 @@ TABLES: Final = (
 
 
 class Line(NamedTuple):
-    """A row of the results block of the root README."""
+    """Row of the results block of the root README."""
 
     text: str
     campaign: str
@@ -247,12 +246,14 @@ def list_pages() -> list[Path]:
 
 
 def read_kept(name: str) -> dict[str, Row]:
-    """Return the kept figures of a campaign by name; empty if none were kept."""
+    """Return the stored figures of a campaign by name. The result is empty if no figures are
+    stored.
+    """
     return {row["name"]: row for row in _read_rows(name)[1:]}
 
 
 def _read_runs(name: str) -> dict[str, Row]:
-    """Return date, machine and seeds of the kept runs, by commit."""
+    """Return date, machine and seeds of a campaign's stored runs, by commit."""
     return dict(header["runs"]) if (header := next(iter(_read_rows(name)), None)) else {}
 
 
@@ -263,16 +264,17 @@ def _read_rows(name: str) -> list[Row]:
 
 
 def keep_figures(name: str, source: Path) -> str:
-    """Keep the figures of a campaign's last complete run; figures that it did not measure stay.
+    """Store the figures of a campaign's last complete run. Figures that this run did not measure
+    stay as they are.
 
-    Each fault campaign is complete in itself, so `--only NAME` is accepted for them.
+    Each fault campaign is complete in itself, so runs with `--only NAME` are accepted for `faults`.
 
     Args:
         name: key in CAMPAIGNS.
         source: the `figures.json` that the campaign wrote.
 
     Returns:
-        one line with the result, or the reason why nothing was kept.
+        one line with the result, or the reason why nothing was stored.
     """
     campaign = CAMPAIGNS[name]
     if not source.exists():
@@ -313,15 +315,13 @@ def keep_figures(name: str, source: Path) -> str:
 
 
 def _is_wanted(name: str, row: Row, before: dict[str, Row]) -> bool:
-    """Return True for a figure with a bar, a figure that is already kept, and a figure of a
-    table.
-    """
+    """Return True if a figure has a target, is already stored, or belongs to a table."""
     shown = any(table.names.match(row["name"]) for table in TABLES if table.campaign == name)
     return row["bar"] is not None or row["name"] in before or shown
 
 
 def results_page() -> str:
-    """Return the text of `deploy/docs/results.md`, made from the kept figures and nothing else."""
+    """Return the text of `deploy/docs/results.md`, made only from the stored figures."""
     judged = [
         (name, row)
         for name in CAMPAIGNS
@@ -350,7 +350,9 @@ def results_page() -> str:
 
 
 def _campaign_section(name: str) -> Iterator[str]:
-    """Yield the lines of a campaign: command, runs, figures with the failing ones first, tables."""
+    """Yield the lines of a campaign's section: command, runs, figures with missed targets first,
+    tables.
+    """
     found = read_kept(name)
     yield f"\n## `{CAMPAIGNS[name].command}`\n"
     if not found:
@@ -390,7 +392,7 @@ def _is_in_table(row: Row, tables: list[Table]) -> bool:
 
 
 def readme_block() -> str:
-    """Return the results block of the root README, missed bars first."""
+    """Return the results block of the root README as Markdown, missed targets first."""
     rows = []
     for line in LINES:
         row = read_kept(line.campaign).get(line.name)
@@ -406,14 +408,14 @@ def readme_block() -> str:
 
 
 def format_number(value: float | None) -> str:
-    """Return a value with four significant digits."""
+    """Return a value as text with four significant digits."""
     if value is None:
         return ""
     return f"{value:,.0f}".replace(",", " ") if abs(value) >= 1e4 else f"{value:.4g}"
 
 
 def format_bar(row: Row, form: str = "{:g}") -> str:
-    """Return a bar as text, with its direction."""
+    """Return the target of a figure as text: "≤ limit", "≥ limit" or "least – most"."""
     limit = row["bar"]
     if limit is None:
         return ""
@@ -424,26 +426,26 @@ def format_bar(row: Row, form: str = "{:g}") -> str:
 
 
 def format_seeds(given: list[int]) -> str:
-    """Return seeds as text; a run of consecutive numbers as its ends."""
+    """Return seeds as text, consecutive seeds as "first to last"."""
     if len(given) > 2 and given == list(range(given[0], given[0] + len(given))):
         return f"{given[0]} to {given[-1]}"
     return ", ".join(map(str, given))
 
 
 def escape_unit(unit: str) -> str:
-    """Return a unit that can stand in a table."""
+    """Return a unit with the characters escaped that would break a Markdown table."""
     return unit.replace("|", "\\|")
 
 
 def with_block(page: str) -> str:
-    """Return a page with its results block replaced by the current one."""
+    """Return a page's text with its results block replaced by the current block."""
     before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
     return f"{before}{readme_block()}{after}" if begin and end else page
 
 
 def find_stale() -> list[str]:
-    """Return the pages that are not current."""
+    """Return one message per page that is out of date."""
     wanted = {PAGE: results_page(), README: with_block(README.read_text(encoding="utf-8"))}
     return [
         f"{path.relative_to(ROOT)} is not current; run `make results`"
@@ -459,7 +461,7 @@ def write_pages() -> None:
 
 
 def main() -> int:
-    """Keep the figures of all campaigns that ran, and write the pages."""
+    """Store the figures of all campaigns that ran, and write the pages."""
     parser = argparse.ArgumentParser(
         prog="make figures", description=(__doc__ or "").splitlines()[0]
     )

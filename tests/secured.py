@@ -1,5 +1,5 @@
-"""Two routers with mutual TLS and the generated access list, and sessions under any name, all of
-them real.
+"""Two real routers with mutual TLS and the generated access list, and Zenoh sessions under any
+enrolled name.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ RETRY = {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1
 
 
 def make_enrolment(**changed: object) -> Enrolment:
-    """Two routers, a service, a reader and two vehicles."""
+    """Return an enrolment of two routers, a service, a reader and two vehicles; `changed` replaces
+    fields.
+    """
     names = {
         "services": [SERVICE],
         "readers": [READER],
@@ -49,12 +51,12 @@ def make_enrolment(**changed: object) -> Enrolment:
 
 
 def open_registry(folder: Path) -> Registry:
-    """Create an authority in a folder, valid from now on."""
+    """Create a certificate authority in a folder, valid from now on."""
     return Registry(folder, Terms(), datetime.now(UTC))
 
 
 def settings(endpoint: str, folder: Path, **changed: object) -> ZenohSettings:
-    """A session's settings; `changed` are entries of its TLS section."""
+    """Return the settings of a session; `changed` are entries of its TLS section."""
     tls = {
         "root_ca_certificate": str(folder / "trust.pem"),
         "connect_certificate": str(folder / "{name}.pem"),
@@ -70,12 +72,13 @@ def settings(endpoint: str, folder: Path, **changed: object) -> ZenohSettings:
 
 @dataclass
 class Network:
-    """Two routers, each a process of its own; the second is connected to the first.
+    """Two routers, each in a separate process, with the second connected to the first.
 
-    `protocol` is the transport of sessions; routers reach each other over TLS. Without caps, an
-    attack that gets through is not hidden by one that was sent just before. Unguarded they check
-    nobody: a control. They are no part of the test's process because Zenoh may abort one in which
-    one of two connected routers is closed.
+    `protocol` is the transport of sessions; the routers connect to each other over TLS. If `capped`
+    is False, the routers do not limit message rates, so that a test's earlier attack does not hide
+    a later one. If `guarded` is False, they check no certificates, as a control. The routers run
+    outside the test's process because Zenoh may abort a process that closes one of two connected
+    routers.
     """
 
     folder: Path
@@ -87,22 +90,22 @@ class Network:
     between: dict[str, str] = field(default_factory=dict)
 
     def open_session(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
-        """Open a session under a name of the folder.
+        """Open a session under an enrolled name.
 
         Raises:
-            zenoh.ZError: the router does not want it.
+            zenoh.ZError: the router refuses the session.
         """
         return zenoh.open(
             configuration(settings(self.endpoints[router], self.folder, **changed), name)
         )
 
     def session_at(self, name: str, endpoints: Sequence[str]) -> zenoh.Session:
-        """A session under a name of the folder that tries these endpoints in turn."""
+        """Return a session under an enrolled name that tries several endpoints in turn."""
         where = settings(endpoints[0], self.folder).model_copy(update={"connect": list(endpoints)})
         return zenoh.open(configuration(where, name))
 
     def start(self, router: str) -> None:
-        """Start a router from its file in the folder, at its old place if it had one."""
+        """Start a router from its configuration file, on its previous port if it had one."""
         file = self.folder / f"{router}.json5"
         config = json.loads(file.read_text())
         if router != ROUTERS[0]:  # the file names fixed ports; here they are free ones
@@ -138,7 +141,7 @@ class Network:
             process.terminate()
 
     def await_link(self) -> None:
-        """Wait until a message put at one router comes out at the other, both ways."""
+        """Wait until messages pass between the two routers in both directions."""
         for first, second in (ROUTERS, ROUTERS[::-1]):
             with (
                 self.open_session(SERVICE, first) as here,
@@ -151,7 +154,7 @@ class Network:
                 subscriber.undeclare()
 
     def close(self) -> None:
-        """Stop every router that runs."""
+        """Stop all running routers."""
         for router in list(self.routers):
             self.stop(router)
 
@@ -174,7 +177,7 @@ def open_network(
     protocol: str = "tls",
     capped: bool = False,
 ) -> Iterator[Network]:
-    """Certificates in a folder, and both routers."""
+    """Create certificates in a folder, start both routers, and yield the network."""
     open_registry(folder).enrol(fleet or make_enrolment())
     running = Network(folder, guarded, protocol, capped)
     with ExitStack() as stack:

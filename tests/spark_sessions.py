@@ -1,5 +1,5 @@
-"""Local Spark sessions that retry a task as clusters do, and tasks whose process dies at the first
-try.
+"""Local Spark sessions that repeat failed tasks as a cluster does, and tasks whose process is
+killed at the first attempt.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ TRIES = 3
 
 @contextmanager
 def spark_session(count: int) -> Iterator[Any]:
-    """A session of Spark on so many cores, in the place of any other of this process."""
+    """Yield a Spark session with `count` cores. It replaces any other session of this process."""
     from pyspark.sql import SparkSession
 
     if (other := SparkSession.getActiveSession()) is not None:
@@ -44,8 +44,13 @@ def spark_session(count: int) -> Iterator[Any]:
 def killed_at_first(
     work: Callable[[_Task], _Outcome], name_of: Callable[[_Task], str], tries: Path
 ) -> Callable[[_Task], _Outcome]:
-    """Run the same work, but kill its process after the first try at each task. `tries` stores the
-    names of tasks.
+    """Return a function that does the same work, but kills its process at the first attempt of each
+    task.
+
+    Args:
+        work: function of a task.
+        name_of: returns a task's name.
+        tries: folder that records the names of attempted tasks.
     """
     tries.mkdir()
 

@@ -1,5 +1,5 @@
-"""Two or three services that take over from each other: real processes, a real S3 server, and links
-that can be cut.
+"""Two or three services that take over from each other: real processes, a real S3 server, and
+network links that can be cut.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from tests.faults.processes import Part
 
 
 class Link:
-    """A port that forwards to another port of this machine. While it is cut, it accepts connections
-    and forwards nothing.
+    """Port that forwards to another port of this machine. While the link is cut, the port accepts
+    connections and forwards nothing.
     """
 
     def __init__(self, port: int) -> None:
@@ -39,15 +39,15 @@ class Link:
 
     @property
     def is_cut(self) -> bool:
-        """True if it is cut."""
+        """Return True if the link is cut."""
         return not self._open.is_set()
 
     def restore(self) -> None:
-        """Resume the waiting traffic."""
+        """Forward the waiting and all later traffic."""
         self._open.set()
 
     def close(self) -> None:
-        """Close the port."""
+        """Close the port and all its connections."""
         for end in [self._server, *self._ends]:
             with suppress(OSError):
                 end.shutdown(socket.SHUT_RDWR)
@@ -78,7 +78,7 @@ class Link:
 
 
 class Host:
-    """A machine with a service, its link to the routers and its link to the bucket."""
+    """Simulated machine: a service, its link to the router and its link to the bucket."""
 
     def __init__(
         self,
@@ -106,11 +106,13 @@ class Host:
         self.part = Part("service", [sys.executable, *words], folder)
 
     def has_said(self, start: str) -> bool:
-        """Return True if a line of the present start begins with this text."""
+        """Return True if the service has printed a line beginning with this text since its last
+        start.
+        """
         return any(line.startswith(start) for line in self.part.read_lines())
 
     def close(self) -> None:
-        """End the service if it still runs."""
+        """Kill the service if it still runs, and close its links."""
         self.to_router.close()
         self.to_bucket.close()
         self.part.send_signal(signal.SIGCONT)
@@ -127,8 +129,8 @@ def open_hosts(
     named: bool = False,
     **settings: Any,  # noqa: ANN401
 ) -> Iterator[list[Host]]:
-    """Hosts, whose services are not started, each of its own name if `named`; they are gone
-    after the block.
+    """Yield hosts whose services are not yet started, and close them after the block. If `named`,
+    each service has its host's name.
     """
     with ExitStack() as stack:
         own = [{"name": name} if named else {} for name in names]
@@ -142,7 +144,9 @@ def open_hosts(
 
 
 def restore_archive(folder: Path, bucket: BucketServer) -> Path:
-    """Return the archive that an empty disk restores from the bucket. The bucket is not changed."""
+    """Return the archive that a service with an empty disk would restore from the bucket. The
+    bucket is not changed.
+    """
     root = folder / "archive"
     root.mkdir(parents=True)
     copy = BucketReplica(root, bucket.url, bucket.store)

@@ -1,11 +1,11 @@
-"""Figures of the code's structure, counted from its source.
+"""Figures about the structure of the code, counted from its source.
 
     python -m tests.structure [CHECKOUT]          print the table: figure, value, bar, ceiling
-    python -m tests.structure --places [FIGURE]   print where a figure comes from
+    python -m tests.structure --places [FIGURE]   print the code places that a figure counts
 
-Rooms are the entries of a package's folder. An arrow means that one of them imports another.
-`tests/test_structure.py` compares each figure with its ceiling. A ceiling above its bar is a bar
-not reached yet; ceilings only fall.
+A room is a module or sub-package of a package's folder. An arrow means that one room imports
+another. A bar is the target of a figure; its ceiling is the present limit, which may only fall.
+`tests/test_structure.py` compares each figure with its ceiling.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ HEAVY: Final = ("numba", "llvmlite", "scipy", "zenoh")
 
 
 def list_sources(root: Path, *folders: str) -> list[Path]:
-    """Return every handwritten Python file below the folders."""
+    """Return the paths of all handwritten Python files below the folders."""
     found = (path for folder in folders for path in sorted((root / folder).rglob("*.py")))
     return [path for path in found if not path.name.endswith("_pb2.py")]
 
 
 @cache
 def parse(path: Path) -> ast.Module:
-    """Return the syntax tree of a file, read once."""
+    """Return the syntax tree of a file; each file is parsed once."""
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def list_imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """Line and full name of everything imported in a syntax tree, also inside functions."""
+    """Yield line number and full name of every import in a syntax tree, also inside functions."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, name.name) for name in node.names)
@@ -52,13 +52,15 @@ def list_imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 def room_of(name: str) -> tuple[str, str]:
-    """Package and room of a dotted name."""
+    """Return the first two parts of a dotted name: package and sub-package (or module)."""
     package, room, *_ = [*name.split("."), "", ""]
     return package, room
 
 
 def list_room_imports(root: Path, package: str) -> dict[tuple[str, str], str]:
-    """Which room of a package imports which, each with one place where it does."""
+    """Return the pairs of sub-packages of a package of which the first imports the second, each
+    with one file and line.
+    """
     found: dict[tuple[str, str], str] = {}
     for path in list_sources(root, package):
         parts = path.relative_to(root / package).with_suffix("").parts
@@ -70,12 +72,12 @@ def list_room_imports(root: Path, package: str) -> dict[tuple[str, str], str]:
 
 
 def loose_modules(root: Path, package: str) -> list[str]:
-    """Modules that stand outside every room."""
+    """Return the modules that lie directly in a package's folder, outside its sub-packages."""
     return sorted(path.stem for path in (root / package).glob("*.py") if path.name != "__init__.py")
 
 
 def too_wide(root: Path) -> list[str]:
-    """Return functions with too many positional parameters."""
+    """Return the functions with too many positional parameters."""
     found = []
     for path in list_sources(root, *PACKAGES):
         for node in ast.walk(parse(path)):
@@ -88,7 +90,7 @@ def too_wide(root: Path) -> list[str]:
 
 
 def ambiguous_classes(root: Path) -> dict[str, list[str]]:
-    """Return class names that are used for several classes, with their places."""
+    """Return each class name that several classes have, with their files and lines."""
     places: dict[str, list[str]] = {}
     for path in list_sources(root, *PACKAGES):
         for node in ast.walk(parse(path)):
@@ -98,8 +100,8 @@ def ambiguous_classes(root: Path) -> dict[str, list[str]]:
 
 
 def light_import(root: Path) -> tuple[float, int, list[str]]:
-    """Return the time [ms] and number of modules of importing the contract, and the heavy libraries
-    among them.
+    """Return time [ms] and number of loaded modules of importing the contract package, and the
+    heavy libraries loaded with it.
     """
     words = (
         f"import sys, time; before = set(sys.modules); begun = time.perf_counter(); {LIGHT}; "
@@ -126,7 +128,7 @@ PRODUCT: Final = ("schemas", "edge_agent", "fleet_service")
 
 
 def functions(root: Path, *packages: str) -> Iterator[tuple[str, FunctionNode]]:
-    """Yield place and node of every function."""
+    """Yield place (file, line and name) and syntax node of every function."""
     for path in list_sources(root, *packages):
         for node in ast.walk(parse(path)):
             if isinstance(node, FunctionNode):
@@ -134,7 +136,9 @@ def functions(root: Path, *packages: str) -> Iterator[tuple[str, FunctionNode]]:
 
 
 def room_arrows(root: Path, folder: str) -> Places:
-    """Return the pairs of sub-packages (or modules) of a folder of which one imports the other."""
+    """Return the pairs of sub-packages (or modules) of a folder of which the first imports the
+    second.
+    """
     base = folder.replace("/", ".")
     found: dict[tuple[str, str], str] = {}
     for path in list_sources(root, folder):
@@ -151,15 +155,15 @@ def room_arrows(root: Path, folder: str) -> Places:
 
 
 def import_circles(root: Path) -> Places:
-    """Return the circles of modules that import each other, imports inside functions included."""
+    """Return the circles of modules that import each other, also inside functions."""
     return circles_of(
         {path.relative_to(root): parse(path) for path in list_sources(root, *PACKAGES)}
     )
 
 
 def methods_of_largest_class(root: Path) -> Places:
-    """Return every class with its number of methods and properties, largest first, one entry per
-    method.
+    """Return the methods and properties of the class that has most of them, one entry
+    per method.
     """
     largest: Places = []
     for path in list_sources(root, *PACKAGES):
@@ -175,8 +179,8 @@ def methods_of_largest_class(root: Path) -> Places:
 
 
 def most_parameters(root: Path) -> Places:
-    """Return the parameters of the function that has most, keywords counted, `self` and `cls`
-    not.
+    """Return the parameters of the function with the most parameters, including keyword parameters,
+    without `self` and `cls`.
     """
     most: Places = []
     for place, node in functions(root, *PACKAGES):
@@ -188,7 +192,7 @@ def most_parameters(root: Path) -> Places:
 
 
 def functions_with_many_parameters(root: Path) -> Places:
-    """Return the functions with more than six parameters, keywords counted."""
+    """Return the functions with more than six parameters, including keyword parameters."""
     found = []
     for place, node in functions(root, *PACKAGES):
         arguments = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
@@ -199,7 +203,7 @@ def functions_with_many_parameters(root: Path) -> Places:
 
 
 def packed_assignments(root: Path) -> Places:
-    """Return the assignments of a tuple that is written out to several names: `a, b = x, y`."""
+    """Return the statements that assign a literal tuple to several names: `a, b = x, y`."""
     found = []
     for path in list_sources(root, *PACKAGES):
         for node in ast.walk(parse(path)):
@@ -210,7 +214,7 @@ def packed_assignments(root: Path) -> Places:
 
 
 def fmt_skips(root: Path) -> Places:
-    """Return the lines that the formatter must not touch, tests included."""
+    """Return the lines that are excluded from formatting, also in tests."""
     marker = "# fmt: " + "skip"
     return [
         f"{path.relative_to(root)}:{line}"
@@ -221,7 +225,7 @@ def fmt_skips(root: Path) -> Places:
 
 
 def long_lines(root: Path) -> Places:
-    """Return the lines of more than 100 columns, tests included."""
+    """Return the lines of more than 100 characters, also in tests."""
     return [
         f"{path.relative_to(root)}:{line}"
         for path in list_sources(root, *PACKAGES, "tests")
@@ -234,8 +238,8 @@ _NESTING: Final = (ast.If, ast.For, ast.While, ast.With, ast.Try, ast.AsyncFor, 
 
 
 def _measure_depth(node: ast.AST) -> int:
-    """Return how many blocks are nested in a function; `elif` does not count, inner functions
-    count for themselves.
+    """Return the depth of nested blocks in a function. An `elif` adds no depth, and inner functions
+    are measured separately.
     """
     deepest = 0
     for child in ast.iter_child_nodes(node):
@@ -249,13 +253,13 @@ def _measure_depth(node: ast.AST) -> int:
 
 
 def deep_nesting(root: Path) -> Places:
-    """Return the functions with more than four nested blocks."""
+    """Return the functions with more than four levels of nested blocks."""
     found = ((place, _measure_depth(node)) for place, node in functions(root, *PACKAGES))
     return [f"{place} ({depth})" for place, depth in found if depth > 4]
 
 
 def many_locals(root: Path) -> Places:
-    """Return the functions with more than forty local names, parameters counted."""
+    """Return the functions with more than forty local names, including parameters."""
     found = []
     for place, node in functions(root, *PACKAGES):
         names = {item.arg for item in ast.walk(node.args) if isinstance(item, ast.arg)}
@@ -268,7 +272,7 @@ def many_locals(root: Path) -> Places:
 
 
 def named_constants(root: Path) -> Places:
-    """Return the numbers with a name between sensor and map.
+    """Return the named numbers in the packages that process data between sensor and map.
 
     Counted are module constants (capital letters) and fields of classes called …Constants whose
     value is a number or an expression of numbers, in `CONSTANT_ROOMS`.
@@ -298,7 +302,9 @@ def named_constants(root: Path) -> Places:
 
 
 def _is_number(node: ast.AST) -> bool:
-    """Return True for a number or arithmetic of numbers; a bool or a text is none."""
+    """Return True if a node is a number or an arithmetic expression of numbers, but not a bool or a
+    text.
+    """
     parts = list(ast.walk(node))
     constants = [part.value for part in parts if isinstance(part, ast.Constant)]
     plain = all(
@@ -309,7 +315,7 @@ def _is_number(node: ast.AST) -> bool:
 
 
 def only_tests_use(root: Path) -> Places:
-    """Return the product lines of functions and classes that only tests mention.
+    """Return the lines of product functions and classes whose name occurs only in tests.
 
     A name counts as used if any other line of product, deployment, Makefile, pages or examples
     contains it. Functions with a decorator other than `property` are left out, because the
@@ -366,13 +372,13 @@ def _per_1000_lines(count: int, root: Path) -> float:
 
 
 class Figure(NamedTuple):
-    """One row of the table.
+    """Row of the table of figures.
 
     Attributes:
-        name: of the figure.
-        bar: value to reach.
+        name: name of the figure.
+        bar: target value.
         ceiling: value that must not be exceeded; at most the last measured value.
-        places: returns one entry per counted thing.
+        places: function that returns one entry per counted code place.
         per_1000: True if the value is per 1,000 lines of the packages.
     """
 
@@ -383,7 +389,7 @@ class Figure(NamedTuple):
     per_1000: bool = False
 
     def measure(self, root: Path) -> float:
-        """Return the value."""
+        """Return the value of the figure for a checkout."""
         count = len(self.places(root))
         return _per_1000_lines(count, root) if self.per_1000 else float(count)
 
@@ -413,7 +419,7 @@ FIGURES: Final = (
 
 
 def main(arguments: list[str]) -> None:
-    """Print the table of a checkout, or the places of figures."""
+    """Print the table of figures of a checkout, or the code places that figures count."""
     if arguments[:1] == ["--places"]:
         for figure in FIGURES:
             if not arguments[1:] or arguments[1] in figure.name:

@@ -1,7 +1,8 @@
-"""Unmeasured cells have no number to colour by, in any form of output.
+"""No form of output gives a colour value to unmeasured cells.
 
-The first promise: unknown never reads as dry. A cell of which only lower bounds are known, or a row
-that rolled, has a median that is mostly the prior, and the prior's median looks like wet asphalt.
+This tests the first promise: unknown road is never shown as dry. If only lower bounds of a cell's μ
+are known, or a report used little grip, the median of μ is mostly the prior. The prior's median has
+the colour of wet asphalt.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ END: Final = "2026-01-28"
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return an archive with values and bounds. The snapshot of its map contains a bound with mu,
-    as files before version 1.2 do.
+    """Return an archive with measurements and lower bounds. Its map snapshot contains a lower bound
+    with a value of mu, as files before version 1.2 do.
     """
     root = tmp_path_factory.mktemp("bounds") / "archive"
     synthetic.write_archive(root, WORLD, 2000)
@@ -57,7 +58,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def two_cells() -> pa.Table:
-    """Return a measured cell and a cell with only a bound."""
+    """Return a map table with one measured cell and one cell with only a lower bound."""
     fusion = Fusion(120.0)
     likelihoods = np.concatenate([value([0.3]), at_least([0.15])])
     fusion.update(observations(np.array([0, 1]), np.array([0, 1]), likelihoods, [CELL, CELL + 1]))
@@ -69,8 +70,8 @@ def two_cells() -> pa.Table:
 def find_painted(
     rows: list[dict[str, Any]], known: Callable[[dict[str, Any]], bool], *names: str
 ) -> list[dict[str, Any]]:
-    """Return the rows without a measurement that have a number nevertheless. Fail if there are no
-    rows of either kind.
+    """Return the unmeasured rows that nevertheless have a number in one of the columns `names`.
+    Fail if there are no measured or no unmeasured rows.
     """
     bounds = [row for row in rows if not known(row)]
     assert bounds
@@ -101,7 +102,7 @@ def test_an_answer_of_the_service_has_no_mu_for_a_bound(form: Format) -> None:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of an export as a program reads them."""
+    """Return the rows of an exported file (CSV, GeoJSON or Parquet) as dictionaries."""
     if path.suffix == ".csv":
         return pacsv.read_csv(path).to_pylist()
     if path.suffix == ".geojson":

@@ -1,5 +1,5 @@
-"""SIGTERM and Ctrl-C: agent and service flush, settle as many reports as possible, and end, with
-and without a working router.
+"""Tests of SIGTERM and Ctrl-C: agent and service flush, settle as many reports as possible, and
+end, with and without a working router.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tests.waiting import until
 
 @pytest.fixture
 def there(tmp_path: Path) -> Iterator[Stage]:
-    """A router, a service and two vehicles that have had something acknowledged."""
+    """Yield a router, a service and two vehicles, after a first report was acknowledged."""
     with open_stage(tmp_path, segment_s=0.2) as there:
         there.make_load(["sim-001", "sim-002"], 20.0, flush_s=0.2).start()
         until(lambda: read_journals(there.journals).settled)

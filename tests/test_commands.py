@@ -34,7 +34,7 @@ Capture = pytest.CaptureFixture[str]
 
 @pytest.fixture
 def archive(tmp_path: Path) -> Path:
-    """A copy of the archive that is kept."""
+    """Return a copy of the archive that is committed as test data."""
     return Path(shutil.copytree(DATA / "v1.0" / "archive", tmp_path / "archive"))
 
 
@@ -141,7 +141,7 @@ def test_what_destroys_can_be_tried_and_asks_on_a_terminal(
 
 
 def on_terminal(command: list[str], answer: str) -> str:
-    """Return the output of a command for a person who types this answer."""
+    """Return the output of a command that runs on a terminal and reads this answer."""
     here, there = pty.openpty()
     with subprocess.Popen(command, stdin=there, stdout=there, stderr=there) as process:
         os.close(there)
@@ -338,14 +338,14 @@ def test_missing_package_is_one_line_with_its_extra(capsys: pytest.CaptureFixtur
     ],
 )
 def test_demo_and_plain_commands_load_without_optional_packages(modules: str) -> None:
-    """The extras demo and page bring neither SciPy nor matplotlib."""
+    """The extras `demo` and `page` do not install SciPy or matplotlib."""
     hidden = "import sys; sys.modules.update(dict.fromkeys(('scipy', 'matplotlib', 'ibis')))"
     command = [sys.executable, "-c", f"{hidden}; import {modules}"]
     subprocess.run(command, check=True, capture_output=True)
 
 
 def test_demo_extra_brings_what_its_processes_need(tmp_path: Path) -> None:
-    """The demo's service shows metrics; a part that cannot start gives its reason."""
+    """The demo's service serves metrics; a process that cannot start gives its reason."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     names = {re.split(r"[<>=]", one)[0] for one in extras["optional-dependencies"]["demo"]}
     assert {"prometheus-client", "starlette", "uvicorn"} <= names

@@ -1,4 +1,4 @@
-"""Pages that lag behind the code fail here: commands, options, rooms, links and sizes."""
+"""Tests that pages agree with the code: commands, options, folders, links and sizes."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def test_a_mistake_is_made_with_every_command() -> None:
 
 
 def list_commands(text: str) -> list[str]:
-    """Return the commands in the code blocks of a page, without comments; a synopsis with
-    brackets is none.
+    """Return the commands in the code blocks of a page, without comments and without lines that
+    contain brackets (synopses).
     """
     blocks = re.findall(r"^```\w*\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     lines = [line.strip() for block in blocks for line in block.splitlines() if "[" not in line]
@@ -106,7 +106,7 @@ def test_every_command_of_the_tutorials_is_understood_and_writes_to_try() -> Non
 
 
 def test_git_ignores_what_the_tutorials_make_and_every_key() -> None:
-    """`git add .` after the first hour must add no file, above all no private key."""
+    """`git add .` after the tutorials must not add any file, above all no private key."""
     made = [
         "try/certs/ca/key.pem",
         "certs/ca/key.pem",
@@ -127,7 +127,9 @@ def test_git_ignores_what_the_tutorials_make_and_every_key() -> None:
 
 
 def list_anchors(text: str) -> set[str]:
-    """Return the anchors of a page's headings, as forges make them, and its explicit labels."""
+    """Return the anchors of a page: those that GitHub makes from its headings, and its explicit
+    labels.
+    """
     titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     slugs = {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
     return slugs | set(re.findall(r"^\((.*)\)=$", text, re.MULTILINE))

@@ -1,5 +1,5 @@
-"""From wheels to map: recorded drives, the agent, a router, the service, and a client that knows
-only Zenoh.
+"""Whole system in one process: recorded drives, agent, router, service, and a client that uses only
+Zenoh.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ICE = 0.25
 
 
 class System:
-    """A router and a service in this process, and the folder with the files of the service and the
+    """Router and service in this process, with the folder for the files of the service and the
     agents.
     """
 
@@ -46,7 +46,7 @@ class System:
         self.start()
 
     def start(self) -> None:
-        """Start a service on the archive, as a restart would."""
+        """Start a service on the archive, also after `stop`, and wait until it is ready."""
         self._stop = threading.Event()
         service = Service(self.config, self.folder / "archive", self.said.append)
         self._thread = threading.Thread(target=service.run, args=(self._stop,))
@@ -55,13 +55,13 @@ class System:
         until(lambda: any(line.startswith("ready") for line in self.said[before:]))
 
     def stop(self) -> None:
-        """Let the service flush, acknowledge and leave."""
+        """Stop the service, which flushes and acknowledges first."""
         self._stop.set()
         self._thread.join(30)
         assert not self._thread.is_alive()
 
     def publish_drive(self, vehicle: str, manoeuvre: str, mu: float, seed: int) -> None:
-        """Record a drive and publish it as `vehicle`."""
+        """Simulate and record a drive, and publish it under the name `vehicle`."""
         log, file, out = (
             self.folder / f"{vehicle}-{n}"
             for n in ("log.parquet", "vehicle.json", "estimates.parquet")
@@ -93,7 +93,7 @@ class System:
         assert edge_agent([*words, "--trust", "--config", str(self.agent)]) == 0
 
     def query_cells(self, parameters: str = "format=json") -> list[dict[str, object]]:
-        """The map's cells as a client without our code gets them."""
+        """Return the map's cells as a client without GripMap code receives them."""
         session = open_session(ZenohSettings(connect=[self.endpoint]))
         assert session is not None
         with session:
@@ -118,7 +118,7 @@ def system(tmp_path: Path) -> Iterator[System]:
 
 
 def slippery_cells(system: System) -> list[dict[str, object]]:
-    """Return the measured cells after three cars braked on ICE."""
+    """Return the measured cells after three cars braked on a road with friction ICE."""
     for seed, vehicle in enumerate(VEHICLES):
         system.publish_drive(vehicle, "braking", ICE, seed)
     return [
@@ -176,7 +176,7 @@ def _most_slippery_first(cell: dict[str, object]) -> float:
 
 
 def list_archived(folder: Path) -> list[tuple[object, ...]]:
-    """Return the identities of all archived observations."""
+    """Return (vehicle, boot, region, seq, row) of each archived observation."""
     columns = ("vehicle", "boot", "region", "seq", "row")
     tables = reading.read_tables(folder / "archive", Kind.OBSERVATION, columns)
     return [

@@ -1,5 +1,5 @@
-"""Public interfaces: every name exists, is documented and reachable; plug-ins of other
-distributions are found.
+"""Tests of the public interfaces: every name exists, is documented and can be imported; plug-ins of
+other distributions are found.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""The frame of the fault campaigns: it reports missing figures, and its census finds lost and
-doubled rows.
+"""Tests of the framework of the fault campaigns: it reports missing figures, and its census finds
+lost and doubled rows.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def test_a_raising_campaign_ends_the_run_with_its_message(tmp_path: Path) -> Non
 
 @pytest.fixture
 def kept(tmp_path: Path) -> list[Batch]:
-    """Return three batches. The archive holds the first two, and the first one twice."""
+    """Return three batches. The archive contains the first two, and the first one twice."""
     now = time.time_ns()
     batches = [batch("sim-001", seq, now - SECOND, [0.8, 0.7]) for seq in (1, 2, 3)]
     for turn, shown in enumerate((batches[:2], batches[:1])):

@@ -1,4 +1,4 @@
-"""The tutorial's first drive: few commands, no alert, and no slippery cell on the map."""
+"""Tests of the tutorial's first drive: few commands, no alert, and no slippery cell on the map."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MOST_COMMANDS = 5
 
 @pytest.fixture(scope="module")
 def minute(tmp_path_factory: pytest.TempPathFactory) -> tuple[Cells, list[str]]:
-    """The map's cells and the keys of alerts."""
+    """Return the map's cells and the keys of alerts after the recorded minute was published."""
     return map_first_drive(tmp_path_factory.mktemp("minute"))
 
 

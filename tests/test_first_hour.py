@@ -1,4 +1,4 @@
-"""Bugs that new users met in their first hour and that no other test covers."""
+"""Regression tests of bugs that new users met in their first hour and that no other test covers."""
 
 from __future__ import annotations
 

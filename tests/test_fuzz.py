@@ -1,4 +1,6 @@
-"""The fuzzer finds a planted crash by coverage, and the kept seeds of all parsers crash nothing."""
+"""The fuzzer finds a deliberately planted crash by coverage, and the committed seeds crash no
+parser.
+"""
 
 from __future__ import annotations
 

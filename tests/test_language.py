@@ -1,7 +1,7 @@
 """Docstrings, names and pages keep the rules of language; ceilings per package and page only fall.
 
-`python -m tests.language` lowers the ceilings, `python -m tests.language RULE` prints the faults of
-a rule.
+`python -m tests.language` lowers the ceilings, `python -m tests.language RULE` prints the texts
+that break a rule.
 """
 
 from __future__ import annotations

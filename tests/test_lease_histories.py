@@ -1,4 +1,6 @@
-"""Histories of the lease in virtual time keep every promise, and broken protocols are found out."""
+"""Simulated histories of the lease in virtual time keep every promise, and deliberately broken
+protocols are detected.
+"""
 
 from __future__ import annotations
 

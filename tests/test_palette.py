@@ -1,7 +1,7 @@
-"""Colours are distinguishable for every kind of colour vision and on grey paper, by computation.
+"""Colours of the map are distinguishable for every kind of colour vision and when printed in grey.
 
-Sight is simulated as Machado, Oliveira and Fernandes (2009) do at full severity, distances are
-CIEDE2000 (Sharma, Wu and Dalal 2005).
+Colour vision deficiencies are simulated as by Machado, Oliveira and Fernandes (2009) at full
+severity. Distances are CIEDE2000 (Sharma, Wu and Dalal 2005).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ LEAST = 10.0  # CIEDE2000; 2.3 is just noticed side by side
 
 
 def test_the_difference_is_the_published_one() -> None:
-    """Pairs 1, 13 and 21 of table 1 of Sharma, Wu and Dalal (2005)."""
+    """Check pairs 1, 13 and 21 of table 1 of Sharma, Wu and Dalal (2005)."""
     pairs = [
         ((50.0, 2.6772, -79.7751), (50.0, 0.0, -82.7485), 2.0425),
         ((50.0, 2.5, 0.0), (56.0, -27.0, -3.0), 31.9030),
@@ -67,7 +67,9 @@ def test_the_lines_of_the_estimators_are_told_apart(sight: str) -> None:
 
 
 def test_the_old_scale_fails() -> None:
-    """Red to green, the former palette, made dry and snow the same olive for one man in twelve."""
+    """In the former palette (red to green), dry and snow had the same olive colour for
+    deuteranopes.
+    """
     snow = to_lab("#b8831b", "deuteranopia")
     dry = to_lab("#1bb83e", "deuteranopia")
     assert colour_difference(snow, dry) < LEAST

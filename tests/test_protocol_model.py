@@ -1,4 +1,6 @@
-"""The protocol keeps its promises in every state, and each of its rules is needed."""
+"""Exhaustive check of the protocol model: every reachable state keeps the promises, and without any
+one of the rules some state breaks a promise.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The results page and the results block of the root README are made from the kept figures."""
+"""The results page and the results block of the root README are made from the stored figures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests import results
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder in place of deploy/figures, empty."""
+    """Return an empty folder that replaces deploy/figures."""
     monkeypatch.setattr(results, "FOLDER", tmp_path / "figures")
     return tmp_path
 

@@ -1,4 +1,6 @@
-"""Structure of the packages, read from the source: imports, sizes, entries, docstrings."""
+"""Tests of the structure of the packages, read from the source: imports, sizes, entry points,
+docstrings.
+"""
 
 from __future__ import annotations
 
@@ -191,7 +193,7 @@ TRIED = "try"  # where the README's commands write; git ignores it
 
 
 def all_sources(*folders: str) -> list[Path]:
-    """Every Python file below the folders that a person wrote."""
+    """Return the paths of all handwritten Python files below the folders."""
     return [
         path
         for name in folders
@@ -204,13 +206,15 @@ def place_of(path: Path, line: int) -> str:
 
 
 def find_crossings(tree: ast.AST, package: str) -> list[tuple[int, str]]:
-    """Return the imports of project packages that `package` must not have."""
+    """Return line and name of the imports of project packages that `package` must not import."""
     forbidden = set(PACKAGES) - MAY_IMPORT[package] - {package}
     return [(line, name) for line, name in list_imports(tree) if name.split(".")[0] in forbidden]
 
 
 def find_impurities(tree: ast.AST) -> list[tuple[int, str]]:
-    """Return the imports and calls by which a pure module would do I/O."""
+    """Return line and name of the imports and calls that do I/O and are therefore forbidden in a
+    pure module.
+    """
     found = [(line, name) for line, name in list_imports(tree) if name.split(".")[0] in IMPURE]
     for node in ast.walk(tree):
         if (
@@ -229,8 +233,8 @@ def find_impurities(tree: ast.AST) -> list[tuple[int, str]]:
 
 
 def find_undocumented(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Yield public modules, classes and functions without a docstring; names inside a function are
-    private.
+    """Yield line and name of public modules, classes and functions without a docstring. Names
+    inside a function count as private.
     """
     if ast.get_docstring(tree) is None:
         yield 1, "module"
@@ -324,7 +328,9 @@ SHARED_NUMBER = re.compile(
 
 
 def shared_numbers(text: str) -> Iterator[tuple[int, str]]:
-    """Return the lines of code, comments apart, that repeat a shared number."""
+    """Yield line number and text where code repeats a number of `schemas.thresholds`; comments are
+    ignored.
+    """
     for line, words in enumerate(text.splitlines(), 1):
         if found := SHARED_NUMBER.search(words.partition("#")[0]):
             yield line, found[0]

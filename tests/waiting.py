@@ -1,4 +1,4 @@
-"""Wait for a condition with a deadline, instead of sleeping for a fixed time."""
+"""Functions that wait for a condition with a deadline, instead of sleeping for a fixed time."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ PATIENCE_S = 100.0
 
 
 def until(condition: Callable[[], object], patience_s: float = PATIENCE_S) -> None:
-    """Return as soon as `condition` holds.
+    """Wait until `condition()` is true.
 
     Raises:
-        TimeoutError: it did not within `patience_s`.
+        TimeoutError: the condition did not become true within `patience_s`.
     """
     deadline = time.monotonic() + patience_s
     pause = threading.Event()
@@ -27,5 +27,5 @@ def until(condition: Callable[[], object], patience_s: float = PATIENCE_S) -> No
 
 
 def matched(asker: zenoh.Publisher | zenoh.Querier) -> None:
-    """Return as soon as somebody listens, or answers."""
+    """Wait until a publisher has a subscriber, or a querier a queryable."""
     until(lambda: asker.matching_status.matching)  # type: ignore[attr-defined]  # the stubs call it a bool

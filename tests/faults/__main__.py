@@ -1,5 +1,5 @@
-"""`python -m tests.faults [--quick] [--only NAME …] [--out DIR] [--seed N]`: run the campaigns,
-print the table.
+"""`python -m tests.faults [--quick] [--only NAME …] [--out DIR] [--seed N]`: run the fault
+campaigns and print the table of their figures.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from tests.faults.frame import run_and_exit, run_campaigns
 
 
 def main() -> int:
-    """Run; 0 if every bar holds, 1 if one does not."""
+    """Run the chosen campaigns. Return 0 if every figure meets its bar (target), otherwise 1."""
     names = [campaign.name for campaign in CAMPAIGNS]
     parser = argparse.ArgumentParser(
         prog="tests.faults", description="Fault campaigns; see tests/faults/README.md."

@@ -1,11 +1,11 @@
-"""Age of an archive: the time until a service is ready on a grown archive, and the cost of a
-question about the past.
+"""Campaign on the age of an archive: the time until a service is ready on a large archive, and the
+cost of a query about the past.
 
-20 million observations and 40 million states of six days are made once and kept in `age-archive`
-next to the campaigns' folders. A service begins from Parquet alone, takes a checkpoint, and begins
-from that and the few rows since. Each is measured in a process of its own, by its peak memory.
-Finally a service begins from one day alone, and from that day with the other days dated months
-back: expired days must cost nothing.
+20 million observations and 40 million states of six days are generated once and stored in
+`age-archive` next to the campaigns' folders. A service starts from Parquet files only, writes a
+checkpoint, and starts again from this checkpoint and the few later rows. Each start runs in a
+separate process, whose peak memory is measured. Finally a service starts from one day only, and
+from this day plus the other days moved back by months: expired days must cost nothing.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ NEAR: Final = f"{LONGITUDE},{LATITUDE + 0.011},{LONGITUDE + 0.01},{LATITUDE + 0.
 
 
 def run(site: Site) -> list[Figure]:
-    """Twenty million observations and forty million states. In a quick run: eighty thousand
+    """Measure twenty million observations and forty million states; in a quick run, eighty thousand
     observations.
     """
     millions = site.choose_amount(2000, 8) / 100
@@ -92,7 +92,9 @@ def run(site: Site) -> list[Figure]:
 
 
 def _measure_smaller(site: Site, millions: float) -> tuple[dict[str, float], dict[str, float]]:
-    """Measure an archive of so many million observations."""
+    """Generate an archive of `millions` million observations, and return the figures of a start
+    from a checkpoint and of a query about the past.
+    """
     root = _ensure_archive(site, site.folder / f"age-{millions:g}", round(millions * 1e6))
     ready, past = _measure_archive(root)
     site.say(f"{millions:g} million: from a checkpoint {ready}; a question about the past {past}")
@@ -101,7 +103,7 @@ def _measure_smaller(site: Site, millions: float) -> tuple[dict[str, float], dic
 
 
 def _measure_archive(root: Path) -> tuple[dict[str, float], dict[str, float]]:
-    """Measure a start from a checkpoint, and a query about the past."""
+    """Return the figures of a start from a checkpoint, and those of a query about the past."""
     _measure_process("checkpoint", root)
     synthetic.write_archive(
         root, SyntheticFleet(SINCE, 1, vehicles=50, seed=int(time.time())), SEGMENT
@@ -110,7 +112,9 @@ def _measure_archive(root: Path) -> tuple[dict[str, float], dict[str, float]]:
 
 
 def _ensure_archive(site: Site, root: Path, observations: int) -> Path:
-    """Return an archive; make it if it is not there in this size."""
+    """Return the folder of an archive with this number of observations; generate it if it does not
+    exist.
+    """
     said = root / "size"
     if said.exists() and said.read_text() == str(observations):
         return root
@@ -127,8 +131,8 @@ def _ensure_archive(site: Site, root: Path, observations: int) -> Path:
 
 
 def _last_day(root: Path, to: Path, old: int) -> Path:
-    """Yield an archive that links to the same files: those of the last day and, if `old` is not 0,
-    the others shifted into the past by `old` times MAP_DAYS.
+    """Create an archive of links to the files of `root`, and return its folder. It contains the
+    last day and, if `old` is not 0, the other days moved back by `old` times MAP_DAYS.
     """
     shutil.copytree(root / "keys", to / "keys") if (root / "keys").exists() else None
     days = sorted({folder.name for folder in root.glob("observations/date=*")})
@@ -142,7 +146,7 @@ def _last_day(root: Path, to: Path, old: int) -> Path:
 
 
 def _write_states(root: Path, rows: int) -> None:
-    """States of a thousand vehicles at 2 Hz, in batches of two, on the roads of the
+    """Write states of a thousand vehicles at 2 Hz, two states per batch, on the roads of the
     observations.
     """
     writer = Writer(root, "shard-1")
@@ -171,14 +175,14 @@ def _write_states(root: Path, rows: int) -> None:
 
 
 def _encode_past_query(root: Path) -> bytes:
-    """Return a query of the past that the service would accept."""
+    """Return an encoded query about the past that the service would accept."""
     question = PastQuery(query.parse({"bbox": NEAR}), START_NS + (DAYS - 1) * DAY_NS, 120.0, None)
     assert 0 < rows_near(root, question.at, box_of(question), LOOKED_ROWS) <= LOOKED_ROWS
     return encode_question(question)
 
 
 def _measure_process(what: str, root: Path, asked: bytes = b"") -> dict[str, float]:
-    """Return the output of a process; see `age_process`."""
+    """Run `age_process` on an archive, and return the figures that it prints."""
     command = [sys.executable, "-m", "tests.faults.age_process", what, str(root)]
     done = subprocess.run(command, input=asked, stdout=subprocess.PIPE, check=True)
     found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])

@@ -1,8 +1,8 @@
-"""`python -m tests.faults.age_process WHAT ARCHIVE`: a process as the service begins it, measured
-by itself.
+"""`python -m tests.faults.age_process WHAT ARCHIVE`: one operation of a service in a separate
+process that measures itself.
 
-`ready`: begin from the archive; `checkpoint`: and take one; `past`: answer the question on stdin.
-Says seconds and the most megabytes that it ever had.
+`ready` starts a service from the archive, `checkpoint` also writes a checkpoint, and `past` answers
+the query on stdin. The process prints its time [s] and its peak memory [MB].
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def main() -> None:
-    """Run the chosen operation, and print its time and memory."""
+    """Run the chosen operation, and print its time [s] and peak memory [MB]."""
     what = sys.argv[1]
     root = Path(sys.argv[2])
     began = time.perf_counter()
@@ -52,8 +52,8 @@ def _start_engine(root: Path, and_checkpoint: bool) -> dict[str, float]:
 
 
 def _most_mb() -> float:
-    """Return the peak memory of this process. `getrusage` is not used because its value includes
-    the parent's.
+    """Return the peak memory of this process [MB]. `getrusage` is not used because its value
+    includes the parent process.
     """
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024

@@ -1,9 +1,9 @@
-"""Watcher behind a router that is restarted: it receives every standing alert soon after the
+"""Campaign on a restarted router: a watcher behind it receives every active alert soon after its
 session is back.
 
-Two routers, the service behind the one, a watcher behind the other. The watcher's router is killed,
-alerts are raised, and the router comes back. The watcher must receive the alerts raised meanwhile,
-and receives nothing while the router is down.
+The service is connected to the first router, the watcher to the second. The watcher's router is
+killed, alerts are raised, and the router is started again. The watcher must then receive these
+alerts, and nothing while its router is down.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Place = tuple[int, int]  # cell and sector
 
 
 def run(site: Site) -> list[Figure]:
-    """Run eight restarts with twenty alerts each; in a quick run one restart with ten alerts."""
+    """Run eight restarts with twenty alerts each; in a quick run, one restart with ten alerts."""
     each = site.choose_amount(20, 10)
     missing = 0
     waits = []
@@ -79,7 +79,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def _make_second_router(there: Stage) -> Part:
-    """Yield a second router on a fixed port that clients of the first router do not know."""
+    """Return a second router on a fixed port that clients of the first router do not know."""
     config = Path(there.folder) / "router-b.json"
     settings = zenoh.Config.from_file(str(CONFIG))
     settings.insert_json5("connect/endpoints", json.dumps([there.endpoint]))
@@ -104,7 +104,9 @@ def _record_alert(heard: dict[Place, float], sample: zenoh.Sample) -> None:
 
 
 def _make_ice_batches(turn: int, places: int) -> list[Batch]:
-    """Publish ice at this many new places, each reported by every witness."""
+    """Return batches that report ice in `places` new cells, each cell reported by every vehicle
+    that is needed for an alert.
+    """
     latitude = LATITUDE + APART * turn
     longitudes = [LONGITUDE + APART * place for place in range(places)]
     cells = [int(grid.cell_of(latitude, longitude)) for longitude in longitudes]
@@ -125,12 +127,12 @@ def _make_ice_batches(turn: int, places: int) -> list[Batch]:
 
 
 def _has_alerts(session: zenoh.Session, least: int) -> bool:
-    """Return True if so many alerts stand."""
+    """Return True if at least `least` alerts are active."""
     return len(_list_alerts(session)) >= least
 
 
 def _list_alerts(session: zenoh.Session) -> set[Place]:
-    """Return the standing alerts of the service."""
+    """Return cell and sector of each active alert of the service."""
     replies = [reply.ok for reply in session.get(f"{keys.ROOT}/alert/**")]
     return {
         (alert.cell, alert.sector)

@@ -1,5 +1,5 @@
-"""Attacks on a secured fleet. Each is a function that returns True if the attack succeeded; none
-may succeed.
+"""Attacks on a secured fleet. Each function returns True if the attack succeeded, which no attack
+may do.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ ALL_OBSERVATIONS = f"{keys.ROOT}/obs/**"
 
 
 def register_attempt(function: Attempt) -> Attempt:
-    """Enter an attack in the table under its name."""
+    """Add an attack to the table ATTEMPTS under its function name."""
     ATTEMPTS[function.__name__] = function
     return function
 
 
 def can_open(ground: Ground, name: str, router: str = ROUTERS[1], **changed: object) -> bool:
-    """Return True if a session opens."""
+    """Return True if the router accepts a session with this name and these TLS settings."""
     try:
         with ground.network.open_session(name, router, **changed):
             return True
@@ -62,7 +62,7 @@ def can_open(ground: Ground, name: str, router: str = ROUTERS[1], **changed: obj
 def issue_certificate(
     ground: Ground, name: str, folder: Path, *, days_ago: float = 0.0, days: float = 5.0
 ) -> dict[str, Any]:
-    """Issue a certificate with the authority of the fleet, and return its TLS entries."""
+    """Issue a certificate with the fleet's own authority, and return its TLS entries."""
     authority = ca.read_pair(ground.folder / "authority" / "ca")
     assert authority is not None
     folder.mkdir(exist_ok=True)
@@ -76,7 +76,7 @@ def issue_certificate(
 
 
 def make_stranger(ground: Ground) -> Path:
-    """Create another authority with the same names, and return its folder."""
+    """Create another certificate authority with the same names, and return its folder."""
     folder = ground.folder / "stranger"
     open_registry(folder).enrol(make_enrolment())
     return folder
@@ -127,7 +127,7 @@ def plain_tcp(ground: Ground) -> bool:
 
 
 def can_lure_vehicle(ground: Ground, folder: Path, name: str) -> bool:
-    """Return True if an honest vehicle opens a session at a router with this certificate."""
+    """Return True if an honest vehicle opens a session at a router that uses this certificate."""
     tls = {
         "root_ca_certificate": str(folder / "trust.pem"),
         "listen_certificate": str(folder / f"{name}.pem"),
@@ -163,7 +163,7 @@ def false_router_with_the_certificate_of_a_vehicle(ground: Ground) -> bool:
 
 
 def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
-    """Return True if any listener receives a message that is published there."""
+    """Publish a message on each key. Return True if any listener receives one of these messages."""
     for expression in expressions:
         session.put(expression, SECRET + expression.encode())
     ground.await_effects(session)
@@ -173,7 +173,7 @@ def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
 
 
 def list_foreign_keys(name: str) -> list[str]:
-    """Keys that do not belong to a vehicle of this name."""
+    """Return keys on which a vehicle of this name may not publish."""
     other = HONEST if name != HONEST else ROGUE
     return [
         key(other),
@@ -301,7 +301,7 @@ def spoofed_reply(ground: Ground) -> bool:
 
 
 def can_overhear(ground: Ground, session: zenoh.Session) -> bool:
-    """Return True if a session receives another vehicle's observations or acknowledgements."""
+    """Return True if a session receives observations or acknowledgements of another vehicle."""
     listener = Listener(
         session,
         (
@@ -363,7 +363,7 @@ def who_is_alive_is_told_to_a_vehicle(ground: Ground) -> bool:
 
 
 def as_router(ground: Ground, mode: str) -> bool:
-    """Connect as a router or peer, so that traffic of others might pass through the vehicle."""
+    """Connect as a router or peer, through which messages of others might pass."""
     given = settings(ground.network.endpoints[ROUTERS[1]], ground.folder)
     given = given.model_copy(
         update={"config": {**given.config, "mode": mode, "listen/endpoints": []}}
@@ -504,7 +504,7 @@ def administration_of_the_routers(ground: Ground) -> bool:
 
 @register_attempt
 def revoked_vehicle(ground: Ground) -> bool:
-    """Connect after the name was removed from the list and the routers were restarted."""
+    """Connect with a certificate of a name that was removed from the list."""
     network = ground.network
     lost = {
         f"connect_{part}": str(ground.folder / f"lost.{end}")

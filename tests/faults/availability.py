@@ -1,9 +1,9 @@
-"""Availability of page and service for another reader during attacks: share of its requests that
-are answered.
+"""Availability of the page and the service for another reader during attacks: share of that
+reader's requests that are answered.
 
-Each attacker runs for itself, from an address of its own. The other reader sends requests of the
-kind that the attacker competes for, one after the other. One that is refused, or not answered
-within PATIENCE_S, is not served. Page, service and router are processes of their own.
+Each attacker runs alone, from its own address. The other reader sends requests of the kind that the
+attacker competes for, one after the other. A request counts as failed if it is refused or not
+answered within PATIENCE_S. Page, service and router run in separate processes.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Attack = AbstractContextManager[None]
 
 
 class Target(NamedTuple):
-    """Attack the page, the query endpoint and past maps in turn."""
+    """Addresses of the attacked page and service."""
 
     host: str
     port: int
@@ -51,7 +51,7 @@ class Target(NamedTuple):
 
 
 def run(site: Site) -> list[Figure]:
-    """Send twenty requests next to each attacker; in a quick run six."""
+    """Send twenty requests during each attack; in a quick run, six."""
     asked = site.choose_amount(20, 6)
     served = {}
     with open_stage(site.folder, vehicle_kb_s=1e4, vehicle_burst_kb=1e5) as there:
@@ -96,7 +96,7 @@ def _await_page(target: Target) -> None:
 
 
 def _get(target: Target, path: str, source: str = "127.0.0.1") -> int:
-    """Return the status of a request; 0 without an answer."""
+    """Return the HTTP status of a request, or 0 without an answer."""
     connection = HTTPConnection(target.host, target.port, PATIENCE_S, (source, 0))
     try:
         connection.request("GET", path)
@@ -130,7 +130,7 @@ def _ask_events(target: Target) -> bool:
 
 
 def _ask_tile(target: Target, parameters: str = "") -> bool:
-    """Ask the service itself for one tile."""
+    """Query the service for one tile over Zenoh. Return True if it answers."""
     session = open_session(ZenohSettings(connect=[target.endpoint]))
     assert session is not None
     with session:
@@ -144,7 +144,7 @@ def _ask_service_past(target: Target) -> bool:
 
 @contextmanager
 def _loops(work: Callable[[], object]) -> Iterator[None]:
-    """Repeat work in LOOPS threads."""
+    """Repeat `work` in LOOPS threads for the duration of the `with` block."""
     stop = threading.Event()
 
     def go_on() -> None:
@@ -181,7 +181,9 @@ def _loop_service_past(target: Target) -> Attack:
 
 @contextmanager
 def _loop_service(target: Target, query: str) -> Iterator[None]:
-    """Ask the service in LOOPS threads of one session."""
+    """Send a query to the service again and again, in LOOPS threads of one session, during the
+    block.
+    """
     session = open_session(ZenohSettings(connect=[target.endpoint]))
     assert session is not None
     with session, _loops(lambda: list(session.get(query, timeout=PATIENCE_S))):
@@ -190,7 +192,9 @@ def _loop_service(target: Target, query: str) -> Iterator[None]:
 
 @contextmanager
 def _hold_connections(target: Target, *parts: bytes) -> Iterator[None]:
-    """Open connections and send these parts on each, reading a little of an answer in between."""
+    """Open CONNECTIONS connections, and on each send the given parts and read a little of the
+    answer after each part. The connections stay open during the block.
+    """
     with ExitStack() as stack:
         for _ in range(CONNECTIONS):
             with suppress(OSError):
@@ -220,7 +224,7 @@ def _hold_unread_answers(target: Target) -> Attack:
 
 @contextmanager
 def _hold_streams(target: Target) -> Iterator[None]:
-    """Open event streams and read none of them."""
+    """Open event streams without reading them, and keep them open during the block."""
     with ExitStack() as stack:
         for _ in range(STREAMS):
             one = HTTPConnection(target.host, target.port, PATIENCE_S, (ATTACKER, 0))

@@ -1,11 +1,12 @@
-"""The service away for an hour while routers stand and cars drive on; then it comes back, with a
-limited rate.
+"""Campaign on an outage of an hour: the service is down while routers run and cars drive on; then
+the service returns with a limited rate.
 
-The cars' outboxes and the service's engine are the real ones; network and time are simulated, so
-that an hour takes a minute. A service takes the messages of its queue and drops the rest, and
-acknowledges rows on disk twice a second. Each car has its share of the capacity of a service for a
-thousand cars: 20 batches a second, and 20 places of the queue. Every second it enters a cell that
-no car visited before. In the end all these cells must be on the map, the old ones as late reports.
+The cars' outboxes and the service's engine are real. Network and time are simulated, so that an
+hour takes a minute. The simulated service puts messages into a queue and drops those that do not
+fit. It acknowledges rows on disk twice a second. Its capacity is that of a service for a thousand
+cars, scaled to the number of cars: 20 batches a second and 20 places in the queue per car. Every
+second each car enters a cell that no car visited before. At the end all these cells must be on the
+map, the old ones as late reports.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ QUEUED: Final = 20.0  # messages of its queue for each
 
 @dataclass
 class Made:
-    """A simulated service: a real engine, waiting batches, and the number of bytes that reached the
-    routers.
+    """Simulated service: a real engine, a queue of batches, and the number of bytes that reached
+    the routers.
     """
 
     cars: int
@@ -57,8 +58,8 @@ class Made:
             self.queue.append(batch)
 
     def store_queued(self, now: float) -> list[tuple[str, bytes]]:
-        """Ingest as many batches as one step allows, write them to disk, and return the
-        acknowledgements.
+        """Ingest as many queued batches as one step allows, write them to disk, and return
+        (vehicle, acknowledgement) pairs.
         """
         if not self.up:
             return []
@@ -76,9 +77,7 @@ def _make_message(one: StoredBatch) -> Message:
 
 
 def _make_draft(car: int, now: float) -> tuple[Draft, int]:
-    """Return the reports of a car for half a second, and their cell; each car has a road of its
-    own.
-    """
+    """Return the reports of a car for half a second, and their cell. Each car has its own road."""
     latitude = PLACE[0] + 2 * CELL_DEG * car
     longitude = PLACE[1] + CELL_DEG * int(now)
     cell = int(grid.cell_of(latitude, longitude))
@@ -104,7 +103,7 @@ def _make_draft(car: int, now: float) -> tuple[Draft, int]:
 
 
 def run(site: Site) -> list[Figure]:
-    """Simulate an absence of one hour; in a quick run of ten minutes."""
+    """Simulate an outage of one hour; in a quick run, of ten minutes."""
     with closing(Engine(ServiceConfig(), site.folder / "archive")) as engine:
         return _run_outage(site, engine)
 
@@ -176,6 +175,6 @@ def _run_outage(site: Site, engine: Engine) -> list[Figure]:
 
 
 def _list_shown_cells(engine: Engine) -> set[int]:
-    """Return the cells that are on the map because of a visit that was counted."""
+    """Return the cells on the map with at least one counted visit."""
     fusion = engine.state.fusion
     return set(fusion.cell[fusion.live.visits[: fusion.size] > 0].tolist())

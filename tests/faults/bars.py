@@ -1,4 +1,4 @@
-"""Names, units and bars of the figures of the fault campaigns."""
+"""Names, units and bars (targets) of the figures of the fault campaigns."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from schemas.runtime.figures import Figure
 
 
 class Bar(NamedTuple):
-    """Bar of a figure."""
+    """Target of a figure, with its unit and direction."""
 
     unit: str
     bar: float
@@ -202,6 +202,6 @@ BARS: Final = {
 
 
 def make_figure(name: str, value: float) -> Figure:
-    """Return a figure of the table above; raise KeyError for an unknown name."""
+    """Return a figure with unit and target from BARS. Raise KeyError for an unknown name."""
     unit, bar, better = BARS[name]
     return Figure(name, value, unit, bar, better)

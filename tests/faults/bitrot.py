@@ -1,9 +1,10 @@
-"""Single-bit errors in every kind of file of service and agent: each error is detected or has no
-effect.
+"""Campaign on single-bit errors in every kind of file of service and agent: each error is detected
+or has no effect.
 
-Each time a copy of an archive is damaged and a service begins from it. Its map and its rows are
-compared with those of the whole archive, and every difference must have been counted. The same for
-spools: an agent must send exactly the stored bytes.
+For each error, one bit in a copy of an archive is changed, and a service starts from the copy. Its
+map and its rows are compared with those of the undamaged archive. Every difference must have been
+counted as damage. The outbox files of agents are tested in the same way: an agent must send exactly
+the stored bytes.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ BATCHES: Final = 40  # of a spool
 
 
 def run(site: Site) -> list[Figure]:
-    """Flip some bits in each kind of file."""
+    """Change random bits in each kind of file, and count errors that were not detected."""
     logging.getLogger("fleet_service").setLevel(logging.ERROR)  # every damage says so
     logging.getLogger("edge_agent").setLevel(logging.ERROR)
     random_ = random.Random(site.seed)
@@ -94,7 +95,9 @@ def _flip_bit(path: Path, random_: random.Random) -> int:
 
 
 def _reload_service(root: Path, whole: Path) -> dict[str, Any]:
-    """Return map, rows and counters of a service that begins here and receives every batch again."""
+    """Return map, rows and counters of a service that starts from `root` and receives every batch
+    again.
+    """
     with closing(Engine(ServiceConfig(), root)) as engine:
         for turn in range(ROUNDS):
             if root != whole:
@@ -129,7 +132,9 @@ def _is_same(found: dict[str, Any], right: dict[str, Any]) -> bool:
 
 
 def _damage_spool(site: Site, random_: random.Random, times: int) -> tuple[int, list[str]]:
-    """Change bits of a spool; return how often, and the errors that were not noticed."""
+    """Change bits of an outbox file. Return the number of changes, and the errors that were not
+    detected.
+    """
     path = site.folder / "whole.sqlite"
     wrong = []
     outbox = Outbox(path, boot=5)

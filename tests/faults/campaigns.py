@@ -1,4 +1,4 @@
-"""The campaigns, in the order in which they run."""
+"""List of the fault campaigns, in the order in which they run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Comparison of the generators' journals with the archive."""
+"""Comparison of the load generators' journals with the archive."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ Name = tuple[str, int, int, int]  # vehicle, boot, region, seq
 
 @dataclass(frozen=True)
 class Census:
-    """Counts after everything came to rest.
+    """Counts after all load has ended.
 
     Attributes:
-        stored: batches that were committed to a outbox.
-        settled: of those, batches that an acknowledgement settled.
+        stored: batches that were committed to an outbox.
+        settled: number of these batches that an acknowledgement settled.
         acknowledged_lost: settled batches of which a row is missing in the archive.
         lost: stored batches of which a row is missing, settled or not.
-        doubled: rows that are there more than once.
-        rows: in the archive.
-        observations: in the stored batches.
+        doubled: rows that the archive contains more than once.
+        rows: rows in the archive.
+        observations: observations in the stored batches.
     """
 
     stored: int
@@ -44,16 +44,16 @@ class Census:
 
 
 class Told(NamedTuple):
-    """Content of the journals: records and time [s] of every stored batch, time of every settled
-    one.
+    """Content of the journals: records and time [s] of every stored batch, and time of every
+    settled batch.
     """
 
     stored: dict[Name, tuple[int, float]]
     settled: dict[Name, float]
 
     def longest_wait(self, since: float) -> float:
-        """Seconds from `since` until the last batch stored before it was settled; infinite if
-        one never was.
+        """Return the time [s] from `since` until the last batch stored before it was settled. The
+        result is infinite if such a batch was never settled.
         """
         waits = [
             self.settled.get(name, float("inf")) - since
@@ -63,7 +63,7 @@ class Told(NamedTuple):
         return max(waits, default=0.0)
 
     def stored_between(self, begin: float, end: float) -> int:
-        """Batches that were stored between two times [s]."""
+        """Return the number of batches that were stored between two times [s]."""
         return sum(begin <= at <= end for _, at in self.stored.values())
 
 
@@ -84,7 +84,7 @@ def read_journals(journals: Iterable[Path]) -> Told:
 
 
 def compare_with_archive(journals: Iterable[Path], archive: Path) -> Census:
-    """Compare the journals with the whole archive."""
+    """Compare the journals with the whole archive, and return the counts."""
     stored, settled = read_journals(journals)
     held, doubled, rows = _count_archived(archive, {name[:2] for name in stored})
     doubled = max(doubled, _doubled_outside(archive))
@@ -101,8 +101,8 @@ def compare_with_archive(journals: Iterable[Path], archive: Path) -> Census:
 
 
 def _doubled_outside(archive: Path) -> int:
-    """Count the rows that appear twice for a reader that knows nothing of the format's rules and
-    reads the compacted files directly.
+    """Return the number of rows that appear twice for a program that reads the compacted files
+    directly, without the rules of the archive format.
     """
     paths = list(layout.compacted_files(archive, Kind.OBSERVATION))
     whole = [pq.read_table(path, columns=ROW, partitioning=None) for path in paths]
@@ -114,8 +114,12 @@ def _doubled_outside(archive: Path) -> int:
 def _count_archived(
     archive: Path, starts: set[tuple[str, int]]
 ) -> tuple[dict[Name, int], int, int]:
-    """Return the distinct rows of every archived batch by start (vehicle, boot), the number of
-    repeated rows, and the number of all rows.
+    """Return the number of distinct rows per archived batch, the number of repeated rows, and the
+    number of all rows.
+
+    Args:
+        archive: folder of the archive.
+        starts: (vehicle, boot) of the batches to count.
     """
     tables = list(reading.read_tables(archive, Kind.OBSERVATION, ROW))
     if not tables:

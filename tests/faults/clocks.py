@@ -1,9 +1,9 @@
-"""A service's clock a year ahead or back for a minute, while it runs or at its start; vehicles go
-on, and sit on ice.
+"""Campaign on a service's clock that is years ahead or behind for a minute, while the service runs
+or at its start. Meanwhile vehicles drive on, some of them on ice.
 
-The clock is the service's own, on made-up clocks of the machine; messages, engine, archive,
-checkpoint, retention and restart are real. Each case: vehicles find ice, the clock jumps, they go
-on and send some batches again; then a restart.
+The clock is the service's own, but it reads simulated clocks of the machine. Messages, engine,
+archive, checkpoint, retention and restart are real. In each case vehicles report ice, the clock
+jumps, the vehicles go on and send some batches again, and the service is restarted.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ CONFIG: Final = ServiceConfig(raw_days=31)
 
 
 class Case(NamedTuple):
-    """Size of a clock error, and when it occurs."""
+    """Size of a clock error, and whether it occurs at the start or while the service runs."""
 
     jump: int
     at_start: bool
@@ -60,15 +60,15 @@ class Machine:
         return SteadyClock(seen, lambda: self.true + self.off, lambda: self.true)
 
     def has_jumped(self, clock: SteadyClock) -> bool:
-        """Return True if a service's clock is far from the true time, or reports that the system
-        clock is.
+        """Return True if a service's clock is far from the true time, or if it reports that the
+        system clock is far away.
         """
         return max(abs(clock.now() - self.true), abs(clock.lag())) > YEAR // 2
 
 
 @dataclass
 class Found:
-    """Numbers of failures, summed over cases."""
+    """Numbers of failures, summed over the cases."""
 
     sent: int = 0
     rejected: int = 0
@@ -80,8 +80,8 @@ class Found:
 
 
 def run(site: Site) -> list[Figure]:
-    """Run all cases: a year ahead, a year back, and thirty years back as after an empty battery;
-    while running and at the start.
+    """Run all cases: a year ahead, a year behind, and thirty years behind (as after an empty
+    battery), each while the service runs and at its start.
     """
     cases = [
         Case(jump, at_start) for jump in (YEAR, -YEAR, -30 * YEAR) for at_start in (False, True)
@@ -105,8 +105,8 @@ def _run_case(root: Path, case: Case, found: Found, seconds: int) -> None:
     seq = 0
 
     def drive(engine: Engine, clock: SteadyClock, steps: int) -> None:
-        """Let all vehicles report each second and send their previous batches once more; then the
-        service does its jobs.
+        """For `steps` seconds, let all vehicles report and send their previous batches once more,
+        and then run the service's jobs.
         """
         nonlocal seq
         for _ in range(steps):
@@ -165,7 +165,7 @@ def _run_case(root: Path, case: Case, found: Found, seconds: int) -> None:
 
 
 def _apply_retention(root: Path, engine: Engine, clock: SteadyClock) -> None:
-    """Run retention as the service does."""
+    """Run the retention job as the service does."""
     jobs = archive_jobs(engine, CONFIG, root, clock.moment)
     next(job for job in jobs if job.name == "retention").work(threading.Event())
 
@@ -178,8 +178,8 @@ def _make_message(vehicle: int, seq: int, at: int) -> Message:
 
 
 def _count_rows(root: Path) -> Counter[tuple[int, int]]:
-    """Return how often each batch's row is in the archive; a vehicle has another pseudonym in
-    another month.
+    """Return the number of archived rows per (boot, seq). The vehicle is left out because its
+    pseudonym differs from month to month.
     """
     tables = list(reading.read_tables(root, Kind.OBSERVATION, ["boot", "seq"]))
     table = pa.concat_tables(tables)

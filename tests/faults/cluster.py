@@ -1,9 +1,9 @@
-"""`python -m tests.faults.cluster [--failovers 100] [--out DIR] [--seed N]`: services that follow
-each other, again and again, under load: killed, frozen, cut off, during a compaction, during an
-upload, with two standbys, and with one that wakes from a freeze.
+"""`python -m tests.faults.cluster [--failovers 100] [--out DIR] [--seed N]`: repeated failovers
+between services under load.
 
-At the end each machine, and one that begins with an empty disk, must hold all acknowledged rows,
-once.
+The active service is killed, frozen or cut off, at random times, during a compaction, or during an
+upload. Some failovers have two standbys, and some services resume after a freeze. At the end each
+machine, and one that starts with an empty disk, must have all acknowledged rows exactly once.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
 
 
 def rows_of(root: Path) -> int:
-    """Return the rows of an archive."""
+    """Return the number of observations in an archive."""
     return sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["row"]))
 
 
@@ -196,12 +196,12 @@ def _make_figures(failovers: int, happened: list[Failover], census: list[Census]
 
 
 def _make_figure(failovers: int, name: str, value: float, unit: str) -> Figure:
-    """Return a figure with its bar if the whole campaign ran."""
+    """Return a figure, with its target only if the whole campaign ran."""
     return make_figure(name, value) if failovers >= FULL else Figure(name, value, unit)
 
 
 def _make_median_figures(happened: list[Failover]) -> list[Figure]:
-    """Return the median time per kind of failure, as figures without bars."""
+    """Return the median takeover time [s] per kind of failure, as figures without targets."""
     found = []
     for name, kinds in {"kill": KILLED, "freeze": FROZEN, "cut": ("bucket", "routers")}.items():
         seconds = [one.seconds for one in happened if one.way in kinds]
@@ -217,7 +217,7 @@ def _make_median_figures(happened: list[Failover]) -> list[Figure]:
 
 
 def main() -> int:
-    """Run; 0 if every bar holds."""
+    """Run the campaign. Return 0 if every figure meets its target, otherwise 1."""
     parser = argparse.ArgumentParser(
         prog="tests.faults.cluster", description="Services that follow each other."
     )

@@ -1,6 +1,8 @@
-"""`python -m tests.faults.cluster_service …`: `fleet-service` that prints when it compacts and when
-it uploads, and does both often, so that a campaign can interrupt them. A line that begins an
-operation without one that ends it shows an interruption.
+"""`python -m tests.faults.cluster_service …`: `fleet-service` that prints when it compacts and
+uploads, so that a campaign can interrupt these operations.
+
+It compacts and uploads more often than usual. A printed beginning without a printed end shows that
+the operation was interrupted.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ def _print_mark(sign: str, what: str) -> None:
 def run(
     what: str, module: str, words: Sequence[str], stop: threading.Event, told: str | None = None
 ) -> str | None:
-    """Run a module as the service does, and print when it begins and ends."""
+    """Run a module in a subprocess as the service does, and print when the subprocess begins and
+    ends.
+    """
     _print_mark(BEGINS, COMPACTING)
     output = _run(what, module, words, stop, told)
     _print_mark(ENDS, COMPACTING)
@@ -41,7 +45,9 @@ def run(
 
 
 def sync_and_report(copy: BucketReplica) -> int:
-    """Print when a sync begins and ends."""
+    """Run one sync of the bucket copy, and print its end if it uploaded anything. Return the number
+    of changes.
+    """
     _copying.at = False
     changed = _follow(copy)
     if _copying.at:
@@ -50,7 +56,7 @@ def sync_and_report(copy: BucketReplica) -> int:
 
 
 def put_there(copy: BucketReplica, name: str) -> bool:
-    """Print when the first upload of a turn begins."""
+    """Upload one file, and print the beginning of the first upload of a sync."""
     if getattr(_copying, "at", None) is False:
         _copying.at = True
         _print_mark(BEGINS, COPYING)

@@ -1,8 +1,8 @@
-"""The machines of the cluster campaign: services of one region that follow each other, and the ways
-in which each of them ends.
+"""Machines of the cluster campaign: services of one region that take over from each other, and the
+ways in which each service fails.
 
-Three machines, a router, a bucket that a real S3 server keeps, loads that are acknowledged, and a
-client that asks for the map all the time.
+There are three machines, a router, a bucket on a real S3 server, load generators that receive
+acknowledgements, and a client that queries the map continuously.
 """
 
 from __future__ import annotations
@@ -49,7 +49,9 @@ PATIENCE_S: Final = 600.0  # a takeover that takes long is a figure, no hang
 
 
 def write_town_archive(root: Path) -> str:
-    """Create an archive with a town's map as of today, and return the box of the town."""
+    """Create an archive with a town's map of today, and return the bounding box of the town as
+    text.
+    """
     writer = Writer(root, "shard-0")
     since = time.time_ns() - START_NS - DAY_S * NS - 60 * NS
     for rows in synthetic.make_chunks(WORLD):
@@ -64,7 +66,7 @@ def write_town_archive(root: Path) -> str:
 
 
 class Journals:
-    """Batches that were acknowledged to the loads, updated as acknowledgements arrive."""
+    """Batches that were acknowledged to the load generators, updated as acknowledgements arrive."""
 
     def __init__(self, paths: Iterable[Path]) -> None:
         self._paths = list(paths)
@@ -72,7 +74,7 @@ class Journals:
         self._times: list[float] = []
 
     def read_new_times(self) -> list[float]:
-        """Times [s] of the acknowledgements since the last call."""
+        """Return the times [s] of the acknowledgements since the last call."""
         found: list[float] = []
         for path in self._paths:
             with path.open("rb") as file:
@@ -84,7 +86,7 @@ class Journals:
         return found
 
     def longest_pause(self, since: float) -> float:
-        """Return the longest time [s] without an acknowledgement since a moment."""
+        """Return the longest time [s] between successive acknowledgements since a moment."""
         return float(np.diff(sorted(at for at in self._times if at >= since)).max())
 
     def first_after(self, moment: float) -> float:
@@ -102,7 +104,9 @@ class Journals:
 def start_loads(
     folder: Path, endpoint: str, processes: int, vehicles: int, rate: float
 ) -> list[Part]:
-    """Start load generators with `rate` observations per second and vehicle."""
+    """Start load generators in `processes` processes, each with `vehicles` vehicles and `rate`
+    observations per second and vehicle.
+    """
     made = []
     for number in range(processes):
         config = folder / f"load-{number}.json"
@@ -124,13 +128,13 @@ def start_loads(
 
 
 class Asking:
-    """A client that asks for a box all the time. A correct answer has everything that is known, or
-    says that no service serves the box.
+    """Client that queries a box continuously. A correct answer is complete, or reports that no
+    service serves the box.
 
     Attributes:
-        whole: answers with all that was known at the beginning.
-        unserved: answers, or errors, that say that something is missing.
-        silent: answers without it that say nothing.
+        whole: number of answers with everything that was known at the beginning.
+        unserved: number of answers, or errors, that report that something is missing.
+        silent: number of incomplete answers that do not report this.
     """
 
     PAUSE_S: Final = 0.2
@@ -152,7 +156,9 @@ class Asking:
         self._thread.join(PATIENCE_S)
 
     def _read_cells(self) -> tuple[frozenset[tuple[int, int]], bool]:
-        """Return cells and sectors of the box, and True if the answer reports a missing region."""
+        """Return (cell, sector) of each row in the box, and True if the answer reports a missing
+        region.
+        """
         try:
             answer = map_client.query_map(self._router, {"bbox": self._box})
         except InputError:
@@ -183,7 +189,7 @@ Go = Callable[[Host, random.Random, float], None]
 
 
 class Way(NamedTuple):
-    """A kind of failure, and the lease time [s] of the service."""
+    """Kind of failure, and the lease time [s] of the service that fails."""
 
     go: Go
     end: Callable[[Host, random.Random], None] = lambda host, _: host.part.kill()
@@ -218,7 +224,7 @@ def _kill_during(what: str) -> Go:
 
 
 def _restore_link(host: Host, random_: random.Random) -> None:
-    """Return when the link comes back: at a given time, or after the service has noticed its
+    """Restore a host's links, after a random time or after the service has noticed its
     successor.
     """
     if random_.random() < 0.5 or host.to_router.is_cut:
@@ -258,7 +264,7 @@ class Failover(NamedTuple):
 
 
 class Machines:
-    """Machines of one region: one serves, one is the standby, the others are spare."""
+    """Machines of one region: one is active, some are standbys, the others are spare."""
 
     def __init__(
         self,
@@ -288,7 +294,9 @@ class Machines:
         )
 
     def fail_over(self, name: str) -> Failover | None:
-        """Let the service go; None if nobody had to follow it."""
+        """Let the active service fail, and return the result. Return None if no standby had to take
+        over.
+        """
         gone = self.serving
         way = WAYS[name]
         terms = self._count_leases()
@@ -311,7 +319,7 @@ class Machines:
         return sum(1 for _ in self._leases.glob("*.json"))
 
     def _await_takeover(self) -> None:
-        """Wait until one of the standbys serves, and return it."""
+        """Wait until one of the standbys is active, and record it as the active machine."""
         until(self._find_ready, PATIENCE_S)
         taker = self._find_ready()
         assert taker is not None
@@ -337,15 +345,17 @@ class Machines:
         return former
 
     def pause_s(self, router: ZenohSettings) -> float:
-        """Measure a hand-over under load: the time without any acknowledgement [s]."""
+        """Hand the region over under load, and return the longest time [s] without any
+        acknowledgement.
+        """
         began = self._journals.first_after(time.time())
         self.hand_over(router)
         self._journals.first_after(time.time())
         return self._journals.longest_pause(began)
 
     def map_difference(self, router: ZenohSettings, parts: list[Part]) -> float:
-        """Measure a hand-over without load: the largest difference between both states, as in
-        their checkpoints.
+        """Hand the region over without load, and return the largest difference between the states
+        of both services, read from their checkpoints.
         """
         for part in parts:
             part.send_signal(signal.SIGSTOP)
@@ -363,7 +373,9 @@ class Machines:
         return find_difference(both[0].tables, both[1].tables)
 
     def stop_all(self) -> list[Host]:
-        """Let each machine take over and stop in turn, so that each one has seen all data."""
+        """Let each machine take over and stop in turn, so that each one has received all data.
+        Return all machines.
+        """
         seen = []
         everybody = len(self.waiting) + len(self._idle)
         for left in range(everybody, -1, -1):
@@ -388,8 +400,8 @@ def _was_amid(host: Host, what: str) -> bool:
 
 
 def find_difference(one: dict[str, pa.Table], other: dict[str, pa.Table]) -> float:
-    """Return the largest difference of numbers with a fraction; infinite if anything else
-    differs.
+    """Return the largest difference of the floating-point numbers in two sets of tables. The result
+    is infinite if anything else differs.
     """
     worst = 0.0
     if one.keys() != other.keys():
@@ -407,7 +419,9 @@ def find_difference(one: dict[str, pa.Table], other: dict[str, pa.Table]) -> flo
 
 
 def drain_loads(parts: list[Part]) -> None:
-    """Stop new observations, and wait until all are acknowledged or acknowledgements stop."""
+    """Stop new observations, and wait until all of them are acknowledged or no more
+    acknowledgements arrive.
+    """
     for part in parts:
         part.send_signal(signal.SIGUSR1)
     with suppress(TimeoutError):

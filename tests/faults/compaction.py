@@ -1,7 +1,8 @@
-"""kill -9 during compaction, again and again, while a log is written to and a reader reads.
+"""Campaign of kill -9 during compaction, repeated while one thread writes to the log and another
+reads the archive.
 
-`python -m tests.faults.compaction ARCHIVE` compacts for ever, in small rounds; the campaign kills
-it at random moments.
+`python -m tests.faults.compaction ARCHIVE` compacts in an endless loop of small rounds; the
+campaign kills this process at random moments.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ UNTIL_KILL_S: Final = (0.0, 0.6)  # since it began: a round takes a tenth of a s
 
 
 class Writing:
-    """A thread that writes to a log until it is closed. Every seq up to `acknowledged` is durable."""
+    """Thread that writes batches to the log until it is closed. Every seq up to `acknowledged` is
+    durable.
+    """
 
     def __init__(self, root: Path) -> None:
         self.acknowledged = 0
@@ -59,8 +62,8 @@ class Writing:
 
 
 class Reading:
-    """A thread that reads the archive until it is closed. It counts reads, and reads in which a row
-    was missing or doubled.
+    """Thread that reads the archive until it is closed. It counts its reads, and the reads in which
+    a row was missing or doubled.
     """
 
     def __init__(self, root: Path, writing: Writing) -> None:
@@ -86,7 +89,7 @@ class Reading:
 
 
 def read_compacted(root: Path) -> Iterable[pa.Table]:
-    """Return the rows that a foreign tool reads: the compacted files alone, as listed at one
+    """Return the rows that another program would read: only the compacted files, as listed at one
     moment.
     """
     for path in list(layout.compacted_files(root, Kind.OBSERVATION)):
@@ -94,7 +97,7 @@ def read_compacted(root: Path) -> Iterable[pa.Table]:
 
 
 def is_complete(tables: Iterable[pa.Table], owed: int) -> bool:
-    """Return True if the rows of batches 1 … `owed` are there, and none twice."""
+    """Return True if every row of batches 1 to `owed` is present, and no row occurs twice."""
     rows = Counter(
         p for t in tables for p in zip(t["seq"].to_pylist(), t["row"].to_pylist(), strict=True)
     )
@@ -103,7 +106,7 @@ def is_complete(tables: Iterable[pa.Table], owed: int) -> bool:
 
 
 def run(site: Site) -> list[Figure]:
-    """Kill 50 compactions; in a quick run five."""
+    """Kill 50 compactions; in a quick run, five."""
     root = site.folder / "archive"
     random_ = random.Random(site.seed)
     part = Part(

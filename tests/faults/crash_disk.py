@@ -1,11 +1,12 @@
-"""A simulated disk with power loss: while it is in use, power can fail at any operation of the code
-under test.
+"""Simulated disk with power loss: while it is in use, power can fail at any file operation of the
+code under test.
 
-The files are real and lie in a folder; the code's operations on them go through here (`os.fsync`,
-`os.rename`, `os.unlink`, `os.mkdir`, `os.rmdir`, `os.open`, `Path.open`, `shutil.rmtree`). After
-power loss only synced data is certain: the bytes of a file at its last fsync, and the names in a
-folder at its own. Of everything later any part may have reached the disk: of the bytes a prefix,
-with or without rubbish behind, and of the changes of names any that keep the order of each name.
+The files are real and lie in a folder. The code's operations on them are redirected to this module
+(`os.fsync`, `os.rename`, `os.unlink`, `os.mkdir`, `os.rmdir`, `os.open`, `Path.open`,
+`shutil.rmtree`). After power loss only synced data is certain: the bytes of a file at its last
+fsync, and the names in a folder at the folder's last fsync. Any part of the later data may have
+reached the disk. For bytes this is a prefix, with or without random bytes after it. For changes of
+names it is any subset that keeps the order of the changes of each name.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ FOLDER = -1  # instead of the number of a file
 
 
 class PowerLoss(BaseException):
-    """Power loss. Code under test must not catch it, and nothing is executed after it."""
+    """Simulated power loss. Code under test must not catch this exception, and nothing is executed
+    after it.
+    """
 
 
 class CrashDisk:
@@ -34,9 +37,9 @@ class CrashDisk:
 
     Args:
         live: the folder; empty, or an image that `write_image` made.
-        random_: chooses what survives.
-        power: operations until power is lost; None: it stays.
-        full: operations that find the disk full, by number.
+        random_: chooses which unsynced data survives.
+        power: number of operations until power is lost; None for no power loss.
+        full: numbers of the operations that find the disk full.
     """
 
     def __init__(self, live: Path, random_: random.Random, power: int | None, full: range) -> None:
@@ -67,13 +70,13 @@ class CrashDisk:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _number_file(self, path: Path) -> int:
-        """Return the inode number of a new file."""
+        """Assign the next file number to a new file, and return it."""
         self._numbers += 1
         self._number[path.stat().st_ino] = self._numbers
         return self._numbers
 
     def _keep_content(self, path: Path) -> None:
-        """Record that a file is about to lose its name."""
+        """Record the content of a file that is about to lose its name."""
         if path.is_file():
             self._written[self._number[path.stat().st_ino]] = path.read_bytes()
 
@@ -141,8 +144,8 @@ class CrashDisk:
         return rename
 
     def _move_names(self, source: str, target: str) -> None:
-        """Rename a folder: its durable content stays durable under whichever of the two names
-        survives.
+        """Record that a folder was renamed: its durable content remains durable under the surviving
+        name.
         """
         for path in [path for path in self._names if f"{path}/".startswith(f"{source}/")]:
             self._names[target + path.removeprefix(source)] = self._names[path].copy()
@@ -210,7 +213,9 @@ class CrashDisk:
         return open_
 
     def write_image(self, target: Path) -> None:
-        """Create the folder that a machine finds after power loss at this moment."""
+        """Write the files that a machine would find after power loss at this moment into the folder
+        `target`.
+        """
         there = [Path(folder) / name for folder, _, files in os.walk(self.live) for name in files]
         numbered = {self._number.get(path.stat().st_ino): path for path in there}
         written = {
@@ -236,8 +241,8 @@ class CrashDisk:
                 )
 
     def _draw_surviving(self, synced: bytes | None, written: bytes) -> bytes:
-        """Return the bytes of a file after power loss: the synced ones, or a prefix of those
-        written since, and rubbish.
+        """Return a random possible content of a file after power loss: the synced bytes, or a
+        prefix of the bytes written since, possibly followed by random bytes.
         """
         if written == synced:
             return synced
@@ -246,7 +251,7 @@ class CrashDisk:
 
 
 def _rmtree(path: Path, ignore_errors: bool = False) -> None:
-    """Remove a tree like `shutil.rmtree`, but by names instead of handles."""
+    """Remove a folder tree like `shutil.rmtree`, but by path names instead of file descriptors."""
     try:
         for inner in sorted(Path(path).iterdir()):
             if inner.is_dir():

@@ -1,5 +1,5 @@
-"""A few lives of one archive on a disk with power loss: each but the last ends by a power loss at a
-random operation, and the next one starts from the surviving files.
+"""Histories of an archive on a disk with power loss. A history has a few lives: each except the
+last ends by power loss at a random operation, and the next life starts from the surviving files.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ BatchType = TypeVar("BatchType")
 
 
 class Lives(ABC, Generic[BatchType]):
-    """One history by its number, in an empty folder.
+    """One history, identified by its number, in an empty folder.
 
     Attributes:
-        lives: how many.
-        operations: within so many the power goes.
-        full_after: within so many the disk may become full, for a few.
-        acknowledged: batches.
-        at_stake: how many of these before a power loss.
+        lives: number of lives.
+        operations: upper limit of the number of operations until power loss.
+        full_after: upper limit of the number of operations until the disk may be full for a short time.
+        acknowledged: batches that were acknowledged.
+        at_stake: number of batches that were acknowledged before a power loss.
     """
 
     lives: ClassVar[int]
@@ -59,11 +59,11 @@ class Lives(ABC, Generic[BatchType]):
 
     @abstractmethod
     def _run_life(self, root: Path, last: bool) -> None:
-        """Run one life on the disk."""
+        """Run one life on the disk `root`."""
 
     @abstractmethod
     def _find_problems(self, root: Path, last: bool) -> list[str]:
-        """Read the archive as the next life finds it."""
+        """Read the archive as the next life finds it, and return the problems."""
 
     def _pass_time(self) -> None:
-        """Run the checks between two lives."""
+        """Change the archive between two lives, as time or an operator would."""

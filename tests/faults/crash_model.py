@@ -1,13 +1,14 @@
-"""Histories on a disk with power loss: power lost at any operation, torn writes, a full disk.
+"""Campaign of histories on a disk with power loss: power lost at any operation, partly written
+data, a full disk.
 
-Thousands of histories of the log and its compaction are here; `crash_spool` has those of the
-agent's outbox, `crash_service` those of a whole service with its keys, checkpoints, weather,
-retention and forgetting.
+This module has thousands of histories of the log and its compaction. `crash_spool` has histories of
+the agent's outbox. `crash_service` has histories of a whole service with its keys, checkpoints,
+weather, retention and erasure.
 
-A history of the log is a few lives of one archive. In each, batches are let in, segments written,
-compacted; then the power fails at a random operation, and the next life starts from the surviving
-files. Acknowledged rows must be there, each once, and a batch may only count as held if it is. In
-the last life everything that was not acknowledged is sent again.
+A history of the log is a few lives of one archive. In each life batches are admitted, and segments
+are written and compacted. Then the power fails at a random operation, and the next life starts from
+the surviving files. Every acknowledged row must be present exactly once, and a batch may count as
+received only if it is present. In the last life every unacknowledged batch is sent again.
 """
 
 from __future__ import annotations
@@ -49,14 +50,14 @@ CELLS: Final = grid.cell_of(np.array([57.7, 57.7]), np.array([11.97, 15.97]))
 
 
 class Batch(NamedTuple):
-    """Return one batch of the history."""
+    """One batch of the history."""
 
     kind: Kind
     seq: int
 
 
 def rows_of(batches: list[Batch]) -> Rows:
-    """Return rows of batches of one kind in the form that the log takes."""
+    """Return the rows of batches of one kind as columns, as the log expects them."""
     kind = batches[0].kind
     n = ROWS * len(batches)
     rows: Rows = {
@@ -81,7 +82,7 @@ def rows_of(batches: list[Batch]) -> Rows:
 
 
 class History(Lives[Batch]):
-    """A history of the log."""
+    """History of the log."""
 
     lives = 3
     operations = 80
@@ -166,7 +167,7 @@ class History(Lives[Batch]):
 
 
 def run_log_history(number: int) -> list[str]:
-    """Return the violations of one history of the log."""
+    """Return the violations (broken promises) found in one history of the log."""
     return _run_log(number)[0]
 
 
@@ -183,27 +184,31 @@ def _run_log(number: int) -> tuple[list[str], int]:
 
 
 def _run_outbox(number: int) -> tuple[list[str], int]:
-    """Return the same for the outbox, where nothing is acknowledged."""
+    """Return the violations found in one history of the outbox, and 0 because nothing is
+    acknowledged.
+    """
     return spool_history(number), 0
 
 
 def _run_service(number: int) -> tuple[list[str], int]:
-    """Return the same for a whole service."""
+    """Return the violations found in one history of a whole service, and the number of batches
+    acknowledged before a power loss.
+    """
     with tempfile.TemporaryDirectory(prefix="crash-", dir=_find_memory_folder()) as folder:
         one = ServiceHistory(number, Path(folder))
         return one.find_violations(), one.at_stake
 
 
 def _find_memory_folder() -> str | None:
-    """Return a folder in memory if there is one. The simulated disk decides about durability, so
-    the real one need not be used.
+    """Return a folder in memory if the system has one. A real disk is not needed, because the
+    simulated disk decides about durability.
     """
     return "/dev/shm" if Path("/dev/shm").is_dir() else None
 
 
 def run(site: Site) -> list[Figure]:
-    """Run 5 000 histories of the log, 500 of the outbox and 600 of a service; in a quick run 120 of
-    all.
+    """Run 5 000 histories of the log, 500 of the outbox and 600 of a service; in a quick run, 120
+    in total.
     """
     logs = site.choose_amount(5000, 100)
     outboxes = site.choose_amount(500, 10)

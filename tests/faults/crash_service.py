@@ -1,12 +1,12 @@
 """Histories of a whole service on a disk with power loss: keys, log, compaction, roll-ups,
-checkpoints, snapshots, weather, retention and forgetting.
+checkpoints, snapshots, weather, retention and erasure.
 
-A history is a few lives of one archive, days apart. In each the engine takes batches and weather,
-and the jobs of its upkeep run in any order. Between two lives an operator may have a vehicle's
-month forgotten, or the whole month. The power fails at a random operation. The next life must find
-all acknowledged rows, each once, and all weather that acted. It must know a batch again if and only
-if it holds it. The map from a checkpoint and the log equals the map from the log alone, no
-compacted file is damaged, and forgotten rows do not come back.
+A history is a few lives of one archive, days apart. In each life the engine receives batches and
+weather, and its maintenance jobs run in any order. Between two lives an operator may erase one
+vehicle's month or the whole month. The power fails at a random operation. The next life must find
+every acknowledged row exactly once, and all weather that was used. It must recognise a repeated
+batch if and only if the archive contains it. The map from a checkpoint and the log must equal the
+map from the log alone, no compacted file may be damaged, and erased rows must not come back.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ NEARLY: Final = 0.01  # likewise, of a cell that was dropped for a week's rest a
 
 
 class Sent(NamedTuple):
-    """A batch as its vehicle holds it; `time` of its last row [ns]."""
+    """Batch as its vehicle stores it; `time` is that of its last row [ns]."""
 
     vehicle: str
     seq: int
@@ -67,17 +67,17 @@ class Sent(NamedTuple):
 
     @property
     def rows(self) -> tuple[int, int]:
-        """Return the identity of its rows in the archive."""
+        """Return the times of the batch's rows [ns], which identify the rows in the archive."""
         return self.time - SECOND, self.time
 
     @property
     def month(self) -> str:
-        """Return the month to which the batch belongs."""
+        """Return the month to which the batch belongs, as YYYY-MM."""
         return f"{datetime.fromtimestamp(self.rows[0] // SECOND, UTC):%Y-%m}"
 
 
 class ServiceHistory(Lives[Sent]):
-    """A history of a service.
+    """History of a service.
 
     Attributes:
         done: operations that were completed before a power loss.
@@ -120,7 +120,7 @@ class ServiceHistory(Lives[Sent]):
         self._now += self.random.randint(0, AWAY_DAYS * 86_400) * SECOND
 
     def _forget_month(self, root: Path) -> None:
-        """Erase a vehicle's month, or a whole month, while no service runs."""
+        """Erase one vehicle's month, or a whole month, while no service runs."""
         one = self.random.choice(self.sent)
         whole = self.random.random() < 0.3
         key = root / "keys" / f"{one.month}.key"
@@ -174,7 +174,7 @@ class ServiceHistory(Lives[Sent]):
             self.done[job] += 1
 
     def _write_checkpoint(self, engine: Engine, root: Path) -> None:
-        """Take a checkpoint: requested by the background job, written by the worker after a
+        """Write a checkpoint: the background job requests it, and the worker writes it after a
         segment.
         """
         stop = threading.Event()
@@ -268,8 +268,8 @@ class ServiceHistory(Lives[Sent]):
         return found
 
     def _find_lost(self, rows: Counter[int], last: bool) -> list[str]:
-        """Return acknowledged rows that are missing without a reason. In the last life every
-        vehicle has sent its batches again.
+        """Return one message per acknowledged batch with missing rows. In the last life this also
+        covers unacknowledged batches, because every vehicle has sent its batches again.
         """
         owed = [
             one for one in self.sent if one in self.acknowledged or (last and self._may_come(one))
@@ -288,7 +288,7 @@ class ServiceHistory(Lives[Sent]):
         return one.rows[0] // layout.DAY_NS <= self.retired or bool(marks & self.forgetting)
 
     def _came_back(self, root: Path, rows: Counter[int]) -> list[str]:
-        """Return forgotten data that is there nevertheless."""
+        """Return one message per erased batch or key that is present again."""
         found = [
             f"{one.vehicle} {one.seq} came back"
             for one in self.gone
@@ -299,7 +299,7 @@ class ServiceHistory(Lives[Sent]):
 
     def _find_state_errors(self, root: Path, rows: Counter[int]) -> list[str]:
         """Compare the map and the known batches restored from a checkpoint with those restored from
-        the log alone.
+        the log alone, and return the differences.
         """
         if not (root / "inbox").is_dir():
             return []
@@ -336,12 +336,12 @@ class ServiceHistory(Lives[Sent]):
 
 
 def _compute_boot(vehicle: str) -> int:
-    """Return a batch like `examples.batch`."""
+    """Return the boot number that `examples.batch` gives to a vehicle's batches."""
     return 1 + sum(vehicle.encode())
 
 
 def _find_differences(begun: ServiceState, whole: ServiceState, now: int) -> list[str]:
-    """Return the differences in belief of two states of one archive."""
+    """Return the differences between the beliefs of two states restored from one archive."""
     if not whole.fusion.size:
         return []
     slots = np.arange(whole.fusion.size)

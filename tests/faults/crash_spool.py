@@ -1,9 +1,9 @@
 """Histories of the agent's outbox: power lost at any byte that SQLite had not yet synced.
 
-SQLite writes by itself, so its files are observed from outside: before and after each commit. When
-a commit has returned, its bytes are synced. Power loss in the middle of the next one leaves the old
-files with a part of the new log. If the log was being folded into the database, it leaves any
-mixture of old and new pages, with the old log.
+SQLite writes its files itself, so the files are read before and after each commit. When a commit
+has returned, its bytes are synced. Power loss during the next commit leaves the old files with a
+part of the new log. If SQLite was copying the log into the database, power loss leaves any mixture
+of old and new pages, with the old log.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ CAPACITY: Final = 10**9
 
 
 class Files(NamedTuple):
-    """Bytes of the database and of its log."""
+    """Bytes of the database file and of its write-ahead log."""
 
     database: bytes
     log: bytes
@@ -36,7 +36,7 @@ class Files(NamedTuple):
 
 
 def spool_history(number: int) -> list[str]:
-    """Return the violations of one history."""
+    """Return the violations (broken promises) found in one history."""
     random_ = random.Random(number)
     folder = Path(tempfile.mkdtemp(prefix="spool-"))
     try:
@@ -75,7 +75,7 @@ def _run_history(random_: random.Random, folder: Path) -> list[str]:
 
 
 def _tear_write(random_: random.Random, before: Files, after: Files) -> Files:
-    """Return the files that power loss during the commit may leave."""
+    """Return a possible content of the files after power loss during a commit."""
     if before.database != after.database and random_.random() < 0.5:
         pages = range(0, max(len(before.database), len(after.database)), PAGE)
         chosen = (

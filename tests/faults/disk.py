@@ -1,11 +1,12 @@
-"""A real small file system that is full: a service and an agent's outbox on it, load going on, then
-room again.
+"""Campaign on a full disk: a service and an agent's outbox on a small file system that is full for
+a while under load.
 
-Where this process may mount, it is a tmpfs of some megabytes. Elsewhere every call by which log,
-upkeep and outbox make or move a file fails with ENOSPC. While it is full, only stored rows may be
-acknowledged and jobs go on in turn; with room again, everything is acknowledged and nothing hangs.
-Finally it is full with days that retention removes and whose roll-ups must be made before: the
-reserved space is enough for that.
+If this process may mount, the file system is a real tmpfs of some megabytes. Otherwise every system
+call by which log, maintenance jobs and outbox create or rename a file fails with ENOSPC. While the
+disk is full, only stored rows may be acknowledged, and jobs must still be tried. When there is
+space again, everything must be acknowledged and nothing may hang. Finally the disk is full with
+days that retention would remove, but whose roll-ups must be computed first: the reserved space must
+be enough for them.
 """
 
 from __future__ import annotations
@@ -51,7 +52,9 @@ STUCK_S: Final = 60.0
 
 @contextmanager
 def small_disk(folder: Path) -> Iterator[bool]:
-    """Mount a small file system at a folder. Return False if this process may not mount."""
+    """Mount a small file system at a folder during the block. Yield False if this process may not
+    mount.
+    """
     folder.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", f"size={SIZE_MB}m", "tmpfs", str(folder)]
     try:
@@ -67,7 +70,9 @@ def small_disk(folder: Path) -> Iterator[bool]:
 
 @contextmanager
 def fill_disk(folder: Path, mounted: bool) -> Iterator[None]:
-    """Fill the disk for the duration of the block."""
+    """Fill the disk for the duration of the block. Without a mounted disk, let writing
+    calls fail.
+    """
     if mounted:
         ballast = folder / "ballast"
         with suppress(OSError), ballast.open("wb", buffering=0) as file:
@@ -85,7 +90,7 @@ def fill_disk(folder: Path, mounted: bool) -> Iterator[None]:
 
 @contextmanager
 def _refuse_writes(*names: str) -> Iterator[None]:
-    """Let system calls that write fail as on a full disk."""
+    """Let the named functions of `os` fail as on a full disk, for the duration of the block."""
 
     def refuse(*_: object, **__: object) -> object:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -101,7 +106,7 @@ def _refuse_writes(*names: str) -> Iterator[None]:
 
 
 def run(site: Site) -> list[Figure]:
-    """Fill the disk several times, at different moments of the jobs."""
+    """Fill the disk several times, at different stages of the background jobs."""
     false = 0
     stuck = 0
     refused = 0
@@ -150,7 +155,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def _drive(engine: Engine, since: int, steps: int) -> int:
-    """Run some seconds of load, and return the acknowledged batches."""
+    """Run `steps` seconds of load, and return the number of acknowledged batches."""
     got = 0
     for seq in range(since + 1, since + steps + 1):
         now = time.time_ns()
@@ -183,8 +188,8 @@ def _until_settled(engine: Engine) -> int:
 
 
 def _until_done(engine: Engine) -> int:
-    """Wait, with room again, until each job has succeeded once; return the rows acknowledged
-    meanwhile.
+    """Wait, with free space again, until each job has succeeded once. Return the number of rows
+    acknowledged meanwhile.
     """
     got = 0
     deadline = time.monotonic() + STUCK_S
@@ -214,7 +219,9 @@ def _room_made(engine: Engine, folder: Path) -> int:
 
 
 def _outbox_recovers(folder: Path, mounted: bool) -> bool:
-    """Return True if an outbox refuses messages without room, keeps the accepted ones, and goes on."""
+    """Return True if an outbox refuses messages on a full disk, keeps the accepted ones, and
+    continues with free space.
+    """
     outbox = Outbox(folder / "spool.sqlite", boot=5)
     draft = Draft("car-a", Kind.OBSERVATION, 77, 1, lambda seq, first: bytes(60_000))
     took = len(outbox.store([draft], 0.0))

@@ -1,9 +1,9 @@
-"""One vehicle sends as fast as it can while the others go on: their waiting time, and the effect on
-the map.
+"""Campaign on one vehicle that sends as fast as it can: its effect on the acknowledgement times of
+the others and on the map.
 
-Its reports are true, so that it should count as one vehicle that sent once a second. The map with
-the flood is compared with one that an engine without a network makes of the same honest batches and
-one report a second of that vehicle.
+Its reports are true, so the flooding vehicle should count like a vehicle that sends once a second.
+The resulting map is compared with a reference map. An engine without a network makes the reference
+from the same batches of the honest vehicles and one report per second of the flooding vehicle.
 """
 
 from __future__ import annotations
@@ -46,27 +46,27 @@ _ASKED: Final = "gripmap/v1/map/**"
 
 
 def list_places() -> list[tuple[int, float, float]]:
-    """The road: cell, latitude and longitude."""
+    """Return (cell, latitude, longitude) of each place along the road."""
     longitudes = [LONGITUDE + 2e-4 * place for place in range(CELLS)]
     return [(int(grid.cell_of(LATITUDE, one)), LATITUDE, one) for one in longitudes]
 
 
 def make_visit(name: str, seq: int, now: int) -> Batch:
-    """Return a visit of a vehicle that drives round the road."""
+    """Return a batch with one visit of a vehicle that drives along the road repeatedly."""
     cell, latitude, longitude = list_places()[(seq + hash_of(name)) % CELLS]
     mu = FLOODED_MU if name == FLOODER else 0.75 + 0.01 * (hash_of(name) % 10)
     return batch(name, seq, now, [mu], cell=[cell], latitude=[latitude], longitude=[longitude])
 
 
 def hash_of(name: str) -> int:
-    """Return a number for a name, the same in every run."""
+    """Return a number computed from a name, the same in every run."""
     return sum(name.encode())
 
 
 @dataclass
 class Honest:
-    """An honest vehicle. It sends, repeats batches that are not settled, and records how long each
-    took.
+    """Honest vehicle that sends batches, repeats unsettled batches, and records the time until each
+    acknowledgement.
     """
 
     session: zenoh.Session
@@ -103,7 +103,7 @@ class Honest:
         self._put_batch(one)
 
     def resend(self) -> None:
-        """Send again what waits for longer than an outbox waits."""
+        """Send again the batches that wait for longer than RESEND_S, as an outbox does."""
         now = time.monotonic()
         for seq in [seq for seq in self._last if seq in self.delays]:
             del self._last[seq]
@@ -115,7 +115,7 @@ class Honest:
 
 
 def run(site: Site) -> list[Figure]:
-    """Flood for half a minute; in a quick run for three seconds."""
+    """Flood for half a minute; in a quick run, for three seconds."""
     seconds = site.choose_amount(30, 3)
     fleet = make_enrolment(vehicles=[*HONEST, FLOODER])
     with open_network(site.folder / "certificates", fleet=fleet) as running:
@@ -157,7 +157,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def _start_service(folder: Path, running: Network) -> subprocess.Popen[bytes]:
-    """Start the service as a process, and return when it listens."""
+    """Start the service as a separate process, and return when it accepts messages."""
     config = ServiceConfig(
         zenoh=settings(running.endpoints[ROUTERS[0]], running.folder), name=SERVICE
     )
@@ -198,7 +198,9 @@ def _settle(honest: Sequence[Honest]) -> None:
 
 
 def _run_flood(running: Network, honest: Sequence[Honest], seconds: float) -> int:
-    """Let them drive while the flood runs; returns how many messages it put."""
+    """Let the honest vehicles drive during the flood. Return the number of messages that the
+    flooding vehicle sent.
+    """
     told = {
         "settings": settings(running.endpoints[ROUTERS[0]], running.folder).model_dump(),
         "name": FLOODER,
@@ -227,8 +229,8 @@ def _read_map(running: Network) -> pa.Table:
 def _simulate_unflooded(
     folder: Path, honest: Sequence[Honest], seconds: float, now: int
 ) -> pa.Table:
-    """Return the map of the same honest visits with a flooder that sends one visit a second and has
-    gone round the road at least once.
+    """Return the map of the same honest visits with a flooding vehicle that sends only one visit a
+    second, but visits every cell of the road at least once.
     """
     sent = [one for vehicle in honest for one, _ in vehicle.sent.values()]
     began = min(int(one.columns["leave_time"][0]) for one in sent)
@@ -248,8 +250,8 @@ def _simulate_unflooded(
 
 
 def _find_difference(found: pa.Table, expected: pa.Table, honest: Sequence[Honest]) -> float:
-    """Return the largest difference of a bound of mu over the cells of the honest vehicles; NaN if
-    a cell is missing.
+    """Return the largest difference of `mu_lower` or `mu_upper` over the cells of the honest
+    vehicles, or NaN if a cell is missing.
     """
     driven = {int(sent.columns["cell"][0]) for one in honest for sent, _ in one.sent.values()}
     ends = [

@@ -1,8 +1,8 @@
-"""`python -m tests.faults.flooder`: one enrolled vehicle that sends good observations as fast as it
-can.
+"""`python -m tests.faults.flooder`: one enrolled vehicle that sends valid observations as fast as
+it can.
 
-Reads one line of JSON: settings, name, cells (cell, latitude, longitude), mu, seconds. Prints how
-many messages it put.
+It reads one line of JSON: settings, name, cells (cell, latitude, longitude), mu, seconds. It prints
+the number of messages that it sent.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ROWS = (1, 1, 1, 50)  # the smallest messages cost most for their size, the larg
 
 
 def main() -> None:
-    """Send messages until the time is over."""
+    """Send messages for the given time."""
     told = json.loads(sys.stdin.readline())
     name = told["name"]
     cells = told["cells"]

@@ -1,14 +1,13 @@
-"""The frame of the fault campaigns: a plain list of them, run one after the other, each in a folder
-of its own.
+"""Framework of the fault campaigns: they run one after the other, each in its own folder.
 
-A campaign is a function from a `Site` to figures. One with a bar is made by `bars.figure(name,
-value)`; a figure that only describes the load (kills, rates) is a `Figure` without a bar. To add
-one: write `tests/faults/NAME.py` with `def run(site: Site) -> list[Figure]`, and name it in
-`campaigns.py` with the figures that it must give.
+A campaign is a function from a `Site` to figures. `bars.make_figure(name, value)` makes a figure
+with a bar (target). A figure that only describes the load (kills, rates) is a `Figure` without a
+bar. To add a campaign, write `tests/faults/NAME.py` with `def run(site: Site) -> list[Figure]`, and
+add its name to `campaigns.py` with the figures that it must return.
 
-`quick` is for `make check`: seconds, the same mechanism, smaller numbers. A required figure that is
-missing fails. A campaign that raises ends the run with its traceback, because its measurements are
-unknown.
+`make check` runs the campaigns with `quick`: seconds, the same mechanism, smaller numbers. A
+missing required figure is a failure. If a campaign raises an error, the run ends with its
+traceback, because its measurements are unknown.
 """
 
 from __future__ import annotations
@@ -35,13 +34,13 @@ RAISED: Final = 2  # exit code; 1: a bar does not hold
 
 @dataclass(frozen=True)
 class Site:
-    """Where and how a campaign runs.
+    """Environment of a campaign.
 
     Attributes:
-        folder: empty, its own; kept for inspection when a bar does not hold.
-        quick: seconds instead of minutes.
-        seed: of everything random.
-        say: takes a line of progress.
+        folder: the campaign's own empty folder; it is not deleted if a figure misses its bar.
+        quick: True for a run of seconds instead of minutes.
+        seed: seed of all random numbers.
+        say: function that prints a line of progress.
     """
 
     folder: Path
@@ -50,12 +49,14 @@ class Site:
     say: Callable[[str], None]
 
     def choose_amount(self, full: int, quick: int) -> int:
-        """Return one of two values, depending on whether the run is quick."""
+        """Return `quick` in a quick run, otherwise `full`."""
         return quick if self.quick else full
 
 
 class Campaign(NamedTuple):
-    """A campaign by name, and the figures that it owes; in a quick run it may be left out."""
+    """Campaign by name, with the figures that it must return; a figure may be marked as left out of
+    quick runs.
+    """
 
     name: str
     run: Callable[[Site], list[Figure]]
@@ -66,8 +67,8 @@ class Campaign(NamedTuple):
 def run_campaigns(
     campaigns: Sequence[Campaign], out: Path, title: str, quick: bool, seed: int
 ) -> list[Figure]:
-    """Run them, with progress on stderr; writes `out/figures.json` and `out/figures.md`, returns
-    all figures.
+    """Run the campaigns with progress on stderr, write `out/figures.json` and `out/figures.md`, and
+    return all figures.
     """
     found: list[Figure] = []
     out.mkdir(parents=True, exist_ok=True)
@@ -79,11 +80,11 @@ def run_campaigns(
 
 
 def run_and_exit(run: Callable[[], int]) -> NoReturn:
-    """Run campaigns and end the process with their exit code; with RAISED and a traceback at once
-    if one raises.
+    """Run campaigns and end the process with their exit code. If a campaign raises, print the
+    traceback and exit at once with RAISED.
 
-    A session that is still open holds the interpreter's end up for minutes, and processes that were
-    started would stay.
+    The process ends without interpreter teardown. Otherwise an open session would delay its end for
+    minutes, and started processes would remain.
     """
     try:
         code = run()

@@ -1,8 +1,8 @@
-"""Malformed messages and queries among honest ones, through the whole engine: admission, fusion,
-archive, answers.
+"""Campaign of malformed messages and queries among honest ones, through the whole engine:
+admission, fusion, archive, answers.
 
-The oracle knows nothing of the service's own rules. It reads the archive, where every value must be
-finite or absent and within the physical limits of its unit, and where every honest row must be
+The check is independent of the service's own rules. It reads the archive: every value must be
+finite or absent and within the physical limits of its unit, and every honest row must be present
 exactly once.
 """
 
@@ -77,7 +77,7 @@ NEEDED: Final = {"latitude", "longitude"}
 
 
 def run(site: Site) -> list[Figure]:
-    """Run a million malformed messages; in a quick run some thousands."""
+    """Process a million malformed messages; in a quick run, some thousands."""
     count = site.choose_amount(1_000_000, 10_000)
     began = time.time_ns()
     crashes = 0
@@ -137,7 +137,9 @@ def _make_honest(seq: int, now: int) -> Iterator[Message]:
 
 
 def _run_turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
-    """Run one turn of the service's worker. Return 1 if anything other than a refusal resulted."""
+    """Process messages in one turn of the service's worker. Return 1 if anything failed except by a
+    refusal, otherwise 0.
+    """
     try:
         engine.intake.ingest(messages, now)
         for _, ack in engine.settlement.flush():
@@ -153,8 +155,8 @@ def _run_turn(site: Site, engine: Engine, messages: list[Message], now: int) -> 
 def _ask_query(
     site: Site, engine: Engine, asked: dict[str, str], now: int, past: bool
 ) -> tuple[int, int, int]:
-    """Return whether a query crashed, was answered, and rebuilt a past map; none does without
-    `past`.
+    """Answer a query. Return three counts (0 or 1): crashes, answers, and past maps rebuilt.
+    Without `past` no past map is rebuilt.
     """
     rebuilt = 0
     try:
@@ -172,7 +174,7 @@ def _ask_query(
 
 
 def _decode_damaged_tiles(site: Site, engine: Engine, now: int) -> tuple[int, int]:
-    """Decode damaged tiles as a client does. Return the number of tiles and of crashes."""
+    """Decode damaged tiles as a client does. Return the numbers of tiles and of crashes."""
     r = np.random.default_rng(site.seed)
     crashes = 0
     count = site.choose_amount(50_000, 1_000)
@@ -197,7 +199,7 @@ def _decode_damaged_tiles(site: Site, engine: Engine, now: int) -> tuple[int, in
 
 def _count_archived(root: Path, began: int, now: int) -> tuple[int, int, int]:
     """Return the numbers of rows, of impossible rows, and of rows of the honest vehicles in all
-    files.
+    files of the archive.
     """
     rows = impossible = found = 0
     honest = _list_pseudonyms(root, began) | _list_pseudonyms(root, now)

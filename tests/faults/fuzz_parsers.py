@@ -1,7 +1,7 @@
-"""Coverage-guided fuzzing of every parser in `tests.fuzz`, from the kept seeds.
+"""Campaign of coverage-guided fuzzing: every parser in `tests.fuzz`, from the committed seeds.
 
-The full form goes in rounds, in which each parser has ROUND_S, until all together have run
-EXECUTIONS inputs: ten minutes on a machine that is otherwise idle. It gives up after LONGEST_S.
+The full form runs in rounds of ROUND_S per parser, until all parsers together have run EXECUTIONS
+inputs. This takes ten minutes on an idle machine. The campaign stops after LONGEST_S at the latest.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LONGEST_S: Final = 7200.0
 
 
 def run(site: Site) -> list[Figure]:
-    """Run ten million inputs; in a quick run some thousands."""
+    """Run ten million inputs; in a quick run, some thousands."""
     fuzzers = {
         name: Fuzzer(parser, seeds_of(name), site.seed, make_keeper(site.folder / name))
         for name, parser in PARSERS.items()

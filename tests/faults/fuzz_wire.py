@@ -1,10 +1,10 @@
-"""Malformed messages, weather, questions and acknowledgements through a real router, into a service
-and vehicles.
+"""Campaign of malformed messages, weather, queries and acknowledgements through a real router, to a
+service and vehicles.
 
-The inputs that `fuzz` hands to the engine in its own process go the whole way here: Zenoh's
-threads, the bounded queue, the limits of a vehicle, the queryables, the worker's turns. Meanwhile
-vehicles report through the agent's publisher and outbox. None of the acknowledgements sent here can
-be decoded: certificates protect from forged ones (`security`).
+Campaign `fuzz` passes its inputs directly to the engine. Here the inputs pass through the whole
+system: Zenoh's threads, the bounded queue, rate limits of vehicles, queryables, and the worker.
+Meanwhile vehicles report through the agent's publisher and outbox. The acknowledgements sent here
+are all undecodable; certificates protect against forged ones (campaign `security`).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ ASKED: Final = (
 
 
 def run(site: Site) -> list[Figure]:
-    """Send two hundred thousand malformed messages; in a quick run four thousand."""
+    """Send two hundred thousand malformed messages; in a quick run, four thousand."""
     r = random.Random(site.seed)
     sent = 0
     answers = 0
@@ -121,8 +121,8 @@ def _unreadable_ack(r: random.Random) -> bytes:
 
 
 def _put_message(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> int:
-    """Put it; 0 where it is Zenoh that refuses the key. A longer encoding is the end of the
-    sender's own session.
+    """Publish a message. Return 1, or 0 if Zenoh refuses the key or the encoding is too long: a
+    longer encoding would end the sender's own session.
     """
     if len(encoding) > LONGEST_ENCODING:
         return 0
@@ -136,8 +136,8 @@ def _put_message(session: zenoh.Session, key: str, payload: bytes, encoding: str
 
 
 def _ask_query(session: zenoh.Session, r: random.Random, mutants: Mutants) -> int:
-    """Ask something malformed, with something malformed in hand; how many answers came, errors
-    not counted.
+    """Send a malformed query with a malformed payload. Return the number of answers, errors not
+    counted.
     """
     parameters = ";".join(f"{name}={value}" for name, value in mutants.make_query().items())
     payload = r.choice((None, b"", r.randbytes(300), mutants.make_message().payload))
@@ -149,7 +149,7 @@ def _ask_query(session: zenoh.Session, r: random.Random, mutants: Mutants) -> in
 
 
 def _read_metrics(there: Stage) -> dict[str, float]:
-    """Return the service's metrics."""
+    """Return the service's metrics by name."""
     address = there.service.line_with("ready: ").split()[-1]
     with urllib.request.urlopen(f"{address}/metrics", timeout=30.0) as page:
         lines = [line for line in page.read().decode().splitlines() if not line.startswith("#")]

@@ -1,10 +1,10 @@
-"""Set-up of the attacks: two routers with TLS and access list, a running service, honest parties,
-and listeners.
+"""Environment of the attacks: two routers with TLS and access list, a running service, honest
+vehicles and readers, and listeners.
 
-No step waits by sleeping. Samples of one priority keep their order on each way. So a marker that is
-put after an attack, and received, shows that nothing of the attack is still under way. Messages
-that reached the service wait there for its worker, which takes them in order: only a later batch
-that is acknowledged shows that they were judged and counted.
+No step waits by sleeping. Messages of one priority keep their order on each path. So if a marker is
+sent after an attack and received, no message of the attack is still in transit. Messages that
+reached the service wait for its worker, which processes them in order. So only the acknowledgement
+of a later batch shows that the service has processed and counted the messages of the attack.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MARKER = f"{keys.ROOT}/map/0000/000/000/0000"
 
 @dataclass
 class Listener:
-    """A session that records all messages on some key expressions."""
+    """Session that records all messages on some key expressions."""
 
     session: zenoh.Session
     expressions: tuple[str, ...]
@@ -49,12 +49,12 @@ class Listener:
         self.heard.append((str(sample.key_expr), put, sample.payload.to_bytes()))
 
     def has_payload(self, payload: bytes) -> bool:
-        """Return True if it received this payload."""
+        """Return True if the listener received a message that contains this payload."""
         return any(payload in told for _, _, told in list(self.heard))
 
 
 class Ground:
-    """Environment of an attack; the rogue is enrolled as a vehicle and connected to the second
+    """Environment of an attack. The attacker is enrolled as a vehicle and connected to the second
     router.
     """
 
@@ -72,7 +72,7 @@ class Ground:
         self._marks = self._seq = 0
 
     def open_session(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
-        """Yield a session that is closed at the end."""
+        """Open a session that is closed together with this environment."""
         return self._stack.enter_context(self.network.open_session(name, router, **changed))
 
     @property
@@ -81,8 +81,8 @@ class Ground:
         return self.service.engine.counts[wire.Kind.OBSERVATION]
 
     def drive(self, session: zenoh.Session | None = None, name: str = HONEST) -> None:
-        """Put a good batch of one observation until the service has it on disk, as an outbox
-        does.
+        """Send a valid batch of one observation, again and again, until the service has
+        acknowledged it as durable.
         """
         self._seq += 1
         sent = batch(name, self._seq, time.time_ns() - SECOND, [0.8])
@@ -97,10 +97,10 @@ class Ground:
         until(is_settled)
 
     def _is_durable(self, sent: wire.Batch) -> bool:
-        """Return True if this very batch was acknowledged.
+        """Return True if this batch was acknowledged as durable.
 
-        What else lies on the key counts for nothing: the acknowledgement of a batch before that was
-        sent twice, or one that an attack forged.
+        Other messages on the key are ignored: the acknowledgement of an earlier batch that was sent
+        twice, or one that an attack forged.
         """
         for place, _, payload in list(self.monitor.heard):
             if place == keys.ack_key(sent.vehicle):
@@ -117,11 +117,11 @@ class Ground:
         return False
 
     def await_judgement(self) -> None:
-        """Return when the service has judged and counted everything that reached it before."""
+        """Wait until the service has processed and counted every message that reached it before."""
         self.drive()
 
     def await_effects(self, session: zenoh.Session, *listeners: Listener) -> None:
-        """Return when everything that `session` did has gone through and the listeners received its
+        """Wait until every message of `session` has been delivered and the listeners received its
         effects.
         """
         list(session.get(f"{keys.ROOT}/map/**"))
@@ -134,7 +134,9 @@ class Ground:
 
 @contextmanager
 def open_ground(network: Network) -> Iterator[Ground]:
-    """Yield a service behind the network and the honest parties, connected and acknowledged."""
+    """Yield a service behind the network, and connected honest parties of which each got an
+    acknowledgement.
+    """
     config = ServiceConfig(
         zenoh=settings(network.endpoints[ROUTERS[0]], network.folder),
         name=SERVICE,

@@ -1,7 +1,8 @@
-"""A region goes to and fro between two services while vehicles report.
+"""Campaign of hand-overs: a region is handed over to and fro between two services while vehicles
+report.
 
-At the end both machines, and one that begins with an empty disk, must hold all acknowledged rows,
-once.
+At the end both machines, and one that starts with an empty disk, must have every acknowledged row
+exactly once.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ PERIODS: Final[dict[str, object]] = {"compact_s": 5.0, "checkpoint_s": 4.0, "seg
 
 
 def run(site: Site) -> list[Figure]:
-    """Twenty hand-overs."""
+    """Run twenty hand-overs."""
     pauses = []
     lease_s = ServiceConfig().lease_s
     with ExitStack() as stack:

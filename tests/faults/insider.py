@@ -1,11 +1,11 @@
-"""One enrolled car that does all that a valid car may, for a simulated hour, with ten honest ones
-on their road.
+"""Campaign on one enrolled car that uses everything a valid car may do, for a simulated hour, with
+ten honest cars on the same road.
 
-It sends as much as its limit lets through: visits all over a region and the world, a boot for each
-batch, JSON, batches with a foot in another month, its own reports again, as they were and under
-other numbers, and ice on a road that is its own. The cost of questions is measured in `queries`.
-Engine, limits and archive are the service's; only time is simulated. The amount of its actions is a
-figure too.
+The insider sends as much as its rate limit allows: visits all over a region and over the world, a
+new boot for each batch, JSON, batches whose rows lie in two months, its own reports again
+(unchanged and under other numbers), and ice on a road that only it drives. Engine, limits and
+archive are real; only time is simulated. One figure counts the insider's actions. The campaign
+`queries` measures the cost of queries.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ WARM_S: Final = 60  # until pools and windows are what they are
 
 
 def _make_growth_figure(grown: float, seconds: int, *, quick: bool) -> Figure:
-    """Return memory growth per hour. A quick run returns the plain difference, because three
-    minutes give no rate.
+    """Return memory growth per hour. A quick run returns the growth itself [MB], because three
+    minutes are too short for a rate.
     """
     if quick:
         return replace(make_figure("faults.insider.mb_per_hour", grown), unit="MB in all")
@@ -49,7 +49,7 @@ def _make_growth_figure(grown: float, seconds: int, *, quick: bool) -> Figure:
 
 
 def run(site: Site) -> list[Figure]:
-    """Run an hour; in a quick run four minutes."""
+    """Simulate an hour; in a quick run, four minutes."""
     seconds = site.choose_amount(3600, 240)
     counts = Counter[str]()
     random_ = np.random.default_rng(site.seed)
@@ -110,7 +110,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def _make_attack(number: int, second: int, now: int, random_: np.random.Generator) -> Message:
-    """Return the next of its permitted messages, in turn."""
+    """Return the next message of the insider; its six kinds of messages take turns."""
     seq = number + 1
     what = number % 6
     if what == 0:  # places all over the region
@@ -146,7 +146,7 @@ def _make_ice(seq: int, now: int, rows: int) -> Batch:
 
 
 def _make_visit(name: str, seq: int, now: int, second: int) -> Batch:
-    """Return an honest visit on a road of twenty cells driven at 12 m/s."""
+    """Return a batch of an honest car that drives along a road of twenty cells at 12 m/s."""
     longitude = LONGITUDE + 2e-4 * ((second + sum(name.encode())) % 20)
     one = batch(name, seq, now, [0.8])
     cell = grid.cell_of(LATITUDE, longitude)
@@ -156,7 +156,9 @@ def _make_visit(name: str, seq: int, now: int, second: int) -> Batch:
 
 
 def _make_scattered(seq: int, now: int, random_: np.random.Generator, degrees: float) -> Batch:
-    """Return a batch of visits to fifty cells near a place. Its region is that of the first visit."""
+    """Return a batch of visits to fifty random cells within `degrees` of a place. Its region is
+    that of the first visit.
+    """
     spread = random_.uniform(-degrees, degrees, (2, 50))
     latitude = np.clip(LATITUDE + spread[0], -80.0, 80.0)
     longitude = LONGITUDE + spread[1]
@@ -176,7 +178,7 @@ def _make_message(one: Batch) -> Message:
 
 
 def _make_text_message(one: Batch) -> Message:
-    """Return a batch as handwritten JSON."""
+    """Return a message with a batch as handwritten JSON."""
     text = {
         "vehicle": one.vehicle,
         "boot": str(one.boot),
@@ -193,7 +195,9 @@ def _make_text_message(one: Batch) -> Message:
 
 
 def _is_insider_only(latitude: float, longitude: float) -> bool:
-    """Return True if an alert is at a place that only the insider reports."""
+    """Return True if a place lies outside the road of the honest cars, so that only the insider
+    reports there.
+    """
     return abs(latitude - LATITUDE) > 1e-3 or not -1e-3 <= longitude - LONGITUDE <= 5e-3
 
 

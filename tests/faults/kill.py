@@ -1,9 +1,10 @@
-"""kill -9 of agents, router and service, one or several at once, again and again, under load.
+"""Campaign of kill -9: agents, router and service are killed again and again, one or several at
+once, under load.
 
-In rounds, each with an archive of its own, so that a restarted service has minutes to read back and
-not hours. It has old rows too, which retention removes amid all this, and is killed as well. At the
-end of a round everything is left running until all is settled; then the archive is compared with
-the journals.
+The kills run in rounds, each with its own archive, so that a restarted service has to read back
+minutes and not hours. The archive also has old rows, which a retention process removes meanwhile;
+this process is killed too. At the end of a round everything runs until all batches are settled.
+Then the archive is compared with the journals.
 """
 
 from __future__ import annotations
@@ -61,8 +62,8 @@ RETIRING_KILLED: Final = 0.5
 
 
 class Load(NamedTuple):
-    """Load during the kills: its amount, its duration [s], and whether retention removed a day
-    meanwhile.
+    """Load during the kills: number of observations, duration [s], and whether retention removed a
+    day meanwhile.
     """
 
     observations: int
@@ -71,8 +72,8 @@ class Load(NamedTuple):
 
 
 def run(site: Site) -> list[Figure]:
-    """Kill 200 times in ten rounds; in a quick run five times in one round, with six agents and
-    weaker bars.
+    """Kill 200 times in ten rounds; in a quick run, five times in one round, with six agents and
+    weaker targets.
     """
     random_ = random.Random(site.seed)
     kills = 0
@@ -121,13 +122,15 @@ def run(site: Site) -> list[Figure]:
 
 
 def _make_figure(site: Site, name: str, value: float, quick: float) -> Figure:
-    """Return a figure with its bar; the bar of a quick run is weaker."""
+    """Return a figure with its target; a quick run uses the weaker target `quick`."""
     found = make_figure(name, value)
     return replace(found, bar=quick) if site.quick else found
 
 
 def begin_with_old_rows(archive: Path) -> None:
-    """Create an archive with old rows that no service reads back, and a day of recent rows."""
+    """Create an archive with a day of recent rows, and with old rows that a service does not read
+    at its start.
+    """
     synthetic.write_archive(archive, OLD, OLD.rows // 4)
     compact(archive)
     (archive / layout.TABLES[Kind.OBSERVATION] / f"date={datetime.now(UTC).date()}").mkdir(
@@ -136,20 +139,22 @@ def begin_with_old_rows(archive: Path) -> None:
 
 
 def old_days(archive: Path) -> list[Path]:
-    """Return the days that retention removes."""
+    """Return the folders of the days that retention removes."""
     return due_folders(archive, LEAST_DAYS, datetime.now(UTC).date())
 
 
 def _find_finished_jobs(archive: Path) -> frozenset[str]:
-    """Return the results of background jobs, which prove that the kills met them."""
+    """Return the names of the background jobs that have left results, which shows that they ran
+    during the kills.
+    """
     found = {"checkpoints": "checkpoints/*-*", "compaction": "observations/*/*/*.parquet"}
     return frozenset(name for name, pattern in found.items() if any(archive.glob(pattern)))
 
 
 def map_difference(archive: Path) -> float:
-    """Compare the map that a service restores from its checkpoint with that of the log alone.
-    Return the largest difference of mu, its bounds and P(slippery); infinite if a cell or a visit
-    is missing.
+    """Compare the map that a service restores from its checkpoint with the map from the log alone.
+    Return the largest difference of mu, its bounds and P(slippery), or infinity if a cell or a
+    visit is missing.
     """
     maps = []
     for _ in range(2):
@@ -172,7 +177,7 @@ def map_difference(archive: Path) -> float:
 def _run_round(
     there: Stage, agents: int, kills: int, random_: random.Random
 ) -> tuple[Census, Load]:
-    """Run one round; return its census, and the load offered from the start of all processes until
+    """Run one round. Return its census, and the load offered from the start of all processes until
     the drain.
     """
     for number in range(agents):
@@ -216,8 +221,8 @@ def _run_round(
 
 
 def _choose_victims(there: Stage, random_: random.Random) -> list[Part]:
-    """Return the processes to kill: one or several; router and service together as often as all
-    agents together.
+    """Return the processes to kill, one or several at random. Router or service are chosen as often
+    as agents alone.
     """
     chosen = [part for part in (there.router, there.service) if random_.random() < 0.45]
     return chosen + random_.sample(

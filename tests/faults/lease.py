@@ -1,5 +1,5 @@
-"""Histories with unlike lease times, skewed clocks, pauses, partitions and kills; see
-`lease_histories`.
+"""Campaign of simulated lease histories with different lease times, skewed clocks, pauses,
+partitions and kills; see `lease_histories`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tests.faults.lease_histories import ServiceHistory, judge_history
 
 
 class Judged(NamedTuple):
-    """Sums over histories."""
+    """Sums of the results over histories."""
 
     acknowledged_by_two: int
     violations: int
@@ -27,7 +27,7 @@ class Judged(NamedTuple):
 
 
 def judge_seeds(seeds: Iterable[int]) -> Judged:
-    """Play and judge a history per seed."""
+    """Simulate and judge one history per seed, and return the sums."""
     counts = [0] * len(Judged._fields)
     for seed in seeds:
         history = ServiceHistory(seed)
@@ -46,20 +46,24 @@ def judge_seeds(seeds: Iterable[int]) -> Judged:
 
 
 def judge_without_comparison(seeds: Iterable[int]) -> Judged:
-    """Judge histories in which lease times are not compared."""
+    """Judge histories of a broken protocol: services do not compare their lease times."""
     with patch.object(lease_module, "_check_settings", lambda *_: None):
         return judge_seeds(seeds)
 
 
 def judge_without_expiry(seeds: Iterable[int]) -> Judged:
-    """Judge histories in which a holder acknowledges until it notices its successor."""
+    """Judge histories of a broken protocol: a holder acknowledges until it notices its
+    successor.
+    """
     fresh = property(lambda lease: not lease.lost)
     with patch.object(Lease, "may_acknowledge", fresh):
         return judge_seeds(seeds)
 
 
 def run(site: Site) -> list[Figure]:
-    """Judge the histories, and two protocols that each lack a rule and must be found out."""
+    """Judge histories of the real protocol, and of two broken protocols in which violations must be
+    found.
+    """
     first = 1000 * site.seed
     judged = judge_seeds(range(first, first + site.choose_amount(200, 12)))
     controls = range(first, first + site.choose_amount(40, 12))

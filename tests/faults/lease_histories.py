@@ -1,11 +1,12 @@
-"""Histories of services that share an archive, in virtual time, and their checker.
+"""Simulated histories of services that share an archive, in virtual time, and a checker of these
+histories.
 
 The product's `Lease` runs unchanged on a bucket in memory. Every process has its own clock rate,
 wall clock and lease time. Processes are killed, frozen, cut off from the bucket, and lose their
-token; requests are slow, and some take effect after the client gave up. All of it follows from a
+token. Requests are slow, and some take effect after the client gave up. All events follow from a
 seed.
 
-A history is the life of every batch: uploaded by a service, acknowledged, known to each later
+A history records the life of every batch: uploaded by a service, acknowledged, known to each later
 owner when it begins to serve, and counted by a reader at the end.
 """
 
@@ -38,8 +39,8 @@ _SILENT: Final = logging.Logger("silent", logging.CRITICAL + 1)
 
 
 class Event(NamedTuple):
-    """Event of a history: a service with a lease number `serves` and knows batches, or it
-    `acknowledges` them; at the end a reader `reads` all that count.
+    """Event of a history. A service with a lease number `serves` and knows batches, or it
+    `acknowledges` batches; at the end a reader `reads` all batches that count.
     """
 
     kind: str
@@ -48,16 +49,16 @@ class Event(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """Result of a check."""
+    """Result of the check of a history."""
 
     acknowledged_by_two: int
     violations: int
 
 
 def judge_history(events: list[Event]) -> Verdict:
-    """Return acknowledgements by a holder after its successor began to serve, and batches whose
-    life breaks a promise: acknowledged and unknown to a later owner or to the reader, or counted
-    twice.
+    """Return the number of acknowledgements by a holder after its successor began to serve, and the
+    batches that break a promise: acknowledged but unknown to a later owner or to the reader, or
+    counted twice.
     """
     served = 0
     by_two = 0
@@ -77,11 +78,11 @@ def judge_history(events: list[Event]) -> Verdict:
 
 
 class _EndError(BaseException):
-    """Raised in a thread when its process or the history has ended."""
+    """Exception that ends a thread when its process or the history has ended."""
 
 
 class _Process:
-    """State of a process that the world changes."""
+    """State of a simulated process."""
 
     def __init__(self, name: str, random_: random.Random, lease_s: float) -> None:
         self.name = name
@@ -103,7 +104,9 @@ class _Actor:
 
 
 class VirtualTime:
-    """Scheduler of threads of which one runs at a time, in the order of virtual time."""
+    """Scheduler of threads in virtual time. Only one thread runs at a time, the one with the
+    earliest wake-up time.
+    """
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -115,19 +118,21 @@ class VirtualTime:
 
     @property
     def process(self) -> _Process:
-        """Return the process that runs."""
+        """Return the process whose thread is running."""
         assert self._actor is not None
         return self._actor.process
 
     def spawn(self, process: _Process, run: Callable[[], None]) -> _Actor:
-        """Start a thread of a process."""
+        """Start a thread of a process, and return it."""
         actor = _Actor(process, run)
         self._push_event(self.now, actor)
         threading.Thread(target=self._run_actor, args=(actor,), daemon=True).start()
         return actor
 
     def sleep(self, seconds: float) -> None:
-        """Let the running thread sleep [s of true time], and longer while it is frozen."""
+        """Let the running thread sleep for `seconds` of true time, and longer while its process is
+        frozen.
+        """
         actor = self._actor
         assert actor is not None
         end = self.now + seconds
@@ -142,7 +147,7 @@ class VirtualTime:
             end = actor.process.frozen_until
 
     def run(self, until: float) -> None:
-        """Run everything until a moment, and end all threads."""
+        """Run all threads until the true time `until`, and then end them."""
         while self._queue:
             at, _, actor = heapq.heappop(self._queue)
             self._is_over = self._is_over or at > until
@@ -169,7 +174,7 @@ class VirtualTime:
     # what the module of the lease uses of `time`
 
     def monotonic(self) -> float:
-        """Return the clock of the running process [s]."""
+        """Return the elapsed-time clock of the running process [s]."""
         return self.now * self.process.rate
 
     def time(self) -> float:
@@ -178,7 +183,9 @@ class VirtualTime:
 
 
 class VirtualStop:
-    """Event whose wait takes virtual time of the process's own clock."""
+    """Event like `threading.Event`, whose wait takes virtual time by the clock of the running
+    process.
+    """
 
     def __init__(self, world: VirtualTime) -> None:
         self._world = world
@@ -189,17 +196,17 @@ class VirtualStop:
         return self._is_set
 
     def set(self) -> None:
-        """End all waits at their next look."""
+        """Set the event; waits return at their end."""
         self._is_set = True
 
     def wait(self, seconds: float) -> bool:
-        """Wait; return True if it was set."""
+        """Wait for `seconds` of the process's clock. Return True if the event is set."""
         self._world.sleep(seconds / self._world.process.rate)
         return self._is_set
 
 
 class VirtualBucket:
-    """Bucket in memory with slow and lost requests, of which some take effect later."""
+    """Bucket in memory. Requests are slow or lost, and some lost requests take effect later."""
 
     def __init__(self, world: VirtualTime, random_: random.Random) -> None:
         self.objects: dict[str, bytes] = {}
@@ -208,11 +215,11 @@ class VirtualBucket:
         self._network = _Process("network", random_, 1.0)
 
     def list_names(self, folder: str) -> list[str]:
-        """Return the names in a folder."""
+        """Return the names of the objects in a folder."""
         return list(self._request(lambda: [n for n in self.objects if n.startswith(f"{folder}/")]))
 
     def get(self, name: str) -> bytes | None:
-        """Return an object."""
+        """Return the content of an object, or None if it does not exist."""
         return cast("bytes | None", self._request(lambda: self.objects.get(name)))
 
     def put(self, name: str, content: bytes) -> None:
@@ -220,7 +227,9 @@ class VirtualBucket:
         self._request(lambda: self.objects.__setitem__(name, content))
 
     def create(self, name: str, content: bytes) -> bool:
-        """Create an object; return False if it exists. A repeated request knows its own object."""
+        """Create an object. Return False if one with other content exists; so a repeated request
+        succeeds.
+        """
         return bool(self._request(lambda: self.objects.setdefault(name, content) == content))
 
     def _request(self, effect: Callable[[], Any]) -> Any:  # noqa: ANN401 of many kinds
@@ -243,11 +252,11 @@ class VirtualBucket:
 
 
 class ServiceHistory:
-    """One history of three services; `run` it once.
+    """History of three services; call `run` once.
 
     Attributes:
-        events: in the order of true time.
-        refused: starts that were refused because of another lease time.
+        events: events in the order of true time.
+        refused: number of starts that were refused because of a different lease time.
     """
 
     def __init__(self, seed: int) -> None:
@@ -261,7 +270,7 @@ class ServiceHistory:
         self.refused = 0
 
     def run(self) -> None:
-        """Play the history to its end."""
+        """Simulate the history to its end."""
         for name in NAMES:
             self._start_process(name, 0.0)
         chaos = _Process("chaos", self._random, 1.0)
@@ -277,7 +286,9 @@ class ServiceHistory:
         self.events.append(Event("reads", max(self._fences, default=0), read))
 
     def _start_process(self, name: str, after: float) -> None:
-        """Start a process; half of them have a lease time of their own."""
+        """Start a process. Half of the processes have a lease time that may differ from the common
+        one.
+        """
         common = LEASES[0]
         own = self._random.choice(LEASES) if self._random.random() < 0.5 else common
         process = _Process(name, self._random, own)
@@ -313,7 +324,7 @@ class ServiceHistory:
         return process is not None and self._world.now >= process.token_until
 
     def _serve_once(self, process: _Process) -> None:
-        """Wait for the lease, serve until it is lost or released."""
+        """Wait for the lease, and serve until it is lost or released."""
         name = process.name
         lease = Lease(name, cast(ObjectBucket, self._bucket), name, process.lease_s)
         stop = VirtualStop(self._world)
@@ -340,7 +351,9 @@ class ServiceHistory:
             lease.release()
 
     def _begin_serving(self, lease: Lease) -> set[int]:
-        """List the bucket, put the fence, and begin to serve."""
+        """List the bucket, write the fence (the batches of earlier holders that count), and begin
+        to serve. Return the batches that the service knows.
+        """
         self._world.sleep(self._random.uniform(0.0, 0.3))
         number = lease.term.number
         names = self._find_counted(self._bucket.list_names("batches"))
@@ -373,8 +386,8 @@ class ServiceHistory:
             self.events.append(Event("acknowledges", number, (batch,)))
 
     def _find_counted(self, names: Iterable[str]) -> list[str]:
-        """Return the names that count: those of the newest owner or later, and those in its
-        fence.
+        """Return the names of the objects that count: those of the newest owner or of a later one,
+        and those in the newest owner's fence.
         """
         newest = max(self._fences, default=0)
         before = self._fences.get(newest, frozenset())

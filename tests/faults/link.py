@@ -1,9 +1,9 @@
-"""Campaign on the link between a car and its router: loss, a new address, blocked UDP, a router
-that returns, a flood.
+"""Campaign on the link between a car and its router: packet loss, a new address, blocked UDP, a
+router that returns, and a flood.
 
-Router and service are in one network namespace, cars in others; between them are links of
-`link_relay.py`. The same traffic runs over QUIC and over TLS, so that each figure has its control.
-Making namespaces and TUN devices needs root.
+Router and service run in one network namespace, cars in others. `link_relay.py` simulates the links
+between them. The same traffic runs over QUIC and over TLS for comparison. Creating namespaces and
+TUN devices needs root.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ TILE: Final = int(grid.tile_of(int(grid.cell_of(LATITUDE, LONGITUDE))))
 
 
 class Namespaces:
-    """Network namespaces of one run, the routers in `road`, and the links of cars to it."""
+    """Network namespaces of one run: the routers are in `road`, and links connect the
+    cars to it.
+    """
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.folder = folder
@@ -77,7 +79,9 @@ class Namespaces:
     def connect_cars(
         self, name: str, terms: LinkTerms, net: str = "10.77.0"
     ) -> tuple[str, subprocess.Popen[str]]:
-        """Return a new namespace of cars, linked to the road, and the process of the link."""
+        """Return the name of a new namespace of cars that is linked to the road, and the process of
+        the link.
+        """
         car = self._add_namespace(name)
         device = f"{DEVICE}{net[3:5]}"
         given = {"left": car, "right": self.road, "device": device, "terms": asdict(terms)}
@@ -93,7 +97,7 @@ class Namespaces:
         return car, link
 
     def move_car(self, car: str, number: int) -> None:
-        """Give the car another address, as a mobile network does; the old one is gone."""
+        """Give the car another address, as a mobile network does; the old address is removed."""
         device = f"{DEVICE}77"
         run_command("ip", "-n", car, "address", "flush", "dev", device)
         run_command("ip", "-n", car, "address", "add", f"10.77.0.{number}/24", "dev", device)
@@ -101,15 +105,17 @@ class Namespaces:
     def start_process(
         self, namespace: str, module: str, given: dict[str, Any]
     ) -> subprocess.Popen[str]:
-        """Start a process of the campaign; it ends with the campaign at the latest."""
+        """Start a process of the campaign in a namespace. It is ended with the campaign at the
+        latest.
+        """
         inside = ["ip", "netns", "exec", namespace] if namespace else []
         return self._open_process([*inside, sys.executable, "-m", module, json.dumps(given)])
 
     def start_router(
         self, letter: str = "a", protocols: Sequence[str] = ("quic", "tls"), *, capped: bool = True
     ) -> subprocess.Popen[str]:
-        """Start a router of the road as `fleet-service certs` configures it, on some of its
-        transports.
+        """Start a router in `road` as `fleet-service certs` configures it, but only with the
+        transports `protocols`.
         """
         file = self.certificates / f"router-{letter}.json5"
         config = json.loads(file.read_text())
@@ -139,7 +145,9 @@ class Namespaces:
     def start_end(
         self, role: str, namespace: str, name: str, protocols: Sequence[str], **given: object
     ) -> subprocess.Popen[str]:
-        """Start one end of the campaign; see `link_ends.py`."""
+        """Start one endpoint of the campaign (see `link_ends.py`) with a role and a certificate
+        name.
+        """
         inside = "127.0.0.1" if namespace == self.road else ROUTER_ADDRESS
         ports = given.pop("ports", PORTS[:1])
         assert isinstance(ports, Sequence)
@@ -167,7 +175,7 @@ def run_command(*command: str) -> None:
 
 
 def stop_process(process: subprocess.Popen[str]) -> None:
-    """End a process."""
+    """Kill a process and close its pipes."""
     process.kill()
     process.wait()
     for pipe in (process.stdin, process.stdout):
@@ -177,7 +185,7 @@ def stop_process(process: subprocess.Popen[str]) -> None:
 
 
 def read_line(process: subprocess.Popen[str]) -> str:
-    """Return the next line of a process."""
+    """Return the next line that a process prints."""
     assert process.stdout is not None
     line = process.stdout.readline()
     assert line, f"{process.args!r} ended early"
@@ -185,7 +193,7 @@ def read_line(process: subprocess.Popen[str]) -> str:
 
 
 def finish_end(process: subprocess.Popen[str]) -> dict[str, Any]:
-    """Close the stdin of an end, which then prints its result."""
+    """Close the stdin of an endpoint, and return the result that it then prints."""
     assert process.stdin is not None
     process.stdin.close()
     found: dict[str, Any] = json.loads(read_line(process))
@@ -193,7 +201,7 @@ def finish_end(process: subprocess.Popen[str]) -> dict[str, Any]:
 
 
 def write_line(process: subprocess.Popen[str], line: str) -> None:
-    """Write a line to a process."""
+    """Write a line to the stdin of a process."""
     assert process.stdin is not None
     process.stdin.write(line + "\n")
     process.stdin.flush()
@@ -201,7 +209,7 @@ def write_line(process: subprocess.Popen[str], line: str) -> None:
 
 @contextmanager
 def open_namespaces(folder: Path) -> Iterator[Namespaces]:
-    """Namespaces that are gone afterwards."""
+    """Yield network namespaces, which are removed after the block."""
     folder.mkdir(parents=True)
     with ExitStack() as stack:
         yield Namespaces(folder, stack)
@@ -210,11 +218,11 @@ def open_namespaces(folder: Path) -> Iterator[Namespaces]:
 def change_address(
     site: Site, protocol: str, seconds: float, *, capped: bool = False
 ) -> tuple[int, int, float]:
-    """Return how many samples a car put and lost while its address changed twice, and the
-    longest gap [s].
+    """Return how many messages a car sent and lost while its address changed twice, and the longest
+    gap [s] between received messages.
 
-    A router's cap drops a message that arrives within 10 ms of the one before it, so that with it
-    the jitter of a busy machine counts as loss of the link.
+    A router with a rate limit (`capped`) drops a message that arrives within 10 ms of the previous
+    one. Then timing jitter of a busy machine would count as loss of the link.
     """
     with open_namespaces(site.folder / f"address-{protocol}-{capped}") as there:
         there.start_router(capped=capped)
@@ -240,7 +248,9 @@ def change_address(
 
 
 def delay_alerts(site: Site, protocol: str, seconds: float) -> dict[str, float]:
-    """Return the delays of alerts over a lossy link with tiles next to them."""
+    """Return the p50 and p99 delay of alerts [ms], the numbers of alerts that arrived and were
+    lost, and the share of tiles that arrived, over a lossy link.
+    """
     with open_namespaces(site.folder / f"lossy-{protocol}") as there:
         there.start_router()
         car, _ = there.connect_cars("car", LOSSY)
@@ -271,7 +281,7 @@ def delay_alerts(site: Site, protocol: str, seconds: float) -> dict[str, float]:
 
 
 def block_udp(site: Site) -> float:
-    """Return how long a session takes to open where UDP is blocked [s]."""
+    """Return the time [s] until a session is open where UDP is blocked."""
     with open_namespaces(site.folder / "udp") as there:
         for letter in "ab":
             there.start_router(letter)
@@ -284,8 +294,8 @@ def block_udp(site: Site) -> float:
 
 
 def return_with_tls(site: Site, outages_s: Sequence[float]) -> float:
-    """Return the longest time that a car takes to find a router that came back with TLS only
-    [s].
+    """Return the longest time [s] that a car takes to find a router that came back with
+    TLS only.
     """
     longest = 0.0
     with open_namespaces(site.folder / "back") as there:
@@ -308,8 +318,8 @@ def return_with_tls(site: Site, outages_s: Sequence[float]) -> float:
 
 
 def measure_flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, float]:
-    """Return the p99 of honest messages with a flooding car over that without, and what passed
-    of the flood [1/s].
+    """Return two figures: the p99 delay of honest messages with a flooding car, divided by that
+    without, and the rate of flood messages that passed [1/s].
     """
     with open_namespaces(site.folder / f"flood-{capped}") as there:
         there.start_router(capped=capped)
@@ -349,7 +359,7 @@ def measure_flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, f
 
 
 def measure(site: Site) -> list[Figure]:
-    """Run all parts of the campaign."""
+    """Run all parts of the campaign, and return the figures."""
     address_s = site.choose_amount(15, 6)
     lossy_s = site.choose_amount(60, 12)
     flood_s = site.choose_amount(20, 5)

@@ -1,9 +1,10 @@
-"""`python -m tests.faults.link_ends JSON`: one end of the link campaign, in the network namespace
-that starts it.
+"""`python -m tests.faults.link_ends JSON`: one endpoint of the link campaign, in the network
+namespace in which it is started.
 
-Roles: `receive` subscribes and notes when each numbered message arrives; `send` puts numbered
-messages at a rate; `open` measures how long a session takes to open; `watch` tells when its link
-changes. Times are of the system's monotonic clock, which all processes of a machine share.
+Roles: `receive` subscribes and records when each numbered message arrives; `send` publishes
+numbered messages at a rate; `open` measures how long a session takes to open; `watch` prints when
+its link changes. Times are those of the system's monotonic clock, which all processes of a machine
+share.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ HEAD: Final = struct.Struct("<Id")  # number of the message, time at which it wa
 
 
 def open_end(given: dict[str, Any]) -> zenoh.Session:
-    """Open a session with the certificate of its name."""
+    """Open a session with the certificate of the given name."""
     one = settings(given["connect"][0], Path(given["certificates"]))
     config = {key: value for key, value in one.config.items() if key != "connect/retry"}
     session = open_session(
@@ -41,8 +42,8 @@ def open_end(given: dict[str, Any]) -> zenoh.Session:
 
 
 def receive(given: dict[str, Any]) -> None:
-    """Subscribe until stdin is closed; then print number, delay [s] and time of arrival [s] of
-    each message by key.
+    """Subscribe until stdin is closed. Then print number, delay [s] and time of arrival [s] of each
+    message by key.
     """
     arrived: dict[str, list[tuple[int, float, float]]] = {}
 
@@ -62,10 +63,11 @@ def receive(given: dict[str, Any]) -> None:
 
 
 def send(given: dict[str, Any]) -> None:
-    """Put messages of several streams until stdin is closed; print how many were put by key.
+    """Publish messages of several streams until stdin is closed. Then print the number of messages
+    by key.
 
-    Each stream has a key, a size in bytes and a rate; its quality of service is that of its topic.
-    A rate of 0 puts as fast as the session takes it.
+    Each stream has a key, a message size [bytes] and a rate [1/s]. Its quality of service is that
+    of its topic. A stream with rate 0 sends as fast as the session accepts messages.
     """
     over = threading.Event()
     counts = dict[str, int]()
@@ -114,7 +116,7 @@ def send(given: dict[str, Any]) -> None:
 
 
 def wait_for_link(session: zenoh.Session) -> list[str]:
-    """Return the transports of a session, once it has one."""
+    """Wait until a session has a link, and return the link's transports."""
     watch = LinkWatch(session, "link")
     while not watch.protocols:
         time.sleep(0.005)
@@ -122,7 +124,7 @@ def wait_for_link(session: zenoh.Session) -> list[str]:
 
 
 def measure_opening(given: dict[str, Any]) -> None:
-    """Print how long a session took to open, and its transport."""
+    """Print the time [s] until a session was open, and its transport."""
     began = time.monotonic()
     with open_end(given) as session:
         took = time.monotonic() - began
@@ -153,7 +155,7 @@ ROLES: Final = {"receive": receive, "send": send, "open": measure_opening, "watc
 
 
 def main() -> int:
-    """Play one role."""
+    """Run the role that the command line names."""
     given = json.loads(sys.argv[1])
     ROLES[given["role"]](given)
     return 0

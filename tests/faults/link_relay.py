@@ -1,10 +1,10 @@
-"""`python -m tests.faults.link_relay JSON`: one mobile link between two network namespaces, with
-loss, delay and rate.
+"""`python -m tests.faults.link_relay JSON`: simulated mobile link between two network namespaces,
+with packet loss, delay and limited rate.
 
-Each namespace gets a TUN device. This process moves packets between both: it loses some at random,
-lets the others wait in a queue of limited length for the rate of the link, and delivers them after
-the delay. It needs no kernel module beyond TUN. Settings can be changed by a line of JSON on stdin,
-for example `{"drop_udp": true}`.
+Each namespace gets a TUN device, and this process moves packets between the two devices. It drops
+some packets at random. The others wait in a queue of limited length for the rate of the link, and
+are delivered after the delay. No kernel module except TUN is needed. A line of JSON on stdin
+changes the settings, for example `{"drop_udp": true}`.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ class LinkTerms:
 
     Attributes:
         loss: share of packets that are lost.
-        delay_s: one way.
+        delay_s: delay of one direction.
         bytes_per_s: rate; 0 for no limit.
-        queue_bytes: length of the queue in front of the rate; packets that do not fit are lost.
-        drop_udp: True where a network blocks UDP.
-        seed: of the losses.
+        queue_bytes: length of the queue of packets that wait for the rate; others are lost.
+        drop_udp: True for a network that blocks UDP.
+        seed: seed of the random losses.
     """
 
     loss: float = 0.0
@@ -55,7 +55,9 @@ class LinkTerms:
 
 @dataclass
 class Direction:
-    """One way of the link: packets in flight, and when the rate is free again."""
+    """One direction of the link: packets in flight, and the time at which the rate allows the next
+    packet.
+    """
 
     out: int
     flying: list[tuple[float, int, bytes]] = field(default_factory=list)
@@ -65,7 +67,7 @@ class Direction:
     def accept_packet(
         self, packet: bytes, now: float, terms: LinkTerms, draw: random.Random
     ) -> None:
-        """Accept a packet or lose it."""
+        """Queue a packet for delivery, or drop it."""
         if terms.drop_udp and len(packet) > 9 and packet[9] == UDP:
             return
         if draw.random() < terms.loss:
@@ -79,7 +81,7 @@ class Direction:
         heapq.heappush(self.flying, (self.free_at + terms.delay_s, self.number, packet))
 
     def deliver_packets(self, now: float) -> None:
-        """Write the packets that have arrived."""
+        """Write the packets that have arrived by `now` to the other end."""
         while self.flying and self.flying[0][0] <= now:
             packet = heapq.heappop(self.flying)[2]
             try:
@@ -96,7 +98,7 @@ def enter_namespace(namespace: str) -> None:
 
 
 def open_device(namespace: str, device: str) -> int:
-    """Create a TUN device in a namespace; return its file descriptor."""
+    """Create a TUN device in a namespace, and return its file descriptor."""
     enter_namespace(namespace)
     found = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
     fcntl.ioctl(found, TUNSETIFF, struct.pack("16sH", device.encode(), IFF_TUN | IFF_NO_PI))
@@ -138,7 +140,7 @@ def _read_packets(device: int) -> list[bytes]:
 
 
 def main() -> int:
-    """Create both devices, say `relay: ready`, and move packets."""
+    """Create both devices, print `relay: ready`, and move packets until stdin is closed."""
     given = json.loads(sys.argv[1])
     ends = (
         open_device(given["left"], given["device"]),

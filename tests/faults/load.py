@@ -1,10 +1,11 @@
-"""Load: observations of made-up visits through the agent's real publisher and outbox, with a
-journal of stored and settled batches.
+"""Load generator: observations of synthetic visits through the agent's real publisher and outbox,
+with a journal of stored and settled batches.
 
-`python -m tests.faults.load FILE` with a JSON file of the fields of `Plan`. The journal is its
+`python -m tests.faults.load FILE` reads the fields of `Plan` from a JSON file. The journal is the
 standard output: one line per batch that was committed to the outbox, and one per batch that an
-acknowledgement settled; unbuffered, so that it survives kill -9. SIGUSR1: offer nothing more, leave
-when everything is settled. SIGTERM: leave as an agent does. At the end, one line of JSON.
+acknowledgement settled. The output is unbuffered, so that the journal survives kill -9. On SIGUSR1
+the generator offers no new observations, and ends when every batch is settled. On SIGTERM it ends
+as an agent does. At the end it prints one line of JSON.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ class Plan:
 
 
 def print_events(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
-    """Print `+ vehicle boot kind region seq records time` for each batch on disk, `- …` for each
-    settled one.
+    """Print a line for each batch: `sign vehicle boot kind region seq records time`. The sign is
+    `+` for a batch on disk and `-` for a settled batch.
     """
     at = f"{time.time():.3f}"
     for stream, seq, records in events:
@@ -62,7 +63,7 @@ def print_events(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
 
 
 class WatchedOutbox(Outbox):
-    """Outbox of an agent that also writes a journal."""
+    """Outbox of an agent that also prints a journal."""
 
     def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
         held = super().store(drafts, now)
@@ -80,7 +81,7 @@ class WatchedOutbox(Outbox):
 def make_visits(
     rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: int
 ) -> RecordBlock:
-    """Return one synthetic visit per element of `vehicle` (n,), all ending now [ns]."""
+    """Return one synthetic visit per element of `vehicle` (n,), all ending at `now` [ns]."""
     n = len(vehicle)
     columns: Columns = {}
     for name, dtype in column_types(Kind.OBSERVATION).items():
@@ -103,8 +104,8 @@ def make_visits(
 
 
 def offer_blocks(plan: Plan, publisher: Publisher, quiet: threading.Event) -> tuple[int, float]:
-    """Offer a block every BLOCK_S until `quiet`. Return the number of blocks that were late by a
-    whole block, and the longest lag [s].
+    """Offer a block of observations every BLOCK_S until `quiet` is set. Return the number of blocks
+    that were late by a whole block, and the longest delay [s].
     """
     rng = np.random.default_rng(plan.seed)
     per_block = plan.rate * BLOCK_S * len(plan.names)
@@ -133,7 +134,7 @@ def _set_events(*events: threading.Event) -> None:
 
 
 def main(path: str) -> int:
-    """Run one generator."""
+    """Run one load generator."""
     plan = Plan(**json.loads(Path(path).read_text()))
     quiet = threading.Event()
     leave = threading.Event()

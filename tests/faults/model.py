@@ -1,5 +1,5 @@
-"""The model of acknowledgement, lease, hand-over and erasure: every state, and every rule
-switched off once.
+"""Campaign on the model of acknowledgement, lease, hand-over and erasure: all states are checked,
+also with each rule switched off.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from tests.faults.protocol_model import BROKEN, Rules, explore_states
 
 
 def run(site: Site) -> list[Figure]:
-    """Check all states with equal and different lease times, and that the checker finds each broken
-    protocol.
+    """Check all states with equal and different lease times, and check that the model finds each
+    broken protocol.
     """
     checked = [
         explore_states(Rules(), most_turn=site.choose_amount(2, 1)),

@@ -1,4 +1,6 @@
-"""Malformed messages and queries, made from valid ones: bytes, fields, text, encodings and keys."""
+"""Malformed messages and queries, made from valid ones by changes of bytes, fields, text, encodings
+and keys.
+"""
 
 from __future__ import annotations
 
@@ -89,7 +91,7 @@ _ENCODINGS: Final = (
 
 
 class Mutants:
-    """Source of malformed messages of the vehicles `rogue-NN` as of the time `now` [ns], which a
+    """Source of malformed messages of the vehicles `rogue-NN`. Their time is `now` [ns], which a
     test may set.
     """
 
@@ -99,7 +101,7 @@ class Mutants:
         self._seq = 0
 
     def make_message(self) -> Message:
-        """Return the next message."""
+        """Return the next malformed message."""
         r = self._random
         kind = r.choice(list(Kind))
         name = f"rogue-{r.randrange(50):02}"
@@ -174,7 +176,9 @@ def _make_states() -> Any:  # noqa: ANN401
 
 
 def _shift_columns(place: int, rows: int) -> dict[str, Any]:
-    """Return the columns of a batch moved east by some cells."""
+    """Return the position and cell columns of a batch of `rows` rows, moved east by
+    `place` cells.
+    """
     longitude = LONGITUDE + 2e-4 * place
     return {
         "longitude": [longitude] * rows,
@@ -204,7 +208,7 @@ _QUERY: Final = {
 
 
 def changed_bytes(r: Random, data: bytes) -> bytes:
-    """Return bytes of which a few were changed, removed, repeated or inserted."""
+    """Return a copy of `data` in which a few bytes were changed, removed, repeated or inserted."""
     out = bytearray(data)
     for _ in range(r.choice((1, 1, 1, 2, 4, 16))):
         at = r.randrange(len(out)) if out else 0

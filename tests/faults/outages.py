@@ -1,5 +1,5 @@
-"""Outages: router gone for a minute, router and service frozen, full disks, and shutdown. No
-acknowledged report is lost.
+"""Campaigns on outages: a router that is down for a minute, a frozen router and service, full
+disks, and shutdown. No acknowledged report may be lost.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ DRAIN_S: Final = 60.0
 
 
 def router_down(site: Site) -> list[Figure]:
-    """Kill the router for a minute. Every report of that minute must be settled soon after its
-    return.
+    """Kill the router for a minute. Every report of that minute must be settled soon after the
+    router's return.
     """
     down_s = site.choose_amount(60, 4)
     with open_stage(site.folder) as there:
@@ -48,7 +48,9 @@ def router_down(site: Site) -> list[Figure]:
 
 
 def freeze_parts(site: Site) -> list[Figure]:
-    """Freeze the router, then the service. Agents must keep pace meanwhile and lose nothing."""
+    """Freeze the router, then the service. Meanwhile agents must keep up with their signals, and
+    nothing may be lost.
+    """
     frozen_s = site.choose_amount(20, 3)
     spans = []
     with open_stage(site.folder) as there:
@@ -77,7 +79,7 @@ def freeze_parts(site: Site) -> list[Figure]:
 
 
 def stop_parts(site: Site) -> list[Figure]:
-    """Send SIGTERM with a running router and with a frozen one: agent and service end soon, and
+    """Send SIGTERM with a running router and with a frozen one. Agent and service must end soon and
     lose nothing.
     """
     longest = 0.0
@@ -108,7 +110,7 @@ def stop_parts(site: Site) -> list[Figure]:
 
 def disk_full(site: Site) -> list[Figure]:
     """Prevent the files of the service, then those of the agents, from growing. Nothing may be
-    acknowledged falsely, and everything must be acknowledged later.
+    acknowledged without being stored, and everything must be acknowledged later.
     """
     full_s = site.choose_amount(10, 2)
     false_acks = recovered = waiting = 0
@@ -144,7 +146,7 @@ def _load_agents(there: Stage, processes: int) -> None:
 
 
 def _is_settled(there: Stage) -> bool:
-    """Return True if everything stored by now gets settled in time."""
+    """Return True if every batch stored by now is settled within DRAIN_S."""
     since = time.time()
     deadline = time.monotonic() + DRAIN_S
     while time.monotonic() < deadline:

@@ -1,10 +1,11 @@
-"""Vehicles at places where they cannot be, and two vehicles that report ice on roads where nobody
-drives.
+"""Campaign on impossible positions: vehicles that report places where they cannot be, and two
+vehicles that report ice on roads where nobody else drives.
 
-Teleports: cars that drive honestly also report one far place, in the same batch, in another batch,
-boot or region, before or after their other reports, or in short leaps. The oracle is the distance
-from their own way. Two cars: they report ice at 210 places along 400 km by leaps, as a backlog, or
-live, with a path at 65 m/s that is plausible.
+Teleports: cars that drive honestly also report one distant place. It is in the same batch or in
+another batch, boot or region, before or after their other reports, or reached in short leaps.
+Whether a report is impossible follows from its distance to the car's own path. Two cars: they
+report ice at 210 places along 400 km, either in leaps, or later as a backlog, or live at a
+plausible 65 m/s.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ METRES_PER_DEGREE: Final = 111_195.0
 
 
 def run(site: Site) -> list[Figure]:
-    """Send a thousand teleports and three drives of two cars; in a quick run a few hundred
+    """Send a thousand teleports and three drives of two cars; in a quick run, a few hundred
     teleports.
     """
     teleports = site.choose_amount(1_000, 140)
@@ -67,7 +68,9 @@ def _offset_position(north_m: Numbers, east_m: Numbers) -> tuple[FloatArray, Flo
 def _make_visits(
     name: str, seq: int, when: IntArray, place: tuple[FloatArray, FloatArray], mu: float
 ) -> list[Batch]:
-    """Return one batch per region of visits at these times [ns] and places."""
+    """Return one batch per region of visits at the given times [ns] and places (latitude,
+    longitude).
+    """
     cell = grid.cell_of(*place)
     regions = grid.region_of(cell)
     out = []
@@ -95,7 +98,9 @@ def _make_messages(batches: Sequence[Batch]) -> list[Message]:
 
 
 def _drive_teleports(site: Site, count: int) -> tuple[int, int]:
-    """Return how many of the teleports were fused, and how many honest rows were not."""
+    """Return the number of teleports that were fused, and the number of honest rows that were not
+    fused.
+    """
     rng = np.random.default_rng(site.seed)
     start = time.time_ns() - 7200 * SECOND
     fused = excluded = 0
@@ -137,7 +142,7 @@ def _drive_teleports(site: Site, count: int) -> tuple[int, int]:
 
 
 def _far_away(kind: str, name: str, start: int, rng: np.random.Generator) -> list[Batch]:
-    """Return reports of a place far from the car's way, at about the same time."""
+    """Return batches that report a place far from the car's path, at about the same time."""
     far = rng.uniform(FAR_M, 4e5) * np.exp(1j * rng.uniform(0, 2 * np.pi))
     second = {"before": -5, "between": 14.5}.get(kind, 31.0)
     if (
@@ -165,7 +170,7 @@ def _far_away(kind: str, name: str, start: int, rng: np.random.Generator) -> lis
 
 
 def _two_cars(site: Site, way: str) -> int:
-    """Return at how many places two cars raise an alert where nobody else drives."""
+    """Return the number of places at which two cars raise an alert where nobody else drives."""
     start = time.time_ns() - 9000 * SECOND
     raised = set[int]()
     apart = SECOND // 1000 if way == "leaps" else int(STEP_M / SPEED * SECOND)
@@ -189,7 +194,9 @@ def _two_cars(site: Site, way: str) -> int:
 
 
 def _count_honest_alerts(site: Site, cars: int) -> int:
-    """Return at how many icy places of a lonely road this many honest cars raise an alert."""
+    """Return the number of icy places at which `cars` honest cars raise an alert, on a road without
+    other traffic.
+    """
     start = time.time_ns() - 3600 * SECOND
     raised = set[int]()
     with closing(Engine(ServiceConfig(), site.folder / f"honest-{cars}")) as engine:

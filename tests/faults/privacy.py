@@ -1,12 +1,15 @@
-"""Reader that follows a lone car by night, with the shipped secure settings.
+"""Campaign on privacy: a reader of the map tries to follow a lone car at night, with the shipped
+secure settings.
 
-Five side streets with STREETS households join a main road. All cars leave twice by day; one leaves
-alone by night, and its agent cuts the begin of the trip. The reader holds the tiles of every put.
-In each put it takes the cell that appeared, or whose interval, times or counts changed most, for
-the place of the car, and the street nearest to the first such places for the car's. A reader that
-sees no change guesses at random; such guesses count by their probability.
+Five side streets with STREETS households join a main road. All cars leave twice by day. One car
+leaves alone at night, and its agent cuts the beginning of the trip. The reader stores the tiles of
+every publication. After each publication it takes the cell that is new, or whose interval, times or
+counts changed most, as the place of the car. From the first such places it takes the nearest street
+as the car's street. A reader that sees no change guesses at random; such a guess counts by its
+probability of being right.
 
-The control shows every visit at once. The reader must find the car there.
+As a control, a map that shows every visit at once is also tested. There the reader must find the
+car.
 """
 
 from __future__ import annotations
@@ -51,15 +54,15 @@ ICE: Final = 0.12
 
 
 class Trip(NamedTuple):
-    """Return cells and sectors of a trip that the agent publishes, one visit a second."""
+    """Cells and sectors of a trip as the agent publishes it, one visit a second."""
 
     cell: IntArray
     sector: IntArray
 
 
 class Pursuit(NamedTuple):
-    """Result of an attempt to follow a car: probabilities of a right place per put, of a random
-    place, and of the right street.
+    """Result of an attempt to follow a car: the probability of naming the right place for each
+    publication, that of a random place, and the probability of naming the right street.
     """
 
     hits: list[float]
@@ -68,7 +71,7 @@ class Pursuit(NamedTuple):
 
 
 def _trip(street: int, house: int) -> Trip:
-    """Return the trip from a house down its street to the main road's end."""
+    """Return the trip from a house along its street and the main road to the road's end."""
     column, row = (int(v) for v in grid.deinterleave(np.int64(CELL)))
     junction = 10 * street + 5
     down = np.arange(LENGTH - house, 0, -1)
@@ -80,7 +83,7 @@ def _trip(street: int, house: int) -> Trip:
 
 
 def _visit(name: str, seq: int, when: int, trip: Trip, at: slice, mu: float) -> list[Message]:
-    """Return the messages of a part of a trip that ends at `when` [ns]."""
+    """Return the messages for the visits `at` of a trip; the last visit ends at `when` [ns]."""
     cell = trip.cell[at]
     latitude, longitude = grid.centre(cell)
     regions = grid.region_of(cell)
@@ -108,7 +111,7 @@ def _visit(name: str, seq: int, when: int, trip: Trip, at: slice, mu: float) -> 
 
 
 class Town:
-    """Service of a town, its cars by day, and the tiles that a reader holds."""
+    """Service of a town, its cars by day, and the tiles that a reader has stored."""
 
     def __init__(self, folder: Path, seed: int, public: int = PUBLIC) -> None:
         self._random = np.random.default_rng(seed)
@@ -131,7 +134,7 @@ class Town:
     def drive(
         self, name: str, when: int, trip: Trip, at: slice, mu: float = MU
     ) -> list[wire.Alert]:
-        """Take in a part of a trip; return the alerts."""
+        """Process the visits `at` of a trip, and return the alerts that they raise."""
         self._sent += 1
         seen = float(np.clip(mu + self._random.normal(0.0, 0.02), 0.05, 1.0))
         alerts = self.engine.intake.ingest(
@@ -141,7 +144,7 @@ class Town:
         return alerts
 
     def put(self, now: int) -> dict[int, tuple[pa.Table | None, pa.Table]]:
-        """Publish the changed tiles; return each as it was and as it is."""
+        """Publish the changed tiles. Return for each tile its table before (or None) and after."""
         out = {}
         for tile, payload in self.engine.queries.changed_tiles(now):
             table = pa.ipc.open_stream(payload).read_all()
@@ -151,7 +154,9 @@ class Town:
 
 
 def _suspects(before: pa.Table | None, after: pa.Table) -> Iterator[tuple[float, int]]:
-    """Yield by how much each cell changed in a way that age does not change it."""
+    """Yield (size of change, cell) for each cell that changed in a way that ageing does not
+    explain.
+    """
     known = {}
     if before is not None:
         known = {(row["cell"], row["sector"]): row for row in before.to_pylist()}
@@ -168,7 +173,7 @@ def _suspects(before: pa.Table | None, after: pa.Table) -> Iterator[tuple[float,
 
 
 def _places(cells: IntArray) -> FloatArray:
-    """Return places [m] as complex numbers."""
+    """Return positions of cells as complex numbers, east + i·north [m]."""
     latitude, longitude = grid.centre(cells)
     north = (latitude - LATITUDE) * 111_195.0
     east = (longitude - LONGITUDE) * 111_195.0 * np.cos(np.radians(LATITUDE))
@@ -176,7 +181,9 @@ def _places(cells: IntArray) -> FloatArray:
 
 
 def pursue(town: Town, street: int) -> Pursuit:
-    """Let a car of a street leave alone by night, and its pursuer look at each put."""
+    """Let a car of a street leave alone at night, let the reader examine each publication, and
+    return the result.
+    """
     trip = _trip(street, 0)
     begin = town.day + 22 * HOUR
     hits: list[float] = []
@@ -202,7 +209,9 @@ def pursue(town: Town, street: int) -> Pursuit:
 
 
 def _name_street(found: list[int], street: int) -> float:
-    """Return the probability that the reader names the right street from the first places."""
+    """Return the probability that the reader names the right street from the first
+    suspected cells.
+    """
     if not found:
         return 1.0 / len(STREETS)
     first = _places(np.array(found[:3]))
@@ -215,7 +224,7 @@ def _name_street(found: list[int], street: int) -> float:
 
 
 def _slippery_delay(folder: Path, public: int) -> float:
-    """Return after how many seconds the map and an alert tell of ice that two cars found."""
+    """Return the time [s] until both the map and an alert show ice that two cars measured."""
     town = Town(folder, 0, public)
     with closing(town.engine):
         trip = _trip(0, 0)
@@ -234,7 +243,7 @@ def _slippery_delay(folder: Path, public: int) -> float:
 
 
 def run(site: Site) -> list[Figure]:
-    """Pursue a car of each street, and find it in a map that shows every visit."""
+    """Pursue a car of each street, and as a control a car on a map that shows every visit."""
     over: list[float] = []
     puts = 0
     streets: list[float] = []
@@ -263,7 +272,9 @@ def run(site: Site) -> list[Figure]:
 
 
 def _control(folder: Path) -> float:
-    """Return the share of places found over chance if every visit is shown at once."""
+    """Return how much more often than by chance the reader finds the place if every visit is shown
+    at once.
+    """
     with patch.object(TileCache, "source", property(lambda tiles: tiles.state.fusion)):
         town = Town(folder, 0)
         with closing(town.engine):

@@ -1,9 +1,9 @@
-"""Router, service and load as processes of their own: started, killed, frozen and stopped by a
-campaign.
+"""Router, service and load generators as separate processes, which a campaign starts, kills,
+freezes and stops.
 
-Their output goes through a pipe to `folder/NAME.log`, one file over all starts. So lines that a
-process printed before it was killed are there, and a limit on its files does not limit its log. A
-router keeps its port over restarts.
+The output of a process goes through a pipe to `folder/NAME.log`, one file for all starts. Lines
+printed before a kill are therefore in the file, and a limit on the process's files does not limit
+its log. A router keeps its port over restarts.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ STOP_S = 30.0  # a stopped part is gone after 3 s, on a machine that has time fo
 
 
 class Part:
-    """One process under test, by its command; `start` it as often as you like."""
+    """Process under test, given by its command. It can be started any number of times."""
 
     def __init__(self, name: str, command: Sequence[str], folder: Path) -> None:
         self.name = name
@@ -37,7 +37,9 @@ class Part:
         self._writer: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """Start it, once its last start has ended; does not wait until it is ready."""
+        """Start the process after its previous run has ended. Return without waiting until it is
+        ready.
+        """
         if self._process is not None:
             self.wait(STOP_S)
         self._since = self.log.stat().st_size if self.log.exists() else 0
@@ -50,7 +52,7 @@ class Part:
 
     @property
     def pid(self) -> int:
-        """Process id of the present start."""
+        """Return the process id of the present run."""
         assert self._process is not None, f"{self.name} was never started"
         return self._process.pid
 
@@ -60,7 +62,7 @@ class Part:
         return self._process is not None and self._process.poll() is None
 
     def read_lines(self) -> list[str]:
-        """Return the lines printed since the present start."""
+        """Return the lines printed since the last start."""
         return self.log.read_bytes()[self._since :].decode(errors="replace").splitlines()
 
     def line_with(self, start: str) -> str:
@@ -77,7 +79,7 @@ class Part:
         return find_lines()[0]
 
     def send_signal(self, number: signal.Signals) -> None:
-        """Send a signal; one that is gone does not mind."""
+        """Send a signal to the process if it is alive."""
         if self.is_alive:
             os.kill(self.pid, number)
 
@@ -88,8 +90,8 @@ class Part:
             self.wait(STOP_S)
 
     def wait(self, patience_s: float) -> int:
-        """Exit code, once it is gone and its log whole; subprocess.TimeoutExpired if it is not
-        in time.
+        """Wait until the process has ended and its log is complete, and return the exit code. Raise
+        subprocess.TimeoutExpired if this takes longer than `patience_s`.
         """
         assert self._process is not None
         assert self._writer is not None
@@ -98,18 +100,22 @@ class Part:
         return code
 
     def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
-        """Send SIGTERM or another signal, and return the exit code."""
+        """Send SIGTERM or another signal, wait for the end of the process, and return its exit
+        code.
+        """
         self.send_signal(number)
         return self.wait(STOP_S)
 
     def limit_files(self, size: int) -> None:
-        """Limit the files of the process to `size` bytes, as on a full disk; -1 removes the limit."""
+        """Limit each file of the process to `size` bytes, which acts like a full disk; -1 removes
+        the limit.
+        """
         _, hard = resource.prlimit(self.pid, resource.RLIMIT_FSIZE)
         resource.prlimit(self.pid, resource.RLIMIT_FSIZE, (hard if size < 0 else size, hard))
 
 
 class Stage:
-    """A router and a service, and the load that is added to them."""
+    """Router and service, and the load generators added to them."""
 
     def __init__(self, folder: Path, **service: object) -> None:
         self.folder = folder
@@ -131,8 +137,8 @@ class Stage:
         return [sys.executable, "-m", "deploy.router", "--listen", endpoint]
 
     def make_load(self, names: Sequence[str], rate: float, **more: object) -> Part:
-        """Return a generator, not yet started, that sends `rate` observations per second for each
-        vehicle.
+        """Return a load generator, not yet started, that sends `rate` observations per second for
+        each vehicle.
         """
         name = f"load-{len(self.loads):02}"
         config = self.folder / f"{name}.json"
@@ -155,19 +161,19 @@ class Stage:
 
     @property
     def parts(self) -> list[Part]:
-        """Return every process that can be killed."""
+        """Return all processes that can be killed."""
         return [self.router, self.service, *self.loads]
 
     @property
     def journals(self) -> list[Path]:
-        """Return the batches that the generators know to be on disk and settled."""
+        """Return the paths of the load generators' journals of stored and settled batches."""
         return [part.log for part in self.loads]
 
     def drain(self, patience_s: float) -> None:
-        """Stop new observations; wait until every generator has all of its batches settled.
+        """Stop new observations, and wait until every batch of every load generator is settled.
 
-        Ends before if none settles anything for `patience_s`: batches left in an outbox then are
-        missing in the archive, and counted there.
+        The wait ends early if no batch is settled for `patience_s`. Batches left in an outbox are
+        then missing in the archive, and the census counts them.
         """
         for part in self.loads:
             part.line_with("ready: ")  # before, the signal would end it
@@ -177,8 +183,8 @@ class Stage:
                 self._await_news(patience_s)
 
     def _await_news(self, patience_s: float) -> None:
-        """Wait until the generators have told more than now, or are gone. TimeoutError: nothing
-        for so long.
+        """Wait until a load generator has printed more lines, or all of them have ended. Raise
+        TimeoutError after `patience_s` without news.
         """
         told = sum(journal.stat().st_size for journal in self.journals)
 

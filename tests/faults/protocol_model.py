@@ -1,26 +1,27 @@
-"""Explicit-state model of acknowledgement, lease, take-over, hand-over and erasure; `explore_states` visits
-every state.
+"""Explicit-state model of acknowledgement, lease, takeover, hand-over and erasure; `explore_states`
+visits every reachable state.
 
-Two services share a bucket; a vehicle has BATCHES. Time passes in ticks, during which each
-service's clock advances by one; that of a holder may stand still in every second tick. No step must
-be taken: a service that takes none for a while is frozen, or cut off. Uploads and renewals take
-effect in the bucket at any time after they began.
+Two services share a bucket; a vehicle has BATCHES. Time passes in ticks. In each tick a service's
+clock advances by one, but the clock of a lease holder may stand still in every second tick. No step
+is compulsory: a service that does nothing for a while models a frozen or disconnected one. Uploads
+and renewals take effect in the bucket at any time after they began.
 
     renew    begins at a moment; if the bucket shows no higher number afterwards, the renewal
-             counts from its begin; one that is given up may still write its turn later
-    ack      only within lease / 2 of the begin of the last valid renewal, and only for batches
-             that are uploaded
+             counts from its beginning; a renewal that was given up may still write its turn later
+    ack      only within lease / 2 after the beginning of the last valid renewal, and only for
+             batches that are uploaded
     take     a standby that saw the same turn for its lease time creates the next number; if the
-             turn changed meanwhile, it waits for its lease time more
-    list     reads all objects of the bucket: these count, and later objects of older numbers do
-             not (the fence)
+             turn changed meanwhile, the standby waits for another lease time
+    list     reads all objects of the bucket: these objects count, and later objects of lower
+             numbers do not (the fence)
     release  hands the lease over at once; the holder acknowledges nothing afterwards
-    erase    the holder deletes a batch from the bucket after it wrote that it is erased
+    erase    the holder records that a batch is erased, and then deletes it from the bucket
 
 Invariants: every acknowledged batch that is not erased is known to each serving service; a batch
 counts at most once; an erased batch counts nowhere and is not accepted again.
 
-`Rules` switches single rules off. Each of them must then break an invariant: so the model can fail.
+`Rules` can switch off single rules. Without any one of the rules an invariant must break, which
+shows that the model can detect errors.
 """
 
 from __future__ import annotations
@@ -61,19 +62,19 @@ class Service(NamedTuple):
     """State of a service.
 
     Attributes:
-        role: "waiting", "taking" (has created its number and not listed yet), "serving", or "gone".
-        number: of its lease; 0 without one.
-        age: ticks since the begin of its last valid renewal, capped.
-        begun: age of a renewal under way; NOT_YET for none.
-        seen: (number, turn) of the lease that it saw last, and `same` for how long [ticks].
-        same: see `seen`.
-        wait: ticks to wait before it lists.
+        role: "waiting", "taking" (has created its number, but not listed yet), "serving", or "gone".
+        number: number of its lease; 0 without a lease.
+        age: ticks since the beginning of its last valid renewal, capped.
+        begun: age of a renewal that is under way; NOT_YET without one.
+        seen: (number, turn) of the lease object that it saw last.
+        same: number of ticks for which it has seen the same (number, turn).
+        wait: number of ticks to wait before it lists.
         known: batches that it knows.
         sending: batches whose upload is under way.
-        uploaded: own uploads that it knows to be in the bucket.
-        slow: its clock did not advance in the last tick.
-        turn: last turn of its lease that it used up.
-        late: turn of a renewal that it gave up and that may still be written; 0 for none.
+        uploaded: own uploads of which it knows that they are in the bucket.
+        slow: True if its clock did not advance in the last tick.
+        turn: last turn of its lease that it has used.
+        late: turn of a renewal that was given up and may still be written; 0 without one.
     """
 
     role: str = "waiting"
@@ -92,14 +93,14 @@ class Service(NamedTuple):
 
 
 class World(NamedTuple):
-    """State of everything.
+    """State of the whole model.
 
     Attributes:
-        services: both.
+        services: states of both services.
         number, holder, turn, released: the newest lease object.
-        objects: (batch, number) in the bucket.
-        fence: (number, objects of before that count).
-        acked: batches that the vehicle was told are durable.
+        objects: (batch, number) of each object in the bucket.
+        fence: (number, older objects that count).
+        acked: batches that were acknowledged to the vehicle as durable.
         erased: batches that were erased.
     """
 
@@ -122,15 +123,15 @@ class Violation(NamedTuple):
 
 
 class Checked(NamedTuple):
-    """Result of a check."""
+    """Result of exploring all states."""
 
     states: int
     violation: Violation | None
 
 
 def explore_states(rules: Rules, most_number: int = 2, most_turn: int = 3) -> Checked:
-    """Visit all states with up to this many lease numbers and turns; stop at the first
-    violation.
+    """Visit all states with at most `most_number` lease numbers and `most_turn` turns. Stop at the
+    first violation.
     """
     start = World((Service(), Service()))
     came: dict[World, tuple[World, str] | None] = {start: None}
@@ -156,13 +157,13 @@ def _steps_to(world: World, came: dict[World, tuple[World, str] | None]) -> tupl
 
 
 def list_counted(world: World) -> list[int]:
-    """Return the batches of the objects that count for a reader of the bucket."""
+    """Return the batches that count for a reader of the bucket; a batch may occur twice."""
     number, before = world.fence
     return [batch for batch, epoch in world.objects if epoch >= number or (batch, epoch) in before]
 
 
 def find_problem(world: World) -> str:
-    """Return the broken invariant, or ""."""
+    """Return a message for the broken invariant, or "" if none is broken."""
     counted = list_counted(world)
     if len(counted) != len(set(counted)):
         return "a batch counts twice"
@@ -179,7 +180,7 @@ def find_problem(world: World) -> str:
 def list_steps(
     world: World, rules: Rules, most_number: int, most_turn: int
 ) -> Iterator[tuple[str, World]]:
-    """Yield each possible step and the state after it."""
+    """Yield the name of each possible step and the state after it."""
     for slow in (NOT_YET, *NAMES):
         if slow == NOT_YET or (
             not world.services[slow].slow and world.services[slow].role == "serving"
@@ -292,8 +293,8 @@ def _stand_by(world: World, me: int, rules: Rules, most_number: int) -> Iterator
 
 
 def _advance_clocks(world: World, slow: int, rules: Rules) -> World:
-    """Advance the clocks that are in use: of a lease, of a wait for it, or of a wait before
-    listing.
+    """Return the state after a tick: all clocks in use advance (of a lease, of a wait for it, of a
+    wait before listing), except that of the service `slow`.
     """
     out = []
     for me, one in enumerate(world.services):
@@ -312,7 +313,9 @@ def _advance_clocks(world: World, slow: int, rules: Rules) -> World:
 
 
 def _end_service(one: Service) -> Service:
-    """Return a service that serves no more; messages of it that the network still holds may land."""
+    """Return the state of a service after its end; its messages in transit may still
+    take effect.
+    """
     return Service("gone", one.number, age=0, sending=one.sending, late=one.late)
 
 

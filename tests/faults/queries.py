@@ -1,8 +1,8 @@
-"""Two readers ask for the whole map as GeoJSON in a loop; a third asks for one tile. How long does
-it wait?
+"""Campaign on expensive queries: two readers query the whole map as GeoJSON in a loop, and the
+waiting time of a third reader that queries one tile is measured.
 
-The service is a process of its own, filled with cells before; askers are threads of processes of
-their own.
+The service runs in a separate process, and its map is filled before. The readers are threads of
+other processes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ HEAVY: Final = 2
 
 
 def run(site: Site) -> list[Figure]:
-    """Run twenty thousand cells for half a minute; in a quick run five thousand for four seconds."""
+    """Query twenty thousand cells for half a minute; in a quick run, five thousand for four
+    seconds.
+    """
     seconds = site.choose_amount(30, 4)
     with open_stage(site.folder, vehicle_kb_s=1e4, vehicle_burst_kb=1e5) as there:
         session = open_session(ZenohSettings(connect=[there.endpoint]))
@@ -64,8 +66,8 @@ def run(site: Site) -> list[Figure]:
 
 
 def _fill_map(session: zenoh.Session, there: Stage, vehicles: int) -> int:
-    """Fill the map: each vehicle visits 250 cells, one per second. Return when all reports are
-    settled.
+    """Fill the map: each vehicle visits 250 cells, one per second. Return the number of cells after
+    all reports are settled.
     """
     acked: set[str] = set()
     acks = session.declare_subscriber(
@@ -115,7 +117,7 @@ def _await_tile(session: zenoh.Session) -> None:
 
 
 def _time_light_queries(session: zenoh.Session, seconds: float) -> list[float]:
-    """Return the time of each query for one tile."""
+    """Return the answer time [s] of each query for one tile."""
     waits = []
     end = time.monotonic() + seconds
     pause = threading.Event()
@@ -133,7 +135,7 @@ def _start_reader(endpoint: str) -> subprocess.Popen[str]:
 
 
 def main() -> None:
-    """Ask for everything in a loop; a line for each whole answer."""
+    """Query the whole map in a loop, and print a line for each complete answer."""
     session = open_session(ZenohSettings(connect=[sys.argv[1]]))
     assert session is not None
     with session:

@@ -1,10 +1,11 @@
-"""`python -m tests.faults.rogue`: a session of any mode in a process of its own, for attacks that
-may break its sender.
+"""`python -m tests.faults.rogue`: Zenoh session of any mode in a separate process, for attacks that
+may crash their sender.
 
-Reads one line of JSON: settings, name, keys to subscribe to, messages to put. Prints a line when
-the messages have gone out. At the next line it asks for the map, so that all expected messages have
-arrived, and prints the keys that it received. It ends without closing: a Zenoh session in router
-mode may abort its own process when it closes.
+The process reads one line of JSON: settings, name, keys to subscribe to, messages to publish. It
+prints a line when the messages are sent. After the next line of input it queries the map, which
+shows that all expected messages have arrived, and prints the keys of the received messages. It ends
+without closing the session, because a Zenoh session in router mode may abort its process when it
+closes.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from schemas.runtime.zenoh_session import configuration
 
 
 def main() -> None:
-    """Carry out the instructions of the campaign."""
+    """Run the instructions on stdin."""
     told = json.loads(sys.stdin.readline())
     heard: list[str] = []
     session = zenoh.open(

@@ -1,5 +1,5 @@
-"""Attacks on a fleet with TLS and access list, each by the means of a vehicle, a reader or a
-stranger.
+"""Campaign of attacks on a fleet with TLS and access list, each with the access of a vehicle, a
+reader or a stranger.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from tests.secured import open_network
 
 
 def run(site: Site) -> list[Figure]:
-    """Run every attack on one set-up. The last attack revokes the attacker."""
+    """Run every attack in one environment. The last attack revokes the attacker's certificate."""
     breaches = []
     with open_network(site.folder / "certificates") as running, open_ground(running) as found:
         for name, attempt in ATTEMPTS.items():

@@ -1,4 +1,4 @@
-"""`python -m tests.faults.soak [--minutes 30] [--out DIR]`: steady load for half an hour, and a
+"""`python -m tests.faults.soak [--minutes 30] [--out DIR]`: steady load for half an hour, with a
 check that no resource grows.
 """
 
@@ -38,21 +38,21 @@ OWES: Final = (
 
 
 def memory_mb(part: Part) -> float:
-    """Return the resident memory of a process."""
+    """Return the resident memory of a process [MB]."""
     lines = Path(f"/proc/{part.pid}/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) / 1024
 
 
 def count_handles(part: Part) -> int:
-    """Open files and sockets of a process."""
+    """Return the number of open files and sockets of a process."""
     return sum(1 for _ in Path(f"/proc/{part.pid}/fd").iterdir())
 
 
 def fit_slope(times: FloatArray, megabytes: FloatArray) -> float:
-    """Return the growth of a process's permanent memory [MB per 10 min]: a line through the least
-    of each minute.
+    """Return the growth of a process's memory [MB per 10 min]: the slope of a line through the
+    minimum of each minute.
 
-    Within a minute it takes and gives back: a segment, a compaction, a query.
+    Within a minute memory rises and falls because of segments, compactions and queries.
     """
     minute = (times // 60.0).astype(int)
     least = np.array([megabytes[minute == m].min() for m in np.unique(minute)])
@@ -62,7 +62,9 @@ def fit_slope(times: FloatArray, megabytes: FloatArray) -> float:
 
 
 def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
-    """Return the steepest slope of memory and the largest growth of handles of any process."""
+    """Return two figures: the steepest slope of memory and the largest growth of handles of any
+    process.
+    """
     times: list[float] = []
     seen: dict[str, list[tuple[float, int]]] = {}
     with open_stage(site.folder, compact_s=300.0) as there:
@@ -107,7 +109,7 @@ def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
 
 
 def main() -> int:
-    """Run the campaign. Return 0 if every bar holds."""
+    """Run the campaign. Return 0 if every figure meets its target, otherwise 1."""
     parser = argparse.ArgumentParser(
         prog="tests.faults.soak", description="A steady load; does anything grow?"
     )

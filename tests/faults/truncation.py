@@ -1,9 +1,9 @@
-"""The newest segment cut, and any of its bytes changed, at every place: acknowledged and held
-batches agree.
+"""Campaign on a damaged newest segment: it is cut at every byte, and its bytes are changed one at a
+time. The service must not count rows that are missing.
 
-The newest segment is one that was written and not yet acknowledged when the power failed: its rows
-may be lost, those of the older segments may not. A batch that is not held must be new to the
-service when its vehicle sends it again.
+The newest segment models one that was written but not yet acknowledged when the power failed: its
+rows may be lost, but rows of older segments may not. A batch whose rows are lost must be accepted
+as new when its vehicle sends it again.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ WHOLE_WAY: Final = 200
 
 
 def run(site: Site) -> list[Figure]:
-    """Cut at every byte, changed at every fifth; in a quick run, some hundred."""
+    """Cut the segment at every byte, and change every fifth byte; in a quick run, some hundred
+    bytes.
+    """
     logging.getLogger(load.__name__).setLevel(logging.ERROR)  # thousands of files are set aside
     batches, newest = _write_archive(site.folder)
     whole = newest.read_bytes()
@@ -62,7 +64,9 @@ def run(site: Site) -> list[Figure]:
 
 
 def _write_archive(root: Path) -> tuple[list[Batch], Path]:
-    """Return the batches in the order of their segments, and the newest segment."""
+    """Write an archive. Return its batches in the order of their segments, and the newest segment's
+    path.
+    """
     now = time.time_ns() - SECOND
     batches = [batch("sim-001", seq, now, [0.8, 0.7]) for seq in range(1, SEGMENTS * BATCHES + 1)]
     with closing(Engine(ServiceConfig(), root)) as engine:
@@ -101,8 +105,8 @@ def _list_expected(batches: Sequence[Batch]) -> set[tuple[int, int, float]]:
 
 
 def _count_lost(root: Path, batches: Sequence[Batch]) -> int:
-    """Count rows of older segments that are missing, and rows of the newest segment that are
-    counted as held but are missing or wrong.
+    """Return the number of missing rows of older segments, plus the number of rows of the newest
+    segment that the service counts as received although they are missing or wrong.
     """
     held = {(seq, row, round(mu, 3)) for seq, row, mu in _read_rows(root)}
     streams = SequenceTrackers()
@@ -123,7 +127,9 @@ def _count_lost(root: Path, batches: Sequence[Batch]) -> int:
 
 
 def _after_all_is_sent_again(root: Path, batches: Sequence[Batch]) -> int:
-    """Count rows that are missing or doubled after every batch was sent again and acknowledged."""
+    """Send every batch again and check its acknowledgement. Return the number of rows that are then
+    missing or doubled.
+    """
     with closing(Engine(ServiceConfig(), root)) as engine:
         engine.intake.ingest(_make_messages(batches), time.time_ns())
         ((_, ack),) = engine.settlement.flush()

@@ -1,8 +1,8 @@
-"""Archives of other versions: one that was kept from before files had any, under a service of
-today; and one of today with columns that nobody knows yet, as a newer version would write them,
-under a service that is rolled back to today's.
+"""Campaign on archives of other format versions. One archive was written before files had a
+version, and today's service reads it. The other has additional columns, as a newer version would
+write them, and is read by today's service after a rollback.
 
-Nothing is set aside, every row is read, and the map is the one that its writer had.
+No file may be set aside, every row must be read, and the map must equal that of the writer.
 """
 
 from __future__ import annotations

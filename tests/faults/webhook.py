@@ -1,8 +1,9 @@
-"""Broken receivers of a webhook: every alert arrives, waits in the queue, or is counted as lost.
+"""Campaign on broken receivers of a webhook: every alert arrives, waits in the queue, or is counted
+as lost.
 
-Each kind of receiver is broken for its first connections and then sound. Two kinds never recover. A
-receiver keeps the ids of the alerts that it confirmed; this is the oracle, because the sender's own
-counters only show the losses that it noticed.
+Each kind of receiver fails for its first connections and then works. Two kinds never recover. A
+receiver records the ids of the alerts that it confirmed. The check uses this record, because the
+sender's own counters show only the losses that the sender noticed.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ BREAKS: Final[dict[str, Callable[[socket.socket], None]]] = {
 
 
 class Receiver:
-    """An HTTP server on loopback that fails in one way for its first connections."""
+    """HTTP server on loopback that fails in one way for its first connections."""
 
     def __init__(self, kind: str) -> None:
         self.heard: set[str] = set()
@@ -128,7 +129,7 @@ def _read_request(client: socket.socket) -> tuple[bytes, bytes]:
 
 
 def make_stretch(number: int) -> StretchAlert:
-    """Return an alert with a number as its id."""
+    """Return a road-section alert with a number as its id."""
     return StretchAlert(
         id=f"id-{number}",
         state="raised",
@@ -152,8 +153,8 @@ def make_stretch(number: int) -> StretchAlert:
 
 
 def run_kind(folder: Path, kind: str) -> tuple[int, int]:
-    """Send alerts to one kind of receiver; return how many arrived, and how many were lost
-    without a word.
+    """Send alerts to one kind of receiver. Return the number of alerts that arrived, and the number
+    lost without being counted.
     """
     receiver = Receiver(kind)
     said = list[str]()
@@ -172,7 +173,7 @@ def run_kind(folder: Path, kind: str) -> tuple[int, int]:
 
 
 def run(site: Site) -> list[Figure]:
-    """Run all kinds at once, for some seconds."""
+    """Run all kinds of receivers at once, for some seconds."""
     with ThreadPoolExecutor(len(BREAKS)) as pool:
         found = dict(
             zip(BREAKS, pool.map(lambda kind: run_kind(site.folder, kind), BREAKS), strict=True)
