@@ -1,4 +1,4 @@
-"""The software of one vehicle: sensors in, friction evidence out.
+"""The software of one vehicle: computes evidence on road friction from sensor signals.
 
     import edge_agent
     log, vehicle = edge_agent.read_log("drive.parquet"), edge_agent.load_vehicle("drive.json")

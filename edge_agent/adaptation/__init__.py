@@ -1,4 +1,6 @@
-"""Fuzzy adaptation of the measurement noise on the mismatch of innovation covariances."""
+"""Fuzzy adaptation of the measurement noise R from the mismatch between actual and theoretical
+innovation variance.
+"""
 
 from edge_agent.adaptation.memberships import Memberships
 

@@ -1,4 +1,4 @@
-"""Fuzzy inference from the innovation mismatch to a bounded factor on the measurement noise.
+"""Fuzzy inference of a bounded factor on the measurement noise from the innovation mismatch.
 
 Legend
     nu2         actual innovation variance, averaged over a window [unit^2]
@@ -6,8 +6,8 @@ Legend
     mismatch    nu2/s - 1 [1]
     factor      R over its nominal value [1], within [LEAST_FACTOR, LARGEST_FACTOR]
 
-Where the actual variance exceeds the theoretical one, R grows: paper 004, equations 29 to 31, with
-the direction of the errata, and with bounds that the paper lacks.
+If the actual variance exceeds the theoretical one, R increases: paper 004, equations 29 to 31, with
+the direction corrected (errata), and with bounds that the paper does not have.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ LARGEST_FACTOR = 10.0
 
 @compiled
 def infer_step(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> float:
-    """Return the log multiplier [nat]: outputs (5,) weighted by the triangular memberships of the
-    mismatch at peaks inputs (5,).
+    """Return the logarithm of the multiplier on R [nat] for a mismatch.
 
-    Triangles that meet at each other's peaks make the weighted mean a straight line between
-    neighbours.
+    It is the mean of `outputs` (5,), weighted by the memberships of the mismatch in triangular sets
+    with peaks `inputs` (5,). Each triangle ends at its neighbours' peaks, so the weighted mean is
+    linear between neighbouring peaks.
     """
     last = inputs.shape[0] - 1
     if mismatch <= inputs[0]:
@@ -43,7 +43,9 @@ def infer_step(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> floa
 def adapted_factor(
     factor: float, actual: float, theoretical: float, inputs: FloatArray, outputs: FloatArray
 ) -> float:
-    """Return the next factor on R: factor*exp(infer(actual/theoretical - 1)), bounded."""
+    """Return the next factor on R: factor*exp(infer_step(actual/theoretical - 1)), limited to the
+    bounds.
+    """
     return adapted_within(
         factor, actual, theoretical, inputs, outputs, 1.0, (LEAST_FACTOR, LARGEST_FACTOR)
     )
@@ -59,8 +61,8 @@ def adapted_within(
     pace: float,
     bounds: tuple[float, float],
 ) -> float:
-    """Return the same as `adapted_factor` with other bounds, and with the step of ln R multiplied
-    by `pace`.
+    """Return the next factor on R like `adapted_factor`, but with other bounds, and with the step
+    of ln R multiplied by `pace`.
     """
     if not theoretical > 0.0:
         return factor

@@ -1,5 +1,5 @@
-"""Triangular fuzzy sets whose lower vertices are free: the sets that paper 004 tunes (section
-III.C, figures 2 and 3).
+"""Triangular fuzzy sets with free lower vertices: the sets that paper 004 tunes (section III.C,
+figures 2 and 3).
 
 Legend
     peaks       upper vertices of the five sets of the mismatch [1] (5,)
@@ -8,12 +8,13 @@ Legend
     out_peaks   upper vertices of the five sets of the step, ln of the factor on R [nat] (5,)
     out_feet    their lower vertices [nat] (8,)
     w_k, c_k    membership of set k, and centroid (left foot + peak + right foot)/3 of its output
-    set
+                set
 
-The step is sum(w_k*c_k)/sum(w_k). The outer sets are shoulders: beyond the outer peaks they hold
-with full weight. With the feet at the neighbouring peaks and out_feet at the neighbouring
-out_peaks these are almost the sets of `memberships.Memberships`, whose feet are tied to the peaks;
-there the output sets are points. Where no set holds, because feet leave a gap, the step is zero.
+The step is sum(w_k*c_k)/sum(w_k). The outer sets are shoulders: beyond the outer peaks their
+membership is 1. With the feet at the neighbouring peaks and out_feet at the neighbouring out_peaks,
+these are almost the sets of `memberships.Memberships`, whose feet always lie at the neighbouring
+peaks and whose output sets are points. If the feet leave a gap and no set has a membership there,
+the step is zero.
 """
 
 from __future__ import annotations
@@ -34,15 +35,18 @@ LEAST_OVERLAP: Final = 0.02
 
 @dataclass(frozen=True)
 class LowerVertices:
-    """Sets of mismatch and step with free feet, as shares of the way between neighbouring peaks.
+    """Sets of mismatch and step with free feet, given as shares of the distance between
+    neighbouring peaks.
 
     Attributes:
-        feet: alternately how far set k reaches towards peak k + 1, and set k + 1 towards peak k
-        [1], 1 at the peak.
+        feet: alternately how far set k extends towards peak k + 1, and set k + 1 towards peak k
+            [1]; 1 means up to the peak.
         out_feet: the same for the output sets.
+        peaks: upper vertices of the sets of the mismatch [1].
+        out_peaks: upper vertices of the output sets [nat].
 
     Raises:
-        InputError: a share leaves its range, or peaks are not in increasing order.
+        InputError: a share is out of range, or peaks are not in increasing order.
     """
 
     feet: tuple[float, ...] = (1.0,) * FEET
@@ -85,8 +89,7 @@ class LowerVertices:
         return float(weight @ outputs.mean(axis=1)) / total if total > 0.0 else 0.0
 
     def knot_table(self, knots: int) -> tuple[FloatArray, FloatArray]:
-        """Return mismatches and steps, (knots,) each, between which the filter interpolates
-        linearly."""
+        """Return a table for linear interpolation: mismatches and steps, (knots,) each."""
         inputs, _ = self.triangle_sets()
         corners = np.unique(np.clip(inputs.ravel(), self.peaks[0], self.peaks[-1]))
         even = np.linspace(self.peaks[0], self.peaks[-1], knots - len(corners) + 2)
@@ -95,12 +98,14 @@ class LowerVertices:
         return at, np.array([self.step(float(value)) for value in at])
 
     def to_vector(self) -> FloatArray:
-        """Return the free numbers, (16,): shares of the input sets, then of the output sets."""
+        """Return the free parameters, (16,): shares of the input sets, then of the output sets."""
         return np.array([*self.feet, *self.out_feet])
 
     @classmethod
     def from_vector(cls, vector: FloatArray) -> LowerVertices:
-        """Return the sets of a vector (16,); a pair that would leave a gap is widened evenly."""
+        """Return the sets with the free parameters `vector` (16,). Two neighbouring sets that would
+        leave a gap are both widened.
+        """
         shares = np.asarray(vector, float).copy()
         pairs = shares[:FEET].reshape(-1, 2)
         lack = np.maximum(1.0 + LEAST_OVERLAP - pairs.sum(axis=1), 0.0)
@@ -109,12 +114,14 @@ class LowerVertices:
 
     @staticmethod
     def bounds() -> tuple[FloatArray, FloatArray]:
-        """Return the lower and upper ends of the vector, (16,) each."""
+        """Return the lower and upper limits of the free parameters, (16,) each."""
         return np.full(2 * FEET, 0.3), np.full(2 * FEET, 1.8)
 
 
 def _triangle_sets(peaks: tuple[float, ...], feet: tuple[float, ...]) -> FloatArray:
-    """Return left foot, peak and right foot of each set, (5, 3); outer sets end at their peaks."""
+    """Return left foot, peak and right foot of each set, (5, 3). The outer feet of the first and
+    last set lie at their peaks.
+    """
     sets = np.repeat(np.asarray(peaks, float)[:, None], 3, axis=1)
     for k in range(SETS - 1):
         gap = peaks[k + 1] - peaks[k]
@@ -124,7 +131,7 @@ def _triangle_sets(peaks: tuple[float, ...], feet: tuple[float, ...]) -> FloatAr
 
 
 def _membership_weights(sets: FloatArray, mismatch: float) -> FloatArray:
-    """Return the memberships (5,) of a mismatch; the outer sets are shoulders."""
+    """Return the memberships (5,) of a mismatch in the sets. The outer sets are shoulders."""
     weight = np.zeros(SETS)
     for k, (left, peak, right) in enumerate(sets):
         if mismatch <= peak:

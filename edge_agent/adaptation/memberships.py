@@ -1,27 +1,28 @@
 """Parameters of the adaptation's fuzzy sets, with conversions for files and optimisers.
 
 Legend
-    mismatch    actual over theoretical innovation variance, minus 1 [1]; 0 when R is right, -1 is
-                its lower end
+    mismatch    actual over theoretical innovation variance, minus 1 [1]; 0 if R is right, -1 is
+                its smallest value
     inputs      peaks of the five triangular sets: much smaller, smaller, equal, larger, much larger
                 (5,)
-    outputs     log of the multiplier on R that each set asks for [nat] (5,)
-    ln_scales   log of the nominal R relative to the table of constants: wheel speed rows, axle rows
+    outputs     ln of the multiplier on R for each set [nat] (5,)
+    ln_scales   ln of the nominal R relative to the table of constants: wheel speed rows, axle rows
                 [nat] (2,)
 
-Rules of the default estimator (`rule_base.py`): pairs (foot, peak) of ramps, and consequents of two
-rules:
-    far         mismatch from which, and at which, the innovations are FAR beyond their theory [1]
-    consequents ln of the axles' R where steering is WIDE [nat]; pace at which offsets, slope and
-                bank return to their prior where the wheels are FAR [1/s]
-    shares      ln of the share of a block's evidence on friction that is taken, by whether a wheel
-                slides (no, yes), then demand (low, middle, high), then forces (as before, new)
-                [nat] (12,)
-    strained    term added to `shares` where beliefs about the car are strained, by whether a
-                wheel slides [nat] (2,)
+Rules of the default estimator (`rule_base.py`): `far` is a ramp (foot, peak), the others are
+consequents of rules.
 
-Neighbouring triangles meet at each other's peaks, so memberships of a mismatch sum to one and the
-range is covered.
+    far         mismatches at which the membership in FAR (beyond theory) begins and is complete [1]
+    consequents ln of the axles' R where steering is WIDE [nat]; rate at which offsets, slope and
+                bank return to their prior where the wheels are FAR [1/s]
+    shares      ln of the share of a block's evidence on friction that is used, in the order: a
+                wheel slides (no, yes), demand (low, middle, high), forces (as before, new) [nat]
+                (12,)
+    strained    term added to `shares` where the beliefs about the car are strained, in the order: a
+                wheel slides (no, yes) [nat] (2,)
+
+Each triangle ends at its neighbours' peaks. Therefore the memberships of a mismatch sum to one, and
+the sets cover the whole range.
 """
 
 from __future__ import annotations
@@ -60,10 +61,10 @@ CLOSEST = 0.01  # peaks of neighbouring sets stay apart
 
 @dataclass(frozen=True)
 class Memberships:
-    """Vertices of the fuzzy sets and the noise scales tuned with them.
+    """Vertices of the fuzzy sets, and the noise scales tuned with them.
 
     Raises:
-        InputError: a vertex is not finite, out of order or out of range; names the field.
+        InputError: a vertex is not finite, out of order or out of range; the error names the field.
     """
 
     inputs: tuple[float, ...] = (-0.8, -0.4, 0.0, 1.0, 4.0)
@@ -143,14 +144,14 @@ class Memberships:
                 )
 
     def to_vector(self) -> FloatArray:
-        """Return the free numbers for an optimiser, shape (30,): the fields one after the other."""
+        """Return the free parameters for an optimiser, shape (30,): the fields one after the other."""
         return np.array([number for name in LENGTHS for number in getattr(self, name)])
 
     @classmethod
     def from_vector(cls, vector: FloatArray) -> Memberships:
-        """Return the memberships given by an optimiser's vector (30,), which lies within `bounds`.
+        """Return the memberships for an optimiser's vector (30,), which lies within `bounds`.
 
-        Inputs and outputs are sorted, so that every such vector is valid. A vector (12,) gives
+        Inputs and outputs are sorted, so that every such vector is valid. A vector (12,) contains
         only the fields up to `ln_scales`; the other fields keep their untuned values.
         """
         v = np.asarray(vector, float)
@@ -173,7 +174,7 @@ class Memberships:
 
     @staticmethod
     def bounds() -> tuple[FloatArray, FloatArray]:
-        """Return lower and upper ends of the vector, (30,) each: the range of an optimiser's
+        """Return the lower and upper limits of the vector, (30,) each: the range of an optimiser's
         search.
         """
         lower = [-0.95, -0.8, -0.3, 0.1, 1.0, -0.4, -0.2, -0.02, 0.0, 0.02, -0.1, -0.1]
@@ -186,13 +187,13 @@ class Memberships:
         return np.array(lower), np.array(upper)
 
     def to_json(self) -> dict[str, list[float]]:
-        """Return a plain dictionary for a JSON file."""
+        """Return the memberships as a dictionary for a JSON file."""
         return {name: list(getattr(self, name)) for name in LENGTHS}
 
     @classmethod
     def from_json(cls, document: object) -> Memberships:
-        """Return the memberships in a parsed JSON document; a document without rules gets the
-        untuned rules.
+        """Return the memberships in a parsed JSON document. If the document has no rules, the
+        untuned rules are used.
 
         Raises:
             InputError: a field is missing or is not a list of numbers.

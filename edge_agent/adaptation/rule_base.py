@@ -1,19 +1,20 @@
-"""Fuzzy rules by which the default estimator adapts the noise, the share of the evidence that
-it uses, and the rate of forgetting.
+"""Fuzzy rules by which the default estimator adapts the noise, the share of the evidence that it
+uses, and the rate of forgetting.
 
 | if | then | kind |
 |---|---|---|
-| the mismatch of the wheels, or of the axles, is one of five sets | ln R of that group moves by its step | Sugeno |
+| the mismatch of the wheels, or of the axles, is in one of five sets | ln R of that group changes by the set's step | Sugeno |
 | the wheels' mismatch is FAR | offsets, slope and bank return to their prior faster | Sugeno |
 | steering is WIDE | R of the axle that is steered is larger | Sugeno |
-| slide, demand, new forces and strain are in one set each | ln of the share of evidence taken | Takagi–Sugeno |
+| slide, demand, new forces and strain are in one set each | ln of the share of evidence that is used | Takagi–Sugeno |
 
-Sugeno: the consequent of a rule times its membership. The first line is `fuzzy.py`. Sets are ramps
-from a foot (membership 0) to a peak (1); feet, peaks and consequents are `Memberships`. Inputs come
-from the block that has just ended, so that no rule sees its own effect.
+Sugeno: the result is the consequent of a rule times its membership. The first line is implemented
+in `fuzzy.py`. Sets are ramps from a foot (membership 0) to a peak (membership 1); feet, peaks and
+consequents are `Memberships`. Inputs come from the block that has just ended, so that no rule uses
+its own effect as input.
 
 `plain_rules` has no fuzzy set: the share of evidence is a product of two ramps, and nothing else
-changes. It is the baseline of the rules (`fuzzy.worth`).
+changes. It is the baseline for the evaluation of the rules (`fuzzy.worth`).
 """
 
 from __future__ import annotations
@@ -86,8 +87,10 @@ def is_high(value: float, ramp: FloatArray) -> float:
 
 @compiled
 def forgetting_rate(rules: RuleBase, wheels: float) -> float:
-    """Return the rate, added to the usual one, at which offsets, slope and bank return to their
-    prior [1/s].
+    """Return the rate [1/s], added to the usual one, at which offsets, slope and bank return to
+    their prior.
+
+    `wheels` is the innovation mismatch of the wheels [1].
     """
     return rules.pace * is_high(wheels, rules.far)
 
@@ -100,8 +103,11 @@ def wide_noise(rules: RuleBase, angle: float) -> float:
 
 @compiled
 def plain_share(plain: FloatArray, demand: float, new: float) -> float:
-    """Return ln of the share of a block's evidence that is used, without fuzzy rules:
-    (steady + (1 - steady)*new)/(1 + (half/demand)^power)."""
+    """Return ln of the share of a block's evidence that is used without fuzzy rules.
+
+    The share is (steady + (1 - steady)*new)/(1 + (half/demand)^power), with `plain` = (half, power,
+    steady).
+    """
     used = demand ** plain[1]
     taken = used / (used + plain[0] ** plain[1])
     share = (plain[2] + (1.0 - plain[2]) * new) * taken

@@ -3,17 +3,17 @@ rate (paper 001).
 
 Legend
     alpha       mismatch of the innovation variance, actual over theoretical, minus 1 [1]; the
-                paper's (18) is a difference of traces, which adds squares of unlike units
-    rate        its rate [1/s]
+                paper's (18) is a difference of traces, which adds squares of different units
+    rate        rate of alpha [1/s]
     level       consequent of a rule: ln of the factor on R [nat]                         (5, 7)
 
-Sets are triangles that meet at each other's peaks, so memberships sum to one and the inference is
-bilinear.
+Sets are triangles that end at their neighbours' peaks, so memberships sum to one and the inference
+is bilinear.
 
-Table 1 of paper 001, rows NB NM Z PM PB of the rate, columns NB NM NS Z PS PM PB of alpha. Where
-alpha is negative the printed table grows R, although the text asks for less: there the level counts
-as its reciprocal. PMB and PSM, which the declared sets do not have, are taken as the steps next to
-PM.
+Table 1 of paper 001 has rows NB NM Z PM PB for the rate, and columns NB NM NS Z PS PM PB for alpha.
+For negative alpha the printed table increases R, although the text asks for a decrease; there the
+reciprocal of the level is used. The sets PMB and PSM, which the paper does not define, are assumed
+to be the steps next to PM.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ def rule_table(printed: tuple[str, ...] = PRINTED) -> FloatArray:
 def infer_two(
     alpha: float, rate: float, at: FloatArray, of: FloatArray, levels: FloatArray
 ) -> float:
-    """Return ln of the factor on R: bilinear in alpha (peaks `at` (7,)) and rate (peaks `of` (5,)),
-    constant beyond the ends.
+    """Return ln of the factor on R [nat], bilinear in alpha (peaks `at` (7,)) and rate (peaks `of`
+    (5,)), and constant beyond the outer peaks.
     """
     i, u = bracket_peaks(alpha, at)
     j, v = bracket_peaks(rate, of)
@@ -76,8 +76,8 @@ def infer_two(
 
 @compiled
 def bracket_peaks(value: float, peaks: FloatArray) -> tuple[int, float]:
-    """Return (k, share) with value = (1 - share)*peaks[k] + share*peaks[k + 1], held at the
-    ends.
+    """Return (k, share) such that value = (1 - share)*peaks[k] + share*peaks[k + 1]. Beyond the
+    outer peaks the share is 0 or 1.
     """
     last = peaks.shape[0] - 2
     k = 0

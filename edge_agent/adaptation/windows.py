@@ -1,9 +1,10 @@
-"""Measurement noise from a moving window of innovations, larger ones weighing more (paper 002,
-equations 24 and 25).
+"""Measurement noise from a moving window of innovations in which larger innovations have more
+weight (paper 002, equations 24 and 25).
 
 Legend: e_j innovations of the last N samples of one row; c_j = |e_j| their weights, normalised (the
 paper's are not); P variance of the predicted measurement; R = sum(c_j*e_j^2)/sum(c_j)/2 - P. The
-half is the departure that makes it right: of a normal variable E|e|^3 / E|e| = 2 var(e).
+factor one half is not in the paper; it makes R correct, because for a normal variable E|e|^3 / E|e|
+= 2 var(e).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def push_innovation(window: FloatArray, innovation: float) -> None:
-    """Put the newest innovation first in window (N,), and drop the oldest."""
+    """Insert the newest innovation at the front of window (N,), and drop the oldest one."""
     for j in range(window.shape[0] - 1, 0, -1):
         window[j] = window[j - 1]
     window[0] = innovation
@@ -24,8 +25,8 @@ def push_innovation(window: FloatArray, innovation: float) -> None:
 def weighted_noise(
     window: FloatArray, predicted: float, nominal: float, least: float, largest: float
 ) -> float:
-    """Return R of a row from its window (N,), limited to [least, largest]*nominal; nominal while
-    the window is not full.
+    """Return R of a row from its window (N,), limited to [least, largest]*nominal. While the window
+    is not full, return `nominal`.
     """
     weight = total = 0.0
     for error in window:

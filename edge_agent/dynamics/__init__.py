@@ -1,3 +1,3 @@
-"""Vehicle and tyre equations as compiled scalar functions, independent of filters, files and
+"""Vehicle and tyre equations as compiled scalar functions; they do not depend on filters, files or
 clocks.
 """

@@ -1,4 +1,4 @@
-"""The planar rigid body: from wheel forces to accelerations.
+"""The planar rigid body: accelerations that result from wheel forces.
 
 Legend: Fx, Fy wheel forces in the wheel's frame [N], delta road-wheel angle [rad], m mass [kg], Iz
 yaw inertia [kg m^2], (x, y) wheel position [m], a_x, a_y acceleration of the centre of gravity in
@@ -21,8 +21,9 @@ from schemas.runtime.jit import compiled
 def planar_accelerations(
     row: FloatArray, force_x: FloatArray, force_y: FloatArray, delta: FloatArray
 ) -> tuple[float, float, float]:
-    """Return (a_x, a_y [m/s^2], yaw acceleration [rad/s^2]); force_x, force_y [N] and delta [rad]
-    of shape (4,).
+    """Return (a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) of the body.
+
+    force_x and force_y [N] and delta [rad] have shape (4,).
     """
     total_x = total_y = moment = 0.0
     for wheel in range(4):
@@ -45,8 +46,8 @@ def planar_accelerations(
 def axle_lateral_forces(
     row: FloatArray, ay: float, yaw_acceleration: float, moment_x: float
 ) -> tuple[float, float]:
-    """Return (front, rear) lateral force [N] of the axles in body axes, from accelerometer and
-    gyroscope.
+    """Return (front, rear) lateral force [N] of the axles in body axes, computed from accelerometer
+    and gyroscope readings.
 
     moment_x [N m] is the yaw moment of the forces along the body, sum of -y*F_ahead.
     """
@@ -61,10 +62,11 @@ def axle_lateral_forces(
 def advance_velocity(
     vx: float, vy: float, ax: float, ay: float, yaw_rate: float, step: float
 ) -> tuple[float, float]:
-    """Return (v_x, v_y) [m/s] after `step` [s] of constant a_x, a_y, r: the exact solution, a
-    rotation by -r*step.
+    """Return (v_x, v_y) [m/s] after `step` [s] with constant a_x, a_y and r. The solution is exact:
+    a rotation by -r*step.
 
-    Heun's rule is its second-order part; Euler's rule costs a factor of four in v_y (errata).
+    Heun's rule is its second-order approximation. Euler's rule makes the error of v_y four times
+    larger (errata).
     """
     angle = yaw_rate * step
     cos = math.cos(angle)

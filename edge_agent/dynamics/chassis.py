@@ -1,5 +1,5 @@
-"""Body and four tyres together: the accelerations of a vehicle for given state, steering, wheel
-speeds and friction.
+"""Vehicle body and four tyres together: the accelerations for a given state, steering, wheel speeds
+and friction.
 """
 
 from __future__ import annotations
@@ -22,8 +22,10 @@ DUGOFF = 0.0  # in place of a Magic Formula shape c, which is above 1
 
 @compiled
 def wheel_inputs(delta: FloatArray, omega: FloatArray) -> FloatArray:
-    """Return (4, 3): cosine and sine of the steering (4,) [rad], which many states share, and wheel
-    speed (4,) [rad/s].
+    """Return an array (4, 3): cosine and sine of the steering angles (4,) [rad], and wheel speeds
+    (4,) [rad/s].
+
+    They are computed once, because many states share them.
     """
     out = np.empty((4, 3))
     for wheel in range(4):
@@ -39,8 +41,10 @@ def wheel_inputs(delta: FloatArray, omega: FloatArray) -> FloatArray:
 def _wheel_slips(
     radius: float, ahead: float, aside: float, cos: float, sin: float, omega: float
 ) -> tuple[float, float]:
-    """Return the slips of a wheel whose centre moves by ahead, aside [m/s] in body axes, at
-    cos(delta), sin(delta).
+    """Return the (longitudinal, lateral) slips of a wheel.
+
+    `ahead` and `aside` [m/s] are the velocity of the wheel centre in body axes; `cos` and `sin`
+    belong to the steering angle. A wheel with unknown speed (NaN) has no longitudinal slip.
     """
     along = cos * ahead + sin * aside
     across = cos * aside - sin * ahead
@@ -50,10 +54,11 @@ def _wheel_slips(
 
 @inlined
 def stiffness(body: Body, load: float, mu: float, rear: bool) -> tuple[float, float]:
-    """Return the slip stiffness (along [N], across [N/rad]) of a tyre under `load` [N] on friction
-    `mu`.
+    """Return the slip stiffness (longitudinal [N], lateral [N/rad]) of a tyre under `load` [N] on
+    friction `mu`.
 
-    It is proportional to load alone, unless the row selects PROPORTIONAL, QUADRATIC or REAR_SLOPE.
+    It depends only on the load (proportionally), unless the parameter row selects PROPORTIONAL,
+    QUADRATIC or REAR_SLOPE.
     """
     by_load = 1.0 + body.quadratic - body.quadratic * load * (4.0 / (body.mass * GRAVITY))
     share = (1.0 + body.proportional * (mu - 1.0)) * by_load
@@ -71,11 +76,11 @@ def tyre_forces(
     force_x: FloatArray,
     force_y: FloatArray,
 ) -> None:
-    """Fill force_x, force_y (4,) [N] at motion (5,) = v_x, v_y, r, a_x, a_y; the accelerations give
-    the loads.
+    """Fill force_x and force_y (4,) [N], the tyre forces in the wheels' axes, at motion (5,) = v_x,
+    v_y, r, a_x, a_y. The accelerations determine the loads.
 
-    wheels: (4, 3) of `wheel_inputs`, a wheel whose speed is NaN rolls freely; mu (4,); shape: c of
-    the Magic Formula (e = 0), or DUGOFF.
+    wheels: result (4, 3) of `wheel_inputs`; a wheel with speed NaN rolls freely; mu (4,); shape: c
+    of the Magic Formula (e = 0), or DUGOFF.
     """
     parameters = body_of(row)
     loads = wheel_loads(parameters, motion[3], motion[4])
@@ -100,7 +105,7 @@ def tyre_forces(
 
 
 class PlanarMotion(NamedTuple):
-    """Motion of the body."""
+    """Motion of the body: velocity [m/s], yaw rate [rad/s], accelerations [m/s^2]."""
 
     vx: float
     vy: float
@@ -110,7 +115,7 @@ class PlanarMotion(NamedTuple):
 
 
 class WheelInputs(NamedTuple):
-    """Inputs of the four wheels."""
+    """Inputs of the four wheels: steering, wheel speed, given longitudinal force, friction."""
 
     cos: Four  # of the steering
     sin: Four
@@ -123,10 +128,11 @@ class WheelInputs(NamedTuple):
 def planar_response(
     body: Body, motion: PlanarMotion, wheels: WheelInputs
 ) -> tuple[float, float, float]:
-    """Return (a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) from the forces of four Dugoff tyres.
+    """Return (a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) that result from the forces of four
+    Dugoff tyres.
 
-    Written out per wheel, with scalars and no arrays between, because the papers' filters spend
-    most of their time here.
+    The code is written out per wheel with scalars instead of arrays, because the papers' filters
+    spend most of their time here.
     """
     vx, vy, rate, ax, ay = motion
     cos, sin, omega, force_x, mu = wheels
@@ -167,8 +173,10 @@ def _wheel_force(
     wheel: tuple[float, float, float, float, float, float],
     rear: bool,
 ) -> tuple[float, float]:
-    """Return the force (forward, left) [N] in body axes of a wheel with load, mu, cos, sin, omega
-    and given longitudinal force.
+    """Return the (forward, left) force [N] of a wheel in body axes.
+
+    `wheel` is (load, mu, cos, sin, omega, given longitudinal force). If the given force is not NaN,
+    it replaces the tyre's longitudinal force.
     """
     load, mu, cos, sin, omega, given_x = wheel
     slip = _wheel_slips(body.radius, ahead, aside, cos, sin, omega)

@@ -1,16 +1,16 @@
-"""The electric drive wheel: motor, wheel and tyre force, and the force's derivative by a sliding
-mode (paper 002).
+"""The electric drive wheel: motor, wheel and tyre force; a sliding mode models the derivative of
+the force (paper 002).
 
 Legend
     tau         motor torque at the wheel, K_t*i [N m]              J   inertia of wheel and rotor [kg m^2]
-    tau_u       torque that the voltage would settle at [N m]       T_e electric time constant L/R [s]
+    tau_u       stationary torque for the applied voltage [N m]     T_e electric time constant L/R [s]
     omega       wheel speed [rad/s]                                 R   wheel radius [m]
     F, F'       longitudinal force and its derivative [N, N/s]      k1, k2  sliding mode [N/s^2, 1/s]
 
-tau' = (tau_u - tau)/T_e (10), J*omega' = tau - R*F (11), F'' = -k1*sgn(F') - k2*F' (31). Torque
-stands for current: the paper's K_a, K_t and J are not of one machine, and there are no signals of
-current or voltage. (31) prints the derivative of F where that of F' belongs, and takes the sign of
-a difference of unlike units.
+tau' = (tau_u - tau)/T_e (10), J*omega' = tau - R*F (11), F'' = -k1*sgn(F') - k2*F' (31). Torque is
+used in place of current, because the paper's K_a, K_t and J do not belong to one machine, and there
+are no signals of current or voltage. Equation (31) prints the derivative of F in place of that of
+F', and takes the sign of a difference of quantities with different units; both are corrected here.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SOFT_N_S = 500.0  # the sign is smoothed over so much
 
 
 class WheelState(NamedTuple):
-    """State of a driven wheel."""
+    """State of a driven wheel: torque, wheel speed, longitudinal force and its derivative."""
 
     torque: float  # tau
     omega: float
@@ -41,7 +41,7 @@ class WheelState(NamedTuple):
 def drive_wheel(
     state: WheelState, settled: float, inertia: float, radius: float, step: float
 ) -> WheelState:
-    """Return the state after `step` [s] by Euler's rule, as printed (32); settled is tau_u."""
+    """Return the state after `step` [s] by Euler's rule, as printed (32). `settled` is tau_u [N m]."""
     torque, omega, force, slope = state
     pull = SLIDING_GAIN * math.tanh(slope / SOFT_N_S) + SLIDING_RATE * slope
     return WheelState(
@@ -54,8 +54,8 @@ def drive_wheel(
 
 @compiled
 def slip_share(radius: float, omega: float, along: float) -> float:
-    """Return the weight of the tyre model's force, 1/2 + 2^(-1/|s|) (33), s of (15): one half at
-    all ordinary slips.
+    """Return the weight of the tyre model's force, 1/2 + 2^(-1/|s|) (33), with the slip s of (15).
+    It is about one half at all ordinary slips.
     """
     turning = radius * omega
     most = max(abs(turning), abs(along), 1e-3)
@@ -67,6 +67,6 @@ def slip_share(radius: float, omega: float, along: float) -> float:
 def blend_forces(
     share: FloatArray, model: FloatArray, observed: FloatArray, out: FloatArray
 ) -> None:
-    """Compute out (4,) = share*model + (1 - share)*observed: the compensated force (33)."""
+    """Compute the compensated force (33): out (4,) = share*model + (1 - share)*observed."""
     for wheel in range(4):
         out[wheel] = share[wheel] * model[wheel] + (1.0 - share[wheel]) * observed[wheel]

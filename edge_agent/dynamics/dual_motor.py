@@ -1,4 +1,4 @@
-"""One motor per axle with a differential: paper 004, equations (4) to (6).
+"""Drive with one motor per axle and a differential: paper 004, equations (4) to (6).
 
 Legend: omega_1, omega_2 speeds of an axle's wheels and omega_c of its midpoint [rad/s], T_m motor
 torque [N m], i_t transmission ratio, eta_t its efficiency, F_x longitudinal force of the axle [N],
@@ -7,9 +7,9 @@ J_w inertia of a wheel, R radius.
     J_w*omega_i' = T_di - F_xi*R                    (4)
     2*J_w*omega_c' = T_m*i_t*eta_t - F_x*R          (5), (6)
 
-The paper takes the larger of two wheel speeds for the midpoint's; that is the outer wheel, so the
-mean is used here. Signals hold the torque at the wheels, so T_m*i_t*eta_t is the sum of an axle's
-two torques. The paper does not give i_t and eta_t.
+The paper uses the larger of the two wheel speeds as midpoint speed. That is the outer wheel's
+speed, so the mean is used here. The signals are torques at the wheels, so T_m*i_t*eta_t is the sum
+of an axle's two torques. The paper does not give i_t and eta_t.
 """
 
 from __future__ import annotations
@@ -24,19 +24,22 @@ EFFICIENCY: Final = 0.95  # eta_t
 
 @inlined
 def midpoint_speed(left: float, right: float) -> float:
-    """Return omega_c [rad/s] of an axle from the speeds of its wheels."""
+    """Return the midpoint speed omega_c [rad/s] of an axle from the speeds of its wheels."""
     return 0.5 * (left + right)
 
 
 @inlined
 def axle_force(torque: float, turning: float, inertia: float, radius: float) -> float:
-    """Return F_x [N] of an axle from the sum of its wheel torques [N m] and omega_c' [rad/s^2]."""
+    """Return the longitudinal force F_x [N] of an axle from the sum of its wheel torques [N m] and
+    omega_c' [rad/s^2].
+    """
     return (torque - 2.0 * inertia * turning) / radius
 
 
 @inlined
 def motor_torque(torque: float, ratio: float, efficiency: float) -> float:
-    """Return T_m [N m] from the sum of an axle's wheel torques; a motor that brakes gains by the
-    losses."""
+    """Return the motor torque T_m [N m] from the sum of an axle's wheel torques. While the motor
+    brakes, the losses reduce its torque.
+    """
     share = efficiency if torque >= 0.0 else 1.0 / efficiency
     return torque / (ratio * share)

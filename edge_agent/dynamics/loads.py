@@ -1,9 +1,9 @@
-"""Vertical wheel loads under quasi-static transfer.
+"""Vertical wheel loads with quasi-static load transfer.
 
 Legend: m mass [kg], h height of the centre of gravity [m], L wheelbase [m], a, b distances to the
 axles [m], a_x, a_y acceleration of the centre of gravity [m/s^2], Fz load [N]; wheels in the order
-fl, fr, rl, rr. ISO 8855 signs: accelerating loads the rear, a left turn (a_y > 0) loads the right
-wheels.
+fl, fr, rl, rr. ISO 8855 signs: forward acceleration moves load to the rear, and a left turn (a_y >
+0) to the right wheels.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LEAST_LOAD_SHARE = 0.02
 def wheel_loads(body: Body, ax: float, ay: float) -> Four:
     """Return the loads (fl, fr, rl, rr) [N] at accelerations ax, ay [m/s^2].
 
-    The lateral transfer of each axle is in proportion to the mass it carries (equal roll stiffness
+    The lateral transfer of each axle is proportional to the load it carries (equal roll stiffness
     per load).
     """
     mass = body.mass

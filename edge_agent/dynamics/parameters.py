@@ -1,4 +1,4 @@
-"""Parameters of a vehicle as one row of numbers for the compiled kernels."""
+"""Parameters of a vehicle as an array of numbers for the compiled kernels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from schemas.vehicle import Vehicle
 
 
 class Parameter(IntEnum):
-    """Index of a vehicle parameter in its row."""
+    """Index of a vehicle parameter in its array (row)."""
 
     MASS = 0  # [kg]
     YAW_INERTIA = 1  # [kg m^2]
@@ -40,10 +40,10 @@ class Parameter(IntEnum):
 def parameter_row(vehicle: Vehicle) -> FloatArray:
     """Return the parameters of `vehicle`, shape (15,), indexed by `Parameter`.
 
-    Stiffnesses of the vehicle file are means over the four wheels at static load; a slope per
-    newton of load makes them valid for the lightly and the heavily loaded wheel alike. Where the
-    file has its own rear stiffness, that one is used. The difference of the front axle from it is
-    compliance, a state of the default estimator.
+    Stiffnesses of the vehicle file are means over the four wheels at static load. The row has
+    stiffness per newton of load, which is valid for lightly and heavily loaded wheels. If the file
+    gives a separate rear stiffness, the rear one is used for all wheels. The difference of the
+    front axle from it is compliance, a state of the default estimator.
     """
     static_load = vehicle.mass * GRAVITY / 4.0
     rear = vehicle.cornering_stiffness_rear
@@ -72,7 +72,9 @@ def parameter_row(vehicle: Vehicle) -> FloatArray:
 
 
 def parameter_table(vehicles: Sequence[Vehicle]) -> FloatArray:
-    """Return one row per vehicle, shape (N, 15); a repeated vehicle is converted once."""
+    """Return the parameters of all vehicles, one row each, shape (N, 15). A vehicle that occurs
+    several times is converted once.
+    """
     models = {id(vehicle): vehicle for vehicle in vehicles}
     place = {model: k for k, model in enumerate(models)}
     rows = np.stack([parameter_row(vehicle) for vehicle in models.values()])
@@ -80,7 +82,9 @@ def parameter_table(vehicles: Sequence[Vehicle]) -> FloatArray:
 
 
 class Body(NamedTuple):
-    """Parameters that body and tyres use, as scalars instead of an array: see `inlined`."""
+    """Parameters that body and tyres use, as scalars instead of an array; see `inlined` for the
+    reason.
+    """
 
     mass: float
     yaw_inertia: float
@@ -99,7 +103,7 @@ class Body(NamedTuple):
 
 @inlined
 def body_of(row: FloatArray) -> Body:
-    """Return the body of a row (15,)."""
+    """Return the body parameters in a parameter row (15,)."""
     p = Parameter
     return Body(
         row[p.MASS],
@@ -124,5 +128,5 @@ Four: TypeAlias = tuple[float, float, float, float]
 
 @inlined
 def as_four(values: FloatArray) -> Four:
-    """Return values (4,) as four scalars."""
+    """Return the values (4,) as a tuple of four scalars."""
     return values[0], values[1], values[2], values[3]

@@ -18,8 +18,8 @@ SLOWEST_M_S = 0.5  # slip's denominator is kept above it: near standstill slip h
 
 @compiled
 def wheel_position(row: FloatArray, wheel: int) -> tuple[float, float]:
-    """Return (x, y) [m] of wheel 0..3 (fl, fr, rl, rr) from the centre of gravity; y is positive to
-    the left.
+    """Return the position (x, y) [m] of wheel 0..3 (fl, fr, rl, rr) relative to the centre of
+    gravity; y is positive to the left.
     """
     front = wheel < 2
     x = row[Parameter.TO_FRONT] if front else -row[Parameter.TO_REAR]
@@ -31,8 +31,8 @@ def wheel_position(row: FloatArray, wheel: int) -> tuple[float, float]:
 def wheel_velocity(
     row: FloatArray, wheel: int, vx: float, vy: float, yaw_rate: float, delta: float
 ) -> tuple[float, float]:
-    """Return (v_wx, v_wy) [m/s] of the centre of `wheel`, along and across the wheel's own
-    plane.
+    """Return (v_wx, v_wy) [m/s]: the velocity of the wheel's centre along and across the plane of
+    the wheel.
     """
     x, y = wheel_position(row, wheel)
     ahead = vx - y * yaw_rate
@@ -46,17 +46,19 @@ def wheel_velocity(
 def along_wheel(
     row: FloatArray, wheel: int, vx: float, vy: float, yaw_rate: float, cos: float, sin: float
 ) -> float:
-    """Return v_wx [m/s] of the centre of `wheel`, for its steering's cosine and sine."""
+    """Return v_wx [m/s]: the velocity of the wheel's centre along the wheel, for given cosine and
+    sine of its steering angle.
+    """
     x, y = wheel_position(row, wheel)
     return cos * (vx - y * yaw_rate) + sin * (vy + x * yaw_rate)
 
 
 @inlined
 def wheel_slips(radius: float, omega: float, along: float, across: float) -> tuple[float, float]:
-    """Return (slip_x, slip_y) [1]: (R*omega - v_wx)/|v_wx| and -v_wy/|v_wx|, the tangent of the
-    slip angle.
+    """Return the slips (slip_x, slip_y) [1]: (R*omega - v_wx)/|v_wx| and -v_wy/|v_wx|, the tangent
+    of the slip angle.
 
-    Positive slip_x drives forward, positive slip_y pushes to the left.
+    Positive slip_x gives a forward force, positive slip_y a force to the left.
     """
     share = 1.0 / max(abs(along), SLOWEST_M_S)  # one division, which is what a step waits for
     return (radius * omega - along) * share, -across * share

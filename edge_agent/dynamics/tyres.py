@@ -8,9 +8,9 @@ Legend
     f           curve with f(0) = 0, f'(0) = 1, peak 1; the force is mu*Fz*f(theta)
     c, e        shape and curvature of the Magic Formula [1]
 
-Because K does not depend on mu, all roads share one initial slope: friction is seen in the bend of
-the curve only (errata of papers 002 and 004). Sources: Pacejka, Tyre and Vehicle Dynamics, chapters
-3 (brush) and 4; Dugoff, Fancher and Segel, SAE 700377.
+Because K does not depend on mu, the curve has the same initial slope on all roads. Friction shows
+only where the curve bends (errata of papers 002 and 004). Sources: Pacejka, Tyre and Vehicle
+Dynamics, chapters 3 (brush) and 4; Dugoff, Fancher and Segel, SAE 700377.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ TINY = 1e-12  # below it a slip has no direction and no force
 
 @compiled
 def magic_formula(theta: float, c: float, e: float) -> float:
-    """Return the Magic Formula f(theta) = sin(c*atan(b - e*(b - atan(b)))), b = theta/c; odd in
-    theta; 1 < c <= 2, e < 1.
+    """Return the Magic Formula f(theta) = sin(c*atan(b - e*(b - atan(b)))) with b = theta/c.
+
+    It is odd in theta; 1 < c <= 2, e < 1.
     """
     b = theta / c
     return math.sin(c * math.atan(b - e * (b - math.atan(b))))
@@ -33,7 +34,7 @@ def magic_formula(theta: float, c: float, e: float) -> float:
 
 @compiled
 def magic_formula_inverse(rho: float, c: float) -> float:
-    """Return theta on the rising branch with magic_formula(theta, c, 0) = rho; infinite at and
+    """Return theta on the rising branch such that magic_formula(theta, c, 0) = rho; infinite at and
     beyond the peak, |rho| >= 1.
     """
     if rho >= 1.0:
@@ -45,8 +46,8 @@ def magic_formula_inverse(rho: float, c: float) -> float:
 
 @compiled
 def brush(theta: float) -> float:
-    """Return the brush curve with parabolic pressure: theta - theta|theta|/3 + theta^3/27 up to 3,
-    then 1; odd in theta.
+    """Return the brush curve with parabolic pressure, odd in theta: theta - theta|theta|/3 +
+    theta^3/27 up to theta = 3, then 1.
     """
     size = min(abs(theta), 3.0)
     return math.copysign(size - size * size / 3.0 + size**3 / 27.0, theta)
@@ -67,10 +68,11 @@ def combined_magic(
     c: float,
     e: float,
 ) -> tuple[float, float]:
-    """Return (Fx, Fy) [N] of one wheel in its own frame by similarity with the Magic Formula.
+    """Return the forces (Fx, Fy) [N] of one wheel in its own frame, by similarity with the Magic
+    Formula.
 
-    slip (along, tan of the slip angle) [1], stiffness (along [N], across [N/rad]), mu [1], load
-    [N].
+    slip (longitudinal, tangent of the slip angle) [1], stiffness (longitudinal [N], lateral
+    [N/rad]), mu [1], load [N].
     """
     grip = mu * load
     if grip <= 0.0:
@@ -88,10 +90,10 @@ def combined_magic(
 def combined_dugoff(
     slip: tuple[float, float], stiffness: tuple[float, float], mu: float, load: float
 ) -> tuple[float, float]:
-    """Return (Fx, Fy) [N] of one wheel in its own frame by similarity with the Dugoff curve;
-    arguments as in `combined_magic`.
+    """Return the forces (Fx, Fy) [N] of one wheel in its own frame, by similarity with the Dugoff
+    curve. The arguments are as in `combined_magic`.
 
-    The curve is theta up to one half, where the force is K*slip itself, then 1 - 1/(4*theta); it
+    The curve is theta up to one half, where the force is K*slip itself, then 1 - 1/(4*theta). It
     has no falling branch.
     """
     grip = max(mu * load, 0.0)

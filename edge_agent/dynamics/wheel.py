@@ -2,7 +2,8 @@
 
 Legend: T torque at the wheel, driving positive [N m], J inertia [kg m^2], omega wheel speed
 [rad/s], R radius [m], F_x longitudinal tyre force [N]: J*omega' = T - R*F_x. Torque gives the force
-with little noise; wheel speed is a measurement, never an exact input (errata, what held up).
+with little noise. Wheel speed is used as a measurement, never as an exact input (errata, what held
+up).
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from schemas.runtime.jit import compiled
 def force_from_torque(
     torque: float, wheel_acceleration: float, inertia: float, radius: float
 ) -> float:
-    """Return F_x = (T - J*omega')/R [N]."""
+    """Return the longitudinal tyre force F_x = (T - J*omega')/R [N]."""
     return (torque - inertia * wheel_acceleration) / radius
 
 
 @compiled
 def wheel_acceleration(torque: float, force_x: float, inertia: float, radius: float) -> float:
-    """Return omega' = (T - R*F_x)/J [rad/s^2]."""
+    """Return the wheel acceleration omega' = (T - R*F_x)/J [rad/s^2]."""
     return (torque - radius * force_x) / inertia

@@ -1,1 +1,1 @@
-"""Sigma rules and square roots of covariances: the core of every estimator."""
+"""Sigma-point rules and square-root covariance operations, which all estimators use."""

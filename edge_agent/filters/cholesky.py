@@ -1,8 +1,8 @@
-"""The square root of a covariance, and the covariance of a square root.
+"""Cholesky factor of a covariance, and covariance of a square root.
 
 Legend: P covariance, L its lower-triangular factor with P = L*L' (Cholesky), both (n, n); q
-variances (n,). A pivot is the variance of a state given the states before it. It cannot be smaller
-than the state's own noise; where rounding makes it smaller, the noise variance replaces it.
+variances (n,). A pivot is the variance of a state given the states before it, so it is at least the
+variance of the state's own noise. If rounding makes it smaller, the noise variance replaces it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from schemas.runtime.jit import compiled, inlined
 
 @inlined
 def factorize_column(a: FloatArray, j: int, least: float) -> None:
-    """Compute column j of the factor of a (n, n) in place, with the columns before it done; a pivot
-    is at least `least` > 0.
+    """Compute column j of the factor of a (n, n) in place; the columns before it must be complete.
+    A pivot is limited to at least `least` > 0.
 
     Only the lower half is read; entries right of the diagonal become zero.
     """
@@ -36,7 +36,9 @@ def factorize_column(a: FloatArray, j: int, least: float) -> None:
 
 @compiled
 def factorize(covariance: FloatArray, sqrt_cov: FloatArray, least: float) -> None:
-    """Compute sqrt_cov (n, n) = factor of covariance (n, n), of which the lower half is read."""
+    """Compute sqrt_cov (n, n), the lower-triangular factor of covariance (n, n). Only the lower
+    half of the covariance is read.
+    """
     n = covariance.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -49,7 +51,7 @@ def factorize(covariance: FloatArray, sqrt_cov: FloatArray, least: float) -> Non
 def covariance_of_factor(
     sqrt_cov: FloatArray, variances: FloatArray, covariance: FloatArray
 ) -> None:
-    """Compute covariance (n, n) = L*L' + diag(q), of any square root L (n, n) and variances q (n,)
+    """Compute covariance (n, n) = L*L' + diag(q), for any square root L (n, n) and variances q (n,)
     of independent noise.
     """
     n = sqrt_cov.shape[0]

@@ -1,14 +1,14 @@
-"""The cubature filter with its points in adjacent columns, for kernels that step millions of times
-a second.
+"""The cubature filter with its points in adjacent columns, for kernels that run millions of steps
+per second.
 
 Legend
     m, L        state's mean (n,), and its lower-triangular square root of the covariance, P = L*L'     (n, n)
     x           points in columns                                                                      (n, 2n)
     q           standard deviations of the process noise, independent                                  (n,)
 
-Points and prediction equal those of `points` and `householder` with `sigma.cubature_rule`, with less
-work because all weights are 1/(2n). Points lie along the contiguous axis, so that the model moves
-several at once.
+Points and prediction equal those of `points` and `householder` with `sigma.cubature_rule`, but need
+less work, because all weights are 1/(2n). Points lie along the contiguous axis, so that the
+compiler can vectorise the model over points.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from schemas.runtime.jit import inlined
 
 @inlined
 def spread_points(mean: FloatArray, sqrt_cov: FloatArray, points: FloatArray) -> None:
-    """Fill points (n, 2n): column j is m + sqrt(n)*L[:, j], column n + j is m - sqrt(n)*L[:, j]."""
+    """Fill the cubature points (n, 2n): column j is m + sqrt(n)*L[:, j], and column n + j is m -
+    sqrt(n)*L[:, j].
+    """
     n = mean.shape[0]
     size = math.sqrt(n)
     for i in range(n):
@@ -35,12 +37,12 @@ def spread_points(mean: FloatArray, sqrt_cov: FloatArray, points: FloatArray) ->
 def gather_points(
     points: FloatArray, noise_std: FloatArray, pace: float, mean: FloatArray, sqrt_cov: FloatArray
 ) -> None:
-    """Compute mean and sqrt_cov of moved points (n, 2n), which become deviations, with process
-    noise pace*q.
+    """Compute mean and sqrt_cov of propagated points (n, 2n) with process noise pace*q. Afterwards
+    `points` contains the deviations from the mean.
 
     The mean is the first point plus the mean deviation from it, so that large offsets lose no
-    digits. The covariance is summed and factorized, at half the cost of an orthogonal
-    transformation. A pivot cannot be smaller than its own process noise, because the earlier states
+    digits. The covariance is summed and factorised, at half the cost of an orthogonal
+    transformation. A pivot is at least its own process noise variance, because the earlier states
     explain only the deviations.
     """
     n, count = points.shape

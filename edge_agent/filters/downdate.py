@@ -1,4 +1,4 @@
-"""Rank-one downdate of a covariance factor, refused if the covariance does not contain the rank."""
+"""Rank-one downdate of a covariance factor. It is refused if the result would not be a covariance."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ LEAST_LEFT = 1e-12  # of the variance in the direction of v; below it rounding d
 
 @compiled
 def downdate(sqrt_cov: FloatArray, column: FloatArray, white: FloatArray) -> bool:
-    """Change sqrt_cov (n, n) to the factor without column (n,); return False, and change nothing,
-    where there is no such factor.
+    """Change the factor L (`sqrt_cov`, (n, n)) to that of L*L' - column*column', with column (n,).
+    Return True.
 
-    white (n,) is scratch.
+    If the result is not a covariance, return False and change nothing. `white` (n,) is scratch.
     """
     n = column.shape[0]
     square = 0.0
@@ -57,11 +57,11 @@ def update_by_downdate(
     noise_std: FloatArray,
     work: FloatArray,
 ) -> tuple[int, float, float, bool]:
-    """Run the measurement update in place as paper 003 does: L loses the columns of U =
-    P_xz*S^-T/2, one after the other.
+    """Run the measurement update in place as in paper 003: the factor L is downdated with the
+    columns of U = P_xz*S^-T/2, one after the other.
 
-    Arguments as in `householder.update`. Return the same values, and whether a downdate was
-    refused. In that case `update` has done the work, because its orthogonal transformation cannot
+    Arguments as in `householder.update`. Return the same values, and True if a downdate was
+    refused. In that case `update` performs the step, because its orthogonal transformation cannot
     fail.
     """
     n, points = state_deviations.shape

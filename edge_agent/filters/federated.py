@@ -1,5 +1,5 @@
-"""The two operations of a federated filter: the master shares its information, and fuses the
-results of the sub-filters.
+"""The two operations of a federated filter: the master shares its information with the sub-filters,
+and fuses their results.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def share_information(sqrt_cov: FloatArray, beta: float, out: FloatArray) -> None:
-    """Compute out (n, n) = sqrt_cov of a sub-filter that gets the share beta in (0, 1] of the
-    information.
+    """Compute out (n, n): the covariance factor of a sub-filter that gets the share beta in (0, 1]
+    of the information.
     """
     gain = 1.0 / math.sqrt(beta)
     for i in range(sqrt_cov.shape[0]):
@@ -30,8 +30,9 @@ def fuse_estimates(
     other_root: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Fuse the independent estimate (other, other_root) into (mean, sqrt_cov), in place; work
-    (2n, 2n) or larger.
+    """Fuse the independent estimate (other, other_root) with (mean, sqrt_cov), in place.
+
+    `work` is scratch, (2n, 2n) or larger.
     """
     n = mean.shape[0]
     for i in range(n):

@@ -1,4 +1,4 @@
-"""Square-root predict and update by orthogonal transformations, for use inside larger compiled
+"""Square-root prediction and update by orthogonal transformations, for use inside larger compiled
 kernels.
 
 Legend
@@ -6,13 +6,13 @@ Legend
     L           sqrt_cov, lower triangular, covariance P = L*L'             (n, n)
     X           weighted centred deviations of state points                 (n, points)
     Z           weighted centred deviations of measurement points           (k, points)
-    nu          innovation, measured minus predicted; NaN = row not there    (k,)
+    nu          innovation, measured minus predicted; NaN for a missing row  (k,)
     r           standard deviations of the measurement noise, independent    (k,)
     S           innovation covariance Z*Z' + diag(r^2)                       (k, k)
 
-Everything is an orthogonal transformation of an array of factors (Householder): no covariance is
-ever subtracted, so none can lose its sign. Kernels write into arrays of the caller; they allocate
-nothing.
+All operations are orthogonal (Householder) transformations of an array of factors. No covariance is
+ever subtracted, so variances cannot become negative. The functions write into arrays of the caller
+and allocate nothing.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ LOG_TWO_PI = math.log(2.0 * math.pi)
 
 @compiled
 def triangularize(a: FloatArray, rows: int, columns: int) -> None:
-    """Replace a[:rows, :columns] by its lower-triangular factor with the same a*a', diagonal not
-    negative.
+    """Replace a[:rows, :columns] by its lower-triangular factor, which has the same a*a'; the
+    diagonal is not negative.
 
-    Householder reflections from the right; entries right of the diagonal become zero. columns >=
-    rows.
+    The method is Householder reflections from the right; entries right of the diagonal become zero.
+    Requires columns >= rows.
     """
     for i in range(rows):
         square = 0.0
@@ -69,10 +69,10 @@ def predict(
     sqrt_cov: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Compute mean and sqrt_cov of propagated points (points, n) with process noise factor
-    sqrt_noise (n, n).
+    """Compute mean (n,) and sqrt_cov (n, n) of propagated points (points, n) with process noise
+    factor sqrt_noise (n, n).
 
-    Writes mean (n,) and sqrt_cov (n, n); work is (n, points + n) or larger.
+    `work` is scratch, (n, points + n) or larger.
     """
     count, n = points.shape
     weighted_mean(points, w_mean, mean)
@@ -105,7 +105,7 @@ def update(
         work: (k + n, points + k) or larger.
 
     Returns:
-        rows used, the log-likelihood of the innovation [nat] and nu' S^-1 nu.
+        number of rows used, log-likelihood of the innovation [nat], nu' S^-1 nu.
 
     The array [[Z, diag(r)], [X, 0]] becomes [[S^1/2, 0], [P_xz*S^-T/2, L_new]].
     """

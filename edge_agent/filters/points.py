@@ -1,4 +1,4 @@
-"""Points of a sigma rule from a mean and a square root of the covariance, and back.
+"""Points of a sigma rule computed from a mean and a square root of the covariance, and the reverse.
 
 Legend
     m, L        mean (n,) and sqrt_cov, lower triangular, covariance P = L*L'            (n, n)
@@ -22,8 +22,8 @@ from schemas.runtime.jit import compiled
 def sigma_points(
     mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray
 ) -> None:
-    """Compute points[j] = mean + sqrt_cov @ xi[j]; mean (n,), sqrt_cov (n, n), xi and points
-    (points, n).
+    """Compute points[j] = mean + sqrt_cov @ xi[j]. Shapes: mean (n,), sqrt_cov (n, n), xi and
+    points (points, n).
     """
     count, n = xi.shape
     for p in range(count):
@@ -37,7 +37,9 @@ def sigma_points(
 @compiled
 def axis_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray) -> None:
     """Compute points[p] = mean + A·S·xi[p] with the singular value decomposition A·S·Vᵀ of
-    `sqrt_cov`. Shapes: mean (n,), sqrt_cov (n, n), finite; xi and points (points, n).
+    `sqrt_cov`.
+
+    Shapes: mean (n,), sqrt_cov (n, n), finite; xi and points (points, n).
     """
     axes, size, _ = np.linalg.svd(sqrt_cov)
     count, n = xi.shape
@@ -51,8 +53,10 @@ def axis_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: 
 
 @compiled
 def weighted_mean(points: FloatArray, w_mean: FloatArray, mean: FloatArray) -> None:
-    """Compute mean = sum of w_mean[j]*points[j], as the first point plus deviations so that large
-    offsets lose no digits.
+    """Compute mean = sum of w_mean[j]*points[j].
+
+    It is computed as the first point plus weighted deviations, so that large offsets lose no
+    digits.
     """
     count, n = points.shape
     for i in range(n):
@@ -66,8 +70,9 @@ def weighted_mean(points: FloatArray, w_mean: FloatArray, mean: FloatArray) -> N
 def centred_deviations(
     points: FloatArray, mean: FloatArray, w_cov: FloatArray, out: FloatArray, row: int
 ) -> None:
-    """Compute out[row + i, j] = sqrt(w_cov[j])*(points[j, i] - mean[i]): the factor of a covariance
-    from centred deviations.
+    """Compute out[row + i, j] = sqrt(w_cov[j])*(points[j, i] - mean[i]).
+
+    These centred deviations are a factor of the covariance.
     """
     count, n = points.shape
     for p in range(count):

@@ -1,4 +1,4 @@
-"""Measurement updates of a square root by one scalar after the other.
+"""Measurement updates of a square-root filter with one scalar measurement after the other.
 
 Legend
     m, L        state's mean (n,), and its square root of the covariance, P = L*L'                      (n, n)
@@ -6,8 +6,8 @@ Legend
     r, a        variance of the noise, and of the innovation, a = f'*f + r
     nu          innovation, measured minus predicted
 
-No variance is ever subtracted from another, so none can become negative. Rows with independent
-noise may be taken in one by one in any order. The deviations f of the remaining rows change with L,
+No variance is ever subtracted from another, so variances cannot become negative. Rows with
+independent noise may be applied in any order. The deviations f of the remaining rows change with L,
 and `apply_projection` updates them in the same way.
 """
 
@@ -21,8 +21,8 @@ from schemas.runtime.jit import inlined
 
 @inlined
 def potter_factors(f: FloatArray, noise: float) -> tuple[float, float]:
-    """Return (a, g) of a row f (k,) with noise variance > 0: then m <- m + L*f*nu/a and L <- L*(I -
-    g*f*f') (Potter 1963).
+    """Return (a, g) for a row f (k,) with noise variance `noise` > 0. The update is then m <- m +
+    L*f*nu/a and L <- L*(I - g*f*f') (Potter 1963).
     """
     a = noise
     for c in range(f.shape[0]):
@@ -35,8 +35,8 @@ def potter_factors(f: FloatArray, noise: float) -> tuple[float, float]:
 def apply_projection(
     mean: FloatArray, root: FloatArray, f: FloatArray, step: float, gain: float
 ) -> None:
-    """Compute mean (n,) += L*f*step, root L (n, k or more) <- L*(I - gain*f*f'); f (k,) is zero
-    beyond.
+    """Compute mean (n,) += L*f*step and root L (n, k or more) <- L*(I - gain*f*f'), with f (k,).
+    Columns of L beyond k are unchanged.
     """
     for i in range(mean.shape[0]):
         along = 0.0
@@ -57,11 +57,10 @@ def carlson_update(
     variance: float,
     gain: FloatArray,
 ) -> tuple[float, float]:
-    """Take in a `reading` of state i itself with noise `variance` > 0; return (innovation squared
-    over a, a).
+    """Update the filter with a `reading` of state i itself with noise `variance` > 0.
 
-    L stays triangular (Carlson 1973): its rows are turned by 2 x 2 rotations whose cosines come
-    from sums of squares alone. gain (n,) is scratch.
+    Return (innovation squared over a, a). L stays triangular (Carlson 1973): its rows are rotated
+    by 2 x 2 rotations whose cosines come from sums of squares only. gain (n,) is scratch.
     """
     n = mean.shape[0]
     for k in range(n):

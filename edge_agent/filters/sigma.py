@@ -1,4 +1,4 @@
-"""Sigma rules: tables of points and weights that are checked when built.
+"""Sigma rules: tables of points and weights that are checked when they are created.
 
 Legend
     n           dimension of the state
@@ -6,8 +6,8 @@ Legend
     w_mean      weights of the mean                                       (points,)
     w_cov       weights of the covariance                                 (points,)
 
-A rule integrates moments of the standard normal exactly: sum w = 1, sum w*xi = 0, sum w*xi*xi' = I.
-The points of a state with mean m and sqrt_cov L are m + L*xi.
+A rule integrates the moments of the standard normal distribution exactly up to the second: sum w =
+1, sum w*xi = 0, sum w*xi*xi' = I. The points of a state with mean m and sqrt_cov L are m + L*xi.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ EXACTNESS = 1e-9  # moments may miss by this much; alpha = 1e-3 costs six of the
 
 @dataclass(frozen=True)
 class SigmaRule:
-    """Points and weights of one rule; its constructor refuses wrong moments.
+    """Points and weights of one rule. The constructor rejects wrong moments.
 
     Raises:
         InputError: shapes do not agree, a moment up to the second is not exact, or a covariance
@@ -66,12 +66,13 @@ class SigmaRule:
 
     @property
     def dimension(self) -> int:
-        """Dimension n of the state."""
+        """Return the dimension n of the state."""
         return int(self.xi.shape[1])
 
 
 def unscented_rule(n: int, alpha: float, beta: float, kappa: float) -> SigmaRule:
-    """Return the scaled unscented rule (Julier 2002); a centre without any weight is left out.
+    """Return the scaled unscented rule (Julier 2002). A central point with zero weights is left
+    out.
 
     lambda = alpha^2*(n + kappa) - n; points 0 and +-sqrt(n + lambda)*e_i; w_mean_0 = lambda/(n +
     lambda), w_cov_0 = w_mean_0 + 1 - alpha^2 + beta, others 1/(2*(n + lambda)).

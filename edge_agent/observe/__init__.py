@@ -1,1 +1,1 @@
-"""Estimates along a drive → observations per cell and visit; pure."""
+"""Conversion of estimates along a drive to observations, one per visited cell. The package is pure."""

@@ -1,11 +1,11 @@
-"""Begin and end of visits: from satellite fixes and yaw to the cell and sector of a vehicle, sample
-by sample.
+"""Begin and end of visits: computes the cell and heading sector of a vehicle from position fixes
+and yaw, sample by sample.
 
-A visit begins with a fix in a new cell or heading sector. Fixes jitter, and a road may run along a
-border. So a visit ends only when a fix lies clearly outside: CELL_MARGIN beyond the cell, or
-SECTOR_KEEP beyond the sector. Without a fix for FIX_HELD_S the vehicle is in no cell (cell -1).
-Without yaw the course over ground is used. Pure: state between blocks is a `CellTrack` per vehicle.
-Any split of the samples gives the same result.
+A visit begins with a fix in a new cell or heading sector. Fixes are noisy, and a road may run along
+a border. Therefore a visit ends only when a fix lies clearly outside: CELL_MARGIN beyond the cell,
+or SECTOR_KEEP beyond the sector. After FIX_HELD_S without a fix the vehicle is in no cell (cell
+-1). Without yaw the course over ground is used. The module is pure: the state between blocks is a
+`CellTrack` per vehicle. Any division of the samples into blocks gives the same result.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ NOWHERE: Final = -1  # cell of a vehicle without position
 
 
 class CellTrack:
-    """State of one vehicle between blocks, as a record; NaN where nothing was received yet."""
+    """State of one vehicle between blocks, as a record; NaN where nothing has been received yet."""
 
     fix_time: float  # of the last fix [s]
     latitude: float  # of it [deg]
@@ -51,8 +51,8 @@ class CellTrack:
 
 
 class ReceiverSample:
-    """One sample of the satellite receiver, as a record: position [deg], yaw [rad], its cell and
-    the cell's borders.
+    """One sample of the position receiver, as a record: position [deg], yaw [rad], its cell and the
+    cell's borders.
     """
 
     latitude: float
@@ -66,7 +66,7 @@ class ReceiverSample:
 
 
 class Located(NamedTuple):
-    """Visits per sample, shape (T, N).
+    """Cells visited by N vehicles at T samples, shape (T, N).
 
     closes: True at the first sample of a new visit, or of being in no cell. inside, outside: True
     where a fix of this sample lies inside or outside the visited cell. cell, sector: quadint z21
@@ -85,7 +85,7 @@ class Located(NamedTuple):
 
 
 def new_tracks(vehicles: int) -> RecordArray:
-    """Return tracks (N,) of vehicles that have received nothing yet."""
+    """Return tracks (N,) of vehicles that have not received a position."""
     tracks = records(CellTrack, vehicles)
     for name in tracks.dtype.names or ():
         tracks[name] = NOWHERE if name in ("cell", "sector") else np.nan
@@ -95,16 +95,16 @@ def new_tracks(vehicles: int) -> RecordArray:
 def locate_vehicles(
     tracks: RecordArray, t: FloatArray, signals: FloatArray, *, lost: bool = False
 ) -> tuple[RecordArray, Located]:
-    """Follow N vehicles through a block.
+    """Compute the cells of N vehicles in a block of samples.
 
     Args:
-        tracks: (N,) of the block before.
+        tracks: (N,) tracks after the previous block.
         t: (T, N) [s].
         signals: (T, N, channels).
-        lost: drops the held fixes, which ends every visit.
+        lost: if True, the last fixes are dropped, which ends every visit.
 
     Returns:
-        the tracks for the next block, and the visits per sample.
+        the tracks for the next block, and the cells per sample.
     """
     after = tracks.copy()
     if lost:
@@ -125,7 +125,7 @@ def locate_vehicles(
 
 
 def _receiver_samples(signals: FloatArray) -> RecordArray:
-    """Return the receiver's part of signals (T, N, channels), as records (T, N)."""
+    """Return the receiver's part of signals (T, N, channels), as an array of records (T, N)."""
     fixes = records(ReceiverSample, *signals.shape[:-1])
     latitude = signals[..., S.LATITUDE]
     longitude = signals[..., S.LONGITUDE]
@@ -153,7 +153,7 @@ def _update_course(track: CellTrack, latitude: float, longitude: float) -> None:
 
 @compiled
 def _stays_in_cell(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
-    """Return True if a fix still belongs to the visit, margins included."""
+    """Return True if a fix still belongs to the visit, with the margins of cell and sector."""
     wide = CELL_MARGIN * (track.east - track.west)
     high = CELL_MARGIN * (track.north - track.south)
     off = np.mod(yaw - track.sector * (np.pi / 2) + np.pi, 2 * np.pi) - np.pi
@@ -166,7 +166,7 @@ def _stays_in_cell(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
 
 @compiled
 def _store_readings(track: CellTrack, fix: ReceiverSample, now: float) -> None:
-    """Store the readings of a sample."""
+    """Store the position and the yaw of a sample in the track, where they are valid."""
     if np.isfinite(fix.yaw):
         track.yaw_time = now
         track.yaw = fix.yaw
@@ -179,7 +179,7 @@ def _store_readings(track: CellTrack, fix: ReceiverSample, now: float) -> None:
 
 @compiled
 def _begin_visit(track: CellTrack, fix: ReceiverSample, heading: float) -> None:
-    """Begin a visit of the fix's cell."""
+    """Begin a visit to the cell of the fix, in the sector of `heading` [rad]."""
     track.cell = fix.cell
     track.sector = int(np.floor((heading + np.pi / 4) / (np.pi / 2))) % grid.SECTORS
     track.west = fix.west
@@ -192,7 +192,9 @@ def _begin_visit(track: CellTrack, fix: ReceiverSample, heading: float) -> None:
 def _advance_tracks(
     t: FloatArray, fixes: Records[ReceiverSample], tracks: Records[CellTrack], located: Located
 ) -> None:
-    """Sequential core of `locate_vehicles`: advance the tracks and fill `located`."""
+    """Advance the tracks sample by sample and fill `located`; this is the compiled part of
+    `locate_vehicles`.
+    """
     for k in range(t.shape[0]):
         for n in range(t.shape[1]):
             track = tracks[n]

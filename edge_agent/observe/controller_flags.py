@@ -9,9 +9,9 @@ A flag is implausible
 - while it was on for more than MOST_ACTIVE of the last minutes, once it was on for LEAST_ACTIVE_S
   of them.
 
-Being off for OFF_S ends the second doubt, and the third ends as the share falls. Pure. A
-`FlagRecord` per vehicle and flag is carried between blocks, so that any split of the samples gives
-the same result.
+The second condition ends when the flag was off for OFF_S, and the third when the share decreases.
+The module is pure. A `FlagRecord` per vehicle and flag is kept between blocks, so that any division
+of the samples into blocks gives the same result.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ REASONS: Final = {
 
 
 class FlagRecord:
-    """State of one flag of one vehicle, as a record."""
+    """State of one controller flag of one vehicle, as a record."""
 
     time: float  # of its last sample [s]
     off: float  # for how long it was off without a break [s]
@@ -59,7 +59,7 @@ class FlagRecord:
 
 
 def new_flag_records(vehicles: int) -> RecordArray:
-    """Return records (N, len(FLAGS)) of vehicles whose flags have not been read."""
+    """Return new records (N, len(FLAGS)) for vehicles whose flags have not been read."""
     made = records(FlagRecord, vehicles, len(FLAGS))
     made["time"] = np.nan
     return made
@@ -68,10 +68,10 @@ def new_flag_records(vehicles: int) -> RecordArray:
 def trusted_context(
     before: RecordArray, t: FloatArray, signals: FloatArray, context: FloatArray
 ) -> tuple[RecordArray, FloatArray]:
-    """Remove the implausible flags.
+    """Replace implausible flags in the context by NaN (unknown).
 
     Args:
-        before: (N, len(FLAGS)) records of the block before.
+        before: (N, len(FLAGS)) records after the previous block.
         t: (T, N) [s].
         signals: (T, N, channels); the wheel speeds show whether the vehicle stands.
         context: (T, N, len(CONTEXT)).
@@ -93,8 +93,8 @@ def trusted_context(
 
 
 def doubted_flags(record: RecordArray) -> list[tuple[int, str, str]]:
-    """Yield the flags that are doubted now: index of the vehicle, name of the flag, and the
-    reason.
+    """Return (index of the vehicle, name of the flag, reason) for each flag that is implausible
+    now.
     """
     return [
         (
@@ -112,8 +112,8 @@ def doubted_flags(record: RecordArray) -> list[tuple[int, str, str]]:
 def _check_flags(
     flags: Records[FlagRecord], t: FloatArray, standing: FloatArray, context: FloatArray
 ) -> None:
-    """Sequential core of `trusted_context`: advance the records, and remove doubtful flags from the
-    context.
+    """Advance the records sample by sample, and set implausible flags in the context to NaN; this
+    is the compiled part of `trusted_context`.
     """
     for k in range(t.shape[0]):
         for n in range(t.shape[1]):
@@ -135,7 +135,7 @@ def _check_flags(
 
 @compiled
 def _count_sample(record: FlagRecord, dt: float, on: bool, stands: bool) -> None:
-    """Count one more known sample of a flag, `dt` [s] after the previous one."""
+    """Update the record of a flag with one more known sample, `dt` [s] after the previous one."""
     keep = np.exp(-dt / MEMORY_S)
     record.known = record.known * keep + dt
     record.active = record.active * keep + (dt if on else 0.0)

@@ -1,9 +1,10 @@
-"""Records for publication, built from estimates: one observation per cell visit, and states at a
-set rate.
+"""Construction of the records for publication from estimates: one observation per visit of a cell,
+and states at a given rate.
 
 For each block of samples: `located` marks where visits end (`cell_tracker`), the estimator bank is
-advanced with these `closes`, and `build_records` makes the records. State between blocks is an
-`OpenVisits`. Any split of the samples gives the same records in the same order. Pure.
+advanced with these `closes`, and `build_records` constructs the records. The state between blocks
+is an `OpenVisits`. Any division of the samples into blocks gives the same records in the same
+order. The module is pure.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ EXCLUDED_NATS: Final = (
 
 
 class RecordBlock(NamedTuple):
-    """Records of one kind: wire columns (n, …), the vehicle's index (n,), and True for each record
-    to send at once (n,).
+    """Records of one kind: columns of the message (n, …), index of the vehicle (n,), and True for
+    each urgent record, which is sent immediately (n,).
     """
 
     kind: Kind
@@ -58,7 +59,7 @@ class RecordBlock(NamedTuple):
 
 
 class Visit:
-    """One visit, under way or ended, as a record."""
+    """One visit of a cell, open or ended, as a record."""
 
     sample: int  # of the block, and
     vehicle: int  # at which it ended
@@ -98,7 +99,7 @@ class Visit:
 
 
 class Sample:
-    """Report of an estimator at one sample, as a record."""
+    """Output of an estimator at one sample, with the measured accelerations, as a record."""
 
     health: int
     speed: float  # [m/s]
@@ -112,14 +113,14 @@ class Sample:
 
 @dataclass(frozen=True)
 class OpenVisits:
-    """Visits under way, records (N,), and the number of the last state slot (N,)."""
+    """Open visits as records (N,), and the number of the last state slot (N,)."""
 
     visits: RecordArray
     slot: IntArray
 
     @staticmethod
     def before_any(vehicles: int) -> OpenVisits:
-        """Return the state before any visit."""
+        """Return the state before the first visit."""
         visits = records(Visit, vehicles)
         visits["cell"] = NOWHERE
         return OpenVisits(visits, np.full(vehicles, np.iinfo(np.int64).min))
@@ -134,11 +135,12 @@ def build_records(
     signals: FloatArray | None = None,
     context: FloatArray | None = None,
 ) -> tuple[OpenVisits, RecordBlock, RecordBlock]:
-    """Return the records of a block with times (T, N) [ns UTC]: the carried visits, observations,
-    states.
+    """Build the records of a block with times (T, N) [ns UTC]; return (open visits, observations,
+    states).
 
-    Without `signals` (T, N, channels) observations do not contain how the grip was used. Without
-    `context` (T, N, len(CONTEXT)) they contain nothing of controllers and surroundings.
+    Without `signals` (T, N, channels) observations do not contain the direction in which grip was
+    used. Without `context` (T, N, len(CONTEXT)) they contain no data of controllers and
+    surroundings.
     """
     after = OpenVisits(before.visits.copy(), before.slot.copy())
     ended = records(Visit, int(np.count_nonzero(located.closes)))
@@ -161,10 +163,11 @@ def build_records(
 
 
 class SampleNotes(NamedTuple):
-    """Additional data of samples for the visits that contain them.
+    """Additional data per sample for the visits.
 
-    row, told: where friction changed within a visit (T, N), and the evidence of the part before:
-    row of (k, 32). context: (T, N, len(CONTEXT)); no rows where nothing is known.
+    `row` (T, N): index of a row of `told` at a sample where friction changed within a visit, else
+    -1. `told` (k, 32): evidence of the part of the visit before that change. `context` (T, N,
+    len(CONTEXT)): controllers and surroundings; empty if unknown.
     """
 
     row: IntArray  # -1: nowhere
@@ -183,7 +186,9 @@ def _sample_notes(estimates: Estimates, context: FloatArray | None) -> SampleNot
 
 
 def _visit_samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
-    """Return the inputs of visits from the estimates and the accelerometers, as records (T, N)."""
+    """Return the samples from which visits are computed, from estimates and accelerometers, as
+    records (T, N).
+    """
     samples = records(Sample, *estimates.mu.shape)
     samples["speed"] = np.hypot(estimates.vx, estimates.vy)
     for name in ("health", "mu_utilised", "mu", "mu_lower", "mu_upper"):
@@ -203,8 +208,8 @@ def _advance_visits(
     ended: Records[Visit],
     position_std: float,
 ) -> int:
-    """Sequential core: add each sample to its visit, and write a visit out when the next begins;
-    return the number written.
+    """Add each sample to its visit, and write a visit to `ended` when the next one begins; return
+    the number of ended visits.
     """
     count = 0
     for k in range(time.shape[0]):
@@ -236,7 +241,7 @@ def _advance_visits(
 
 @compiled
 def _begin_visit(visit: Visit, time: int, cell: int, sector: int) -> None:
-    """Start a visit without a sample in a record."""
+    """Start a new visit, still without samples, in the record."""
     visit.enter_time = time
     visit.cell = cell
     visit.sector = sector
@@ -263,8 +268,10 @@ def _begin_visit(visit: Visit, time: int, cell: int, sector: int) -> None:
 
 @compiled
 def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
-    """Begin a part after a change of friction: earlier grip counts only as far as the ended part
-    did not exclude it.
+    """Begin a new part of a visit after a change of friction.
+
+    The grip used before counts only up to the largest friction that the evidence `told` of the
+    ended part does not exclude.
     """
     most = mugrid.UPPER
     for i in range(mugrid.BINS - 1, -1, -1):
@@ -282,7 +289,7 @@ def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
 
 @compiled
 def _add_sample(visit: Visit, time: int, sample: Sample, position_std: float) -> None:
-    """Add one sample to a visit."""
+    """Add one sample at `time` [ns UTC] to a visit."""
     _update_felt_grip(visit, (time - visit.leave_time) / NS, sample, position_std)
     visit.leave_time = time
     visit.samples += 1
@@ -302,7 +309,7 @@ def _add_sample(visit: Visit, time: int, sample: Sample, position_std: float) ->
 
 @compiled
 def _add_context(visit: Visit, context: FloatArray) -> None:
-    """Add one sample of controllers and surroundings to a visit; the sample is (len(CONTEXT),)."""
+    """Add one sample of the context signals (len(CONTEXT),) to a visit; NaN are skipped."""
     for i in range(len(context)):
         if np.isfinite(context[i]):
             visit.known[i] += 1.0
@@ -311,8 +318,8 @@ def _add_context(visit: Visit, context: FloatArray) -> None:
 
 @compiled
 def _update_felt_grip(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
-    """Update the grip felt by the accelerometers `dt` [s] after the last sample; a visit without
-    them excludes no friction.
+    """Update the grip according to the accelerometers, `dt` [s] after the previous sample. Without
+    accelerometer readings it stays infinite and excludes no friction.
     """
     if np.isfinite(sample.ax + sample.ay):
         share = 1.0 - np.exp(-dt / FELT_S)
@@ -334,11 +341,11 @@ def _cast_columns(kind: Kind, columns: dict[str, NDArray[np.generic]]) -> Column
 
 
 def _grip_directions(ended: RecordArray) -> dict[str, FloatArray]:
-    """Return the grip used along and across the vehicle, (n,): divided by squared acceleration; NaN
-    where there was none.
+    """Return the grip used in longitudinal and lateral direction of the vehicle, (n,): the total,
+    divided in proportion to squared accelerations. NaN without acceleration.
 
-    The sign is that of the direction with more of it: a visit that braked and then drove counts as
-    braking or driving.
+    The sign is that of the stronger direction: a visit with braking and driving counts as one of
+    them.
     """
     along = ended["driving"] + ended["braking"]
     across = ended["left"] + ended["right"]
@@ -355,8 +362,11 @@ def _grip_directions(ended: RecordArray) -> dict[str, FloatArray]:
 
 
 def _grip_used(ended: RecordArray) -> FloatArray:
-    """Return the grip used in visits (n,). Its window may reach into the previous cell; where
-    friction jumped, that of the part with least grip is used.
+    """Return the grip used in visits (n,) [1].
+
+    It is limited by the accelerometers in this cell, because the time window of `mu_utilised` may
+    reach into the previous cell. If friction changed within the visit, the smallest value of all
+    parts is used.
     """
     last = np.minimum(ended["mu_utilised"], ended["felt"])
     return np.asarray(np.minimum(last, ended["earlier_used"]))
@@ -398,10 +408,10 @@ def _build_observations(
 
 
 def _context_columns(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
-    """Return the columns of controllers and surroundings of visits, (n,) each.
+    """Return the columns of controllers and surroundings for visits, (n,) each.
 
-    A flag is 1 where it was on at any sample, 0 where it was not and was known at KNOWN_SHARE of
-    them, else unknown.
+    A flag is 1 if it was on at any sample. It is 0 if it was never on and was known at KNOWN_SHARE
+    of the samples. Otherwise it is unknown.
     """
     known = ended["known"]
     told = ended["told"]
@@ -416,10 +426,10 @@ def _context_columns(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
 
 
 def _likelihood_bytes(ended: RecordArray, evidence: FloatArray | None) -> NDArray[np.uint8]:
-    """Return likelihood bytes (n, 32) of visits; (n, 0) of a bank without evidence.
+    """Return the encoded likelihoods (n, 32) of visits; (n, 0) for a bank without evidence.
 
-    A visit that the bank did not follow from its start is flat. Where the friction jumped in the
-    cell, either value may be right, so the larger likelihood counts.
+    The likelihood is flat for a visit that the bank did not process from its start. If friction
+    changed within the cell, either value may be right, so the larger likelihood counts.
     """
     if evidence is None:
         return np.zeros((len(ended), 0), dtype=np.uint8)
@@ -433,8 +443,8 @@ def _likelihood_bytes(ended: RecordArray, evidence: FloatArray | None) -> NDArra
 def _build_states(
     after: OpenVisits, time: IntArray, located: Located, estimates: Estimates, config: AgentConfig
 ) -> RecordBlock:
-    """Return the first sample of each time slot where the position is known; advance
-    `after.slot`.
+    """Return the states: the first sample of each time slot in which the position is known.
+    `after.slot` is advanced.
     """
     slot = np.floor_divide(time, round(NS / config.state_rate_hz))
     earlier = np.vstack([after.slot[None], slot[:-1]])

@@ -1,8 +1,7 @@
-"""One step of the estimation loop: positions of the vehicles, estimates, and records for
-publication.
+"""One step of the estimation loop: computes cells of the vehicles, estimates, and records for
+publication from a block of samples.
 
-The step is the same for one car and a fleet, live and replayed: a block of samples in, estimates
-and records out.
+The step is the same for one car and for a fleet, live and in a replay.
 """
 
 from __future__ import annotations
@@ -28,8 +27,8 @@ FINAL_STEP_S = 1e-3  # after the last sample; short, so that the estimate is not
 
 
 class Seen(NamedTuple):
-    """Position of the vehicles at a block's end, each (N,): [deg], yaw [rad from east], [m/s],
-    [ns]; NaN: unknown.
+    """Position and motion of the vehicles at the end of a block, (N,) each: latitude and longitude
+    [deg], yaw [rad from east], speed [m/s], time [ns UTC]; NaN where unknown.
     """
 
     latitude: FloatArray
@@ -40,8 +39,8 @@ class Seen(NamedTuple):
 
 
 class Grip(NamedTuple):
-    """Beliefs of the vehicles at a block's end, each (N,): quantiles of mu, grip used, [ns]; NaN:
-    unknown.
+    """Friction of the vehicles at the end of a block, (N,) each: quantiles of mu, grip used, time
+    [ns UTC]; NaN where unknown.
     """
 
     mu: FloatArray
@@ -52,8 +51,8 @@ class Grip(NamedTuple):
 
 
 class Pipeline:
-    """A bank of N vehicles with its open visits. Use `step` for each block in order, then
-    `finish` once.
+    """A bank of N vehicles with its open visits. Call `step` for each block in order, then `finish`
+    once.
     """
 
     def __init__(self, bank: EstimatorBank, vehicles: int, config: AgentConfig) -> None:
@@ -69,8 +68,9 @@ class Pipeline:
         self.places: IntArray = np.full(vehicles, NOWHERE)  # cell * 4 + sector at the block's end
 
     def step(self, block: Block) -> tuple[Estimates, RecordBlock, RecordBlock]:
-        """Return estimates, observations and states of a block of at least one sample; the records
-        leave out the ends of trips.
+        """Process a block of at least one sample; return (estimates, observations, states).
+
+        The records near the beginning and end of a trip are left out.
         """
         self._tracks, located = locate_vehicles(self._tracks, block.t, block.signals)
         estimates = self._bank.advance(block.t, block.signals, located.closes)
@@ -106,22 +106,22 @@ class Pipeline:
         )
 
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return the current beliefs of the estimators, and the evidence of the visits so far; see
-        `EstimatorBank.beliefs`.
+        """Return the current friction beliefs of the estimators, and the evidence of the visits so
+        far; see `EstimatorBank.beliefs`.
         """
         return self._bank.beliefs()
 
     def doubted_flags(self) -> list[tuple[int, str, str]]:
-        """Return the controller flags that carry no weight now: index of the vehicle, name of the
-        flag, and the reason.
+        """Return (index of the vehicle, name of the flag, reason) for each controller flag that is
+        ignored now as implausible.
         """
         return doubted_flags(self._flags)
 
     def finish(self) -> RecordBlock | None:
-        """Close the open visits and return their observations; None when there was no sample.
+        """Close the open visits and return their observations; None if no sample was processed.
 
-        A visit's evidence is reported at the sample that follows it, so one sample without readings
-        is added, with the position given up.
+        The evidence of a visit is available only at the next sample. Therefore one sample without
+        readings and without a position is added.
         """
         if self._last is None:
             return None

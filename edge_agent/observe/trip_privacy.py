@@ -1,9 +1,10 @@
 """Privacy of trip ends: observations near the beginning and the end of a trip are not published.
 
-A parking place identifies its owner. A record may be published once the trip's beginning lies
-`metres` and `seconds` behind it, and its end at least as far ahead; so it waits until the vehicle
-has driven on. A trip is the life of a pipeline: records that wait when it ends are never published.
-Pure; with both at zero every record passes at once.
+A parking place identifies its owner. Therefore a record waits until the vehicle has driven on: it
+may be published if the beginning of the trip is at least `metres` and `seconds` before it, and the
+vehicle's present position at least as far after it. A trip lasts as long as the pipeline; records
+that still wait at its end are never published. The module is pure. If both limits are zero, every
+record is published immediately.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ _TIME = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}
 
 
 class TripEnds:
-    """The filter of trip ends for N vehicles. Call `advance` with each block, then
-    `release_records` with its records.
+    """Filter of trip ends for N vehicles. Call `advance` with each block, then `release_records`
+    with its records.
 
     Args:
-        vehicles: N.
-        metres, seconds: at each end; both must have passed.
+        vehicles: number of vehicles.
+        metres, seconds: distance and time at each end of a trip; both must have passed.
     """
 
     def __init__(self, vehicles: int, metres: float, seconds: float) -> None:
@@ -41,7 +42,7 @@ class TripEnds:
         return self._metres == 0.0 and self._ns == 0
 
     def advance(self, time: IntArray, speed: FloatArray) -> None:
-        """Advance by a block: time (T, N) [ns], speed (T, N) [m/s]."""
+        """Advance the filter by a block: time (T, N) [ns UTC], speed (T, N) [m/s]."""
         if self._is_off:
             return
         if self._began is None:
@@ -56,9 +57,7 @@ class TripEnds:
         self._drop_old_track()
 
     def release_records(self, records: RecordBlock) -> RecordBlock:
-        """Return those of the records, and of the earlier waiting ones, that may be published
-        now.
-        """
+        """Return the records that may be published now, from `records` and from those that waited."""
         if self._is_off or self._began is None:
             return records
         waiting = self._waiting.get(records.kind)
@@ -72,7 +71,7 @@ class TripEnds:
         return _select_rows(both, begun & passed)
 
     def _drop_old_track(self) -> None:
-        """Drop the track before the oldest waiting record."""
+        """Drop the stored track before the oldest waiting record."""
         waiting = [
             r.columns[_TIME[kind]].min() for kind, r in self._waiting.items() if len(r.vehicle)
         ]
@@ -81,8 +80,8 @@ class TripEnds:
             del self._times[0], self._odometers[0]
 
     def _distance_at(self, time: IntArray, vehicle: IntArray) -> FloatArray:
-        """Return the distance that each vehicle had driven at a time, (n,), interpolated between
-        the ends of blocks.
+        """Return the distance (n,) [m] that each vehicle had driven at a time (n,) [ns UTC],
+        interpolated between the ends of blocks.
         """
         times = np.vstack(self._times)
         odometers = np.vstack(self._odometers)
