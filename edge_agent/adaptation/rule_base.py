@@ -3,7 +3,7 @@ uses, and the rate of forgetting.
 
 | if | then | kind |
 |---|---|---|
-| the mismatch of the wheels, or of the axles, is in one of five sets | ln R of that group changes by the set's step | Sugeno |
+| the mismatch of the wheels or axles is in one of five sets | ln R of that group changes by the set's step | Sugeno |
 | the wheels' mismatch is FAR | offsets, slope and bank return to their prior faster | Sugeno |
 | steering is WIDE | R of the axle that is steered is larger | Sugeno |
 | slide, demand, new forces and strain are in one set each | ln of the share of evidence that is used | Takagi–Sugeno |
