@@ -1,4 +1,4 @@
-"""Cost of each part on this machine; `make bench`."""
+"""Benchmarks of the cost of each part on this machine; run by `make bench`."""
 
 import os
 

@@ -1,8 +1,8 @@
-"""`make bench`: what each part costs, each against a limit or a peer measured in the same run where
-there is one.
+"""`make bench`: time, memory and bytes of each part, where possible as a ratio to a theoretical
+limit or to another program measured in the same run.
 
-Writes `.bench/figures.json` and prints the table. `python -m tests.benchmarks NAME ...` runs some
-parts only.
+Writes `.bench/figures.json` and prints the table. `python -m tests.benchmarks NAME ...` runs only
+the named parts.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ PARTS: dict[str, Callable[[], list[Figure]]] = {part.__name__: part for part in 
 
 
 def main() -> int:
-    """Run the parts asked for, all without names, with progress."""
+    """Run the named parts, or all parts without names, and print progress. Return the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.benchmarks", description=(__doc__ or "").splitlines()[0]
     )

@@ -1,5 +1,5 @@
-"""Benchmark of the edge agent as processes: time to the first answer, cost of a vehicle, vehicles
-per core, scaling with jobs.
+"""Benchmark of the edge agent as separate processes: time to the first answer, cost of a vehicle,
+vehicles per core, and scaling with the number of jobs.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def agent() -> list[Figure]:
 
 
 def simulate_drive(folder: Path, name: str, seed: int, seconds: float) -> tuple[Path, Path]:
-    """A simulated log and its vehicle file."""
+    """Simulate a drive, and return the paths of its log and its vehicle file."""
     log = folder / f"{name}.parquet"
     vehicle = folder / f"{name}.json"
     files = [
@@ -73,7 +73,9 @@ def simulate_drive(folder: Path, name: str, seed: int, seconds: float) -> tuple[
 
 
 def measure_start(folder: Path) -> list[Figure]:
-    """Measure `--help` and the first estimate of a new process whose compiled code is in the cache."""
+    """Measure the time of `--help`, and of the first estimate of a new process whose compiled code
+    is cached.
+    """
     files = [str(path) for path in simulate_drive(folder, "short", 0, 2.0)]
 
     def run_process(*words: str) -> None:
@@ -94,7 +96,7 @@ def measure_usage(folder: Path, endpoint: str, *words: str) -> tuple[float, floa
     """Return processor time [s] and resident memory [MB] of a command of the edge agent.
 
     Raises:
-        ArithmeticError: it left something unacknowledged, so that its figures would flatter.
+        ArithmeticError: the command left reports unacknowledged, so its figures would be too good.
     """
     config = folder / "agent.json"
     config.write_text(
@@ -113,11 +115,11 @@ def measure_usage(folder: Path, endpoint: str, *words: str) -> tuple[float, floa
 
 
 def watch_memory(pid: int) -> tuple[float, resource.struct_rusage]:
-    """Return the peak resident memory [MB] of a process, sampled until it ends, and its resource
+    """Return the peak resident memory [MB] of a process, sampled until its end, and its resource
     usage.
 
-    The peak that the system reports at the end counts from the fork on, when the memory was still
-    that of its parent.
+    The peak that the system reports cannot be used: it begins at the fork, when the memory was
+    still that of the parent.
     """
     peak = 0.0
     gone = 0
@@ -135,8 +137,8 @@ def watch_memory(pid: int) -> tuple[float, resource.struct_rusage]:
 
 
 def measure_live(folder: Path, endpoint: str) -> list[Figure]:
-    """Measure the processor time of one vehicle at 100 Hz. The difference of a long and a short run
-    leaves out the start.
+    """Measure the processor time of one vehicle at 100 Hz: the difference of a long and a short
+    run, so that the start is not included.
     """
     log, vehicle = simulate_drive(folder, "live", 0, START_S + LIVE_S + 1.0)
     words = (
@@ -160,8 +162,9 @@ def measure_live(folder: Path, endpoint: str) -> list[Figure]:
 
 
 def measure_fleet(folder: Path, endpoint: str) -> list[Figure]:
-    """Measure how many vehicles a core carries in real time: plant, estimator, publishing; from the
-    CPU of a whole fleet."""
+    """Measure how many vehicles one core can simulate, estimate and publish in real time, from the
+    processor time of a whole fleet.
+    """
     words = ("fleet", "--rate", str(FLEET_RATE_HZ), "--vehicles", str(FLEET), "--duration")
     measure_usage(folder, endpoint, *words, str(WARM_S))
     short, _ = measure_usage(folder, endpoint, *words, str(START_S))
@@ -178,8 +181,8 @@ def measure_fleet(folder: Path, endpoint: str) -> list[Figure]:
 
 
 def measure_replay(folder: Path) -> list[Figure]:
-    """Return the throughput of a backfill of many logs, Parquet included, divided by twice that of
-    the kernel on one core.
+    """Measure the throughput of a replay of many logs with two jobs, Parquet included, divided by
+    twice the throughput of the kernel on one core.
     """
     logs = [simulate_drive(folder, f"log-{seed:02d}", seed, LOG_S) for seed in range(LOGS)]
     log = read_log(logs[0][0])

@@ -1,8 +1,8 @@
-"""`make analytics-bench`: archive and analytics on ten million synthetic observations, every bar of
-theirs in one file.
+"""`make analytics-bench`: archive and analytics with ten million synthetic observations, and all
+figures of this area in one file.
 
-Writes `.analytics/figures.json` and prints the table; `--rows` tries it with fewer. Durations are
-wall time on two threads, medians of ROUNDS; rows per second of the compaction are per CPU second.
+Writes `.analytics/figures.json` and prints the table; `--rows` sets a smaller number. Durations are
+wall times on two threads, medians of ROUNDS. Rows per second of the compaction are per CPU second.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ HALF = START_NS + DAY_S * 10**9
 
 
 def print_progress(line: str) -> None:
-    """Print progress."""
+    """Print a line of progress."""
     print(f"  {line}", flush=True)
 
 
 def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
-    """Median duration [s]."""
+    """Return the median duration [s] of a function."""
     spent = []
     for _ in range(rounds):
         began = time.perf_counter()
@@ -72,7 +72,7 @@ def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
 
 
 def write_stations(folder: Path) -> Path:
-    """Hourly readings of five stations."""
+    """Write hourly readings of five weather stations, and return the path of the file."""
     hours = np.arange(DAYS * 24)
     names = np.repeat([f"station-{k}" for k in range(5)], len(hours))
     place = np.repeat(np.arange(5), len(hours))
@@ -92,7 +92,7 @@ def write_stations(folder: Path) -> Path:
 
 
 def measure_archive(root: Path, rows: int) -> list[Figure]:
-    """Return rows per second of compaction, and bytes per observation."""
+    """Measure rows per second of compaction, and bytes per observation."""
     print_progress(f"writing {rows:,} observations")
     synthetic.write_archive(root, SyntheticFleet(rows, DAYS))
     inbox = size_of(segments.list_segments(root, Kind.OBSERVATION))
@@ -115,13 +115,13 @@ def measure_archive(root: Path, rows: int) -> list[Figure]:
 
 
 def _ask_question(name: str, root: Path, options: Options) -> pa.Table:
-    """Ask a question with a new engine."""
+    """Answer a question with a new query engine."""
     return QUESTIONS[name].ask(QueryEngine("duckdb", root, PART), options)
 
 
 def measure_questions(root: Path, readings: Path) -> list[Figure]:
-    """Return the seconds of four questions on all rows, and the milliseconds of the history of one
-    cell.
+    """Measure the time of four questions on all rows [s], and that of the history of
+    one cell [ms].
     """
     found = []
     for name in TIMED:
@@ -149,7 +149,7 @@ def measure_questions(root: Path, readings: Path) -> list[Figure]:
 
 
 def write_small_archive(root: Path) -> dict[int, pa.Table]:
-    """Return a small archive's snapshots by time."""
+    """Write a small archive, and return its map snapshots by time."""
     synthetic.write_archive(root, SMALL, 4000)
     compact(root)
     rollup.complete_parts(root)
@@ -166,8 +166,8 @@ def write_small_archive(root: Path) -> dict[int, pa.Table]:
 
 
 def measure_agreement(root: Path, readings: Path) -> list[Figure]:
-    """Count files that a validator refuses, readers that fail, and questions that two engines
-    answer differently.
+    """Count files that a validator refuses, programs that cannot read the archive, and questions
+    with different answers from two engines.
     """
     invalid = sum(bool(_find_refusals(path)) for path in _geo_files(root))
     expected = sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["seq"]))
@@ -238,7 +238,7 @@ def _count_differences(root: Path, readings: Path) -> int:
 
 @contextmanager
 def open_folder() -> Iterator[Path]:
-    """Yield an empty folder for the archives. It is removed afterwards; the figures stay."""
+    """Yield an empty folder for the archives. It is removed afterwards, but the figures are not."""
     FOLDER.mkdir(exist_ok=True)
     work = FOLDER / "work"
     shutil.rmtree(work, ignore_errors=True)
@@ -250,7 +250,7 @@ def open_folder() -> Iterator[Path]:
 
 
 def main() -> int:
-    """Measure everything; exit code 1 where a bar does not hold."""
+    """Measure everything. Return 1 if a figure misses its target, otherwise 0."""
     parser = argparse.ArgumentParser(
         prog="make analytics-bench", description=(__doc__ or "").splitlines()[0]
     )

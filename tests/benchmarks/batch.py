@@ -1,5 +1,5 @@
 """`make batch-bench`: batch work on an archive and on drives, compared with the same work done
-directly; writes .batch/figures.json.
+directly. It writes .batch/figures.json.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ FOLDER: Final = ROOT / ".batch"
 
 
 def measure_all(folder: Path) -> list[Figure]:
-    """Return all figures; the files made for them go into a folder."""
+    """Return all figures. Temporary files go into `folder`."""
     logs = spread.simulate_drives(folder / "drives")
     return [
         Figure(
@@ -38,7 +38,7 @@ def measure_all(folder: Path) -> list[Figure]:
 
 
 def main() -> int:
-    """Measure; 1 where a bar does not hold."""
+    """Measure everything. Return 1 if a figure misses its target, otherwise 0."""
     FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         rows = measure_all(Path(folder))

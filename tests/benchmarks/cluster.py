@@ -1,8 +1,8 @@
-"""Cost of a second copy: acknowledgements of a service with a bucket copy and of one without, in
-turn.
+"""Benchmark of a second copy: acknowledgement times of a service with a bucket copy and of one
+without, measured in turn.
 
-The copy is a real S3 server on this machine, a process of its own; a bucket over a network adds its
-way there.
+The bucket is on a real S3 server in a separate process of this machine. A bucket over a network
+adds its network delay.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ BAR = 2.0
 
 
 def delays_s(folder: Path, archive: dict[str, Any]) -> list[float]:
-    """Measure a new service with such an archive."""
+    """Return the acknowledgement times [s] of a new service with these archive settings."""
     with ExitStack() as stack:
         router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
         stack.enter_context(router)

@@ -1,4 +1,4 @@
-"""Cost and size of an observation, on the wire and in Parquet."""
+"""Benchmark of the encoding: time and size of an observation in a message and in Parquet."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ WORLD: Final = SyntheticFleet(500_000, days=1, seed=SEED)
 
 
 def contract() -> list[Figure]:
-    """Cost and size of an observation on the wire, ten to a message, and in Parquet."""
+    """Measure time and size of an observation in a message with ten observations, and
+    in Parquet.
+    """
     rows = 10
     columns = make_visits(10, 1, 10)
     names = wire.column_types(Kind.OBSERVATION)
@@ -42,7 +44,9 @@ def contract() -> list[Figure]:
 
 
 def parquet_bytes() -> list[Figure]:
-    """Return bytes per observation of an archive, as its service writes it and after compaction."""
+    """Measure bytes per observation of an archive, as its service writes it and after
+    compaction.
+    """
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
         synthetic.write_archive(root, WORLD)

@@ -1,4 +1,4 @@
-"""Cost of an estimator per vehicle and sample."""
+"""Benchmark of an estimator: time per vehicle and sample."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from tests.benchmarks.measure import ROUNDS, SEED, median_s
 
 
 def estimators() -> list[Figure]:
-    """Measure microseconds per vehicle and sample of the default estimator, for one vehicle and for
-    a bank.
+    """Measure the time [µs] per vehicle and sample of the default estimator, for one vehicle and
+    for a bank.
     """
     log, vehicle = simulate_manoeuvre("double-lane-change", seed=SEED)
     signals = np.stack([log[name].to_numpy(zero_copy_only=False) for name in CHANNELS], axis=-1)[

@@ -10,7 +10,7 @@ from tests.benchmarks.measure import SEED
 
 
 def make_visits(rows: int, vehicles: int, cells: int) -> Columns:
-    """Columns of observations spread over cells."""
+    """Return the columns of `rows` observations of `vehicles` vehicles in `cells` cells."""
     rng = np.random.default_rng(SEED)
     latitude = 57.0 + rng.integers(0, cells, rows) * 1e-4 / 100
     longitude = 11.97 + rng.integers(0, 100, rows) * 2e-4

@@ -1,4 +1,6 @@
-"""Cost of the fusion per observation: updates, commits and trust. Processor time of one thread."""
+"""Benchmark of the fusion: processor time per observation on one thread for updates, commits and
+trust.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ resident()
 def make_visits(
     rng: np.random.Generator, rows: int, cells: int, begin_s: float, seconds: float
 ) -> Observations:
-    """Return visits to the cells of a square, at random places within `seconds`, in order of time."""
+    """Return `rows` visits to random cells of a square of `cells` cells, at random times within
+    `seconds`, in order of time.
+    """
     side = int(np.ceil(np.sqrt(cells)))
     x, y = grid.deinterleave(grid.cell_of(57.7, 11.97))
     k = rng.integers(0, cells, rows)
@@ -72,8 +76,8 @@ def make_visits(
 
 
 def fill_fusion(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.random.Generator]:
-    """Return a fusion that has received this many visits per cell, and the generator for further
-    visits.
+    """Return a fusion that has received `per_cell` visits per cell, and the random generator for
+    further visits.
     """
     rng = np.random.default_rng(SEED)
     fusion = Fusion(120.0)
@@ -89,14 +93,14 @@ def fill_fusion(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.r
 
 
 def split_batches(o: Observations) -> Iterator[Observations]:
-    """Run turns of the service."""
+    """Yield observations in batches, as many as the service takes in one turn."""
     for rows in np.array_split(np.arange(len(o.time)), max(len(o.time) // BATCH, 1)):
         yield o.take(rows)
 
 
 def per_observation_s(cells: int, per_s: int = 5_000) -> float:
-    """Return the processor time per observation [s] of a fusion with this many cells: median over
-    ROUNDS minutes.
+    """Return the processor time per observation [s] of a fusion with `cells` cells, the median over
+    ROUNDS simulated minutes.
     """
     fusion, rng = fill_fusion(cells, 1, 600.0)
     spent = []
@@ -113,7 +117,7 @@ def per_observation_s(cells: int, per_s: int = 5_000) -> float:
 
 def table_vs_dict() -> float:
     """Return the time of a look-up among 10⁶ keys in numba's typed dictionary, divided by that in
-    the store's table, in turns of BATCH.
+    the store's hash table. BATCH keys are looked up at once.
     """
     keys = np.random.default_rng(SEED).permutation(CELLS) * grid.SECTORS
     turns = np.random.default_rng(SEED + 1).choice(keys, (100, BATCH))
@@ -149,8 +153,8 @@ def _look_up(known: Any, keys: IntArray) -> IntArray:  # noqa: ANN401 numba's ow
 
 
 def resident() -> None:
-    """Print the resident memory [MB] of a service's process with 10⁶ cells of three visits in a
-    day.
+    """Print the resident memory [MB] of a service's process with 10⁶ cells that each had three
+    visits in a day.
     """
     import fleet_service.app.service  # noqa: F401 what a service has loaded
     from fleet_service.serve.map_state import MapState

@@ -1,10 +1,10 @@
-"""Growth of a stream's cost with its rate: the engine's processor time from 10³ to 10⁵ observations
-a second.
+"""Benchmark of growth: the engine's processor time at rates from 10³ to 10⁵ observations per
+second.
 
-Ten observations to a message, and one message a second of each vehicle: a higher rate means more
-vehicles, as in life. The engine takes a second of the stream in turns, then does the work of a
-second: segment, acknowledgements, tiles. The stream's clock is simulated, so that rates beyond the
-machine's capacity are measured as well. Without the network.
+A message has ten observations, and each vehicle sends one message per second, so a higher rate
+means more vehicles. The engine ingests one second of messages in turns, and then does the other
+work of a second: segment, acknowledgements, tiles. The clock is simulated, so that rates above the
+machine's capacity can be measured. There is no network.
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ SECOND: Final = 10**9
 
 
 def growth() -> list[Figure]:
-    """Measure the cost of a second of the stream for 10^3 to 10^5 observations in it."""
+    """Measure the processor time for one second of messages at 10³ to 10⁵ observations
+    per second.
+    """
     cost = {rate: second_s(rate, seconds) for rate, seconds in RATES.items()}
     slope = float(np.polyfit(np.log(list(cost)), np.log(list(cost.values())), 1)[0])
     told = ", ".join(f"{1e6 * spent / rate:.1f} us at {rate}/s" for rate, spent in cost.items())
@@ -51,8 +53,8 @@ def growth() -> list[Figure]:
 
 
 def second_s(rate: int, seconds: int) -> float:
-    """Return the processor time [s] of a second of the stream after a warm-up. An epoch ends half
-    way.
+    """Return the mean processor time [s] for one second of messages at `rate`, measured over
+    `seconds` after a warm-up. An epoch (minute of the fusion) ends half way.
     """
     vehicles = rate // ROWS
     spent = 0.0

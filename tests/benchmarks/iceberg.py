@@ -23,7 +23,7 @@ SEEDS: Final = (0, 10, 20, 30)
 
 
 def table_of(uri: str, kind: Kind) -> Table:
-    """Open the table of a kind as a reader does."""
+    """Open the Iceberg table of a kind of rows as another program would."""
     from pyiceberg.catalog import load_catalog
 
     return load_catalog("gripmap", type="sql", uri=uri).load_table(
@@ -32,8 +32,8 @@ def table_of(uri: str, kind: Kind) -> Table:
 
 
 def rows_different(root: Path, uri: str) -> int:
-    """Count rows, with all columns, that occur in the compacted files and in the tables a different
-    number of times.
+    """Return the number of rows that occur in the compacted files and in the tables a different
+    number of times, compared in all columns.
     """
     different = 0
     for kind in Kind:
@@ -55,8 +55,8 @@ def _count_rows(table: pa.Table) -> Counter[str]:
 
 
 def count_different_rows(folder: Path) -> float:
-    """Count differing rows over four rounds of compaction and registration, and after retention has
-    removed a day.
+    """Return the number of differing rows over four rounds of compaction and registration, and
+    after retention has removed a day.
     """
     root = folder / "archive"
     uri = f"sqlite:///{folder}/tables.db"

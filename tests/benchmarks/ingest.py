@@ -1,9 +1,10 @@
-"""Ingest: bytes → decoded, admitted, fused, in a synced Parquet segment, acknowledged; without the
-network.
+"""Benchmark of ingest without the network: messages are decoded, admitted, fused, written to a
+synced Parquet segment, and acknowledged.
 
-Every round sends fresh batches of many vehicles to a new archive. The limit for comparison is a
-subscriber that only decodes the same messages, with protobuf's own module, into one array a column.
-CPU time is given with wall time, because other work on the machine slows the one and not the other.
+Every round sends new batches of many vehicles to a new archive. The limit for comparison is a
+subscriber that only decodes the same messages with protobuf's own module into one array per column.
+CPU time is given in addition to wall time, because other work on the machine affects only wall
+time.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ ROUNDS: Final = 3
 
 
 def ingest() -> list[Figure]:
-    """Return observations per second, ten and one to a message, and CPU time compared with decoding
-    alone.
+    """Measure observations per second with ten and with one observation per message, and CPU time
+    compared with decoding alone.
     """
     ten, bare, own = measure_rates(10)
     one, *_ = measure_rates(1)
@@ -64,10 +65,9 @@ def ingest() -> list[Figure]:
 
 
 def measure_rates(records: int) -> tuple[tuple[float, float], float, float]:
-    """Return observations per second and per processor second; for decoding alone also with the
-    generated module and with our decoder. Medians after a warm-up.
-
-    Medians after a warm-up.
+    """Return medians after a warm-up: observations per wall second and per CPU second of the whole
+    ingest, then of decoding alone with the generated module and with our decoder (both per CPU
+    second).
     """
     sent = make_messages(COUNTS[records], records, time.time_ns())
     taken = [_time_ingest(sent, records) for _ in range(ROUNDS + 1)][1:]
@@ -93,12 +93,12 @@ def _decoding_s(sent: list[Message], decode: Callable[[list[Message]], object]) 
 
 
 def turn_of(sent: list[Message]) -> int:
-    """Messages that the service takes at once."""
+    """Return the number of messages that the service takes at once."""
     return min(STEP_BYTES // len(sent[0].payload), STEP_MESSAGES)
 
 
 def _decode_messages(sent: list[Message]) -> list[NDArray[Any]]:
-    """Return the columns of messages, decoded by the generated module."""
+    """Return the columns of messages, decoded by protobuf's generated module."""
     read = [MESSAGE.FromString(message.payload) for message in sent]
     out: list[NDArray[Any]] = []
     for name, dtype in wire.column_types(Kind.OBSERVATION).items():
@@ -113,10 +113,10 @@ def _decode_messages(sent: list[Message]) -> list[NDArray[Any]]:
 def make_messages(
     count: int, records: int, now: int, vehicles: int = VEHICLES, begin: int = 0, east: int = 0
 ) -> list[Message]:
-    """Return messages of visits that ended `now` [ns], in one region or the next one `east`.
-    `begin` messages were made before, and sequence numbers continue.
+    """Return `count` messages with `records` visits that ended at `now` [ns], in one region or in a
+    region `east` regions further east.
 
-    `begin` messages were made before: vehicles and their sequence numbers go on.
+    The first `begin` messages were made before: vehicles and sequence numbers continue after them.
     """
     rng = np.random.default_rng([SEED, begin])
     columns = make_visits(rng, np.zeros(2 * count * records, np.int64), now, CELLS_ACROSS).columns

@@ -1,5 +1,5 @@
-"""The limits for an estimator, compiled when the benchmark runs: kernel.c for one, kernel_simd.c
-for a bank of them.
+"""Filters in C as a lower limit for the time of an estimator: kernel.c for single filters,
+kernel_simd.c for a bank. They are compiled when the benchmark runs.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ VECTORS = ("-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd", "-lmvec")
 
 @cache
 def compile_library(source: str, *options: str) -> ctypes.CDLL:
-    """Compile a kernel with gcc -O3 -march=native and `options`.
+    """Compile a kernel with gcc -O3 -march=native and `options`, and load it.
 
     Raises:
-        OSError, subprocess.CalledProcessError: there is no gcc, or it refuses.
+        OSError, subprocess.CalledProcessError: gcc is missing or fails.
     """
     target = Path(tempfile.mkdtemp()) / "kernel.so"
     words = [
@@ -57,7 +57,7 @@ def compile_library(source: str, *options: str) -> ctypes.CDLL:
 
 
 def setting_row(memberships: Memberships) -> FloatArray:
-    """Structure Setting of the kernels."""
+    """Return the fields of the kernels' C structure Setting as an array."""
     setting = Setting()
     return np.array(
         [
@@ -77,8 +77,12 @@ def setting_row(memberships: Memberships) -> FloatArray:
 
 
 def first_memory(first: FloatArray, speed: float) -> FloatArray:
-    """Filters (N, doubles) at their first readings (N, 11) and speed [m/s], as both kernels'
-    structs hold them.
+    """Return the initial filters as rows (N, doubles) in the layout of the kernels' C structures.
+
+    Args:
+        first: first readings (N, 11).
+        speed: initial speed [m/s].
+        memberships: fuzzy memberships.
     """
     setting = Setting()
     (count, inputs) = first.shape
@@ -100,13 +104,18 @@ def pointer_to(array: FloatArray) -> ctypes.c_void_p:
 
 
 class Limit:
-    """N filters in C, one struct each, on as many threads as OpenMP uses."""
+    """N filters in C, one structure each, on all OpenMP threads."""
 
     def __init__(
         self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
     ) -> None:
-        """parameters (N, 12); first (N, 11): ax, ay, yaw rate, delta, omega of the first sample;
-        speed [m/s].
+        """Create the filters.
+
+        Args:
+            parameters: vehicle parameters (N, 12).
+            first: first readings (N, 11): ax, ay, yaw rate, delta, omega.
+            speed: initial speed [m/s].
+            memberships: fuzzy memberships.
         """
         self._library = compile_library("kernel.c", "-fopenmp")
         self._parameters = np.ascontiguousarray(parameters)
@@ -114,8 +123,8 @@ class Limit:
         self._memory = first_memory(first, speed)
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
-        """Return the means (T, N, 6) after each of the readings (T, N, 11), which are `gone` [s]
-        apart.
+        """Return the means (T, N, 6) after each of the readings (T, N, 11), which are `gone`
+        seconds apart.
         """
         samples, vehicles, _ = readings.shape
         out = np.empty((samples, vehicles, STATES))
@@ -133,12 +142,14 @@ class Limit:
 
 
 class VectorLimit:
-    """N filters in C, interleaved in vectors, on one thread. N must be a multiple of the lanes."""
+    """N filters in C, interleaved in SIMD vectors, on one thread. N must be a multiple of the
+    vector length.
+    """
 
     def __init__(
         self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
     ) -> None:
-        """Arguments as of `Limit`."""
+        """Create the filters. The arguments are those of `Limit`."""
         self._library = compile_library("kernel_simd.c", *VECTORS)
         self._lanes = int(self._library.lanes())
         self._setting = setting_row(memberships)
@@ -158,8 +169,8 @@ class VectorLimit:
         return out
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
-        """Means (T, N/lanes, 6, lanes) after each of the readings `side_by_side`, `gone` [s]
-        apart.
+        """Return the means (T, N/lanes, 6, lanes) after each reading. The readings have the layout
+        of `side_by_side` and are `gone` seconds apart.
         """
         samples, blocks, _, lanes = readings.shape
         out = allocate_aligned(samples, blocks, STATES, lanes)

@@ -1,4 +1,4 @@
-"""Measurement of durations: medians of rounds after a warm-up."""
+"""Functions that measure durations: medians of rounds after a warm-up."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SEED = 0
 
 
 def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
-    """Return the median duration [s] after one call as a warm-up."""
+    """Return the median duration [s] of a function, after one call as a warm-up."""
     work()
     spent = []
     for _ in range(rounds):
@@ -24,7 +24,7 @@ def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
 def time_in_turn(
     ours: Callable[[], object], other: Callable[[], object], rounds: int = ROUNDS
 ) -> tuple[float, float]:
-    """Return the median durations [s] of two functions that are called in turn, each after a
+    """Return the median durations [s] of two functions that are called alternately, each after a
     warm-up.
     """
     ours(), other()

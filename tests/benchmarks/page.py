@@ -1,9 +1,9 @@
-"""`make page-bench`: the live page measured, compared with MapLibre with the same cells as GeoJSON
-in the same browser.
+"""`make page-bench`: measure the live page, and compare it with a MapLibre page that shows the same
+cells as GeoJSON in the same browser.
 
-Writes `.page/figures.json` and prints the table. Times are of this machine and its software
-renderer: only their ratios are meaningful. Needs Chromium, and npm for MapLibre and axe-core; a row
-whose tool is missing fails.
+Writes `.page/figures.json` and prints the table. The times depend on this machine and its software
+renderer, so only their ratios are meaningful. Chromium is needed, and npm for MapLibre and
+axe-core. A figure whose tool is missing fails.
 """
 
 from __future__ import annotations
@@ -131,8 +131,8 @@ def open_window(address: str) -> Iterator[Opened]:
 
 
 def measure_drawing(on: Stage) -> dict[str, float]:
-    """Return first picture and frames, ours and MapLibre's in turn; requests of the page to other
-    hosts, and its errors.
+    """Measure time of the first picture and frame rate, of our page and of MapLibre in turn. Also
+    count the page's errors and its requests to other hosts. Return the figures by name.
     """
     ours: list[tuple[float, float]] = []
     theirs: list[tuple[float, float]] = []
@@ -172,7 +172,9 @@ def measure_drawing(on: Stage) -> dict[str, float]:
 
 @contextmanager
 def serve_maplibre(on: Stage) -> Iterator[str | None]:
-    """Yield the address of a MapLibre page with the town as GeoJSON; None if npm is not installed."""
+    """Yield the address of a MapLibre page with the town as GeoJSON, or None if npm has not
+    downloaded MapLibre.
+    """
     files = [npm.file_of("maplibre-gl", path) for path in npm.PACKAGES["maplibre-gl"].files]
     if not all(files):
         print("  no MapLibre: npm did not fetch it", file=sys.stderr)
@@ -204,8 +206,8 @@ class _Quiet(http.server.SimpleHTTPRequestHandler):
 
 
 def pushed_ms(on: Stage) -> float:
-    """Return the 95 % quantile of the time from a put at the router to the painted cell, with
-    CHANGED_HZ changed cells a second.
+    """Return the 95 % quantile of the time [ms] from the publication of a cell at the router until
+    it is painted, while CHANGED_HZ cells change per second.
     """
     with open_window(seen_town(on.address, on.town)) as seen:
         tiles = list(on.town.tiles)
@@ -248,15 +250,15 @@ def pushed_ms(on: Stage) -> float:
 
 
 def bytes_per_cell(on: Stage) -> float:
-    """Return the bytes of all blocks, uncompressed, per cell."""
+    """Return the uncompressed bytes of the page's data blocks, per cell."""
     tiles = ",".join(map(str, on.town.tiles))
     with urllib.request.urlopen(f"{on.address}blocks?tiles={tiles}", timeout=30) as answer:
         return len(answer.read()) / CELLS
 
 
 async def _measure_pushes(on: Stage, count: int) -> float:
-    """Return the 95 % quantile of the time [s] from a put to each watcher; infinite if a watcher
-    missed one.
+    """Return the 95 % quantile of the time [s] from a publication until each watcher has received
+    it, or infinity if a watcher missed one.
     """
     host, _, port = on.address.removeprefix("http://").rstrip("/").partition(":")
     heard = [dict[int, float]() for _ in range(count)]
@@ -301,8 +303,9 @@ def _fetch_page(address: str) -> bytes:
 
 
 def count_watchers(on: Stage) -> float:
-    """Return how many watchers get 95 % of the pushes within a second, the page on one core; 0 if
-    fewer than the least tried."""
+    """Return the number of watchers that get 95 % of the updates within a second from a page on one
+    core, or 0 if already the smallest tested number is too large.
+    """
     pin_to_core(on.process, 0)
     for count in WATCHERS:
         late = asyncio.run(_measure_pushes(on, count))
@@ -314,8 +317,8 @@ def count_watchers(on: Stage) -> float:
 
 
 def count_findings(on: Stage) -> float:
-    """Return the number of serious findings of axe-core in all panels; NaN if axe-core is not
-    installed.
+    """Return the number of serious accessibility findings of axe-core in all panels, or NaN if
+    axe-core is not installed.
     """
     with open_window(seen_town(on.address, on.town)) as seen:
         seen.page.evaluate(
@@ -329,8 +332,8 @@ def count_findings(on: Stage) -> float:
 
 
 def colour_distance() -> float:
-    """Return the smallest distance (CIEDE2000) between two classes or a class and the ground, over
-    all kinds of colour vision.
+    """Return the smallest CIEDE2000 difference between two colour classes, or a class and the
+    background, over all kinds of colour vision.
     """
     pairs = [(a, b) for k, a in enumerate(ALL) for b in ALL[:k]]
     return min(
@@ -339,7 +342,7 @@ def colour_distance() -> float:
 
 
 def measure_all() -> list[Figure]:
-    """Return all figures in the order of their table."""
+    """Return all figures in the order of the printed table."""
     with open_stage(SEED) as on:
         found = _time_part("drawn", lambda: measure_drawing(on))
         found["push_p95_ms"] = _time_part("pushed", lambda: pushed_ms(on))
@@ -375,7 +378,9 @@ def _time_part(what: str, measure: Callable[[], T]) -> T:
 
 
 def main() -> int:
-    """Measure and write; 1 where a bar does not hold."""
+    """Measure everything and write the figures. Return 1 if a figure misses its target, otherwise
+    0.
+    """
     began = time.time_ns()
     rows = measure_all()
     OUT.mkdir(exist_ok=True)

@@ -1,4 +1,6 @@
-"""Interfaces of the page for other systems: DATEX II, OGC API Features, links of a road network."""
+"""Benchmarks of the page's interfaces for other systems: DATEX II, OGC API Features, and links of a
+road network.
+"""
 
 from __future__ import annotations
 
@@ -63,17 +65,17 @@ _COUNT: Final = (
 
 
 def list_records(document: bytes) -> list[ET.Element]:
-    """Return the records of a publication."""
+    """Return the situation records of a DATEX II publication."""
     return list(ET.fromstring(document).iterfind(".//sit:situationRecord", _SPACES))
 
 
 def is_over(record: ET.Element) -> bool:
-    """Return True if a record has an end."""
+    """Return True if a record states its end."""
     return record.find(".//com:overallEndTime", _SPACES) is not None
 
 
 def is_valid() -> Callable[[bytes], bool] | None:
-    """Return a validator of publications; None without the schema."""
+    """Return a function that validates DATEX II publications, or None without the schema."""
     if not SCHEMA.exists():
         print(f"  the schema of DATEX II is not at {SCHEMA}", file=sys.stderr)
         return None
@@ -84,11 +86,11 @@ def is_valid() -> Callable[[bytes], bool] | None:
 
 
 def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
-    """Publications that are not valid, and situations whose alert was over and that were not ended,
-    of STEPS steps.
+    """Return two counts over STEPS publications: invalid publications, and situations that were not
+    ended although their alert was over.
 
-    Alerts of cells on a road come and go at random. NaN where the schema is not there, or hardly
-    anything ended.
+    Alerts of cells on a road come and go at random. A count is NaN without the schema, or if hardly
+    any alert ended.
     """
     rng = np.random.default_rng(SEED)
     stretches = Stretches()
@@ -141,12 +143,12 @@ def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
 
 
 def measure_publication() -> dict[str, float]:
-    """Return figures of a service, the page and six cars on ice that melts: the page's publication
-    and its features.
+    """Return figures by name of the page's DATEX II publication and features, from a service and
+    six cars on ice that melts.
 
-    `leaked`: cells of situations that the map does not call measured; `unended`: situations that a
-    pull finds open when their alert is over; `readers_failed`: of GDAL, geopandas and, where it is
-    there, ogrinfo.
+    `leaked`: cells of situations that the map does not call measured. `unended`: situations that
+    are still open when their alert is over. `readers_failed`: failures among GDAL, geopandas and,
+    if installed, ogrinfo.
     """
     street.PARTS["melted"] = street.PARTS["ice"]._replace(mu=0.85)
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
@@ -194,7 +196,7 @@ def measure_publication() -> dict[str, float]:
 
 
 def fetch_publication(address: str) -> bytes:
-    """Return the publication; an empty one if there is none yet."""
+    """Return the page's current publication, or an empty one if there is none yet."""
     try:
         with urllib.request.urlopen(f"{address}datex2/situation.xml", timeout=30) as answer:
             found: bytes = answer.read()
@@ -204,7 +206,7 @@ def fetch_publication(address: str) -> bytes:
 
 
 def count_features(address: str) -> int:
-    """Return the number of features."""
+    """Return the number of features that the page's OGC API returns, or 0 without an answer."""
     try:
         with urllib.request.urlopen(f"{address}collections/grip/items", timeout=30) as answer:
             return int(json.loads(answer.read())["numberReturned"])
@@ -213,7 +215,7 @@ def count_features(address: str) -> int:
 
 
 def cells_of(document: bytes) -> set[int]:
-    """Return the number of cells that have a situation."""
+    """Return the cells that lie in a situation of a publication."""
     found = set[int]()
     for record in list_records(document):
         words = record.findtext(".//loc:posList", "", _SPACES).split()
@@ -226,13 +228,13 @@ def cells_of(document: bytes) -> set[int]:
 
 
 def measured_cells(table: pa.Table) -> set[int]:
-    """Return the number of cells for which the map has a value."""
+    """Return the cells of a map table whose basis is `measured`."""
     is_measured = np.array(table["basis"].to_pylist()) == "measured"
     return set(table["cell"].to_numpy()[is_measured].tolist())
 
 
 def can_open(reader: str, address: str) -> bool:
-    """Return True if a reader has all features, the bounds among them without a value."""
+    """Return True if a program reads all features, and lower bounds without a value of μ."""
     script = READERS[reader].format(address=address) + _COUNT
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False
@@ -246,7 +248,7 @@ def can_open(reader: str, address: str) -> bool:
 
 
 def ogrinfo_opens(address: str) -> bool:
-    """Return True if GDAL's program lists all features."""
+    """Return True if GDAL's program ogrinfo lists all features."""
     words = ["ogrinfo", "-ro", "-al", "-q", f"OAPIF:{address}", "grip"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
     held = done.stdout.count("OGRFeature(grip)") == street.count_known("ice", "passed", "wet")
@@ -256,7 +258,9 @@ def ogrinfo_opens(address: str) -> bool:
 
 
 def join_right() -> float:
-    """Return `roads.join_right` of this commit, from an earlier `make roads-bench` or measured now."""
+    """Return the figure `roads.join_right` of this commit, from an earlier `make roads-bench` or
+    measured now.
+    """
     path = roads.FOLDER / "figures.json"
     rows = json.loads(path.read_text()) if path.exists() else [{}]
     if rows[0].get("commit") != figures.commit(Path(roads.__file__)):

@@ -1,5 +1,5 @@
-"""Test set-up for the page: a router, a substitute for the service with a town of twenty thousand
-cells, and the page.
+"""Test set-up for the page: a router, a simulated service with a town of twenty thousand cells, and
+the page.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ BOUND_SHARE: Final = 0.3
 
 
 class Town:
-    """Cells by tile. Changes are published as a service publishes them."""
+    """Cells of a simulated town by tile. Changes are published as a service publishes them."""
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
@@ -50,7 +50,9 @@ class Town:
         self.marker = next(iter(self.tiles))
 
     def local_marker(self, tile: int) -> int:
-        """Return the index of a tile's marker cell, whose vehicle count is the number of the put."""
+        """Return the index of a tile's marker cell, whose vehicle count is the number of the
+        publication.
+        """
         return int(self.tiles[tile]["cell"][0]) & 0x3FFF
 
     def _draw_columns(self, cells: IntArray) -> dict[str, Any]:
@@ -87,7 +89,7 @@ class Town:
         }
 
     def make_batch(self, tile: int) -> pa.RecordBatch:
-        """Return a tile in the schema of the map."""
+        """Return a tile as a record batch with the schema of the map."""
         columns = ((self.tiles[tile][f.name], f.type) for f in tables.MAP_SCHEMA)
         arrays = [
             (c if isinstance(c, pa.Array) else pa.array(c)).cast(kind, safe=False)
@@ -96,7 +98,9 @@ class Town:
         return pa.RecordBatch.from_arrays(arrays, schema=tables.MAP_SCHEMA)
 
     def change_cells(self, tile: int, cells: int, number: int) -> bytes:
-        """Change so many cells of a tile, and its marker; the tile as it is put."""
+        """Change `cells` cells of a tile and set its marker to `number`. Return the tile's bytes
+        for publication.
+        """
         columns = self.tiles[tile]
         which = self.rng.choice(len(columns["cell"]) - 1, cells, replace=False) + 1
         columns["vehicles"][which] = self.rng.integers(1, 250, cells)
@@ -106,7 +110,7 @@ class Town:
 
 
 class Stage(NamedTuple):
-    """Address of the page, a session, the town, and the process of the page."""
+    """Address of the page, a Zenoh session, the town, and the process of the page."""
 
     address: str
     session: zenoh.Session
@@ -117,7 +121,7 @@ class Stage(NamedTuple):
 
 @contextmanager
 def open_stage(seed: int) -> Iterator[Stage]:
-    """Yield the running set-up, with the page as its command in a process of its own."""
+    """Yield the running set-up; the page runs in a separate process."""
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     settings = ZenohSettings(connect=endpoints)
     town = Town(seed)
@@ -146,7 +150,7 @@ def open_stage(seed: int) -> Iterator[Stage]:
 
 
 def tiles_of(address: str) -> int:
-    """Return the number of tiles that the page knows."""
+    """Return the number of tiles that the page has received."""
     import json
     import urllib.request
 
@@ -161,6 +165,6 @@ def seen_town(address: str, town: Town) -> str:
 
 
 def pin_to_core(process: subprocess.Popen[str], core: int) -> None:
-    """Keep a process on one core."""
+    """Restrict all threads of a process to one core."""
     for thread in Path(f"/proc/{process.pid}/task").iterdir():
         os.sched_setaffinity(int(thread.name), {core})

@@ -1,4 +1,6 @@
-"""The map of a past moment over Zenoh, and the map after a restart compared with the one before."""
+"""Benchmarks of a map of the past over Zenoh, and of the map after a restart compared with the map
+before.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +35,8 @@ QUERIES = 15
 
 
 def measure_past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
-    """Return the milliseconds of a query with `at=` for a thousand cells, and the largest change of
-    a probability by a restart.
+    """Measure the time [ms] of a query with `at=` for a thousand cells, and the largest change of a
+    probability by a restart.
     """
     synthetic.write_archive(root, WORLD)
     compact(root)
@@ -77,7 +79,7 @@ def _find_largest_change(
 
 @contextmanager
 def _open_service(root: Path) -> Iterator[zenoh.Session]:
-    """Yield a client of a running service on the archive."""
+    """Yield a client's session to a running service on the archive."""
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     settings = ZenohSettings(connect=endpoints)
     lines: list[str] = []
@@ -100,8 +102,8 @@ def _open_service(root: Path) -> Iterator[zenoh.Session]:
 
 
 def _time_answer(session: zenoh.Session, selector: str) -> tuple[float, list[pa.Table]]:
-    """Return the seconds of an answer and its tiles. Repeat the query while the previous past map
-    is still open.
+    """Return the time [s] of an answer, and its tiles. Repeat the query while another past map is
+    being computed.
     """
     while True:
         began = time.perf_counter()
@@ -116,7 +118,7 @@ def _time_answer(session: zenoh.Session, selector: str) -> tuple[float, list[pa.
 
 
 def _time_queries(root: Path) -> tuple[list[float], int]:
-    """Return the seconds of each query, and the number of cells in the answers."""
+    """Return the time [s] of each query, and the number of cells in the answers."""
     rng = np.random.default_rng(0)
     step = 360.0 / (1 << grid.CELL_ZOOM)
     spent = []

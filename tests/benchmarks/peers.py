@@ -1,4 +1,6 @@
-"""The same filter (f, h, Q and R) as people would write it in numpy, or take it from a library."""
+"""The benchmark's filter (same f, h, Q and R) in plain NumPy and in filter libraries, for
+comparison of their speed.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ PYTHON_STEPS = 300  # enough for a median: these are slow
 
 
 class Problem(NamedTuple):
-    """Input of a peer."""
+    """Input of the compared filters: vehicle, readings, first speed, and time step."""
 
     row: FloatArray  # (12,) of the vehicle
     readings: FloatArray  # (T, 11)
@@ -24,7 +26,9 @@ class Problem(NamedTuple):
     speed: float  # [m/s] at the first
 
     def start(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Mean (6,), covariance (6, 6), Q (6, 6) per sample and R (3, 3)."""
+        """Return mean (6,), covariance (6, 6), process noise Q (6, 6) per sample and measurement
+        noise R (3, 3).
+        """
         setting = Setting()
         mean = np.array([self.speed, 0.0, *self.readings[0, :3], setting.mu])
         noise = np.diag(setting.process) * self.gone / STEP_S
@@ -32,14 +36,16 @@ class Problem(NamedTuple):
 
 
 class Peer(NamedTuple):
-    """A library's filter, and the required speed ratio of the bank to it."""
+    """Filter of a library, and the required ratio of our bank's speed to that of the library."""
 
     drive: Callable[[Problem], object]
     bar: float
 
 
 def by_numpy(problem: Problem) -> FloatArray:
-    """A cubature filter on numpy arrays, its points moved together; the mean at the end (6,)."""
+    """Run a cubature filter on NumPy arrays, with all points moved together. Return the last mean
+    (6,).
+    """
     mean, cov, noise, R = problem.start()
     n = len(mean)
     xi = np.sqrt(n) * np.concatenate([np.eye(n), -np.eye(n)])
@@ -60,7 +66,7 @@ def by_numpy(problem: Problem) -> FloatArray:
 
 
 def by_filterpy(problem: Problem) -> FloatArray:
-    """filterpy's cubature filter; the mean at the end (6, 1)."""
+    """Run filterpy's cubature filter. Return the last mean (6, 1)."""
     from filterpy.kalman import CubatureKalmanFilter
 
     inputs: dict[str, FloatArray] = {}
@@ -84,7 +90,7 @@ def by_filterpy(problem: Problem) -> FloatArray:
 
 
 def by_stonesoup(problem: Problem) -> FloatArray:
-    """Stone Soup's cubature predictor and updater; the mean at the end (6, 1)."""
+    """Run Stone Soup's cubature predictor and updater. Return the last mean (6, 1)."""
     from stonesoup.models.measurement.linear import LinearGaussian
     from stonesoup.models.transition.base import TransitionModel
     from stonesoup.predictor.kalman import CubatureKalmanPredictor
@@ -97,7 +103,7 @@ def by_stonesoup(problem: Problem) -> FloatArray:
     inputs: dict[str, FloatArray] = {}
 
     class Motion(TransitionModel):  # type: ignore[misc]
-        """f with Q."""
+        """Transition model with the function f and the process noise Q."""
 
         ndim_state = 6
 

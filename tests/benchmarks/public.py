@@ -1,5 +1,5 @@
-"""Cost of keeping persons private, for cells that a lone vehicle visited, over that of a map which
-shows every visit.
+"""Benchmark of privacy: cost for cells that a lone vehicle visited, compared with a map that shows
+every visit.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _NOW = START + 10 * PERIOD_NS
 
 
 def public() -> list[Figure]:
-    """Public cells: microseconds per cell that is read, and per visit that is fused."""
+    """Measure the cost of public cells [µs]: per cell that is read, and per visit that is fused."""
     private, public = _Map(1), _Map(LEAST)
     seen, plain = (1e6 * s / CELLS for s in time_in_turn(public.read, private.read))
     # a turn each of warm-up and ROUNDS
@@ -42,7 +42,7 @@ def public() -> list[Figure]:
 
 
 class _Map:
-    """Map of CELLS published cells, each visited by one more vehicle since."""
+    """Map of CELLS published cells, each visited by one more vehicle since its publication."""
 
     def __init__(self, least: int) -> None:
         fusion = Fusion(120.0)

@@ -1,4 +1,4 @@
-"""The process and measurement models of kernel.c in numpy, for filters of libraries."""
+"""Process and measurement models of kernel.c in NumPy, for the filters of libraries."""
 
 from __future__ import annotations
 
@@ -17,7 +17,14 @@ OMEGA = 7
 def move(
     points: FloatArray, row: FloatArray, before: FloatArray, now: FloatArray, gone: float
 ) -> FloatArray:
-    """f: states (P, 6) after `gone` [s] by Heun's rule; row (12,), before and now (11,)."""
+    """Return the states (P, 6) after `gone` seconds by Heun's rule, the process function f.
+
+    Args:
+        points: states (P, 6).
+        row: vehicle parameters (12,).
+        before, now: readings (11,) at both ends of the step.
+        gone: length of the step [s].
+    """
     mu = np.clip(points[:, 5], LOWER, UPPER)
     vx = points[:, 0]
     vy = points[:, 1]
@@ -48,7 +55,9 @@ def compute_response(
     readings: FloatArray,
     mu: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(a_x, a_y, yaw acceleration), each (P,), of four Dugoff tyres."""
+    """Return longitudinal, lateral and yaw acceleration, each (P,), of a vehicle with four Dugoff
+    tyres.
+    """
     front = np.array([True, True, False, False])
     left = np.array([1.0, -1.0, 1.0, -1.0])
     base = row[Parameter.TO_FRONT] + row[Parameter.TO_REAR]
@@ -95,5 +104,5 @@ def compute_response(
 
 
 def predict_measurement(points: FloatArray) -> FloatArray:
-    """h: a_x, a_y and yaw rate (P, 3) of states (P, 6)."""
+    """Return a_x, a_y and yaw rate (P, 3) of states (P, 6), the measurement function h."""
     return points[:, 2:5]

@@ -1,7 +1,8 @@
-"""`make roads-bench`: how often the join of cells to links is right, against SUMO's traffic in the
-centre of Helsinki.
+"""`make roads-bench`: share of positions for which the join of cells to road links is right,
+measured with SUMO's traffic in the centre of Helsinki.
 
-Each fix has an error of NOISE_M on either axis. Writes `.roads/figures.json` and prints the table.
+Each position has a random error of NOISE_M in each axis. Writes `.roads/figures.json` and prints
+the table.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ SECONDS = 600
 
 
 class Traffic(NamedTuple):
-    """Fixes of moving vehicles, each (n,): [deg], yaw [rad from east], and the way that they
-    were on.
+    """Positions of moving vehicles, arrays of shape (n,): latitude and longitude [deg], yaw [rad
+    from east], and the id of the OpenStreetMap way on which the vehicle was.
     """
 
     latitude: FloatArray
@@ -40,7 +41,9 @@ class Traffic(NamedTuple):
 
 
 def simulate_traffic(sumo: Sumo, seed: int) -> Traffic:
-    """Random trips through the town for SECONDS, a fix a second of each vehicle that moves."""
+    """Return one position per second of each moving vehicle, from random trips through the town
+    during SECONDS.
+    """
     sumo.draw_trips(SECONDS, 0.7, seed)
     rows = pd.read_parquet(sumo.drive_trips(SECONDS + 300, 1, seed))
     rows = rows[(rows.vehicle_speed > 1.0) & ~rows.vehicle_lane.str.startswith(":")]
@@ -50,7 +53,9 @@ def simulate_traffic(sumo: Sumo, seed: int) -> Traffic:
 
 
 def judge_join(network: RoadNetwork, traffic: Traffic, seed: int) -> dict[str, float]:
-    """Return the shares of fixes for which the join is right."""
+    """Return figures by name: shares of positions whose joined link or street is right, and
+    reference numbers.
+    """
     rng = np.random.default_rng(seed)
     east = METRES_PER_DEGREE * np.cos(np.radians(traffic.latitude))
     error = rng.normal(0.0, NOISE_M, (2, len(east)))
@@ -77,7 +82,7 @@ def judge_join(network: RoadNetwork, traffic: Traffic, seed: int) -> dict[str, f
 
 
 def main() -> int:
-    """Drive, join, judge; 1 where a bar does not hold."""
+    """Simulate, join and measure. Return 1 if a figure misses its target, otherwise 0."""
     sumo = Sumo(FOLDER)
     network = read_network(sumo.extract)
     found = [judge_join(network, simulate_traffic(sumo, seed), seed) for seed in SEEDS]

@@ -1,7 +1,7 @@
-"""Running service under load: queries compared with a bare queryable, and alerts from publication
-to subscriber.
+"""Benchmark of a running service under load: queries compared with a bare Zenoh queryable, and the
+time of alerts from publication to a subscriber.
 
-Router, service, load, bare queryable and client are processes of their own, as in life.
+Router, service, load, bare queryable and client run in separate processes.
 """
 
 from __future__ import annotations
@@ -50,7 +50,9 @@ _X, _Y = (
 
 
 def make_batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice: bool) -> Batch:
-    """Return visits to cells of the tile, dated now: grip used, or ice."""
+    """Return visits to cells of the tile, dated now. They report ice if `ice` is True, otherwise
+    only the grip used.
+    """
     cell = grid.interleave(_X + column.astype(np.int64), _Y + row.astype(np.int64))
     latitude, longitude = grid.centre(cell)
     n = len(cell)
@@ -85,7 +87,7 @@ def make_batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice:
 
 
 def put_batch(session: zenoh.Session, one: Batch) -> None:
-    """Put a batch on its vehicle's key."""
+    """Publish a batch on its vehicle's key."""
     session.put(
         keys.observation_key(one.region, one.vehicle),
         wire.encode(one),
@@ -94,7 +96,7 @@ def put_batch(session: zenoh.Session, one: Batch) -> None:
 
 
 def load(endpoint: str) -> None:
-    """Send RATE observations a second of unexcited visits until this process is ended."""
+    """Send RATE observations per second, all with little grip used, until this process is ended."""
     rng = np.random.default_rng(0)
     seq = 0
     began = time.monotonic()
@@ -111,7 +113,7 @@ def load(endpoint: str) -> None:
 
 
 def bare(endpoint: str, folder: str) -> None:
-    """Answer with the bytes of two files and nothing else until this process is ended."""
+    """Answer every query with the bytes of one of two files, until this process is ended."""
     session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None
 
@@ -148,7 +150,7 @@ def fetch_reply(session: zenoh.Session, selector: str) -> bytes:
 
 
 def poll_until(something: Callable[[], object]) -> None:
-    """Repeat a query until the answer is not empty."""
+    """Repeat a query until its answer is not empty. Raise TimeoutError after two minutes."""
     deadline = time.monotonic() + 120.0
     while not something():
         if time.monotonic() > deadline:
@@ -157,7 +159,9 @@ def poll_until(something: Callable[[], object]) -> None:
 
 
 def durations_ms(*works: Callable[[], object]) -> list[list[float]]:
-    """Return the times of QUERIES rounds of all works in turn."""
+    """Return for each function its durations [ms] in QUERIES rounds; in each round the functions
+    run in turn.
+    """
     out: list[list[float]] = [[] for _ in works]
     for _ in range(QUERIES):
         for work, times in zip(works, out, strict=True):
@@ -168,10 +172,10 @@ def durations_ms(*works: Callable[[], object]) -> list[list[float]]:
 
 
 def alert_delays_ms(session: zenoh.Session) -> list[float]:
-    """Measure the time from the second vehicle's publish to the alert of its cell at a subscriber,
-    each far from all others.
+    """Return the times [ms] from the second vehicle's publication to the alert of its cell at a
+    subscriber. The cells are far from each other.
 
-    Alerts of neighbours, and alerts repeated for subscribers that were away, do not count.
+    Alerts of neighbouring cells, and alerts that are published again, do not count.
     """
     heard: SimpleQueue[tuple[int, float]] = SimpleQueue()
 
@@ -198,11 +202,11 @@ def alert_delays_ms(session: zenoh.Session) -> list[float]:
 
 
 def ack_delays_s(session: zenoh.Session) -> list[float]:
-    """Return the time from a vehicle's publication to its acknowledgement, for batches sent at
+    """Return the times [s] from a vehicle's publication to its acknowledgement, for batches sent at
     random times.
 
     Raises:
-        TimeoutError: one was not acknowledged.
+        TimeoutError: a batch was not acknowledged.
     """
     heard: SimpleQueue[tuple[int, float]] = SimpleQueue()
 
@@ -233,8 +237,8 @@ def ack_delays_s(session: zenoh.Session) -> list[float]:
 
 
 def service() -> list[Figure]:
-    """Return figures of queries, alerts and acknowledgements under 20 000 observations/s, compared
-    with a queryable that does nothing.
+    """Measure queries, alerts and acknowledgements under 20 000 observations/s, and compare queries
+    with those of a bare queryable.
     """
     tile = keys.map_key(_TILE)
     west, south, east, north = (

@@ -1,8 +1,8 @@
-"""Two services with a region each compared with one with both: a burst until the last of it is
-acknowledged.
+"""Benchmark of two services with one region each, compared with one service with both regions: time
+from a burst of messages to its last acknowledgement.
 
-Twice: the engines alone, a process each, on messages in memory; and whole services over Zenoh,
-where the router and the sender need a share of the same cores, unlike in a fleet.
+It is measured twice. First with engines alone, in separate processes, on messages in memory. Then
+with whole services over Zenoh, where router and sender use the same cores, unlike in a real fleet.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ PATIENCE_S: Final = 120.0
 
 
 def shards() -> list[Figure]:
-    """Measure a burst into one service and into two that share its regions, with engines alone and
-    over Zenoh.
+    """Measure a burst into one service and into two services that share its regions, with engines
+    alone and over Zenoh.
     """
     sent = [_make_burst(k) for k in range(ROUNDS + 1)]
     alone = [statistics.median(engines_s(sent, split)) for split in (1, 2)]
@@ -66,8 +66,8 @@ def shards() -> list[Figure]:
 
 
 def engines_s(bursts: Sequence[Sequence[Message]], processes: int) -> list[float]:
-    """Return the time from the start signal to the last acknowledgement of every burst except the
-    first.
+    """Return the time [s] from the start signal to the last acknowledgement of every burst except
+    the first.
     """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -93,8 +93,8 @@ def engines_s(bursts: Sequence[Sequence[Message]], processes: int) -> list[float
 
 
 def _time_round(running: Sequence[subprocess.Popen[str]]) -> float:
-    """Start a round in all processes, and wait until all have finished it. The first round is a
-    warm-up.
+    """Start a round in all processes, and return the time [s] until all have finished. The first
+    round is a warm-up.
     """
     began = time.perf_counter()
     for process in running:
@@ -107,7 +107,7 @@ def _time_round(running: Sequence[subprocess.Popen[str]]) -> float:
 
 
 def engine(root: str) -> None:
-    """Run one engine that ingests a burst for each line of standard input."""
+    """Run one engine that ingests one burst per line of standard input."""
     bursts = [
         [Message(*fields) for fields in burst]
         for burst in pickle.loads((Path(root) / "sent").read_bytes())
@@ -124,7 +124,7 @@ def engine(root: str) -> None:
 
 
 def _make_burst(number: int) -> list[Message]:
-    """Return messages of both regions in alternation."""
+    """Return messages for two regions, alternating."""
     now = time.time_ns()
     west, east = (
         make_messages(BURST, ROWS, now, VEHICLES, number * BURST, side) for side in (0, 1)
@@ -133,13 +133,13 @@ def _make_burst(number: int) -> list[Message]:
 
 
 def list_regions(burst: Sequence[Message]) -> list[str]:
-    """Return the two region expressions of a burst."""
+    """Return the region part of the keys of both regions of a burst."""
     return ["/".join(message.key.split("/")[3:6]) for message in burst[:2]]
 
 
 def services_s(bursts: Sequence[Sequence[Message]], services: int) -> list[float]:
-    """Return the time from the first put to the last acknowledgement of every burst except the
-    first.
+    """Return the time [s] from the first message to the last acknowledgement of every burst except
+    the first.
     """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))

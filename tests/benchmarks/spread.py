@@ -1,5 +1,5 @@
-"""Drives and zones processed by Spark, compared with the same ones processed here; `make
-batch-bench` counts the differences.
+"""Benchmark of Spark: drives and zones processed by Spark are compared with the same ones processed
+in this process. `make batch-bench` counts the differences.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ ROUNDS: Final = 3
 
 
 def simulate_drives(folder: Path) -> list[Path]:
-    """Signal logs, each with its vehicle file, made with the seeds."""
+    """Simulate one drive per seed, and return the paths of the signal logs; vehicle files lie next
+    to them.
+    """
     folder.mkdir()
     for seed in SEEDS:
         files = [
@@ -55,8 +57,8 @@ def simulate_drives(folder: Path) -> list[Path]:
 
 
 def replay_difference(logs: Sequence[Path], folder: Path) -> float:
-    """Count files of estimates that differ from those of this machine, although each task was
-    killed once.
+    """Return the number of estimate files from Spark that differ from those of this process,
+    although each Spark task was killed once.
     """
     here = folder / "here"
     there = folder / "there"
@@ -98,8 +100,8 @@ def rebuild_difference(folder: Path) -> float:
 
 
 def replay_scaling(logs: Sequence[Path], folder: Path) -> float:
-    """Return drives per second on two local cores divided by that on one: median of alternate
-    rounds with warm workers.
+    """Return drives per second on two local cores divided by that on one core, the median of
+    alternating rounds with warm workers.
     """
     tasks = [
         Task(log, log.with_suffix(".json"), folder / f"{log.stem}-{copy}.parquet")

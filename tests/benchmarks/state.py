@@ -1,8 +1,9 @@
-"""A million cells: a checkpoint while ingest goes on, and a restart from it with the rows since.
+"""Benchmark of a million cells: a checkpoint during ingest, and a restart from this checkpoint and
+the later rows.
 
-A restart begins from the checkpoint. It is requested as the service's upkeep does, while a worker
-takes messages all the time. The restart is a process of its own: imports, checkpoint, rows since,
-kernels, session, ready.
+The checkpoint is requested by a background thread, as in the service, while a worker ingests
+messages. The restart is a separate process: imports, checkpoint, later rows, kernels, session,
+ready.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ SECOND: Final = 10**9
 
 
 def state() -> list[Figure]:
-    """Return figures of a checkpoint of 10^6 cells during ingest, and of a restart from it."""
+    """Measure a checkpoint of 10⁶ cells during ingest, and a restart from it."""
     now = START + int(SPAN_S) * SECOND
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -68,10 +69,10 @@ def state() -> list[Figure]:
 
 
 def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> tuple[float, float]:
-    """Return the time from the request to the checkpoint on disk, and the worker's longest turn
-    meanwhile [s].
+    """Return the time [s] from the request until the checkpoint is on disk, and the worker's
+    longest turn meanwhile [s].
 
-    All of `sent` is taken, half of it after the checkpoint.
+    All messages of `sent` are ingested, half of them after the checkpoint.
     """
     parts = [sent[at : at + TURN] for at in range(0, len(sent), TURN)]
     turns: list[float] = []
@@ -102,7 +103,9 @@ def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> t
 
 
 def restart_s(folder: Path, root: Path) -> float:
-    """Return the time from the start of the process until it reports that it is ready."""
+    """Return the time [s] from the start of the service's process until it reports that it is
+    ready.
+    """
     router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
     with router:
         config = folder / "service.json"

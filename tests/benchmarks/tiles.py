@@ -1,8 +1,8 @@
-"""Thin traffic over many tiles: the delay of an acknowledgement meanwhile, and the age of a tile
-for a client that asks for all of them.
+"""Benchmark of thin traffic over many tiles: delay of acknowledgements, and age of a tile for a
+client that queries all tiles.
 
-1 600 vehicles, each in a row of five tiles of its own, go back and forth and send a visit each 1.07
-s. Router, service, vehicles and readers are processes of their own.
+1 600 vehicles each drive to and fro in their own row of five tiles, and send a visit every 1.07 s.
+Router, service, vehicles and readers run in separate processes.
 """
 
 from __future__ import annotations
@@ -62,7 +62,9 @@ _ROWS = _ACROSS // ROW
 
 
 def make_visit(vehicle: int, turn: int) -> Batch:
-    """Return a visit of a vehicle to the middle of one of its tiles."""
+    """Return a batch with a visit of a vehicle to the middle of the tile that it
+    reaches in a turn.
+    """
     first = grid.cell_of(LATITUDE, LONGITUDE, grid.REGION_ZOOM)
     x, y = (int(v) for v in grid.deinterleave(first))
     region, place = divmod(vehicle, _ROWS * _ACROSS)
@@ -87,7 +89,7 @@ def make_visit(vehicle: int, turn: int) -> Batch:
 
 
 class Acks:
-    """Record when each batch was put and how long it waited for its acknowledgement."""
+    """Record of when each batch was sent, and how long it waited for its acknowledgement."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.put: dict[tuple[str, int], float] = {}
@@ -103,15 +105,17 @@ class Acks:
                     self.waits[vehicle, seq] = now - self.put[vehicle, seq]
 
     def waits_since(self, since: float) -> list[float]:
-        """Return the waits of batches that were put since then; infinite where nothing came."""
+        """Return the waits [s] of batches that were sent after `since`; infinity without an
+        acknowledgement.
+        """
         return [
             self.waits.get(name, float("inf")) for name, at in list(self.put.items()) if at >= since
         ]
 
 
 def drive(endpoint: str) -> None:
-    """Send until the time is over, wait for the remaining acknowledgements, and print how long each
-    took.
+    """Send visits for the given time, wait for the remaining acknowledgements, and print how long
+    each batch waited.
     """
     session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None
@@ -157,7 +161,7 @@ def drive(endpoint: str) -> None:
 
 
 def read(endpoint: str) -> None:
-    """Ask for the whole map again and again; a line for each whole answer."""
+    """Query the whole map again and again, and print a line for each complete answer."""
     session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None
     while True:
@@ -167,8 +171,8 @@ def read(endpoint: str) -> None:
 
 
 def _time_answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[float], int]:
-    """Return the times [ms] of queries for one tile while READERS query everything, until each
-    has an answer.
+    """Return the times [ms] of queries for one tile while READERS readers query everything, until
+    each reader has an answer. Also return the smallest number of tiles that a reader received.
     """
     words = [sys.executable, "-c", f"from tests.benchmarks.tiles import read; read({endpoint!r})"]
     readers = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(READERS)]
@@ -202,8 +206,8 @@ def _collect_counts(reader: subprocess.Popen[str], got: list[int]) -> None:
 
 
 def tiles() -> list[Figure]:
-    """Measure acknowledgements, tiles put, and a small query behind large ones, with 1 500 visits/s
-    over 8 000 tiles.
+    """Measure acknowledgements, published tiles, and a small query behind large ones, at 1 500
+    visits/s over 8 000 tiles.
     """
     puts: dict[str, int] = {}
 

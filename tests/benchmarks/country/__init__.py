@@ -1,1 +1,3 @@
-"""A city whose streets and speeds are real, and a country made of what its vehicles reported."""
+"""Benchmarks on a city with real streets and speeds, and on a country made of copies of the city's
+reports.
+"""

@@ -1,8 +1,8 @@
 """`make country-bench`: a city on SUMO's routes, then a country of a hundred thousand vehicles for
 ten minutes.
 
-Writes `.country/figures.json`, `.country/country.png`, and prints the table. `--city DIR` takes the
-observations of a city that was driven before.
+Writes `.country/figures.json` and `.country/country.png`, and prints the table. `--city DIR` uses
+the observations of an earlier run of the city.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ SEED: Final = 30_000
 
 
 def main() -> int:
-    """Drive, send, judge; 1 where a bar does not hold."""
+    """Simulate the city and the country, and measure. Return 1 if a figure misses its target,
+    otherwise 0.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m tests.benchmarks.country", description="A city and a country."
     )

@@ -1,5 +1,5 @@
-"""A city: vehicles with the default estimator on SUMO's routes, their observations fused and
-compared with the truth.
+"""Benchmark on a city: vehicles with the default estimator drive SUMO's routes, and their fused
+observations are compared with the true friction.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ PREFIX: Final = "country.city"
 
 
 def simulate_city(sumo: Sumo, folder: Path, seed: int) -> list[Figure]:
-    """Drive, fuse and judge; the observations stay in `folder`/NAME for the country."""
+    """Simulate the drives, fuse the observations, and compare the map with the true friction. The
+    observations stay in `folder`/NAME for the country.
+    """
     folder.mkdir(parents=True, exist_ok=True)
 
     def drive_fleet(into: Path) -> None:

@@ -1,8 +1,8 @@
-"""Memory cost per vehicle, per cell, and per cell of a vehicle, with an engine in a process of its
-own.
+"""Memory cost of a service per vehicle, per cell, and per pair of cell and vehicle, measured with
+an engine in a separate process.
 
-The same number of observations goes through it each time, in messages that are equal except for the
-varied quantity, so that the window of late observations has the same size.
+Each run ingests the same number of observations, in messages that differ only in the varied
+quantity. Therefore the window of late observations has the same size in all runs.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TURN: Final = 512
 
 
 class Coefficients(NamedTuple):
-    """Memory of a service, in bytes."""
+    """Memory cost of a service [bytes]."""
 
     vehicle_bytes: float
     cell_bytes: float
@@ -41,7 +41,7 @@ class Coefficients(NamedTuple):
 
 
 def measure_coefficients() -> Coefficients:
-    """Return the memory at present."""
+    """Measure the memory cost, and return the coefficients."""
     few, vehicles, cells = (_measure_growth(kind) for kind in ("few", "vehicles", "cells"))
     return Coefficients(
         (vehicles[0] - few[0]) / (MANY - FEW), (cells[0] - few[0]) / (cells[1] - few[1]), few[2]
@@ -49,8 +49,8 @@ def measure_coefficients() -> Coefficients:
 
 
 def _measure_growth(kind: str) -> tuple[float, float, float]:
-    """Return the bytes that a stream added, the number of cells at the end, and the bytes of the
-    table of pairs, measured in a new process.
+    """Return the bytes of memory that a stream of messages added, the number of cells at the end,
+    and the bytes of the table of (cell, vehicle) pairs, measured in a new process.
     """
     command = [sys.executable, "-m", "tests.benchmarks.country.coefficients", kind]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
@@ -76,7 +76,7 @@ def _make_stream(kind: str) -> list[Message]:
 
 
 def main(kind: str) -> None:
-    """Ingest the stream of that kind, and print the memory that it added."""
+    """Ingest a stream of the given kind, and print the memory that it added [bytes]."""
     sent = _make_stream(kind)
     with (
         tempfile.TemporaryDirectory() as folder,

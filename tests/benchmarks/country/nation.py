@@ -1,9 +1,9 @@
-"""A country's stream into several services at once: how far behind they are, what grows, and who
-does how much.
+"""Benchmark of a country's reports, sent to several services at once: delay of the services, growth
+of memory, and processor time of each process.
 
-Router, services and the vehicles' sender are processes of their own, on the machine's two cores
-together; what another machine would do (router and sender of a fleet) is told apart by processor
-time.
+Router, services and the sender of all vehicles run in separate processes on the same two cores. In
+a real deployment router and senders would run on other machines, so processor time is measured per
+process.
 """
 
 from __future__ import annotations
@@ -42,9 +42,13 @@ _TICKS: Final = os.sysconf("SC_CLK_TCK")
 
 
 class Look(NamedTuple):
-    """One moment: time since the beginning [s]; of each process memory [MB], but the sender's (the
-    least since the look before: a segment takes and gives back twenty), and processor time [s]; of
-    each service cells, rows admitted, messages that wait."""
+    """Sample of the run at one moment.
+
+    `time` is the time since the beginning [s]. `memory` is the memory of each process except the
+    sender [MB], the minimum since the previous sample, because a segment temporarily needs 20 MB.
+    `spent` is the processor time of each process [s]. `cells`, `rows` (admitted) and `queued`
+    (waiting messages) are numbers per service.
+    """
 
     time: float
     memory: list[float]
@@ -55,13 +59,13 @@ class Look(NamedTuple):
 
 
 def spent_s(part: Part) -> float:
-    """Return the processor time of a process and of its child processes that have ended."""
+    """Return the processor time [s] of a process and of its child processes that have ended."""
     fields = Path(f"/proc/{part.pid}/stat").read_text().rpartition(")")[2].split()
     return sum(int(field) for field in fields[11:15]) / _TICKS
 
 
 class Service(NamedTuple):
-    """A service of the country, and the address of its metrics."""
+    """Service of the country, with the address of its metrics."""
 
     part: Part
     archive: Path
@@ -89,7 +93,7 @@ class Service(NamedTuple):
 
 
 def start_service(folder: Path, endpoint: str, name: str, region: str) -> Service:
-    """Yield a service that is ready."""
+    """Start a service, and return it when it is ready."""
     config = ServiceConfig(
         name=name,
         regions=[region],
@@ -111,7 +115,7 @@ def start_service(folder: Path, endpoint: str, name: str, region: str) -> Servic
 def simulate_nation(
     city: Path, folder: Path, seed: int, coefficients: Coefficients
 ) -> list[Figure]:
-    """Drive the country and measure; its course stays in `folder`/course.npz."""
+    """Run the country and measure. The samples stay in `folder`/course.npz."""
     country = Country(city, seed)
     seconds = WARM_S + MEASURED_S
     with ExitStack() as stack:
@@ -177,7 +181,7 @@ def simulate_nation(
 
 
 def _watch_parts(parts: Sequence[Part], services: Sequence[Service], sender: Part) -> list[Look]:
-    """Sample every EVERY_S seconds until the sender, which ends last, has ended."""
+    """Return samples taken every EVERY_S seconds until the sender, which ends last, has ended."""
     looks: list[Look] = []
     began = time.monotonic() - SAYS_S
     least = [float("inf")] * (len(parts) - 1)
@@ -211,14 +215,14 @@ def _watch_parts(parts: Sequence[Part], services: Sequence[Service], sender: Par
 
 
 def _update_least(before: list[float], parts: Sequence[Part]) -> list[float]:
-    """Return the memory of each process but the last: its memory now, or the earlier one if that
-    was less.
+    """Return for each process except the last the smaller of its earlier memory and its memory now
+    [MB].
     """
     return [min(then, memory_mb(part)) for then, part in zip(before, parts[:-1], strict=True)]
 
 
 def _last_line(sender: Part) -> dict[str, float]:
-    """Return the last complete line of the output."""
+    """Return the last complete line of the sender's output, which is JSON."""
     whole = [line for line in sender.read_lines() if line.endswith("}")]
     said: dict[str, float] = json.loads(whole[-1])
     return said
@@ -240,7 +244,9 @@ def _save_course(folder: Path, looks: Sequence[Look]) -> None:
 
 
 def _make_wait_figures(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure]:
-    """Return the waiting times of the batches of the ten minutes, and the slowest regions."""
+    """Return figures of the waiting times of the batches of the measured ten minutes, and those of
+    the slowest regions.
+    """
     measured = (put >= WARM_S) & (put < WARM_S + MEASURED_S)
     waits = np.where(np.isnan(wait), np.inf, wait)
     halves, most = np.transpose(
@@ -275,8 +281,8 @@ def _make_wait_figures(put: FloatArray, wait: FloatArray, region: FloatArray) ->
 
 
 def _make_growth_figures(looks: Sequence[Look], coefficients: Coefficients) -> list[Figure]:
-    """Return the growth of the services' memory over the ten minutes, and the part due to new
-    cells.
+    """Return figures of the growth of the services' memory over the measured ten minutes, and of
+    the part due to new cells.
     """
     time_s = np.array([look.time for look in looks])
     late = (time_s >= WARM_S) & (
@@ -311,7 +317,7 @@ def _make_growth_figures(looks: Sequence[Look], coefficients: Coefficients) -> l
 
 
 def _make_share_figures(looks: Sequence[Look], observations: int) -> list[Figure]:
-    """Return the processor time of each process in the ten minutes."""
+    """Return figures of the processor time of each process in the measured ten minutes."""
     late = [look for look in looks if look.time >= WARM_S]
     first = late[0]
     last = late[-1]

@@ -1,4 +1,6 @@
-"""Estimate for ten times the vehicles: the country's measured costs times the expected numbers."""
+"""Extrapolation to ten times the vehicles: the country's measured costs times the
+expected numbers.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,11 @@ NEW_PLACES: Final = 1.0
 
 
 def estimate_million(found: Mapping[str, float]) -> list[Figure]:
-    """Return the estimate for a million vehicles at the country's rate each, from measured figures."""
+    """Return estimated figures for a million vehicles that each report at the country's rate.
+
+    Args:
+        found: measured figures of the country by name.
+    """
     rate = FACTOR * found["country.rate"]
     cells = FACTOR * found["country.cells"]
     cores = rate * found["country.service_us"] * 1e-6

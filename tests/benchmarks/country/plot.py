@@ -15,7 +15,12 @@ COLOURS: Final = ("#0072b2", "#d55e00", "#009e73")
 
 
 def draw(course: Path, out: Path) -> None:
-    """Draw the files of a finished course."""
+    """Draw the plot from the files of a finished run.
+
+    Args:
+        course: folder with `course.npz` and `waits.npz`.
+        out: image file to write.
+    """
     with np.load(course / "course.npz") as looks, np.load(course / "waits.npz") as waits:
         time_s = looks["time"]
         memory = looks["memory"]

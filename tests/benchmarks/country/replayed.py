@@ -1,13 +1,14 @@
-"""A country of copies of one town: positions of its vehicles, and the reports of each over time.
+"""Country made of copies of one town: positions of its vehicles, and the reports of each over time.
 
-    regions    17, 17 and 16 in three zones side by side, a service for each zone
-    towns      four in a region; regions are unlike in size, as 1/sqrt(rank)
-    vehicles   each has a piece of the drive of one of the city's, moved by whole tiles, and drives
-               it again and again; those of one town with one drive are spread evenly over it
-    reports    each sends ROWS visits every PERIOD_S, in turn; they take that long: traffic is slow
+    regions    17, 17 and 16 in three zones side by side, one service per zone
+    towns      four in a region; regions have different sizes, proportional to 1/sqrt(rank)
+    vehicles   each repeats a part of the drive of one vehicle of the city, moved by whole tiles;
+               vehicles of one town with the same drive are spread evenly over it
+    reports    each vehicle sends ROWS visits every PERIOD_S, and these visits last PERIOD_S, as in
+               slow traffic
 
-The sender and the observer compute the same country from the seed and the city's observations
-alone.
+The sender and the observer compute the same country independently, from the seed and the city's
+observations.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ class Chunk(NamedTuple):
     """ROWS visits that one vehicle made one after the other.
 
     Attributes:
-        message: its batch, all but who, where and when.
-        x, y: of the positions, columns and rows of cells from the north-western tile of the town,
-            with their fractions.
-        cell_x, cell_y: of the cells that were named, counted in the same way.
-        enter, leave: before the last, as a share of the time that all of them took.
+        message: the batch without vehicle, place and time.
+        x, y: column and row of each position, counted in cells from the north-western tile of the
+            town, with fractions.
+        cell_x, cell_y: column and row of the reported cells, counted in the same way.
+        enter, leave: times before the last visit's end, as a share of the time of all visits.
     """
 
     message: Any
@@ -59,12 +60,12 @@ class Chunk(NamedTuple):
 
 
 class Country:
-    """Return the home region and the repeated drive of each vehicle.
+    """Home region and repeated drive of each vehicle.
 
     Args:
-        folder: of the city's observations.
-        seed: of who lives where.
-        vehicles: how many.
+        folder: folder of the city's observations.
+        seed: seed of the distribution of vehicles over towns.
+        vehicles: number of vehicles.
     """
 
     def __init__(self, folder: Path, seed: int, vehicles: int = VEHICLES) -> None:
@@ -111,7 +112,7 @@ class Country:
         return int(grid.interleave(np.array([x]), np.array([y]))[0])
 
     def encode_report(self, vehicle: int, turn: int, boot: int) -> tuple[str, bytes]:
-        """Return key and bytes of a vehicle's report in its turn, dated now."""
+        """Return key and bytes of the report that a vehicle sends in a turn, dated now."""
         drive = self.drives[self.drive[vehicle]]
         chunk = drive[(self.begin[vehicle] + turn % LOOP) % len(drive)]
         k = int(self.region[vehicle])
@@ -142,8 +143,8 @@ def _compute_shares(count: int) -> FloatArray:
 
 
 def _cut_chunks(columns: dict[str, Any], who: int, corner: IntArray) -> list[Chunk]:
-    """Yield the visits of one vehicle in order of time, ROWS at a time. Fewer visits at the end are
-    left out.
+    """Return the visits of one vehicle in order of time, ROWS per chunk. A remainder of fewer
+    visits is left out.
     """
     mine = np.flatnonzero(columns["vehicle"] == who)
     mine = mine[np.argsort(columns["leave_time"][mine], kind="stable")]

@@ -1,5 +1,5 @@
-"""The country's vehicles: a process that sends their reports, and records how long each batch
-waited for its acknowledgement.
+"""Sender of the country's vehicles: a process that sends their reports, and records how long each
+batch waited for its acknowledgement.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _BLOCK: Final = zenoh.CongestionControl.BLOCK
 
 
 class Waits:
-    """When each vehicle's batches were put and acknowledged [s], each (turns, vehicles); NaN:
-    not yet.
+    """Times [s] at which each vehicle's batches were sent and acknowledged, two arrays of shape
+    (turns, vehicles). NaN means not yet.
     """
 
     def __init__(self, session: zenoh.Session, vehicles: int, turns: int) -> None:
@@ -43,8 +43,8 @@ class Waits:
                 self.acked[first - 1 : last, vehicle] = now
 
     def summarize(self, since: float) -> dict[str, float]:
-        """Return the batches sent and waiting, and the 99 % quantile of finished waits since
-        then [s].
+        """Return the numbers of batches sent and waiting, and the 99 % quantile [s] of the waits
+        that finished after `since`.
         """
         # a copy: it is written meanwhile
         put = self.put
@@ -61,7 +61,9 @@ class Waits:
 
 
 def main() -> int:
-    """Send for so long, wait for the last acknowledgements, write the waits."""
+    """Send for the given time, wait for the last acknowledgements, write the waits, and return the
+    exit code.
+    """
     parser = argparse.ArgumentParser(prog="sender")
     parser.add_argument("endpoint")
     parser.add_argument("city", type=Path, help="folder of the city's observations")

@@ -1,8 +1,9 @@
-"""SUMO's traffic as lanes for our own plant: each vehicle has a lane of its own, with the speeds
-that it had there.
+"""SUMO's traffic as lanes for the simulated vehicles: each vehicle has its own lane, with the
+speeds that it had in SUMO.
 
-SUMO gives only routes and speeds; the plant simulates the tyres. A driver keeps SUMO's speed where
-he believes the road dry, and drives slower elsewhere; where SUMO lets him wait, he creeps.
+SUMO gives only routes and speeds; our vehicle model simulates the tyres. A driver keeps SUMO's
+speed where he believes that the road is dry, and drives slower elsewhere. Where SUMO lets the
+vehicle wait, it creeps.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ ICE_PATCHES = 24
 
 
 class Drive(NamedTuple):
-    """One vehicle's path: points a metre apart (n, 2) [m], and its speed there (n,) [m/s]."""
+    """One vehicle's path: points a metre apart (n, 2) [m], and its speed at each point
+    (n,) [m/s].
+    """
 
     line: FloatArray
     speed: FloatArray
@@ -44,22 +47,22 @@ class Drive(NamedTuple):
 
 @dataclass(frozen=True)
 class Streets(Scenario):
-    """A scenario whose lanes are given."""
+    """Scenario with given lanes."""
 
     lanes: Network | None = None
 
     @property
     def network(self) -> Network:
-        """Return the lanes."""
+        """Return the given lanes as a road network."""
         assert self.lanes is not None
         return self.lanes
 
 
 def simulate_drives(sumo: Sumo, vehicles: int, seconds: int, seed: int) -> list[Drive]:
-    """Paths of the first `vehicles` whose way is long enough for so many seconds.
+    """Return the drives of the first `vehicles` vehicles whose path is long enough for `seconds`.
 
     Raises:
-        RuntimeError: there were fewer.
+        RuntimeError: there are too few such vehicles.
     """
     sumo.draw_trips(6 * vehicles, 2.0, seed, *TRIPS)
     fixes = pd.read_parquet(sumo.drive_trips(6 * vehicles + 900, STEP_S, seed, *CHANGE_S))
@@ -72,7 +75,7 @@ def simulate_drives(sumo: Sumo, vehicles: int, seconds: int, seed: int) -> list[
 
 
 def _make_drive(rows: pd.DataFrame) -> Drive | None:
-    """Return the path of one vehicle, or None if it jumped or did not move."""
+    """Return the drive of one vehicle, or None if the vehicle jumped or did not move."""
     x, y = HELSINKI.from_latlon(rows.vehicle_y.to_numpy(), rows.vehicle_x.to_numpy())
     step = np.hypot(np.diff(x), np.diff(y))
     moves = np.r_[True, step > 0.05]
@@ -98,7 +101,7 @@ def _make_drive(rows: pd.DataFrame) -> Drive | None:
 
 
 def make_streets(found: list[Drive], seed: int) -> Streets:
-    """Return the streets of these drives on random hills, with wet and snowy parts and some ice."""
+    """Return streets along these drives, on random hills, with some wet, snowy and icy parts."""
     allowed = [np.maximum(one.speed, SLOWEST) ** 2 / USUAL_Q for one in found]
     lanes = network_of(
         [one.line for one in found], [[k] for k in range(len(found))], len(found), allowed

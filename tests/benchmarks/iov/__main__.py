@@ -1,5 +1,5 @@
-"""`python -m tests.benchmarks.iov [--only PART …] [--out DIR] [--quick]`: figures of the
-interfaces.
+"""`python -m tests.benchmarks.iov [--only PART …] [--out DIR] [--quick]`: measure the interfaces
+for other vehicles and programs.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ SLOWER: Final = 1.2  # of the time of the quickest route
 
 
 def measure_routes(folder: Path, quick: bool) -> list[Figure]:
-    """Send cars through a town with icy streets, with and without costs of grip."""
+    """Compute routes through a town with icy streets, with and without costs from the friction map,
+    and count those that avoid the ice.
+    """
     draw = np.random.default_rng(SEED)
     engine = routes.Valhalla(folder)
     town = routes.make_town(draw)
@@ -104,7 +106,7 @@ def _route(engine: routes.Valhalla, request: dict[str, Any]) -> dict[str, Any] |
 
 
 def _time(engine: routes.Valhalla, shape: np.ndarray[Any, Any]) -> float:
-    """Return the travel time of a shape, without costs [s]."""
+    """Return the travel time [s] of a route shape without friction costs."""
     points = [{"lat": a, "lon": b} for a, b in shape.tolist()]
     answer = engine.ask(
         "trace_route", {"shape": points, "costing": "auto", "shape_match": routes.EDGE}
@@ -154,7 +156,7 @@ PARTS: Final = {
 
 
 def main() -> int:
-    """Measure all figures. Return 0 if every bar holds."""
+    """Measure all figures. Return 0 if every figure meets its target, otherwise 1."""
     parser = argparse.ArgumentParser(prog="tests.benchmarks.iov", description=__doc__)
     parser.add_argument("--only", nargs="+", choices=PARTS, help="these parts alone")
     parser.add_argument(

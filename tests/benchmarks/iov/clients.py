@@ -1,4 +1,4 @@
-"""The clients in other languages against a router and a service."""
+"""Test of the clients in other languages with a router and a service."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.deploy.clients import PLACES, build_client, missing_tool, run_client,
 
 
 def measure_clients(folder: Path, _quick: bool) -> list[Figure]:
-    """Build and run each client; print the reason of each that is left out or fails."""
+    """Build and run each client. Print the reason for each client that is left out or fails."""
     tested = 0
     failed = 0
     with TemporaryDirectory() as work, served_map(Path(work)) as endpoint:

@@ -1,5 +1,5 @@
-"""DENM of many events through an interchange: validity by a second decoder, identity over
-restarts, and rate.
+"""Benchmark of DENM for many events through an interchange: validity checked by a second decoder,
+constant event numbers after restarts, and message rate.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def _stretch(number: int, draw: np.random.Generator) -> StretchAlert:
 
 
 def measure_denm(folder: Path, quick: bool) -> list[Figure]:
-    """Raise, change and end events, with a restart of the gateway after each step."""
+    """Raise, change and end events, restart the gateway after each step, and return the figures."""
     from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
 
     draw = np.random.default_rng(4202)
@@ -148,7 +148,9 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
 
 
 def _encode_speedup(bodies: list[bytes]) -> float:
-    """Return the processor time of asn1tools over ours, of the same messages."""
+    """Return the processor time of asn1tools divided by that of our encoder, for the
+    same messages.
+    """
     general = compiled_denm()
     contents = [general.decode("DENM", body) for body in bodies]
     records = [decode_denm(body) for body in bodies]
@@ -162,7 +164,9 @@ def _encode_speedup(bodies: list[bytes]) -> float:
 
 
 def _selected_wrongly(received: list[tuple[bytes, dict[str, object]]]) -> int:
-    """Return how often `quadTree LIKE '%,DIGITS%'` and the place of an event disagree."""
+    """Return the number of cases in which the filter `quadTree LIKE '%,DIGITS%'` and the position
+    of an event disagree.
+    """
     wrong = 0
     squares = set[tuple[int, int]]()
     denms = [(decode_denm(body), given) for body, given in received]

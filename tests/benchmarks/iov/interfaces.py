@@ -1,5 +1,5 @@
-"""Foreign DENM that report ice where there is none, the Kuksa provider against the published
-protocol, and readers of MCAP.
+"""Benchmarks of three interfaces: foreign DENM that report ice where there is none, the Kuksa
+provider with a server of the published protocol, and readers of MCAP files.
 """
 
 from __future__ import annotations
@@ -45,10 +45,11 @@ KUKSA: Final = (
 
 
 def measure_foreign(_folder: Path, quick: bool) -> list[Figure]:
-    """Report ice by one foreign publisher: alone, where own vehicles find grip, and where one finds
-    ice.
+    """Report ice by one foreign publisher: alone, where own vehicles measure grip, and where one
+    own vehicle measures ice.
 
-    The last run is the control: a witness that nobody ever believes raises no false alert either.
+    The last case is the control, because a publisher that is never believed would also raise no
+    false alert.
     """
     draw = np.random.default_rng(4204)
     places = draw.normal((57.7, 11.97), 0.02, (20 if quick else 200, 2)).tolist()
@@ -78,12 +79,13 @@ def measure_foreign(_folder: Path, quick: bool) -> list[Figure]:
 def _alerted(
     places: list[tuple[float, float]], *own: dict[str, float], foreign: bool = False
 ) -> tuple[int, int]:
-    """Return the number of places under alert, and of reports taken.
+    """Return the number of places under alert, and the number of foreign reports that were
+    accepted.
 
     Args:
         places: latitude and longitude [deg].
-        own: friction that each own vehicle finds at all of them.
-        foreign: a publisher warns of ice at all of them.
+        own: friction that each own vehicle measures at all places.
+        foreign: True if a publisher warns of ice at all places.
     """
     under_alert = set[int]()
     cells = [int(grid.cell_of(*place)) for place in places]
@@ -116,7 +118,7 @@ def _alerted(
 def _own_report(
     name: str, seq: int, now: int, place: tuple[float, float], friction: dict[str, float]
 ) -> tuple[str, bytes]:
-    """Return key and JSON of six visits on the way north."""
+    """Return key and JSON of a vehicle's six visits at one place, heading north."""
     visits = 6
     region = int(grid.region_of(int(grid.cell_of(*place))))
     values = {"latitude": place[0], "longitude": place[1], "yaw": np.pi / 2, **friction}
@@ -127,7 +129,9 @@ def _own_report(
 
 
 def measure_kuksa(folder: Path, quick: bool) -> list[Figure]:
-    """Write to a gRPC server made from the published modules of kuksa.val.v2."""
+    """Write signals to a gRPC server made from the published modules of kuksa.val.v2, and return
+    the figures.
+    """
     draw = np.random.default_rng(4205)
     wheel = folder / "kuksa"
     if not wheel.exists():
@@ -163,7 +167,9 @@ def _number(point: Any) -> float | None:  # noqa: ANN401 modules of the wheel ha
 
 @contextmanager
 def _broker() -> Iterator[tuple[int, dict[str, Any]]]:
-    """Serve kuksa.val.v2 with types of VSS; return the port, and data points by path."""
+    """Serve kuksa.val.v2 with types of VSS. Yield the port, and the received data
+    points by path.
+    """
     import grpc
     from kuksa.val.v2 import val_pb2, val_pb2_grpc  # type: ignore[import-not-found]
 
@@ -192,7 +198,9 @@ def _broker() -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def measure_mcap(folder: Path, quick: bool) -> list[Figure]:
-    """Read a drive's estimates by the three readers of the format's owners."""
+    """Read a drive's estimates with the three readers of the official MCAP library, and return the
+    figures.
+    """
     from mcap.reader import NonSeekingReader, SeekingReader
     from mcap.records import Message as Record
     from mcap.stream_reader import StreamReader

@@ -1,4 +1,4 @@
-"""Simulated entries to ice with and without the limit that a planner gets."""
+"""Simulated drives onto ice, with and without the speed limit that a planner receives."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ STRAIGHT: Final = 1000  # [m] of road
 
 
 def measure_planner(_folder: Path, quick: bool) -> list[Figure]:
-    """Drive to ice of unknown grip; the map knows it with an interval of 90 %."""
+    """Simulate drives onto ice of unknown friction that the map knows with a 90 % interval. Return
+    the shares of drives that can stop within sight, with and without the limit.
+    """
     draw = np.random.default_rng(SEED)
     drives = 200 if quick else 2000
     stops = {True: 0, False: 0}
@@ -56,7 +58,9 @@ def measure_planner(_folder: Path, quick: bool) -> list[Figure]:
 
 
 def _speed_at(begin: int, speed: float, safe: FloatArray, *, limited: bool) -> float:
-    """Return the speed [m/s] at `begin` [m] of a car that obeys the limit late and gently."""
+    """Return the speed [m/s] at position `begin` [m] of a car that obeys the limit with delay and
+    gentle braking.
+    """
     limit = SteadyLimit()
     obeyed = math.inf
     waiting = list[tuple[float, float]]()

