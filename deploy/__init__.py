@@ -1,1 +1,1 @@
-"""Programs and files that start the parts: the router, configurations, and the demo."""
+"""Programs and files that start the parts of GripMap: the router, configurations, and the demo."""

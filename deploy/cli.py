@@ -1,4 +1,4 @@
-"""`gripmap`: the demo and a router in one word, without a checkout."""
+"""`gripmap`: command that runs the demo or a router, without a checkout of the repository."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LINE: Final = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command line; return the exit code."""
+    """Run the command that `argv` names; return the exit code."""
     given = commandline.join_negative_numbers(sys.argv[1:] if argv is None else argv)
     chosen = next((word for word in given if not word.startswith("-")), None)
     progress_messages.enable_messages(quiet=commandline.wants_quiet(given))

@@ -1,12 +1,12 @@
-"""Observations of simulated vehicles with the real estimator, without a network, for the fusion's
-evaluation.
+"""Simulate vehicles with the real estimator, and write their observations for the evaluation.
 
     python -m deploy.end_to_end --out DIR [--vehicles 200] [--duration 60] [--seed 20000]
     [--scenario demo]
         [--rough 0] [--winter 0]
 
-Simulated vehicles with the default estimator drive a scenario. DIR/observations.parquet gets the
-observations that they would send, DIR/truth.parquet the friction under them.
+Simulated vehicles with the default estimator drive a scenario, without a network. The observations
+that they would send are written to DIR/observations.parquet, and the true friction under them to
+DIR/truth.parquet.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ REPORT_S = 30.0
 
 
 def drive_fleet(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
-    """Return the columns of all observations, with `vehicle`; write the truth."""
+    """Simulate the drive. Return the columns of all observations, with `vehicle`; write the true
+    values to the file `truth`.
+    """
     vehicles = len(fleet.vehicles)
     config = AgentConfig()
     pipeline = Pipeline(bank_of(config.estimator, fleet.vehicles), vehicles, config)
@@ -63,7 +65,7 @@ def drive_fleet(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Column
 
 
 def write_drive(fleet: SimulatedFleet, duration_s: float, folder: Path) -> None:
-    """Drive, and write both files into an existing folder."""
+    """Simulate the drive, and write both files into an existing folder."""
     columns = drive_fleet(fleet, duration_s, folder / "truth.parquet")
     arrays = {
         name: pa.array(list(map(bytes, c)) if c.ndim == 2 else c) for name, c in columns.items()
@@ -73,7 +75,7 @@ def write_drive(fleet: SimulatedFleet, duration_s: float, folder: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Drive and write both files."""
+    """Run the command line: simulate the drive and write both files."""
     parser = argparse.ArgumentParser(
         prog="deploy.end_to_end", description=(__doc__ or "").splitlines()[0]
     )

@@ -1,12 +1,11 @@
-"""Town with listening cars, without a network: simulated cars, the fusion and its alerts, cars that
-receive the map.
+"""Simulate a town whose cars receive the map and its alerts, and measure how many lose grip.
 
     python -m deploy.listening --out DIR [--seeds 20] [--vehicles 36] [--duration 150] [--scenario
     hills-SEED]
 
-Every second the cars' observations are fused, as in a service. Alerts and, now and then, tiles are
-passed to the listening cars as bytes. Each seed is driven twice from the same start, once with all
-cars listening and once with none. DIR/figures.json gets the figures.
+No network is used. Every second the cars' observations are fused, as in a service. Alerts and, at
+intervals, tiles are passed to the listening cars as bytes. Each seed is driven twice from the same
+start: once all cars listen, once no car does. The figures are written to DIR/figures.json.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 
 @dataclass
 class Drive:
-    """Result of one drive; rows are visits of a vehicle to a cell, from the simulator's truth."""
+    """Result of one drive, computed from the simulator's true values."""
 
     slid: set[tuple[int, int]] = field(
         default_factory=set
@@ -74,7 +73,7 @@ class Drive:
 
 
 class ListeningTown:
-    """Simulated town with its fusion and cars, advanced second by second for one drive."""
+    """Simulated town with its cars and the fusion, advanced second by second during one drive."""
 
     def __init__(
         self, scenario: str, vehicles: int, seed: int, *, listening: bool, rough: float = 0.5
@@ -98,7 +97,7 @@ class ListeningTown:
         self._true: dict[int, float] = {}  # friction of the places, as it was driven over last
 
     def run(self, duration_s: float) -> Drive:
-        """Drive, and evaluate the map at the end."""
+        """Simulate the drive, and evaluate the map at its end; return the result."""
         for second in range(int(duration_s)):
             parts = [self._block() for _ in range(round(RATE_HZ / BLOCK))]
             self._fuse([part for part in parts if len(part["cell"])])
@@ -110,8 +109,8 @@ class ListeningTown:
         return self.drive
 
     def _check_intervals(self) -> list[bool]:
-        """Return, for each place that several vehicles visited, whether the map's interval contains
-        the last truth.
+        """Return, for each cell and sector that several vehicles visited, True if the map's
+        interval contains the last true friction.
         """
         place = np.array(list(self._true), np.int64)
         slots = self.fusion.slots_of(place // grid.SECTORS, place % grid.SECTORS)
@@ -132,7 +131,7 @@ class ListeningTown:
         return seen.columns | {"vehicle": seen.vehicle}
 
     def _truth(self, now: float) -> None:
-        """Record the cars on the new ice, and those that slide there."""
+        """Record which cars are on the new ice, and which of them slide there."""
         true = self.fleet.truth
         patch = self.ice
         cells = grid.cell_of(*self.fleet.scenario.to_latlon(true.x[-1], true.y[-1]))
@@ -166,7 +165,7 @@ class ListeningTown:
             self.heard.store_alert(decode_alert_message(key, wire.encode_alert(alert), now), now)
 
     def _hear(self, second: int) -> None:
-        """Pass changed tiles to the cars, and repeat the active alerts."""
+        """Pass the active alerts to the cars, and at intervals the tiles of the map."""
         now = self._now()
         for alert in self.alerts.standing_alerts:
             self.heard.store_alert(alert, now)
@@ -233,7 +232,9 @@ class ListeningTown:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run every seed with and without listening cars, and write the figures."""
+    """Run the command line: drive every seed with and without listening cars, and write the
+    figures.
+    """
     parser = argparse.ArgumentParser(
         prog="deploy.listening", description=(__doc__ or "").splitlines()[0]
     )
@@ -274,7 +275,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def measure(with_: list[Drive], without: list[Drive]) -> list[Figure]:
-    """Return the figures of drives with and without listening."""
+    """Return the figures that compare drives with and without listening cars."""
     slid, before = (
         sum(len({k for k, _ in drive.slid}) for drive in drives) for drives in (with_, without)
     )

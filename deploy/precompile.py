@@ -1,8 +1,9 @@
-"""`python -m deploy.precompile [papers]`: compile frequently used kernels once for this machine.
+"""`python -m deploy.precompile [papers]`: compile frequently used functions once for this machine.
 
-`make setup` ends with the kernels of service, agent and simulated vehicle, so that their first
-start does not wait. The tests need the papers' filters too. A kernel that cannot be compiled here
-is compiled at its first use.
+`make setup` ends with this command, which compiles the functions of service, agent and simulated
+vehicle, so that their first start does not have to wait. With `papers`, the filters of the papers
+are compiled, which the tests need. A function that cannot be compiled here is compiled at its first
+use.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ DEFAULT: Final = "aco-fckf"
 
 
 def main(words: list[str]) -> int:
-    """Compile with one process per core; always return 0."""
+    """Compile the functions with one process per core; always return 0."""
     began = time.monotonic()
     papers = words == ["papers"]
     print(
@@ -61,7 +62,9 @@ def _estimate_command(name: str) -> tuple[str, ...]:
 
 
 def _run_process(folder: str, code: str, *words: str) -> list[str]:
-    """Run a process; return its lines with errors."""
+    """Run Python code in a process; return the lines of its output that contain the word
+    "error".
+    """
     done = subprocess.run(
         [sys.executable, "-c", code, *words], cwd=Path(folder), capture_output=True, text=True
     )

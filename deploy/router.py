@@ -1,7 +1,8 @@
-"""`gripmap router [--config FILE] [--listen ENDPOINT]`: a Zenoh router in a process of its own.
+"""`gripmap router [--config FILE] [--listen ENDPOINT]`: run a Zenoh router as a separate process.
 
-The Python package of Zenoh contains the router, so no other binary is needed. It prints `router:
-tcp/…` when it listens (with the real port if port 0 was given) and ends on SIGINT or SIGTERM.
+The Python package of Zenoh contains the router, so no other program is needed. The router prints
+`router: tcp/…` when it listens (with the actual port if port 0 was given) and ends on SIGINT or
+SIGTERM.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ CONFIG = Path(__file__).with_name("router.json5")
 def load_configuration(
     config: Path = CONFIG, listen: str | Sequence[str] | None = None
 ) -> zenoh.Config:
-    """Return the router's configuration from a file, with other endpoints if some are given.
+    """Return the router's configuration from a file; `listen` replaces the listen endpoints of the
+    file.
 
     Raises:
         InputError: the file is not a Zenoh configuration, or the endpoint is not valid.
@@ -51,7 +53,7 @@ def load_configuration(
 def open_router(
     config: Path = CONFIG, listen: str | Sequence[str] | None = None
 ) -> tuple[zenoh.Session, list[str]]:
-    """Start a router in this process; return its session and the endpoints that it listens on.
+    """Start a router in this process; return its session and the endpoints on which it listens.
 
     Raises:
         InputError: the configuration is wrong, or the endpoint is in use.
@@ -72,7 +74,7 @@ def open_router(
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     parser.add_argument(
         "--config", type=Path, default=CONFIG, help="Zenoh configuration file (JSON5)"
     )
@@ -90,7 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a router until a signal ends it."""
+    """Run a router until a signal ends it; parse the options from `argv`."""
     parser = argparse.ArgumentParser(
         prog="deploy.router", description="Run a Zenoh router for GripMap."
     )
@@ -99,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run a router until a signal ends it."""
+    """Run a router with parsed options until a signal ends it; return the exit code."""
     # Zenoh's threads inherit the mask: a signal that one of them took would never wake Python's
     # main thread.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)

@@ -1,4 +1,4 @@
-"""The demo: `python -m deploy.demo`, the same as `gripmap demo`."""
+"""Start of the demo by `python -m deploy.demo`, which is the same as `gripmap demo`."""
 
 import sys
 

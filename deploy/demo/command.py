@@ -1,6 +1,6 @@
 """`gripmap demo`: from wheel speeds to the map on this machine, in about three minutes.
 
-All files go to `.demo/` of the current folder.
+All files are written to `.demo/` in the current folder.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from schemas.runtime.installing import install_command
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Declare the command's options."""
     parser.add_argument("--vehicles", type=int, default=36, help="simulated vehicles (default 36)")
     parser.add_argument(
         "--duration",

@@ -1,8 +1,8 @@
-"""Figures of the demo: the map compared with the truth.
+"""Figures of the demo: the map compared with the true friction.
 
-The truth is the simulator's record of each visit of a vehicle to a cell: mean friction under its
-wheels, and the largest share of the grip that it used. A visit with a share of at least 0.6 is
-*excited*: it shows the friction.
+True values come from the simulator's record of each visit of a vehicle to a cell: mean friction
+under its wheels, and the largest share of the grip that it used. A visit with a share of at least
+0.6 is called *excited*, because it allows the friction to be measured.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 
 
 def demo_works(found: Sequence[Figure]) -> bool:
-    """Return True if the demo did its work.
+    """Return True if the demo was successful.
 
-    A late alert, a wide map, few passes or a busy machine do not count as a failure.
+    A late alert, wide intervals, few passes or a busy machine do not count as a failure.
     """
 
     def breaks_promise(figure: Figure) -> bool:
@@ -54,8 +54,8 @@ def demo_works(found: Sequence[Figure]) -> bool:
 
 @dataclass(frozen=True)
 class MapComparison:
-    """Cells of the map that have a truth, one per row; `truth` is the friction at the end of the
-    demo.
+    """Cells of the map for which the true friction is known, one per row. `truth` is the true
+    friction at the end of the demo.
     """
 
     cells: pa.Table
@@ -63,30 +63,31 @@ class MapComparison:
 
     @property
     def is_covered(self) -> BoolArray:
-        """True where the truth lies in the interval."""
+        """Mask of rows, (n,): True if the true friction lies in the interval."""
         lower, upper = (self.cells[end].to_numpy() for end in ("mu_lower", "mu_upper"))
         return np.asarray((lower <= self.truth) & (self.truth <= upper))
 
     @property
     def has_several_vehicles(self) -> BoolArray:
-        """True where two or more vehicles were."""
+        """Mask of rows, (n,): True if two or more vehicles visited the cell."""
         return np.asarray(self.cells["vehicles"].to_numpy() >= 2)
 
     @property
     def is_measured(self) -> BoolArray:
-        """True where the value rests on more than lower bounds."""
+        """Mask of rows, (n,): True if the cell's belief is based on more than lower bounds."""
         return np.asarray(self.cells["basis"].to_numpy(zero_copy_only=False) == "measured")
 
     @property
     def values(self) -> FloatArray:
-        """Median of the map, (n,); NaN where nothing was measured."""
+        """Median friction of the map, (n,); NaN where no value was measured."""
         mu = self.cells["mu"].to_numpy()
         return np.where(self.is_measured, mu, np.nan)
 
 
 def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], float]:
-    """Return the friction of each visited (cell, sector) at the end: mean over visits since the
-    change, else over all."""
+    """Return the true friction of each visited (cell, sector) at the end of the demo: the mean over
+    visits since the change of the road, or over all visits if there were none since.
+    """
     keys = _cell_keys(visits)
     after = visits["enter_time"].cast(pa.int64()).to_numpy() >= changed_ns
     mu = visits["mu"].to_numpy()
@@ -100,7 +101,7 @@ def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], floa
 
 
 def write_truth(visits: pa.Table, changed_ns: int, path: Path) -> None:
-    """Write the final truth as a file for the overlay of the live page."""
+    """Write the final true friction as a file that the live page can draw over the map."""
     truth = final_truth(visits, changed_ns)
     cell, sector = zip(*truth, strict=True)
     table = pa.table(
@@ -116,7 +117,7 @@ def write_truth(visits: pa.Table, changed_ns: int, path: Path) -> None:
 
 
 def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison:
-    """Join the map with the truth by (cell, sector)."""
+    """Join the map with the true friction by (cell, sector)."""
     truth = final_truth(visits, changed_ns)
     found = np.array([truth.get(key, np.nan) for key in _cell_keys(cells)])
     known = np.isfinite(found)
@@ -126,15 +127,15 @@ def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison
 def delay_passes(
     visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
 ) -> float:
-    """Return the excited passes over a new patch until its first alert, the median of all patches.
+    """Return the number of excited passes over a new patch of ice until its first alert: the median
+    over all patches.
 
-    A patch without an alert counts as infinite; cells within LINK_CELLS of each other are one
-    patch.
+    A patch without an alert counts as infinite. Cells at most LINK_CELLS apart belong to one patch.
 
     Args:
-        visits: the truth.
-        patch: (visits,) True for visits to a cell of a patch after it had appeared.
-        alerts: (time of receipt [ns], alert).
+        visits: true values of all visits.
+        patch: (visits,) True for visits to a cell of a patch after the patch appeared.
+        alerts: pairs of time of receipt [ns] and alert.
         changed_ns: time at which the patch appeared.
     """
     left: IntArray = visits["leave_time"].cast(pa.int64()).to_numpy()
@@ -150,7 +151,9 @@ def delay_passes(
 def known_patches(
     visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
 ) -> list[tuple[IntArray, int]]:
-    """Return the cells of each patch and the time of its first alert [ns], NEVER without one."""
+    """Return, for each patch of ice, its cells and the time of its first alert [ns]; NEVER if it
+    had no alert.
+    """
     cells = np.unique(visits["cell"].to_numpy()[patch])
     label = link_cells(cells)
     found = []
@@ -163,8 +166,8 @@ def known_patches(
 
 
 def count_passes(rows: pa.Table) -> int:
-    """Return the number of passes: successive visits of one vehicle to neighbouring cells are
-    one pass.
+    """Return the number of passes. Successive visits of one vehicle to neighbouring cells are one
+    pass.
     """
     order = rows.sort_by([("vehicle", "ascending"), ("enter_time", "ascending")])
     vehicle = order["vehicle"].to_numpy(zero_copy_only=False)
@@ -183,7 +186,7 @@ def demo_figures(
     archive: Path,
     wall_s: float,
 ) -> list[Figure]:
-    """Return the demo's figures with their bars."""
+    """Return the demo's figures with their targets."""
     several = comparison.has_several_vehicles
     value = comparison.has_several_vehicles & comparison.is_measured
     error = comparison.cells["mu"].to_numpy() - comparison.truth
@@ -220,10 +223,10 @@ def demo_figures(
 
 @dataclass(frozen=True)
 class LostGrip:
-    """Passes over the new ice since the first alert of its patch, one per row: whether the driver
-    was warned and a wheel lost its grip.
+    """Passes over new ice after the first alert of its patch, one per row: whether the driver was
+    warned, and whether a wheel lost its grip.
 
-    `cell` is where it was lost, or the first of the pass.
+    `cell` is the cell in which grip was lost, or the first cell of the pass.
     """
 
     warned: BoolArray
@@ -231,7 +234,9 @@ class LostGrip:
     cell: IntArray
 
     def figures(self) -> list[Figure]:
-        """Return the shares of passes that lost grip, and their number."""
+        """Return, for warned and for unwarned drivers, the share of passes that lost grip and the
+        number of passes.
+        """
         kinds = (("warned", self.warned), ("unwarned", ~self.warned))
         shares = [
             Figure(f"demo.lost_grip.{name}", _mean_or_nan(self.lost[rows]), "of passes")
@@ -245,7 +250,7 @@ class LostGrip:
         ]
 
     def line(self) -> str:
-        """Return the result as one line."""
+        """Return the result as one line of text."""
         counts = [
             f"{int(self.lost[rows].sum())} of {int(rows.sum())}"
             for rows in (self.warned, ~self.warned)
@@ -257,8 +262,8 @@ class LostGrip:
 def lost_grip(
     visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int, share: float
 ) -> LostGrip:
-    """Return the passes over the new ice since the first alert of its patch; `share` of the
-    drivers is warned.
+    """Return the passes over new ice after the first alert of its patch. `share` is the share of
+    drivers that are warned.
     """
     on = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
     since = np.full(visits.num_rows, NEVER)
@@ -293,8 +298,8 @@ def _vehicle_number(vehicle: str) -> int:
 
 
 def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
-    """Return True for visits (visits,) after the change that found clearly less grip than all
-    before in the cell.
+    """Return a mask of visits, (visits,): True for visits after the change that found clearly less
+    grip than all earlier visits in the cell.
 
     Old snow that is reached late, or its border, does not count as new ice.
     """
@@ -309,7 +314,9 @@ def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
 
 
 def per_stretch(alerts: list[tuple[int, Alert]], visits: pa.Table) -> float:
-    """Return alerts of stretches per icy stretch and driving direction; NaN without ice."""
+    """Return the number of stretch alerts per icy stretch and driving direction; NaN without
+    ice.
+    """
     road = Stretches()
     ids = set[str]()
     for _, alert in alerts:
@@ -325,7 +332,9 @@ def per_stretch(alerts: list[tuple[int, Alert]], visits: pa.Table) -> float:
 
 
 def archive_counts(archive: Path) -> tuple[int, int, int]:
-    """Return rows, distinct rows and distinct vehicles of the archived observations."""
+    """Return the numbers of rows, of distinct rows, and of distinct vehicles in the archived
+    observations.
+    """
     identity = ["vehicle", "boot", "region", "seq", "row"]
     tables = list(reading.read_tables(archive, Kind.OBSERVATION, identity))
     if not tables:
@@ -339,7 +348,7 @@ def archive_counts(archive: Path) -> tuple[int, int, int]:
 
 
 def start_time(visits: pa.Table) -> int:
-    """Return the time of the first visit of any vehicle [ns]."""
+    """Return the time [ns] of the first visit of any vehicle."""
     return int(visits["enter_time"].cast(pa.int64()).to_numpy().min())
 
 

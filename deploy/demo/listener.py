@@ -1,4 +1,4 @@
-"""Subscriber of the demo: receives tiles and alerts while the fleet drives."""
+"""Subscriber of the demo, which receives tiles and alerts while the fleet drives."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def read_tile(payload: bytes) -> pa.Table:
 
 @dataclass
 class Listener:
-    """Subscriber to map and alerts; stores the newest version of each tile, and every alert with
+    """Subscriber to map and alerts. It stores the newest version of each tile, and every alert with
     its time of receipt.
     """
 
@@ -47,11 +47,13 @@ class Listener:
                 self.alerts.append((time.time_ns(), alert))
 
     def close(self) -> None:
-        """End the session; an open session keeps the interpreter from ending."""
+        """End the session; a session that stays open would keep the process from ending."""
         self.session.close()
 
     def progress(self) -> str:
-        """Return one line: cells, how many are measured and slippery, standing alerts."""
+        """Return one line of text: number of cells, how many are measured and by several vehicles,
+        and number of active alerts.
+        """
         with self._lock:
             cells = pa.concat_tables(self.tiles.values()) if self.tiles else None
             alerts = list(self.alerts)
@@ -67,7 +69,7 @@ class Listener:
         )
 
     def whole_map(self) -> pa.Table:
-        """Query the whole map, one reply per tile."""
+        """Query the whole map and return its cells as a table."""
         replies = self.session.get(
             "gripmap/v1/map/**", consolidation=zenoh.ConsolidationMode.NONE, timeout=10.0
         )

@@ -1,5 +1,5 @@
-"""The map next to the truth as one HTML file that opens offline and shows the interval of a
-cell.
+"""HTML file that shows the demo's map next to the true road. It opens offline and shows the
+interval of each cell.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ NAMES = (
 
 
 def write_page(comparison: MapComparison, figures: list[Figure], path: Path) -> None:
-    """Write two maps and the table of figures; nothing is loaded from elsewhere."""
+    """Write an HTML file with the two maps and the table of figures. The file loads nothing from
+    the network.
+    """
     cells = comparison.cells
     boxes = np.stack(
         [cells[side].to_numpy() for side in ("west", "south", "east", "north")], axis=1

@@ -1,5 +1,5 @@
-"""The map next to the truth as an image (PNG): each heading sector of a cell is a quarter of its
-square.
+"""Image (PNG) of the demo's map next to the true road. Each heading sector of a cell is a quarter
+of the cell's square.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from schemas.runtime.palette import SURFACES, UNKNOWN
 
 
 def draw_maps(comparison: MapComparison, path: Path, grip: LostGrip | None = None) -> None:
-    """Draw three panels: the truth, the map (median), and the width of the map's interval.
+    """Draw three panels: the true friction, the median of the map, and the width of the map's
+    interval.
 
-    The truth also shows where drivers lost their grip on the new ice and where they kept it, warned
-    and not.
+    The first panel also shows where warned and unwarned drivers lost or kept their grip on the new
+    ice.
     """
     cells = comparison.cells
     shapes = cell_shapes(cells["cell"].to_numpy(), cells["sector"].to_numpy().astype(np.int64))
@@ -51,8 +52,9 @@ def draw_maps(comparison: MapComparison, path: Path, grip: LostGrip | None = Non
 
 
 def _mark_passes(axes: Axes, grip: LostGrip, drawn: IntArray) -> None:
-    """Mark passes over the new ice: circles of warned drivers, squares of others; black if grip was
-    lost, else white."""
+    """Mark passes over the new ice: circles for warned drivers, squares for others; black if grip
+    was lost, else white.
+    """
     shapes = cell_shapes(np.concatenate([drawn, grip.cell]))[
         len(drawn) :
     ]  # in the axes of what is drawn

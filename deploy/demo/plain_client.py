@@ -1,4 +1,4 @@
-"""Client without GripMap code: only Zenoh and the standard library.
+"""Client of the map without GripMap code: it needs only Zenoh and the standard library.
 
 python -m deploy.demo.plain_client ENDPOINT WEST,SOUTH,EAST,NORTH
 """

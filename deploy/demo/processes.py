@@ -1,4 +1,4 @@
-"""Parts of the system as separate processes, each with a log in the demo's folder."""
+"""Processes of the demo: the parts of the system, each with a log file in the demo's folder."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ SHOWN = {
 
 
 class DemoError(RuntimeError):
-    """A part did not start, or ended early; the message names its log."""
+    """Error: a part of the demo did not start, or ended early; the message names its log file."""
 
 
 class ManagedProcess:
-    """One process of the demo; its output goes to `folder/NAME.log`."""
+    """One process of the demo; its output is written to `folder/NAME.log`."""
 
     def __init__(self, name: str, command: Sequence[str], folder: Path) -> None:
         self.name = name
@@ -37,14 +37,14 @@ class ManagedProcess:
             self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
 
     def lines(self) -> list[str]:
-        """Return the lines printed so far."""
+        """Return the lines that the process has printed so far."""
         return self.log.read_text().splitlines()
 
     def line_with(self, start: str, patience_s: float = START_S) -> str:
         """Wait for the first line that begins with `start`, and return it.
 
         Raises:
-            DemoError: the process ended, or did not print it in time.
+            DemoError: the process ended, or did not print such a line in time.
         """
         deadline = time.monotonic() + patience_s
         while time.monotonic() < deadline:
@@ -58,7 +58,9 @@ class ManagedProcess:
         raise DemoError(f"{self.name} did not print {start!r}; {self.log} ends with: {last}")
 
     def wait(self, every_s: float, tick: Callable[[], None]) -> int:
-        """Wait for the end, calling `tick` now and then; return the exit code."""
+        """Wait for the end of the process and return its exit code; call `tick` every `every_s`
+        seconds.
+        """
         while True:
             try:
                 return self.process.wait(every_s)
@@ -66,7 +68,7 @@ class ManagedProcess:
                 tick()
 
     def stop(self) -> None:
-        """Ask it to end, then force it."""
+        """Ask the process to end; if it does not, kill it."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
             try:
@@ -76,7 +78,7 @@ class ManagedProcess:
                 self.process.wait()
 
     def report(self) -> dict[str, float]:
-        """Return the counts in its last line, which is JSON.
+        """Return the counts that the process printed as JSON in its last line.
 
         Raises:
             DemoError: the last line is not JSON.
@@ -92,10 +94,10 @@ class ManagedProcess:
 
 @contextmanager
 def run_system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
-    """Run a router and a fleet service on a free port of loopback; yield the endpoint and the
-    service.
+    """Run a router and a fleet service on a free port of loopback while the block runs; yield the
+    endpoint and the service.
 
-    The agents' configuration is left in `folder/agent.json`.
+    The configuration for the agents is written to `folder/agent.json`.
     """
     scripts = Path(sys.executable).parent
     router = ManagedProcess(
@@ -127,8 +129,8 @@ def run_system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
 
 @contextmanager
 def run_page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Iterator[str]:
-    """Run the live page on the town's streets; yield its address. The truth can be drawn over
-    the map.
+    """Run the live page with the streets of the simulated town; yield its address. The page can
+    draw the true friction over the map.
     """
     metrics = service.line_with("ready").rpartition(", ")[2]
     tiles, roads = town.write_files(scenario_named(SCENARIO), folder)
@@ -154,8 +156,8 @@ def run_page(folder: Path, endpoint: str, service: ManagedProcess, port: int) ->
 def start_fleet(
     folder: Path, vehicles: int, duration_s: float, seed: int, warned: float
 ) -> ManagedProcess:
-    """Return the process of the simulated vehicles. Each has its own session and identity; a share
-    of the drivers is warned.
+    """Start the process of the simulated vehicles and return it. Each vehicle has its own session
+    and identity. A share `warned` of the drivers is warned of ice.
     """
     scripts = Path(sys.executable).parent
     options = {

@@ -1,5 +1,5 @@
-"""Course of the demo: start the parts, let the fleet drive, compare the map with the truth,
-report.
+"""Sequence of the demo: start the parts, let the fleet drive, compare the map with the true road,
+and report.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ REPORT_S = 5.0
 def drive_fleet(
     folder: Path, endpoint: str, args: argparse.Namespace
 ) -> tuple[Listener, dict[str, float]]:
-    """Let the fleet drive; return the received data and the fleet's counts."""
+    """Let the fleet drive; return the listener with the received data, and the fleet's counts."""
     session = open_session(ZenohSettings(connect=[endpoint]))
     if session is None:
         raise processes.DemoError(f"no session to {endpoint}")
@@ -49,7 +49,7 @@ def drive_fleet(
 
 
 def show_clients(folder: Path, endpoint: str, comparison: compare.MapComparison) -> None:
-    """Show one query by a client without GripMap code, and how to read the Parquet files."""
+    """Run one query with a client without GripMap code, and print how to read the Parquet files."""
     sides = [comparison.cells[side].to_numpy() for side in ("west", "south", "east", "north")]
     bbox = ",".join(
         f"{value:.6f}" for value in (sides[0].min(), sides[1].min(), sides[2].max(), sides[3].max())
@@ -71,8 +71,8 @@ def report_figures(
     grip: compare.LostGrip,
     seed: int,
 ) -> list[figures.Figure]:
-    """Write and print all figures, draw the map next to the truth and the passes that lost grip;
-    return the figures.
+    """Write and print all figures, and draw the map with the passes that lost grip; return the
+    figures.
     """
     found = [*measured, *grip.figures()]
     figures.write(folder / "figures.json", "demo", [seed], found)
@@ -90,10 +90,10 @@ def report_figures(
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the demo; exit code 1 if a bar of a promise does not hold.
+    """Run the demo; return 1 if a figure misses a target that the demo must meet.
 
-    The delay of the first alert, the number of passes and the duration are goals: a miss is
-    reported in figures and README, but does not fail the demo.
+    The delay of the first alert, the number of passes and the duration are only goals: a miss is
+    reported but does not make the demo fail.
     """
     began = time.monotonic()
     shutil.rmtree(FOLDER, ignore_errors=True)

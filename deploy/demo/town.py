@@ -1,9 +1,9 @@
-"""Base map and named roads of the demo's simulated town, so that its page looks like a town and
-needs no network.
+"""Base map and named roads of the demo's simulated town, so that the live page looks like a town
+and needs no network.
 
 `write_files` makes an MBTiles file of vector tiles (streets, buildings, parks, water, names) and a
-GeoJSON file of the roads. The geometry of the streets is the simulation's; houses, parks and the
-lake are drawn around them by a seeded generator.
+GeoJSON file of the roads. The streets have the geometry of the simulation. Houses, parks and the
+lake around them are generated with fixed seeds.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _PER_TILE: Final = EXTENT
 
 @dataclass
 class StreetPlan:
-    """Shapes of the town in metres: streets by name, polygons by layer, names of places."""
+    """Shapes of the town in metres: streets with names, polygons by layer, and names of places."""
 
     streets: list[tuple[str, FloatArray, str]] = field(default_factory=list)
     areas: list[tuple[str, FloatArray]] = field(default_factory=list)
@@ -57,7 +57,7 @@ class StreetPlan:
 
 
 def town_of(scenario: Scenario) -> StreetPlan:
-    """Return the town of a scenario."""
+    """Return the shapes of the town for a scenario."""
     found = StreetPlan()
     for number, road in enumerate(scenario.roads):
         name = STREETS[number % len(STREETS)]
@@ -78,7 +78,7 @@ def _centre_line(scenario: Scenario, road: Road) -> FloatArray:
 
 
 def _blob_outline(shape: tuple[float, float, float, float], seed: int) -> FloatArray:
-    """Return a smooth closed outline around x, y with two radii."""
+    """Return a smooth closed outline around a point; `shape` is x, y and the two radii [m]."""
     x, y, a, b = shape
     rng = np.random.default_rng(seed)
     angle = np.linspace(0.0, 2.0 * math.pi, 48, endpoint=False)
@@ -88,8 +88,8 @@ def _blob_outline(shape: tuple[float, float, float, float], seed: int) -> FloatA
 
 
 def _place_houses(centres: FloatArray) -> Iterable[FloatArray]:
-    """Yield houses along the streets, turned like them and clear of streets, parks and each
-    other.
+    """Yield the outlines of houses along the streets, parallel to them. Houses do not touch
+    streets, parks or each other.
     """
     rng = np.random.default_rng(5)
     placed: list[tuple[float, float, float]] = []
@@ -123,7 +123,7 @@ def _place_houses(centres: FloatArray) -> Iterable[FloatArray]:
 
 
 def _lanes_around(centres: FloatArray) -> list[tuple[str, FloatArray, str]]:
-    """Return roads out of the town, which no simulated car drives."""
+    """Return roads that lead out of the town; no simulated car uses them."""
     out = []
     for name, angle in (("E20", 0.55), ("E20", math.pi + 0.35), ("Skogsvägen", 2.2)):
         away = np.array([math.cos(angle), math.sin(angle)])
@@ -238,7 +238,7 @@ def _touches_tile(points: Sequence[tuple[int, int]]) -> bool:
 
 
 def _clip_line(points: list[tuple[int, int]]) -> Iterable[list[tuple[int, int]]]:
-    """Yield the parts of a line within a tile and its buffer."""
+    """Yield the parts of a line that lie within a tile or its margin."""
     part: list[tuple[int, int]] = []
     for first, second in itertools.pairwise(points):
         if _touches_tile((first, second)):
@@ -252,7 +252,9 @@ def _clip_line(points: list[tuple[int, int]]) -> Iterable[list[tuple[int, int]]]
 
 
 def _to_mercator(scenario: Scenario, line: FloatArray) -> FloatArray:
-    """Return points [m] as parts of the Web Mercator square, x to the east and y to the south."""
+    """Return points [m] as fractions of the Web Mercator square, x to the east and y to the
+    south.
+    """
     latitude, longitude = (np.asarray(one) for one in scenario.to_latlon(line[:, 0], line[:, 1]))
     y = (1.0 - np.arcsinh(np.tan(np.radians(latitude))) / math.pi) / 2.0
     return np.stack([(longitude + 180.0) / 360.0, y], 1)

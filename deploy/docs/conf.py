@@ -1,7 +1,8 @@
-"""Configuration of the documentation site; `make docs` builds it.
+"""Configuration of the documentation site; `make docs` builds the site.
 
-The source is the whole repository, because room READMEs are part of the site. Reference pages of
-commands, settings, tables and metrics are generated here, before Sphinx reads the pages.
+The source is the whole repository, because the READMEs of all folders are part of the site. The
+reference pages of commands, settings, tables and metrics are generated here, before Sphinx reads
+the pages.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Examples to start from; the tests run every one of them."""
+"""Examples to start from; the tests run all of them."""

@@ -1,4 +1,4 @@
-"""The archive in pandas, DuckDB and GeoPandas, and the same question asked by GripMap.
+"""Example: read an archive with pandas, DuckDB and GeoPandas, and with GripMap's own question.
 
 python deploy/examples/archive_questions.py ARCHIVE FOLDER
 """
@@ -16,7 +16,9 @@ import fleet_service
 
 
 def main(archive: Path, folder: Path) -> None:
-    """Compute the median of the values per cell in three ways, and write a map for a GIS."""
+    """Compute the median friction per cell with DuckDB and pandas, find the worst stretches with
+    GripMap, and write a map for a GIS.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     files = f"{archive}/observations/*/*/*.parquet"
     # A row whose `value` is false says only that mu is at least mu_utilised: it is left out.

@@ -1,5 +1,5 @@
-"""Warnings in the car: it receives the map in front of it over its own session, and a callback gets
-each warning.
+"""Example: warnings in a car. The car receives the map of the road ahead over its own session, and
+a callback receives each warning.
 
 python deploy/examples/be_warned.py tcp/127.0.0.1:7447 57.7 11.97
 """
@@ -20,8 +20,8 @@ SPEED = 14.0  # [m/s]
 def main(
     endpoint: str, latitude: float, longitude: float, yaw: float = 0.0, within_s: float = 60.0
 ) -> str:
-    """Look ahead from a place (yaw: radians from east) and print warnings; return the first one, or
-    "".
+    """Look ahead from a place and print warnings; return the first warning, or "" if there was none
+    within `within_s` [s]. `yaw` is in radians from east.
     """
     warnings: queue.Queue[str] = queue.Queue()
     lookout = edge_agent.Lookout(

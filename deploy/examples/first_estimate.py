@@ -1,5 +1,5 @@
-"""First estimate: a simulated drive, two estimators compared with the truth, a data frame and a
-plot.
+"""Example: estimate friction on a simulated drive with two estimators, compare them with the true
+values, and make a data frame and a plot.
 
 python deploy/examples/first_estimate.py FOLDER
 """

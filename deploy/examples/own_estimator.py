@@ -1,12 +1,12 @@
 """Example of your own estimator: it reports only that friction is at least the grip in use.
 
-As a plug-in, your package states in its pyproject.toml
+To make it a plug-in, add this to the pyproject.toml of your package:
 
     [project.entry-points."gripmap.estimators"]
     at-least = "my_package:AtLeast"
 
-Then `edge-agent replay --estimator at-least`, `run` and `make_bank` know it. Here it is used
-directly:
+Then `edge-agent replay --estimator at-least`, `edge-agent run` and `make_bank` can use it. This
+example uses it directly:
 
 python deploy/examples/own_estimator.py
 """
@@ -27,10 +27,10 @@ PRIOR = (0.11, 0.63, 1.14)  # 5 %, 50 %, 95 % of what is believed before anythin
 
 
 class AtLeast:
-    """Bank of N vehicles; its only state is the largest grip used.
+    """Estimator for N vehicles; its only state is the largest grip used by each.
 
     Args:
-        vehicles: nominal vehicles, N of them.
+        vehicles: nominal parameters of the N vehicles.
     """
 
     def __init__(self, vehicles: Sequence[edge_agent.Vehicle]) -> None:
@@ -45,8 +45,9 @@ class AtLeast:
         *,
         threads: int = 1,
     ) -> edge_agent.Estimates:
-        """Estimate samples: t (T, N) [s], signals (T, N, 18) in the order of
-        schemas.signals.CHANNELS; NaN is missing."""
+        """Return estimates for samples: times t (T, N) [s], signals (T, N, 18) in the order of
+        schemas.signals.CHANNELS, NaN where a reading is missing.
+        """
         del closes, threads  # no visits, one thread
         values = np.zeros((*t.shape, ONE_FRICTION))
         pull = np.nan_to_num(np.hypot(signals[..., S.AX], signals[..., S.AY])) / GRAVITY
@@ -64,7 +65,7 @@ class AtLeast:
 
 
 def main() -> None:
-    """Try it on a simulated drive."""
+    """Try the estimator on a simulated drive."""
     log, vehicle = edge_agent.simulate_manoeuvre("double-lane-change", mu=0.5, seed=1)
     signals = np.stack([log[name].to_numpy() for name in edge_agent.CHANNELS], axis=-1)[:, None]
     t = log["t"].to_numpy()[:, None]

@@ -1,4 +1,4 @@
-"""Query of the map: as a table, and one tile decoded by hand as in any client.
+"""Example: query the map as a table, and decode one tile without GripMap code as any client can.
 
 python deploy/examples/query_map.py tcp/127.0.0.1:7447
 """
@@ -13,7 +13,7 @@ import fleet_service
 
 
 def main(endpoint: str) -> int:
-    """Print the known cells, the worst first; return their number."""
+    """Print the known cells, those with the lowest friction first; return their number."""
     cells = fleet_service.ask_map(endpoint, min_vehicles=1).to_pandas()
     measured = cells[
         cells["basis"] == "measured"

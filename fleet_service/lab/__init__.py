@@ -1,3 +1,3 @@
-"""`fleet-service evaluate`: simulated fleets through the real fusion, compared with the truth and
-with simple rules.
+"""Evaluation of the fleet service (`fleet-service evaluate`): simulated fleets report to the real
+fusion, and the map is compared with the true road and with simple rules.
 """

@@ -1,20 +1,20 @@
-"""The synthetic vehicle: reports of an honest but imperfect agent about a stretch of road. Pure.
+"""Simulated vehicle: draws the reports of an honest but imperfect agent about a road. Pure.
 
 Legend
     μ      friction of the road                                                      (n,)
     b, a   a vehicle's own relative and additive error, the same at every visit        (V,)
     k      relative error that all vehicles share in one place                         (n,)
     s      share of the grip used in a visit                                           (n,)
-    ρ      relative noise of a visit: the nearer to the limit, the more a tyre tells   (n,)
-    σ(m)   hypot(NOISE_ABSOLUTE, ρ·m): forces scale with the grip, sensors do not
+    ρ      relative noise of a visit, smaller if more of the grip is used              (n,)
+    σ(m)   hypot(NOISE_ABSOLUTE, ρ·m): noise of forces scales with the grip, of sensors not
     m, z   m = μ·(1 + b + k) + a, and the reading z = m + σ(m)·e                       (n,)
     e      a standard normal, correlated along a drive                                 (n,)
 
-An excited visit (s ≥ .6) sends ln p(z | μ) = -(z - μ)² / 2σ(μ)² - ln σ(μ): apart from b, a and k it
-is calibrated, also where e is correlated with that of the visit before, since each visit's e alone
-is standard normal (a real agent tempers to get there). An unexcited one sends "at least the grip
-used", with a slope above it that is the sender's own and stays within half a nat (contract of the
-log-likelihood). Both are rounded to the wire's bytes.
+A visit with s ≥ .6 ("excited") sends ln p(z | μ) = -(z - μ)² / 2σ(μ)² - ln σ(μ). Apart from the
+errors b, a and k, this likelihood is calibrated: each visit's e alone is standard normal, even
+though successive e are correlated. Any other visit sends a lower bound, the grip used. Above the
+bound its likelihood has a slope of at most half a nat, which differs between vehicles (see the
+contract of the log-likelihood). Both are rounded to bytes as in the messages.
 """
 
 from __future__ import annotations
@@ -48,19 +48,20 @@ BOUND_STD: Final = 0.05  # what the agent admits
 
 
 class ErrorModel(NamedTuple):
-    """Error model of a fleet; the defaults are those of the first fleet.
+    """Error model of a fleet; the defaults are those of the standard fleet.
 
     Attributes:
-        bias: standard deviation of the vehicles' relative errors.
-        common: of the relative error that all vehicles share in a place.
-        by_manoeuvre: of the relative error shared by vehicles with the same manoeuvre there.
-        tails: degrees of freedom of a visit's noise, Student's; infinite: normal.
-        stated: standard deviation that a vehicle states over the one it has.
-        share: of the grip, least and most, that an excited visit uses.
-        low: how much too low a value reads, for each share of the grip that was left.
-        tyres: relative error of all tyres of the fleet.
-        half: further relative error of every second vehicle.
-        alike: share of the passes of a place that do the most frequent manoeuvre.
+        bias: standard deviation of the vehicles' own relative errors.
+        common: standard deviation of the relative error that all vehicles share in a place.
+        by_manoeuvre: standard deviation of the relative error that vehicles with the same manoeuvre
+            share in a place.
+        tails: degrees of freedom of a visit's noise (Student's t); infinite for normal noise.
+        stated: ratio of the standard deviation that a vehicle states to its true one.
+        share: smallest and largest share of the grip that an excited visit uses.
+        low: how far a value reads too low, per share of the grip that was left unused.
+        tyres: relative error common to all tyres of the fleet.
+        half: additional relative error of every second vehicle.
+        alike: share of the passes at a place that do its most frequent manoeuvre.
     """
 
     bias: float = BIAS_RELATIVE
@@ -80,8 +81,8 @@ CLEAN: Final = ErrorModel()
 
 @dataclass(frozen=True)
 class Errors:
-    """Own errors of V vehicles: relative, additive, and the slope of their bounds [nat]; each
-    (V,).
+    """Own errors of V vehicles: relative error, additive error, and slope of their lower bounds
+    [nat]; each (V,).
     """
 
     relative: FloatArray
@@ -103,7 +104,7 @@ class Errors:
 
 class Passes(NamedTuple):
     """Properties of visits (n,): vehicle, friction, error shared in the place, share of the grip
-    used, noise, manoeuvre, and True where they are excited.
+    used, noise, manoeuvre, and a mask of excited visits.
     """
 
     vehicle: IntArray
@@ -117,8 +118,8 @@ class Passes(NamedTuple):
 
 @dataclass(frozen=True)
 class SimulatedReports:
-    """Reports of visits: readings z and σ (n,), NaN where unexcited; grip used (n,), and its
-    manoeuvre (n,); log-likelihood (n, 32).
+    """Reports of visits: reading z and its standard deviation σ (n,), NaN for unexcited visits;
+    grip used (n,); manoeuvre (n,); log-likelihood (n, 32).
     """
 
     reading: FloatArray
@@ -129,17 +130,17 @@ class SimulatedReports:
 
 
 def used_shares(rng: Generator, excited: BoolArray, model: ErrorModel = CLEAN) -> FloatArray:
-    """Return the share s of the grip used in each visit: within the model's range if excited, else
-    that of ordinary driving.
+    """Return the share s of the grip used in each visit, (n,): within the model's range if excited,
+    else as in ordinary driving.
     """
     ordinary = rng.uniform(0.05, min(0.5, model.share[1]), excited.shape)
     return np.where(excited, rng.uniform(*model.share, excited.shape), ordinary)
 
 
 def reading_noise(rng: Generator, along: IntArray, tails: float = np.inf) -> FloatArray:
-    """Return the correlated noise e of successive visits, with standard deviation 1; `along` (n,)
-    is 0 where a drive begins. If `tails` is finite, it is Student's t with so many degrees of
-    freedom.
+    """Return the correlated noise e of successive visits, (n,), with standard deviation 1. `along`
+    (n,) counts the visits of a drive from 0. If `tails` is finite, the noise follows Student's t
+    with this number of degrees of freedom.
     """
     e = rng.normal(size=len(along))
     heavy = 1.0 if np.isinf(tails) else np.sqrt((tails - 2.0) / rng.chisquare(tails, len(along)))
@@ -178,8 +179,8 @@ def draw_reports(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
 def reading_likelihood(
     reading: FloatArray, relative: FloatArray, absolute: float = NOISE_ABSOLUTE
 ) -> FloatArray:
-    """Return ln p(z | μ) of readings (n,) with relative noise (n,), on the grid (n, 32), up to a
-    constant.
+    """Return ln p(z | μ) on the friction grid, (n, 32), up to a constant, for readings z (n,) with
+    relative noise (n,).
     """
     std = np.hypot(absolute, relative[:, None] * mugrid.CENTRES)
     return -0.5 * np.square((reading[:, None] - mugrid.CENTRES) / std) - np.log(std)
@@ -188,7 +189,7 @@ def reading_likelihood(
 def overconfident_likelihood(
     claim: FloatArray | float, std: float = OVERCONFIDENT_STD
 ) -> FloatArray:
-    """Return normal log-likelihoods (n, 32) of a vehicle that claims μ (n,) with a standard
-    deviation that is too small.
+    """Return normal log-likelihoods (n, 32) of a vehicle that claims a friction μ (n,) with a
+    standard deviation that is too small.
     """
     return np.asarray(-0.5 * np.square((mugrid.CENTRES - np.reshape(claim, (-1, 1))) / std))

@@ -1,11 +1,13 @@
-"""Attacks on the map: changes that a few attackers cause compared with the honest vehicles alone.
+"""Attacks on the map: how many alerts a few attackers change, compared with the honest vehicles
+alone.
 
 The attackers of `claim_random`, `shifted_pose` and `flood_one_cell` are enrolled vehicles that were
-honest, and so trusted, until the attack begins. `add_newcomers` are new names. `replay_messages` goes through
-the service's admission: old messages again, other vehicles' messages on an own key, and old visits
-under an own name. A cell is counted if its alert differs from that of the same drive without the
-attack at any minute: dry or wet cells (μ > CLEARLY_DRY) that are raised, icy ones (μ < CLEARLY_ICY)
-that are suppressed, with ENOUGH honest excited vehicles.
+honest, and are therefore trusted, until the attack begins. `add_newcomers` uses new names.
+`replay_messages` sends messages through the service's admission: old messages again, other
+vehicles' messages under the attacker's key, and old visits under the attacker's name. A cell is
+counted if its alert differs at any minute from that of the same drive without the attack. Raised
+alerts count in dry or wet cells (μ > CLEARLY_DRY), suppressed alerts in icy cells (μ <
+CLEARLY_ICY). Only cells with ENOUGH honest excited vehicles are considered.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ ENOUGH = 5
 
 @dataclass(frozen=True)
 class AttackedDrive:
-    """A drive before the attack."""
+    """Drive of the honest fleet, before an attack is added."""
 
     town: Town
     visits: Visits
@@ -54,14 +56,14 @@ class AttackedDrive:
 
 
 def drive_of(rng: Generator) -> AttackedDrive:
-    """Simulate the honest fleet's drive."""
+    """Simulate the drive of the honest fleet."""
     place = town.draw_town(rng, MINUTES, 0.0)
     visits = town.drive_fleet(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
     return AttackedDrive(place, visits, excited_vehicles(visits, place, BEGIN, VEHICLES) >= ENOUGH)
 
 
 def measure(seeds: range) -> dict[str, float]:
-    """Return the number of alerts raised or suppressed per attack, summed over the seeds."""
+    """Return the number of alerts that each attack raises or suppresses, summed over the seeds."""
     out = dict.fromkeys((f"fusion.attack.{name}" for name in ATTACKS), 0.0)
     for seed in seeds:
         rng = np.random.default_rng([seed, 7])
@@ -93,7 +95,7 @@ def _attacking_rows(v: Visits, count: int) -> BoolArray:
 
 
 def claim_random(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return visits in which the attackers claim random values with high confidence at every
+    """Return visits in which the attackers claim random values, with high confidence, at every
     visit.
     """
     v = drive.visits
@@ -113,7 +115,9 @@ def _with_claims(v: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
 
 
 def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Report the attackers' true measurements at a place elsewhere in the town."""
+    """Return visits in which the attackers report their correct measurements from a wrong place in
+    the town.
+    """
     v = drive.visits
     moved = (v.place + int(rng.integers(CELLS // 4, 3 * CELLS // 4))) % CELLS
     return Visits(
@@ -133,8 +137,8 @@ def victim_cells(drive: AttackedDrive) -> IntArray:
 
 
 def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return hundreds of visits per minute that claim ice in the driest cell and a dry road in the
-    iciest; the values vary, so that they look new.
+    """Return visits with hundreds of false reports per minute: ice in the driest cell and a dry
+    road in the iciest. The values vary, so that they seem new.
     """
     count = FLOODERS * FLOOD
     seconds = rng.uniform(60.0 * BEGIN, 60.0 * MINUTES, count)
@@ -146,8 +150,8 @@ def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
 
 
 def add_newcomers(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return visits of forty new names that each pass once and agree: ice on the road of the driest
-    cell, dry on that of the iciest.
+    """Return visits with forty additional names that each pass once and agree with each other: ice
+    on the road of the driest cell, a dry road at the iciest.
     """
     roads = victim_cells(drive) // LENGTH * LENGTH
     who, which, along = (
@@ -192,8 +196,8 @@ VISITS: Final[dict[str, Callable[[Generator, AttackedDrive], Visits]]] = {
 
 
 def replay_messages(rng: Generator, drive: AttackedDrive) -> int:
-    """Return the number of cells whose alert changes if messages of the town's first minutes are
-    sent again: unchanged, on other keys, and under another name.
+    """Return the number of cells whose alert changes if messages of the first minutes are sent
+    again: unchanged, under other keys, and under another name.
     """
     sent = make_messages(drive.visits)
     at = drive.visits.seconds[[m.last for m in sent]]
@@ -213,8 +217,8 @@ def replay_messages(rng: Generator, drive: AttackedDrive) -> int:
 def _alerts_by_minute(
     sent: list[SentMessage], at: FloatArray, forged: list[Message], key: bytes
 ) -> list[BoolArray]:
-    """Return the alerts of each minute. The same `key` gives the vehicles the same numbers, and
-    therefore the same peers, in each run.
+    """Return the alerts (masks of cells) of each minute. With the same `key`, vehicles have the
+    same numbers in each run, and are therefore compared with the same other vehicles.
     """
     out = []
     with tempfile.TemporaryDirectory() as folder:

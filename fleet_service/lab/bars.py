@@ -1,5 +1,5 @@
-"""Bars (required limits) of the campaign's figures. A figure that was not measured fails its
-bar.
+"""Targets (required limits) for the figures of the evaluation. A figure that was not measured
+misses its target.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ Side = Literal["less", "more", "within"]
 
 
 class MapBar(NamedTuple):
-    """Required limit of a figure; if `bar` is None, the figure is listed but not judged."""
+    """Target for a figure; if `bar` is None, the figure is listed but not judged."""
 
     bar: float | tuple[float, float] | None
     better: Side
@@ -142,8 +142,8 @@ BARS: Final[dict[str, MapBar]] = {
 
 
 def judge_figures(measured: Mapping[str, float]) -> list[Figure]:
-    """Return every figure of BARS, NaN if it was not measured, and then all other measured
-    figures.
+    """Return all figures that have an entry in BARS, with NaN if not measured, followed by all
+    other measured figures.
     """
     named = [
         Figure(name, measured.get(name, math.nan), bar.unit, bar.bar, bar.better)

@@ -1,4 +1,4 @@
-"""The whole campaign: every part with progress, then figures, table and plots."""
+"""The complete evaluation: runs every part, and then writes figures, table and plots."""
 
 from __future__ import annotations
 
@@ -56,11 +56,12 @@ def run(
     """Run all parts and write `figures.json` and `figures.md` into `folder`.
 
     Args:
-        folder: is made.
-        quick: one seed, to check that everything runs; too little to judge the bars.
-        drives: end to end; without one, its figures are missing.
-        log_line: gets progress lines.
-        only: name of one part and nothing else; figures that it does not measure are not listed.
+        folder: output folder, which is created.
+        quick: True to run one seed, which checks that everything runs but is too little to judge
+            the targets.
+        drives: end-to-end drives; without them, their figures are missing.
+        log_line: called with lines about the progress.
+        only: name of the only part to run; figures that it does not measure are not listed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     seeds = range(JUDGING, JUDGING + (QUICK_SEEDS if quick else SEEDS))
@@ -88,8 +89,8 @@ def run(
 
 
 def _is_listed(name: str, only: str | None, found: Mapping[str, float]) -> bool:
-    """Return True if a figure belongs to a run; in an end-to-end run also figures that were not
-    measured belong to it.
+    """Return True if a figure must be listed for a run. For an end-to-end run, this includes its
+    figures that were not measured.
     """
     if only == END_TO_END_PART:
         return name.startswith(END_TO_END)
@@ -97,7 +98,9 @@ def _is_listed(name: str, only: str | None, found: Mapping[str, float]) -> bool:
 
 
 def drives_end_to_end(quick: bool) -> Drives:
-    """Return the end-to-end drives, level and rough; if quick, a few seconds of them."""
+    """Return the end-to-end drives, for the level and the rough world; if `quick`, only a few
+    seconds each.
+    """
     return {
         world: end_to_end.drive_command(*((4, 3.0) if quick else length), world)
         for world, length in LENGTHS.items()
@@ -105,7 +108,7 @@ def drives_end_to_end(quick: bool) -> Drives:
 
 
 def all_hold(found: Sequence[Figure]) -> bool:
-    """Return True if every bar holds; a missing figure does not."""
+    """Return True if every figure meets its target; a missing figure does not."""
     return all(figure.holds for figure in found if figure.bar is not None)
 
 
@@ -141,7 +144,9 @@ def _measure_resampled(ways: Drives, folder: Path, seeds: range) -> dict[str, fl
 
 
 def parts_of(seeds: range, log_line: LogLine) -> dict[str, Part]:
-    """Return the parts that need no simulated vehicle, by their names for `--only`."""
+    """Return the parts of the evaluation that need no simulated vehicle, by the names that `--only`
+    accepts.
+    """
     few = seeds[:EXACT_SEEDS]
     return {
         "exact": lambda: _measure_exact(few),

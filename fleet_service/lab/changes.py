@@ -1,4 +1,6 @@
-"""Ice that comes and goes on one road of a town: how many excited passes the map needs. Pure."""
+"""Ice that forms and melts on one road of a town: measures how many excited passes the map needs to
+show the change. Pure.
+"""
 
 from __future__ import annotations
 
@@ -36,11 +38,12 @@ def changing_town(rng: Generator, before: float, after: float) -> Town:
 
 
 def detection_delays(rng: Generator, before: float, after: float) -> IntArray:
-    """Return the number of excited passes over each cell of the road, (LENGTH,), until the map
-    shows the change.
+    """Return the number of excited passes over each cell of the road until the map shows the
+    change, (LENGTH,).
 
-    Ice is seen when P(μ < .4) > .9; its end, when P(μ < .4) < .1, which ends an alert. A pass is
-    one excited visit that was reported for the cell, correctly or not.
+    The map shows ice when P(μ < .4) > .9, and the end of ice when P(μ < .4) < .1, which ends an
+    alert. A pass is one excited visit that was reported for the cell, whether the position was
+    correct or not.
     """
     place = changing_town(rng, before, after)
     visits = town.drive_fleet(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
@@ -68,8 +71,8 @@ def _has_seen(fusion: Fusion, cell: int, ice: bool) -> bool:
 
 
 def measure(seeds: range) -> dict[str, float]:
-    """Return medians and 95 % quantiles over the cells of all seeds, and the share of cells
-    detected after each number of passes.
+    """Return medians and 95 % quantiles of the delays over the cells of all seeds, and the share of
+    cells in which the change was detected after each number of passes.
     """
     out: dict[str, float] = {}
     for name, before, after in (("ice_onset", DRY, ICE), ("ice_end", ICE, DRY)):

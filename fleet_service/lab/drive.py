@@ -1,8 +1,8 @@
-"""Visits through the service's own path: rows as the archive has them → `observations_of` →
+"""Processing of simulated visits by the service's own code: archive rows → `observations_of` →
 `Fusion.update` → alerts.
 
-Deliveries are as in life: a few rows come late (some beyond the lateness), and some twice;
-`SequenceTrackers` drops the second ones, as in the service.
+Deliveries are realistic: a few rows come late (some too late), and some twice; `SequenceTrackers`
+drops the duplicates, as in the service.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ CELL: Final = cell_numbers()
 
 
 def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
-    """Return visits as the archive columns that the fusion reads; every row is a batch of its own.
+    """Return visits as the archive columns that the fusion reads; every row is a separate batch.
 
-    `cells` are the grid's numbers of the visits' places.
+    `cells` contains the grid number of each place of the town.
     """
     n = len(v)
     nan = np.full(len(v), np.nan, np.float32)
@@ -72,8 +72,8 @@ def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
 
 
 def draw_arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
-    """Draw the arrival times [s] of deliveries and the visit in each, in order of arrival: some
-    late, some twice.
+    """Draw deliveries of the visits: some come late, some twice. Return the arrival times [s] in
+    ascending order, and the visit in each delivery.
     """
     n = len(v)
     delay = rng.exponential(DELAY_S, n) + np.where(
@@ -87,7 +87,7 @@ def draw_arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
 
 
 def novel_deliveries(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
-    """Return the deliveries that the service admits: each identity once."""
+    """Return the deliveries that the service accepts: the first delivery of each visit."""
     streams = SequenceTrackers()
     kept = []
     region = rows["region"].tolist()
@@ -103,8 +103,12 @@ def novel_deliveries(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -
 
 @dataclass
 class AlertWatch:
-    """A fusion with its alerts, asked at some minutes: `beliefs` by minute, (cells, 32),
-    `alerted` (minutes, cells).
+    """A fusion with its alerts, read at some minutes.
+
+    Attributes:
+        beliefs: beliefs about the cells by minute, (cells, 32).
+        alerted: for each minute read, a mask of cells with an alert.
+        late: number of observations that came too late.
     """
 
     fusion: Fusion
@@ -114,7 +118,7 @@ class AlertWatch:
     late: int = 0
 
     def snapshot(self, minute: int) -> None:
-        """Record the map's alerts at a minute."""
+        """Read and store the map's beliefs and alerts at a minute."""
         now = START + minute * 60 * NS
         slots = self.fusion.slots_of(CELL, np.zeros(CELLS, np.int64))
         known = slots >= 0
@@ -126,7 +130,9 @@ class AlertWatch:
 
 
 def split_minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Observations]:
-    """Return the observations that arrive in each minute."""
+    """Yield the observations that arrive in each of `count` minutes; `at` contains the arrival
+    times [s].
+    """
     for rows in np.split(np.arange(len(at)), np.searchsorted(at, 60.0 * np.arange(1, count + 1)))[
         :count
     ]:
@@ -136,7 +142,9 @@ def split_minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Obser
 def watch_drive(
     rng: Generator, v: Visits, count: int, asked: tuple[int, ...] | None = None
 ) -> AlertWatch:
-    """Deliver the visits and ask the map after each of `count` minutes, or only those `asked`."""
+    """Deliver the visits to a fusion, and read the map after each of `count` minutes, or only at
+    the minutes in `asked`.
+    """
     rows = rows_of(v)
     at, which = draw_arrivals(rng, v)
     kept = novel_deliveries(rows, v.vehicle, which)

@@ -1,8 +1,8 @@
-"""End to end: simulated vehicles with the real estimator, their observations through the fusion,
-compared with the truth.
+"""End-to-end evaluation: simulated vehicles with the real estimator drive, their observations are
+fused, and the map is compared with the true road.
 
-A command of the deployment drives the vehicles, since the service does not know the agent. This
-module reads the files that it writes.
+A command in `deploy` drives the vehicles, because the service must not import the agent. This
+module reads the files that the command writes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ Drive = Callable[[Path], None]  # drives and writes both files into a folder
 
 
 class World(NamedTuple):
-    """Conditions of a drive: a scenario of the simulator, and the share of rough vehicles."""
+    """Conditions of a drive: scenario of the simulator, and share of vehicles with realistic
+    ("rough") sensor errors.
+    """
 
     scenario: str
     rough: float
@@ -86,8 +88,8 @@ def drive_command(vehicles: int, seconds: float, world: World) -> Drive:
 
 
 def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float]:
-    """Return coverage of cells with SEVERAL vehicles, error of the measured ones among them,
-    alerts, and counts.
+    """Return figures of one drive: coverage of cells that SEVERAL vehicles visited, error of those
+    that are measured, alerts, and counts.
     """
     folder = folder / world.prefix.removeprefix("fusion.")
     drive(folder)
@@ -117,8 +119,8 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
 
 
 def raised_alerts(fusion: Fusion, o: Observations) -> list[Alert]:
-    """Fuse the observations second by second, as a service would, and return the alerts that
-    were raised.
+    """Fuse the observations second by second, as a service does; return the alerts that were
+    raised.
     """
     alerts = Alerts(fusion)
     raised = []
@@ -132,11 +134,12 @@ def raised_alerts(fusion: Fusion, o: Observations) -> list[Alert]:
 
 
 def false_ice(raised: Sequence[Alert], visits: pa.Table) -> tuple[int, int]:
-    """Count alerts on wet and dry road: those with no slippery road near, and those in a cell next
-    to slippery road.
+    """Return two counts of alerts on wet or dry road: alerts without slippery road nearby, and
+    alerts in a cell next to slippery road.
 
-    Slippery is a cell where any vehicle truly found less than SURE_GRIP before the alert. A fix is
-    metres off and a cell ten metres wide, so a warning in the cell next to the ice is correct.
+    A cell is slippery if any vehicle truly had less friction than SURE_GRIP in it before the alert.
+    A cell is ten metres wide and positions are wrong by some metres, so an alert in the cell next
+    to the ice is acceptable.
     """
     east, north = grid.deinterleave(visits["cell"].to_numpy())
     mu = visits["mu"].to_numpy()
@@ -167,8 +170,8 @@ def _score_figures(scores: Scores, measured: np.ndarray[Any, Any]) -> dict[str, 
 
 
 def mean_or_nan(values: np.ndarray[Any, Any]) -> float:
-    """Return the mean, or NaN without values, because a figure that was not measured must not hold
-    its bar.
+    """Return the mean of the values, or NaN if there are none, because a figure that was not
+    measured must miss its target.
     """
     return float(values.mean()) if len(values) else float("nan")
 
@@ -188,7 +191,7 @@ def read_observations(path: Path) -> dict[str, Any]:
 
 
 def driven_in(folder: Path) -> DrivenVisits:
-    """Return the reports of a way together with the truth."""
+    """Return the reports of a drive together with the true values."""
     truth = pq.read_table(folder / TRUTH)
     _, vehicle = np.unique(truth["vehicle"].to_numpy(zero_copy_only=False), return_inverse=True)
     enter = truth["enter_time"].cast(pa.int64()).to_numpy()
@@ -197,7 +200,7 @@ def driven_in(folder: Path) -> DrivenVisits:
 
 
 def observations_in(columns: dict[str, Any]) -> Observations:
-    """Return columns as observations for the fusion, each row a batch of its own."""
+    """Return columns as observations for the fusion; each row is a separate batch."""
     n = len(columns["cell"])
     with_likelihood = np.full(n, columns["log_likelihood"].shape[1] > 0)
     identity = {
@@ -211,8 +214,8 @@ def observations_in(columns: dict[str, Any]) -> Observations:
 
 
 def slots_with_truth(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatArray]:
-    """Return the slots that a vehicle truly visited, and their friction in the half minute of the
-    last such visit.
+    """Return the slots that a vehicle truly visited, and the true friction of each. It is the mean
+    over the last half minute of the drive, or over all visits if there were none then.
     """
     cell = visits["cell"].to_numpy()
     sector = visits["sector"].to_numpy()
@@ -230,7 +233,9 @@ def slots_with_truth(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatA
 
 
 def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Return True for each slot in which all visits truly had one friction, (slots,)."""
+    """Return a mask of slots, (slots,): True if all visits to the slot truly had the same
+    friction.
+    """
     slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))
     mu = visits["mu"].to_numpy()
     known = slot >= 0
@@ -242,8 +247,8 @@ def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np
 
 
 def excited_vehicles(fusion: Fusion, visits: pa.Table) -> IntArray:
-    """Return the number of distinct vehicles that used EXCITED_SHARE of the grip in each slot,
-    (slots,).
+    """Return the number of distinct vehicles that used at least EXCITED_SHARE of the grip in each
+    slot, (slots,).
     """
     rows = visits["utilisation"].to_numpy() >= EXCITED_SHARE
     slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))

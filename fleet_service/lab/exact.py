@@ -1,5 +1,6 @@
-"""Properties that must hold to rounding: the result is independent of the order of arrival, and
-equal in a replay from an archive. Also measures how far unexcited visits lower an upper end.
+"""Properties that must hold except for rounding: the map does not depend on the order of arrival,
+and a replay from the archive gives the same map. The module also measures how far unexcited visits
+lower the upper end of an interval.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ PARTS: Final = 60  # portions in which a shuffled drive comes
 
 
 def largest_difference(a: Fusion, b: Fusion) -> float:
-    """Return the largest difference of any probability in any cell of two fusions; 1 if only one of
-    them has some cell.
+    """Return the largest difference of any probability in any cell between two fusions; 1 if a cell
+    exists in only one of them.
     """
     there = b.slots_of(a.cell[: a.size], a.sector[: a.size])
     if a.size != b.size or (there < 0).any():
@@ -40,8 +41,8 @@ def largest_difference(a: Fusion, b: Fusion) -> float:
 
 
 def drive_town(rng: Generator) -> Visits:
-    """Simulate twenty minutes in a town where some vehicles report false values, so that weights
-    differ.
+    """Simulate twenty minutes in a town in which some vehicles report false values, so that
+    vehicles get different weights.
     """
     visits = town.drive_fleet(
         rng, town.draw_town(rng, MINUTES, 0.3), Errors.draw(rng, VEHICLES), MINUTES
@@ -50,8 +51,8 @@ def drive_town(rng: Generator) -> Visits:
 
 
 def order_difference(rng: Generator) -> float:
-    """Return the largest difference between fusing in order of time and fusing in a random order
-    within the lateness.
+    """Return the largest difference of a probability between fusing in order of time and fusing in
+    random order within the allowed lateness.
     """
     visits = drive_town(rng)
     o = observations_of(rows_of(visits), visits.vehicle)
@@ -66,8 +67,8 @@ def order_difference(rng: Generator) -> float:
 
 
 def replay_difference(rng: Generator) -> float:
-    """Return the largest difference between a service that received messages, some late or twice,
-    and one restarted from its archive.
+    """Return the largest difference of a probability between two services: one received messages,
+    some late or twice, and the other was restarted from its archive.
     """
     visits = drive_town(rng)
     sent = make_messages(visits)
@@ -85,8 +86,8 @@ def replay_difference(rng: Generator) -> float:
 
 
 def upper_shift(rng: Generator) -> float:
-    """Return the largest difference between the prior's upper end and that of unexcited visits,
-    over the numbers of vehicles in UNEXCITED and all surfaces.
+    """Return how far unexcited visits lower the upper end of the interval below that of the prior.
+    The result is the maximum over all surfaces and the numbers of vehicles in UNEXCITED.
     """
     prior = float(mugrid.quantiles(mugrid.PRIOR, 0.95))
     worst = -np.inf

@@ -1,4 +1,4 @@
-"""Fading of a dry road: the lower end of the map's interval that a planner gets some time after the
+"""Fading of knowledge about a dry road: the lower end of the map's interval at some times after the
 last pass. Pure.
 """
 
@@ -28,7 +28,9 @@ AFTER_MIN: Final = (0, 5, 15, 30, 60, 120, 180, 360)  # [min] after the hour of 
 
 
 class WeatherSince(NamedTuple):
-    """Weather that is reported each hour, from the last pass on [°C, mm/h]."""
+    """Weather after the last pass, reported each hour: temperature [°C] and precipitation
+    [mm/h].
+    """
 
     temperature: float
     precipitation: float
@@ -49,7 +51,9 @@ TITLES: Final = {
 
 
 def measure(seeds: range) -> dict[str, float]:
-    """Lower end of the interval, mean of the seeds, by weather and minutes."""
+    """Return the lower end of the interval, averaged over the seeds, by weather and minutes since
+    the last pass.
+    """
     return {
         f"{PREFIX}.{name}.min{minutes}": float(lower)
         for name, known in WEATHER.items()
@@ -64,7 +68,9 @@ def measure(seeds: range) -> dict[str, float]:
 
 
 def lower_ends(rng: Generator, known: WeatherSince | None) -> FloatArray:
-    """Lower end at each of AFTER_MIN, after excited passes over a dry road for an hour."""
+    """Return the lower end of the interval at each time in AFTER_MIN, after an hour of excited
+    passes over a dry road.
+    """
     seconds = np.sort(rng.random(PASSES)) * HOUR_S
     who = rng.integers(0, CARS, PASSES)
     mu = np.full(PASSES, DRY)

@@ -1,5 +1,5 @@
-"""Fleets with and without misbehaving vehicles: coverage, error and alerts, compared with the rules
-of `rules`.
+"""Fleets with and without misbehaving vehicles: coverage, error and alerts of the map, compared
+with the simple rules in `rules`.
 """
 
 from __future__ import annotations
@@ -38,12 +38,13 @@ EARLIER = 20
 
 
 class Fleet(NamedTuple):
-    """One campaign of `minutes`, in which a share of the vehicles always reports the value `claim`.
+    """One simulation of `minutes` [min], in which a share of the vehicles always reports the value
+    `claim`.
 
     The service judges vehicles by their earlier reports. Coverage and error are therefore measured
     from minute `begin` on, when every vehicle has about 200 visits, as many as a car makes in a
-    day. The rates of alerts are measured as soon as each vehicle has EARLIER visits, about two
-    minutes after the start; the figures `…_settled` are measured from `begin` on.
+    day. The rates of alerts are measured as soon as each vehicle has made EARLIER visits, about two
+    minutes after the start. The figures `…_settled` are measured from `begin` on.
     """
 
     name: str
@@ -65,7 +66,9 @@ AT: Final = (5, 10, 20, 30, 40)
 
 @dataclass
 class Found:
-    """Results of a campaign over its seeds."""
+    """Results of one fleet over all seeds: scores of the map (`ours`) and of the rules (`theirs`),
+    and masks of false and missed alerts.
+    """
 
     ours: list[Scores] = field(default_factory=list)
     theirs: list[list[Scores]] = field(default_factory=lambda: [[] for _ in rules.RULES])
@@ -76,7 +79,7 @@ class Found:
 
 
 def drive_seed(fleet: Fleet, seed: int, found: Found) -> None:
-    """Drive one seed and record the map's answers."""
+    """Simulate one seed and add the results to `found`."""
     rng = np.random.default_rng([seed, 1])
     place = town.draw_town(rng, fleet.minutes, CHANGING)
     errors = Errors.draw(rng, VEHICLES)
@@ -108,7 +111,9 @@ def drive_seed(fleet: Fleet, seed: int, found: Found) -> None:
 
 
 def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
-    """Run all campaigns and return their figures; `log_line` receives one line per campaign."""
+    """Simulate all fleets and return their figures; `log_line` is called with one line per
+    fleet.
+    """
     out: dict[str, float] = {}
     for fleet in FLEETS:
         found = Found()

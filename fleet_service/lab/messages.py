@@ -1,4 +1,4 @@
-"""Visits encoded as messages for the service, so that they pass the real admission."""
+"""Simulated visits encoded as messages, so that they pass through the service's real admission."""
 
 from __future__ import annotations
 
@@ -31,12 +31,14 @@ def name_of(vehicle: int) -> str:
 
 
 def clock_of(seconds: float) -> int:
-    """Return the time of the service [ns] at so many seconds after the start."""
+    """Return the service's time [ns] at `seconds` after the start."""
     return START + int(seconds * NS) + NS
 
 
 def make_messages(v: Visits) -> list[SentMessage]:
-    """Return each vehicle's visits as batches, in order of time per vehicle and region."""
+    """Return each vehicle's visits as messages with batches, in order of time per vehicle and
+    region.
+    """
     rows = rows_of(v)
     out = []
     latitude, longitude = grid.centre(rows["cell"])
@@ -87,8 +89,8 @@ def _make_message(
 
 
 def forge_messages(message: Message, thief: int) -> tuple[Message, Message]:
-    """Return forged messages: another vehicle's message under the attacker's own key, and the same
-    visits in a batch of the attacker's own.
+    """Return two forged messages: another vehicle's message under the attacker's own key, and the
+    same visits in a batch with the attacker's own name.
     """
     batch = decode(message.payload, message.encoding, message.kind)
     name = name_of(thief)

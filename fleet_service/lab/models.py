@@ -1,10 +1,10 @@
-"""Fleets whose errors differ from the fusion's assumptions, and the sharpness of one that does not.
-Pure.
+"""Fleets whose errors differ from the fusion's assumptions, and one fleet that follows them. Pure.
 
-Each fleet gets to know itself on half of the roads and is judged on the other half, which no
-vehicle visited before. So the map of a cell there rests only on the cell's excited vehicles. Towns,
-ways and errors are drawn by judging seeds. One fleet follows no error model: it errs as the real
-estimator did on whole ways (`resampled`).
+Each fleet first drives half of the roads, so that the service gets to know its vehicles. It is
+judged on the other half, which no vehicle visited before. So the map there rests only on the
+excited vehicles of each cell. Towns, drives and errors are drawn with the judging seeds. One fleet
+follows no error model: its errors are those of the real estimator on simulated drives
+(`resampled`).
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ MODELS: Final[dict[str, ErrorModel]] = {
 def score_town(
     model: ErrorModel, seed: int, ways: DrivenVisits | None = None
 ) -> tuple[Scores, list[Scores]]:
-    """Return the scores of the map and of the rules in one town; reports are drawn from `ways` if
-    given.
+    """Return the scores of the map, and of the simple rules, in one town. If `ways` is given,
+    reports are drawn from these drives.
     """
     rng = np.random.default_rng([seed, 11])
     place = town.draw_town(rng, MINUTES, 0.0, model)
@@ -72,7 +72,7 @@ def score_town(
 
 
 def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
-    """Return the figures of all fleets; `log_line` receives lines of progress."""
+    """Return the figures of all fleets; `log_line` is called with lines about the progress."""
     out: dict[str, float] = {}
     for name, model in MODELS.items():
         out |= _town_figures(f"fusion.{name}", [score_town(model, seed) for seed in seeds])
@@ -83,8 +83,8 @@ def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
 
 
 def measure_real(ways: DrivenVisits, seeds: range) -> dict[str, float]:
-    """Return the figures of a fleet whose errors are those of the real estimator; empty if no visit
-    or every visit was excited.
+    """Return the figures of a fleet whose errors are those of the real estimator. Return nothing if
+    no visit of the drives, or every visit, was excited.
     """
     if not ways.excited.any() or ways.excited.all():
         return {}

@@ -1,9 +1,8 @@
-"""Whole ways with the real estimator, judged while they go on: after one, six and thirty minutes,
-the worst of all.
+"""Drives with the real estimator, evaluated at several moments: after one, six and thirty minutes.
 
 A map that is calibrated after a minute may later become overconfident about errors that all
-vehicles share, and one that is calibrated after half an hour may have been overconfident in the
-first minute. So each way is asked at MOMENTS, and what counts is the worst.
+vehicles share. A map that is calibrated after half an hour may have been overconfident in the first
+minute. Therefore the map is read at all MOMENTS, and the worst of them counts.
 """
 
 from __future__ import annotations
@@ -41,8 +40,8 @@ MIDDLE: Final = 0.91  # of the bar on coverage: the worst is the farthest from i
 
 
 class AskedWay(NamedTuple):
-    """Scores of the cells that several vehicles had visited at one moment, and True for those that
-    are measured.
+    """Scores at one moment of a drive for the cells that several vehicles had visited, and a mask
+    of the measured cells.
     """
 
     scores: Scores
@@ -50,7 +49,7 @@ class AskedWay(NamedTuple):
 
 
 def ask_moments(folder: Path) -> list[AskedWay]:
-    """Return the map's answers about a way at each of MOMENTS that the way reaches."""
+    """Return the scores of the map at each of MOMENTS that the drive in `folder` reaches."""
     o = end_to_end.observations_in(end_to_end.read_observations(folder / OBSERVATIONS))
     visits = pq.read_table(folder / TRUTH)
     begin = int(o.time.min())
@@ -83,11 +82,11 @@ def ask_moments(folder: Path) -> list[AskedWay]:
 
 
 def moment_figures(ways: Sequence[Sequence[AskedWay]], prefix: str) -> dict[str, float]:
-    """Return the figures of ways (≥ 10 for a judgement): of each moment the mean, the worst and the
-    spread over them.
+    """Return the figures of several drives (at least 10 for a judgement): for each moment the mean,
+    the worst value and the spread over the drives.
 
-    Error and coverage are of measured cells: the interval of an untested cell reaches to the grid's
-    end, so that it covers the truth.
+    Error and coverage are computed for measured cells only. The interval of an untested cell
+    reaches to the end of the grid, so it always covers the true friction.
     """
     out: dict[str, float] = {f"{prefix}.ways": float(len(ways))}
     for k, seconds in enumerate(MOMENTS[: min(map(len, ways))]):

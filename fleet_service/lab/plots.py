@@ -1,4 +1,6 @@
-"""Plots of the campaign, generated from its figures alone. Needs matplotlib (the `demo` extra)."""
+"""Plots of the evaluation, drawn from its figures alone. They need matplotlib (the `demo`
+extra).
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ SIZE = (5.5, 4.2)
 def draw_plots(
     found: Sequence[Figure], folder: Path, forms: Sequence[str] = ("png", "svg", "pdf")
 ) -> list[Path]:
-    """Write the four plots into `folder`, in each form.
+    """Write the four plots into `folder`, in each file format; return their paths.
 
     Raises:
         InputError: matplotlib is not installed.

@@ -1,17 +1,18 @@
-"""Errors of the real estimator: its reports on whole ways, resampled for the visits of a town.
-Pure.
+"""Errors of the real estimator: its reports on simulated drives, resampled for the visits of a
+town. Pure.
 
-The synthetic vehicle of `agent` errs as the fusion assumes, which flatters the fusion. Here each
-vehicle of a town is one of those of the ways, with all that persists in it (offsets, a tilted
-sensor, tyres). Each of its visits is one that this vehicle made on a road nearly as slippery,
-excited or not as the town's visit is:
+The simulated vehicle of `agent` has the errors that the fusion assumes, which makes the fusion look
+too good. Here each vehicle of a town takes its errors from one vehicle of the drives, with all
+errors that persist in it (offsets, a tilted sensor, tyres). Each of its visits is replaced with one
+that this vehicle made on a road with nearly the same friction, excited if the town's visit is
+excited:
 
     μ, μ_w   friction of the town's road, and of the road in the visit that is drawn     (n,)
-    c        μ/μ_w: forces scale with the grip, so value, interval and grip used do, and ℓ(x)
-             becomes ℓ(x/c)
+    c        μ/μ_w, scale factor: value, interval and grip used are multiplied by c, because
+             forces scale with the grip; ℓ(x) becomes ℓ(x/c)
 
-A pass over the border of a surface is drawn as any other. The error that all vehicles of one place
-share is not kept, because each visit is drawn by itself; the whole ways cover it.
+A pass over the border of two surfaces is drawn like any other. Each visit is drawn separately, so
+the error that all vehicles share in one place is lost; the complete drives cover it.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ FARTHEST: Final = 0.35
 
 
 class TrueVisits(NamedTuple):
-    """True visits of vehicles, (m,): vehicle, first moment [ns], mean friction, largest share of it
-    used.
+    """True values of visits, (m,): vehicle, start [ns], mean friction, and largest share of it that
+    was used.
     """
 
     vehicle: IntArray
@@ -47,8 +48,8 @@ class TrueVisits(NamedTuple):
 
 
 class DrivenVisits(NamedTuple):
-    """Visits of whole ways, (k,): vehicle, true friction, whether they were excited, and what
-    was reported of them.
+    """Visits of simulated drives, (k,): vehicle, true friction, mask of excited visits, and
+    reports.
     """
 
     vehicle: IntArray
@@ -58,8 +59,8 @@ class DrivenVisits(NamedTuple):
 
 
 def attach_truth(observations: dict[str, Any], truth: TrueVisits) -> DrivenVisits:
-    """Return observations of a way, columns as `end_to_end.read_observations` gives them, with the truth at the
-    middle of each.
+    """Return the observations of a drive (columns of `end_to_end.read_observations`) with the true
+    values at the middle of each visit.
     """
     vehicle = observations["vehicle"].astype(np.int64)
     middle = (observations["enter_time"] + observations["leave_time"]) // 2
@@ -84,7 +85,7 @@ def attach_truth(observations: dict[str, Any], truth: TrueVisits) -> DrivenVisit
 
 
 def join_ways(ways: Sequence[DrivenVisits]) -> DrivenVisits:
-    """Return the visits of several ways as one; vehicles of different ways are different
+    """Return the visits of several drives as one. Vehicles of different drives remain different
     vehicles.
     """
     begins = np.cumsum([0, *(int(way.vehicle.max()) + 1 for way in ways)])
@@ -98,8 +99,8 @@ def join_ways(ways: Sequence[DrivenVisits]) -> DrivenVisits:
 
 
 def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles: int) -> Visits:
-    """Return the town's visits with reports drawn from `ways`. Each of the `vehicles` uses the
-    reports of one vehicle there, a different one if there are enough.
+    """Return the town's visits with reports drawn from the drives `ways`. Each of the `vehicles`
+    takes the reports of one vehicle of the drives; each of a different one if there are enough.
     """
     there = np.unique(ways.vehicle)
     who = rng.choice(there, vehicles, replace=vehicles > len(there))
@@ -119,8 +120,8 @@ def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles
 
 
 def _nearest_friction(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntArray) -> IntArray:
-    """Return, for each friction, a random one of the NEAREST of `rows`, which are sorted by
-    friction; -1 without rows.
+    """Return one of `rows` for each friction in `mu`: a random one of the NEAREST rows in friction.
+    `rows` must be sorted by friction; the result is -1 if there are no rows.
     """
     if not len(rows):
         return np.full(len(mu), -1)
@@ -129,7 +130,7 @@ def _nearest_friction(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntA
 
 
 def _scale_reports(reports: SimulatedReports, row: IntArray, by: FloatArray) -> SimulatedReports:
-    """Return rows of reports, scaled to roads with `by` times the grip."""
+    """Return the selected rows of reports, scaled to roads with `by` times the friction."""
     width = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
     place = np.clip(
         (mugrid.CENTRES / by[:, None] - mugrid.CENTRES[0]) / width, 0.0, mugrid.BINS - 1.0

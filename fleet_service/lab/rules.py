@@ -1,20 +1,19 @@
-"""Simpler rules for comparison, each a mean and a variance per cell. Pure, compiled.
+"""Simpler fusion rules for comparison; each stores a mean and a variance per cell. Pure, compiled.
 
-All of them get the reports that an agent of such a system would send: the *posterior* (m, P) of its
-own filter, which carries its belief from the cell before. Each lets its variance grow between
-reports as the fusion's own drift does.
+All rules get the reports that an agent of such a system would send: the *posterior* (m, P) of its
+own filter, which also contains information from the previous cell. Between reports, each rule
+increases its variance by the same drift as the fusion.
 
     newest report         the last posterior
-    inverse variance      all posteriors, each sample's: SAMPLES alike ones per pass, information
-                          added up
-    one per pass          one posterior per pass, information added up
+    inverse variance      all posteriors: SAMPLES equal ones per pass, information is added
+    one per pass          one posterior per pass, information is added
     covariance inters.    one per pass, with weights in proportion to information (W. Niehsen,
                           FUSION 2002)
-    federated reset       the cell is the master; local filters start from it, so that only the
-                          reading is added (N. A. Carlson, IEEE Trans. Aerospace and Electronic
-                          Systems 26(3), 1990)
-    median                of the vehicles' last readings of an hour, with an interval of 6 % that
-                          all share and 12 % of one vehicle
+    federated reset       local filters start from the cell's estimate, so that only the reading
+                          is added (N. A. Carlson, IEEE Trans. Aerospace and Electronic Systems
+                          26(3), 1990)
+    median                median of the vehicles' last readings of an hour; the interval contains
+                          6 % of shared error and 12 % per vehicle
 """
 
 from __future__ import annotations
@@ -55,8 +54,8 @@ _NEWEST, _ALL, _ONE, _INTERSECTION, _FEDERATED = range(_KALMAN)
 def vehicle_posteriors(
     vehicle: IntArray, reading: FloatArray, std: FloatArray, vehicles: int
 ) -> FloatArray:
-    """Return the posterior (m, P) that the vehicle of each visit sends, (n, 2): that of its filter,
-    which returns to the prior along the road.
+    """Return the posterior (m, P) that the vehicle of each visit sends, (n, 2). It is the state of
+    the vehicle's filter, which returns to the prior along the road.
     """
     mean = np.full(vehicles, PRIOR_MEAN)
     variance = np.full(vehicles, PRIOR_VAR)
@@ -84,7 +83,7 @@ def fuse_by_rules(
     asked: FloatArray,
     cells: int,
 ) -> FloatArray:
-    """Return mean and variance per query time, rule and cell, (times, 5, cells, 2)."""
+    """Return mean and variance of the first five rules at each query time, (times, 5, cells, 2)."""
     mean = np.full((5, cells), PRIOR_MEAN)
     variance = np.full((5, cells), PRIOR_VAR)
     last = np.zeros(cells)
@@ -124,7 +123,7 @@ def fuse_by_rules(
 
 
 def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
-    """Return the median of the vehicles' last readings within MEDIAN_MIN, and its standard
+    """Return the median of the vehicles' last readings within MEDIAN_MIN minutes, and its standard
     deviation, (cells,) each.
     """
     recent = (v.seconds < 60.0 * minute) & (v.seconds >= 60.0 * (minute - MEDIAN_MIN))
@@ -144,7 +143,7 @@ def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
 def score_rules(
     v: Visits, town: Town, at: tuple[int, ...], vehicles: int, where: BoolArray | bool = True
 ) -> list[Scores]:
-    """Return the scores of each of RULES at the minutes `at`, for those cells of `where` that an
+    """Return the scores of each of RULES at the minutes `at`, for the cells in `where` that an
     excited vehicle has reported.
     """
     sent = vehicle_posteriors(v.vehicle, v.reports.reading, v.reports.std, vehicles)

@@ -1,4 +1,4 @@
-"""Scores of map answers against the truth: coverage, error, interval score and calibration.
+"""Scores of map answers against the true friction: coverage, error, interval score and calibration.
 Pure.
 """
 
@@ -29,11 +29,12 @@ LEVELS: Final = np.linspace(0.05, 0.95, 19)
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of k answers of the map, each (k,).
+    """Scores of k answers of the map, each column (k,). An answer is the belief about one cell at
+    one time.
 
     `vehicles` is the number of distinct excited vehicles that had visited the cell. `slippery` is
-    the answer's P(slippery), and `crps` its continuous ranked probability score; both are NaN if
-    an answer is an interval and not a distribution.
+    the answer's P(slippery), and `crps` its continuous ranked probability score; both are NaN if an
+    answer is an interval and not a distribution.
     """
 
     vehicles: IntArray
@@ -63,7 +64,8 @@ def join_scores(scores: list[Scores]) -> Scores:
 
 def excited_vehicles(v: Visits, town: Town, minute: int, vehicles: int) -> IntArray:
     """Return the number of distinct excited vehicles that reported each cell before `minute` and
-    after the last change of its surface, (CELLS,).
+    after the last change of its surface, (CELLS,). An excited vehicle used enough grip to measure
+    the friction.
     """
     since = np.where(town.changed <= minute, town.changed, 0.0) * 60.0
     rows = v.excited & (v.seconds < 60.0 * minute) & (v.seconds >= since[v.place])
@@ -89,7 +91,7 @@ def of_intervals(
     """Return the scores of 90 % intervals, all (k,).
 
     The interval score is the width plus 2/α times the distance by which the interval misses the
-    truth.
+    true value.
     """
     missed = np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0)
     interval = upper - lower + 2.0 / ALPHA * missed
@@ -108,8 +110,8 @@ def of_intervals(
 
 
 def of_beliefs(belief: FloatArray, truth: FloatArray, vehicles: IntArray) -> Scores:
-    """Return the scores of beliefs (k, 32); `rank` is P(μ ≤ truth), which is uniform for calibrated
-    beliefs.
+    """Return the scores of beliefs (k, 32). `rank` is P(μ ≤ true value), which is uniformly
+    distributed for calibrated beliefs.
     """
     lower, mid, upper = (mugrid.quantiles(belief, q) for q in (0.05, 0.5, 0.95))
     place = np.clip(
@@ -149,7 +151,7 @@ def score_snapshots(
     vehicles: int,
     where: BoolArray | bool = True,
 ) -> Scores:
-    """Return the scores at the minutes `at`, of those cells of `where` that an excited vehicle has
+    """Return the scores at the minutes `at`, for the cells in `where` that an excited vehicle has
     reported.
     """
     out = []
@@ -167,25 +169,27 @@ def rmse(s: Scores) -> float:
 
 
 def coverage(s: Scores) -> float:
-    """Return the share of truths inside the interval."""
+    """Return the share of true values inside the interval."""
     return float(s.covered.mean()) if len(s.covered) else float("nan")
 
 
 def safe_share(s: Scores) -> float:
-    """Return the share of truths above the lower end, from which the 95 % safe deceleration is
-    computed.
+    """Return the share of true values above the lower end of the interval, from which the 95 % safe
+    deceleration is computed.
     """
     return float((s.rank >= ALPHA / 2.0).mean()) if len(s.rank) else float("nan")
 
 
 def of_class(s: Scores, n: int) -> Scores:
-    """Return the answers with `n` excited vehicles or more, but fewer than the next of COUNTS."""
+    """Return the answers with at least `n` excited vehicles, but fewer than the next number in
+    COUNTS.
+    """
     edges = (*COUNTS[1:], np.iinfo(np.int64).max)
     return s.taken((s.vehicles >= n) & (s.vehicles < edges[COUNTS.index(n)]))
 
 
 def by_surface(s: Scores) -> dict[str, float]:
-    """Return the share of truths inside the interval for each of SURFACES."""
+    """Return the share of true values inside the interval, separately for each of SURFACES."""
     return {
         name: coverage(s.taken((s.truth > above) & (s.truth <= to)))
         for name, (above, to) in SURFACES.items()
@@ -195,7 +199,8 @@ def by_surface(s: Scores) -> dict[str, float]:
 def calibration(scores: Sequence[Scores]) -> FloatArray:
     """Return the calibration table of P(slippery), (BINS, 3).
 
-    Columns: number of answers, mean of their P(slippery), and share of truths that were slippery.
+    Columns: number of answers, mean of their P(slippery), and share of them that were truly
+    slippery.
     """
     given = np.concatenate([s.slippery for s in scores])
     truth = np.concatenate([s.truth for s in scores]) < SLIPPERY_MU
@@ -210,10 +215,10 @@ def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
     `grip_raised`.
 
     `ece` is the expected calibration error over BINS bins, weighted by answers (Naeini et al.,
-    2015). `missed` is the share of truly slippery cells given less than MISSED, `grip_raised` that
-    of cells with grip (μ > SURE_GRIP) given more than RAISED. The worst bin is not used:
-    all cells of a simulated way share one snow, so that even a calibrated map passes a limit on it
-    in a third of the campaigns only.
+    2015). `missed` is the share of truly slippery cells with a P(slippery) below MISSED.
+    `grip_raised` is the share of cells with grip (μ > SURE_GRIP) with a P(slippery) above RAISED.
+    The error of the worst bin is not used. All cells of one simulated drive share the same snow, so
+    even a calibrated map would meet a limit on it in only a third of the evaluations.
     """
     given = np.concatenate([s.slippery for s in scores])
     truth = np.concatenate([s.truth for s in scores])
@@ -230,13 +235,15 @@ def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
 
 
 def false_grip(s: Scores) -> float:
-    """Return the share of truths below the interval: road more slippery than the map states."""
+    """Return the share of true values below the interval: the road is more slippery than the map
+    states.
+    """
     return _mean_or_nan(s.rank < ALPHA / 2.0)
 
 
 def false_ice(s: Scores) -> float:
-    """Return the share of truths above the interval: road with more grip than the map thinks
-    possible.
+    """Return the share of true values above the interval: the road has more grip than the map
+    allows for.
     """
     return _mean_or_nan(s.rank > 1.0 - ALPHA / 2.0)
 
@@ -246,7 +253,7 @@ def _mean_or_nan(values: FloatArray | BoolArray) -> float:
 
 
 def reliability(s: Scores) -> FloatArray:
-    """Return the share of truths below the quantile of each of LEVELS; equal to LEVELS for
-    calibrated beliefs.
+    """Return, for each of LEVELS, the share of true values below this quantile of the belief. For
+    calibrated beliefs the result equals LEVELS.
     """
     return np.asarray((s.rank[:, None] <= LEVELS).mean(axis=0))

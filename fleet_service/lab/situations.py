@@ -1,7 +1,7 @@
-"""Short situations in which a fused map can become wrong: many lower bounds, an outage, gentle
+"""Short situations in which a fused map could become wrong: many lower bounds, an outage, careful
 drivers on ice, a wet curve.
 
-The truth is known by construction. Pure.
+The true friction is known by construction. Pure.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ VALUED: Final = 0.3  # of such passes look like values: a tenth to a third with 
 
 
 def bound_excess(used: float, path: str) -> float:
-    """Return by how much the lower end of the interval exceeds `used`, or the prior's lower end if
-    that is larger.
+    """Return how far the lower end of the interval exceeds the grip used, or the prior's lower end
+    if that is larger.
 
-    BOUNDED vehicles have used this much grip and reported it along one `path` (encoding and kind of
-    report).
+    BOUNDED vehicles have used the grip `used` and have reported it along one `path` (encoding and
+    kind of report).
     """
     n = BOUNDED
     nan = float("nan")
@@ -84,7 +84,7 @@ def bound_excess(used: float, path: str) -> float:
 
 
 def _decode_batch(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
-    """Encode a batch and return the observations that the service decodes from the bytes."""
+    """Encode a batch as bytes, and return the observations that the service decodes from them."""
     payload = wire.encode(batch)
     encoding = wire.ENCODING[Kind.OBSERVATION]
     if as_json:
@@ -103,14 +103,14 @@ def _decode_batch(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
 
 
 def lower_excess() -> float:
-    """Return the largest `bound_excess` over all of USED and all paths."""
+    """Return the largest `bound_excess` over all values in USED and all paths."""
     paths = ("protobuf posterior", "json posterior", "protobuf likelihood", "json likelihood")
     return max(bound_excess(used, path) for used in USED for path in paths)
 
 
 def backlog_fused(rng: Generator) -> float:
-    """Return the share of late rows that are fused if an hour's rows arrive after an outage, while
-    another vehicle had a connection all the time.
+    """Return the share of late rows that are fused in this situation: the rows of an hour arrive
+    after an outage, while one other vehicle was connected all the time.
     """
     place = town.draw_town(rng, 60, 0.0)
     errors = Errors.draw(rng, BACKLOG + 1)
@@ -126,11 +126,11 @@ def backlog_fused(rng: Generator) -> float:
 
 
 def safe_excess(rng: Generator) -> float:
-    """Return the safe deceleration of the map minus the true one [m/s²], 30 minutes after black ice
-    formed.
+    """Return the safe deceleration according to the map minus the true one [m/s²], 30 minutes after
+    black ice has formed.
 
-    The road was dry for an hour. On the ice the drivers use a fifth of the grip. The weather report
-    states FREEZING_C and no precipitation.
+    The road was dry for an hour before. On the ice the drivers use a fifth of the grip. The weather
+    report states FREEZING_C and no precipitation.
     """
     seconds: FloatArray = np.concatenate(
         [np.sort(rng.random(60)) * HOUR_S, HOUR_S + np.sort(rng.random(60)) * 1800.0]
@@ -166,8 +166,8 @@ def _make_weather(temperature: float) -> Reports:
 
 
 def false_alert(rng: Generator) -> bool:
-    """Return True if CARS unknown vehicles on winter tyres, all gentle in a wet curve, cause an
-    alert there.
+    """Return True if an alert is raised in a wet curve through which CARS unknown vehicles on
+    winter tyres drive carefully.
     """
     n = CARS
     who = np.arange(CARS)

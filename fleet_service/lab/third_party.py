@@ -1,22 +1,23 @@
-"""Fleets that are not ours: vehicles of another make, with their own error model, that know only
-the public contract.
+"""Fleets of another maker: vehicles that follow only the public contract and have an error model of
+their own. Pure.
 
-Each vehicle has a gain error that is common to its value and to the grip that it reports as used. A
-scheme that learns a correction from both at once sees a relation that is no property of the road.
-Values have noise that their senders state. They send full log-likelihoods and none of the optional
-columns. Pure.
+Each vehicle has a gain error that affects both its value of μ and the grip that it reports as used.
+If a fusion learned a correction from both, it would see a relation between them that is not a
+property of the road. The values have noise, whose size the vehicles state correctly. Vehicles send
+complete log-likelihoods and none of the optional columns.
 
-Two drives:
+There are two drives:
 
     honest fleet   300 cells in stretches of three; 15 visits per cell in 40 minutes, half of them
-                   excited
-    change         30 cells of .85 turn to .15 and back, each for 40 minutes, in a town as above
+                   excited (with enough grip used to measure μ)
+    change         30 cells change from μ = .85 to .15 and back, each phase 40 minutes, next to a
+                   town as above
 
 Legend
-    g    gain error of a vehicle, relative, the same in value and use        (V,)
+    g    gain error of a vehicle, relative, the same in value and grip used  (V,)
     s    share of the grip used in a visit                                   (n,)
-    z    value, mu·(1 + g)·(1 + NOISE·e), e standard normal                  (n,)
-    u    grip reported as used, s·mu·(1 + g)                                 (n,)
+    z    value, μ·(1 + g)·(1 + NOISE·e), e standard normal                   (n,)
+    u    grip reported as used, s·μ·(1 + g)                                  (n,)
 """
 
 from __future__ import annotations
@@ -68,9 +69,7 @@ COLD_GAP_S: Final = 5.0
 
 
 class ForeignDrive(NamedTuple):
-    """Visits, the friction of each cell at each visit's road, and the cells' numbers on the
-    grid.
-    """
+    """Visits of a drive, and the grid number of each cell."""
 
     visits: Visits
     cells: IntArray
@@ -98,7 +97,7 @@ def make_reports(
 
 
 def make_observations(drive: ForeignDrive) -> Observations:
-    """Return the drive's visits as observations for the service, without any optional column."""
+    """Return the visits of a drive as observations for the fusion, without any optional column."""
     rows = rows_of(drive.visits, drive.cells)
     rows["used_longitudinal"] = rows["used_lateral"] = np.full(
         len(drive.visits), np.nan, np.float32
@@ -107,8 +106,8 @@ def make_observations(drive: ForeignDrive) -> Observations:
 
 
 def place_fixes(rng: Generator, place: IntArray) -> IntArray:
-    """Return the cells in which visits to the middles of cells (n,) are reported: fixes err by
-    FIX_STD_M.
+    """Return the cells in which visits to the middle of cells (n,) are reported; the position error
+    is FIX_STD_M [m].
     """
     offset = 0.5 * CELL_M + FIX_STD_M * rng.normal(size=len(place))
     found = place + np.floor(offset / CELL_M).astype(np.int64)
@@ -116,7 +115,7 @@ def place_fixes(rng: Generator, place: IntArray) -> IntArray:
 
 
 def drive_honest(rng: Generator, gain_std: float) -> tuple[ForeignDrive, FloatArray]:
-    """Return an honest fleet's drive, and the friction of each cell (CELLS,)."""
+    """Return a drive of the honest fleet, and the true friction of each cell (CELLS,)."""
     mu = np.repeat(rng.choice(FRICTIONS, CELLS // STRETCH), STRETCH)
     n = CELLS * VISITS
     place = np.repeat(np.arange(CELLS), VISITS)
@@ -138,8 +137,8 @@ def select_visits(v: Visits, rows: IntArray) -> Visits:
 
 
 def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, IntArray]:
-    """Return the map's scores at the end of an honest drive, whether each cell has an alert, and
-    excited visits.
+    """Return three items at the end of an honest drive: the scores of the map, a mask of cells with
+    an alert, and the number of excited visits of each cell.
     """
     drive, mu = drive_honest(rng, gain_std)
     fusion = Fusion(LATENESS_S)
@@ -156,13 +155,17 @@ def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, In
 
 
 def split_by(seconds: FloatArray, step: float) -> list[IntArray]:
-    """Return the rows of visits, which are sorted by time, in portions of `step` seconds."""
+    """Return the row numbers of visits in portions of `step` seconds; the visits must be sorted by
+    time.
+    """
     borders = np.flatnonzero(np.diff(seconds // step)) + 1
     return np.split(np.arange(len(seconds)), borders)
 
 
 def measure_honest(name: str, gain_std: float, seeds: range) -> dict[str, float]:
-    """Return coverage, false grip, false ice, error and alerts of an honest fleet over `seeds`."""
+    """Return coverage, false grip, error and alerts (false and missed) of an honest fleet over
+    `seeds`.
+    """
     found = [score_honest(np.random.default_rng([seed, 23]), gain_std) for seed in seeds]
     scores = join_scores([one[0] for one in found])
     alerted = np.concatenate([one[1] for one in found])
@@ -180,16 +183,16 @@ def measure_honest(name: str, gain_std: float, seeds: range) -> dict[str, float]
 
 
 def share_of(cells: BoolArray) -> float:
-    """Return the share of cells that are true; NaN without cells."""
+    """Return the share of cells for which the mask is true; NaN if there are no cells."""
     return float(cells.mean()) if len(cells) else float("nan")
 
 
 def drive_change(rng: Generator, excitement: float) -> ForeignDrive:
-    """Return a drive over cells that are DRY, then WHITE, then DRY again, in a town where the same
-    fleet drives.
+    """Return a drive over cells that are dry (DRY), then icy (WHITE), then dry again. The same
+    fleet also drives in a town.
 
-    The first CHANGE_CELLS cells are the changing ones. The cells of the town follow, and its visits
-    last as long.
+    The first CHANGE_CELLS cells are the changing ones; the cells of the town follow. The town is
+    driven for the same time.
     """
     town_mu = np.repeat(rng.choice(FRICTIONS, CELLS // STRETCH), STRETCH)
     changing = CHANGE_CELLS * CHANGE_VISITS * 3
@@ -219,11 +222,11 @@ def drive_change(rng: Generator, excitement: float) -> ForeignDrive:
 
 
 def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]:
-    """Return the number of excited passes over each changing cell until the alert and until its
+    """Return two counts of excited passes over each changing cell: until the alert, and until its
     end.
 
-    The first is counted from the change to WHITE, the second from the change back to DRY. Both are
-    (CHANGE_CELLS,), with NEVER where the event did not occur.
+    The first count begins at the change to WHITE, the second at the change back to DRY. Both are
+    (CHANGE_CELLS,), with NEVER if the event did not occur.
     """
     drive = drive_change(rng, excitement)
     v = drive.visits
@@ -255,8 +258,8 @@ def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]
 
 
 def measure_change(seeds: range) -> dict[str, float]:
-    """Return medians and 95 % quantiles of the passes by share of excited visits, and how many
-    cells had no alert.
+    """Return medians and 95 % quantiles of the passes for each share of excited visits, and the
+    number of cells in which an alert was not raised or not cleared.
     """
     out: dict[str, float] = {}
     for percent in CHANGE_EXCITED:
@@ -274,9 +277,10 @@ def measure_change(seeds: range) -> dict[str, float]:
 
 
 def count_cold(rng: Generator) -> int:
-    """Return the number of passes over ice until a service that knows no vehicle raises an alert.
+    """Return the number of passes over ice until a service that knows no vehicle yet raises an
+    alert.
 
-    The vehicles are the lab's own; each makes one pass.
+    The vehicles follow the error model of `agent`; each makes one pass.
     """
     n = VEHICLES
     who = np.arange(n)
@@ -309,7 +313,7 @@ def measure_cold(seed: int) -> dict[str, float]:
 
 
 def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
-    """Return all figures of this module; `log_line` gets the progress."""
+    """Return all figures of this module; `log_line` is called with lines about the progress."""
     out: dict[str, float] = {}
     for name, gain_std in GAINS.items():
         out |= measure_honest(name, gain_std, seeds)

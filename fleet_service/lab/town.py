@@ -1,9 +1,10 @@
-"""A town of roads, cell behind cell, their friction in time, and who drives where and when. Pure.
+"""A simulated town: roads as rows of cells, their friction over time, and the drives of a fleet.
+Pure.
 
-Every road has stretches of one surface; most passes are unexcited, and where drivers brake or steer
-is a property of the place: a few cells get many excited visits, most get hardly any. Where all do
-the same they share an error. Fixes are noisy, so that a visit is sometimes reported of the cell
-before or behind.
+Every road has stretches of one surface each. Most passes use little grip. Where drivers brake or
+steer depends on the place: a few cells get many excited visits (with much grip used), most get
+hardly any. Vehicles that do the same manoeuvre in the same place share an error. Positions are
+noisy, so a visit is sometimes reported for the previous or the next cell.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ _WEST = 11.90
 
 
 def cell_numbers(cells: int = CELLS) -> IntArray:
-    """Return the quadints of the town's cells, (cells,): each road runs east, and the roads are a
-    few cells apart.
+    """Return the grid numbers (quadints) of the town's cells, (cells,). Each road runs east, and
+    the roads are a few cells apart.
     """
     x, y = grid.deinterleave(grid.cell_of(_NORTH, _WEST))
     k = np.arange(cells)
@@ -60,9 +61,15 @@ def cell_numbers(cells: int = CELLS) -> IntArray:
 
 @dataclass(frozen=True)
 class Town:
-    """Friction (minutes + 1, cells) at the beginning of each minute, P(a pass is excited) (cells,),
-    the minute of each cell's change of surface (cells,), infinite without one, the vehicles' common
-    error by manoeuvre (cells, 4), and what most do there (cells,)."""
+    """A town.
+
+    Attributes:
+        mu: friction at the beginning of each minute, (minutes + 1, cells).
+        excitement: probability that a pass is excited, (cells,).
+        changed: minute in which the surface of a cell changes, (cells,), infinite for never.
+        common: error that the vehicles share, by manoeuvre, (cells, 4).
+        usual: most frequent manoeuvre, (cells,).
+    """
 
     mu: FloatArray
     excitement: FloatArray
@@ -71,14 +78,14 @@ class Town:
     usual: IntArray
 
     def at(self, seconds: FloatArray, place: IntArray) -> FloatArray:
-        """Return the friction at times and places, (n,)."""
+        """Return the friction at the given times [s] and places, (n,)."""
         return np.asarray(
             self.mu[np.minimum((seconds // 60.0).astype(np.int64), len(self.mu) - 1), place]
         )
 
 
 def draw_town(rng: Generator, minutes: int, changing: float, model: ErrorModel = CLEAN) -> Town:
-    """Draw a town. `changing` is the share of roads that get another surface at some minute."""
+    """Draw a random town. `changing` is the share of roads whose surface changes at some minute."""
     names = list(SURFACES.values())
     share = [s[2] for s in SURFACES.values()]
     stretches = CELLS // STRETCH
@@ -113,8 +120,8 @@ def draw_town(rng: Generator, minutes: int, changing: float, model: ErrorModel =
 
 @dataclass(frozen=True)
 class Visits:
-    """Visits in order of time, (n,): seconds since the start, vehicle, place reported, true μ,
-    excited, reports.
+    """Visits in order of time, (n,): seconds since the start, vehicle, reported place, true μ, mask
+    of excited visits, and reports.
     """
 
     seconds: FloatArray
@@ -131,10 +138,11 @@ class Visits:
 def drive_fleet(
     rng: Generator, town: Town, errors: Errors, minutes: float, acquainted: float = 0.0
 ) -> Visits:
-    """Let a fleet drive: each vehicle passes a whole road every minute on average, at random times.
+    """Simulate the drives of a fleet: each vehicle passes a whole road every minute on average, at
+    random times.
 
-    Until the minute `acquainted` only the first half of the roads are driven, from then on the
-    other half, if it is not nought: then the service knows the vehicles, but not these roads.
+    If `acquainted` is not 0, only the first half of the roads is driven until this minute, and only
+    the other half afterwards. Then the service knows the vehicles, but not the roads.
     """
     vehicles = len(errors.slope)
     model = errors.model
@@ -178,8 +186,8 @@ def select_visits(v: Visits, rows: IntArray | BoolArray) -> Visits:
 
 
 def claim_falsely(v: Visits, liars: BoolArray, claim: float) -> Visits:
-    """Return the visits after `liars` (V,) have replaced their values with `claim`, with high
-    confidence.
+    """Return the visits with the values of the vehicles `liars` (V,) replaced with `claim`, with
+    high confidence.
     """
     lying = liars[v.vehicle]
     readings = np.where(lying, claim, v.reports.reading)

@@ -1,17 +1,18 @@
-"""Value of the map to its users: road-hours known, alerts next to two simpler rules, minutes of
-unnoticed ice. Pure.
+"""Value of the map to its users: share of the road that is known, quality of alerts compared with
+two simpler rules, and minutes until ice is noticed. Pure.
 
-Drivers use the grip that a place demands, so that slippery road excites every vehicle and dry road
-hardly any. All vehicles are enrolled. The service runs for an hour and a half before it counts.
-Half of the roads get another surface once.
+Drivers use the grip that a place demands. On a slippery road this is a large share of the available
+grip, so every vehicle measures the friction; on a dry road hardly any vehicle does. All vehicles
+are enrolled. The service runs for an hour and a half before the measurement begins. The surface of
+half of the roads changes once.
 
-    d      demand of a pass [g]: log-normal about DEMAND of the kind of place, DEMAND_SPREAD
-    s      share of the grip used, min(d/μ, 1); a slip controller works where it is 1
-    known  cells and moments whose 90 % interval is narrower than NARROW
+    d      demand of a pass [g]: log-normal around DEMAND, with standard deviation DEMAND_SPREAD
+    s      share of the grip used, min(d/μ, 1); a slip controller intervenes if s = 1
+    known  share of cells and times with a 90 % interval narrower than NARROW
 
-The alerts are compared with two rules on the same visits of the last hour: two visits whose
-controller worked at less than slippery road's grip, and at least two values whose median is
-slippery.
+The alerts are compared with two simple rules on the visits of the last hour. The first warns after
+two visits in which a slip controller intervened while less grip than the slippery limit was used.
+The second warns if there are at least two values and their median is slippery.
 """
 
 from __future__ import annotations
@@ -50,14 +51,14 @@ SEEDS: Final = 3
 
 
 class TownTraffic(NamedTuple):
-    """Visits of a town, and whether a slip controller worked, (n,)."""
+    """Visits of a town, and a mask of visits in which a slip controller intervened, (n,)."""
 
     visits: Visits
     limited: BoolArray
 
 
 class Readings(NamedTuple):
-    """Readings of the map and the rules next to the truth, (readings, CELLS)."""
+    """Answers of the map and of the two rules, with the true friction, (readings, CELLS)."""
 
     truth: FloatArray
     width: FloatArray
@@ -68,8 +69,8 @@ class Readings(NamedTuple):
 
 
 def drive_cars(rng: Generator, place: Town, cars: float, demand: float) -> TownTraffic:
-    """Let `cars` an hour pass each road; drivers use `demand` times the grip that the place
-    demands.
+    """Simulate traffic of `cars` per hour on each road. Drivers use `demand` times the grip that
+    the place demands.
     """
     passes = rng.poisson(cars * ROADS * MINUTES / 60.0)
     along = np.tile(np.arange(LENGTH), passes)
@@ -101,14 +102,16 @@ def drive_cars(rng: Generator, place: Town, cars: float, demand: float) -> TownT
 
 
 def make_observations(traffic: TownTraffic) -> Observations:
-    """Return the visits as the service takes them, with the flags of the slip controllers."""
+    """Return the visits as observations for the fusion, with the flags of the slip controllers."""
     rows = rows_of(traffic.visits)
     rows["abs_active"] = traffic.limited.astype(np.int8)
     return observations_of(rows, traffic.visits.vehicle)
 
 
 def two_events(traffic: TownTraffic, seconds: float) -> BoolArray:
-    """Return the cells where two controllers worked at little grip within the hour, (CELLS,)."""
+    """Return a mask of cells, (CELLS,): True if slip controllers intervened twice at little grip
+    within the last hour.
+    """
     v = traffic.visits
     recent = (v.seconds > seconds - HOUR_S) & (v.seconds <= seconds)
     rows = recent & traffic.limited & (v.reports.used < SLIPPERY_MU)
@@ -116,8 +119,8 @@ def two_events(traffic: TownTraffic, seconds: float) -> BoolArray:
 
 
 def slippery_median(traffic: TownTraffic, seconds: float) -> BoolArray:
-    """Return the cells with at least two values within the hour whose median is slippery,
-    (CELLS,).
+    """Return a mask of cells, (CELLS,): True if there are at least two values within the last hour
+    and their median is slippery.
     """
     v = traffic.visits
     rows = np.flatnonzero((v.seconds > seconds - HOUR_S) & (v.seconds <= seconds) & v.excited)
@@ -129,7 +132,9 @@ def slippery_median(traffic: TownTraffic, seconds: float) -> BoolArray:
 
 
 def read_map(place: Town, traffic: TownTraffic) -> Readings:
-    """Fuse the visits minute by minute and read the map every STEP minutes from BEGIN on."""
+    """Fuse the visits minute by minute, and read the map every STEP minutes from minute BEGIN
+    on.
+    """
     o = make_observations(traffic)
     fusion = Fusion(LATENESS_S, enrolled=True)
     alerts = Alerts(fusion)
@@ -155,8 +160,8 @@ def read_map(place: Town, traffic: TownTraffic) -> Readings:
 
 
 def count_unnoticed(place: Town, warned: BoolArray) -> FloatArray:
-    """Return for each cell that became slippery the minutes until it was `warned` of, at most
-    UNNOTICED_MOST.
+    """Return, for each cell that became slippery, the minutes until the first warning, at most
+    UNNOTICED_MOST. `warned` is the mask of warned cells at each reading.
     """
     moments = np.arange(-(-BEGIN // STEP) * STEP, MINUTES + 1, STEP)
     out = []
@@ -174,19 +179,21 @@ def count_unnoticed(place: Town, warned: BoolArray) -> FloatArray:
 
 
 def precision(truth: FloatArray, warned: BoolArray) -> float:
-    """Return the share of warned cell-minutes that were slippery."""
+    """Return the precision of warnings: the share of warned cells and times that were truly
+    slippery.
+    """
     return float((truth[warned] < SLIPPERY_MU).mean()) if warned.any() else float("nan")
 
 
 def recall(truth: FloatArray, warned: BoolArray) -> float:
-    """Return the share of slippery cell-minutes that were warned of."""
+    """Return the recall of warnings: the share of truly slippery cells and times that had a
+    warning.
+    """
     return float(warned[truth < SLIPPERY_MU].mean())
 
 
 def measure_rate(cars: int, seeds: range, demand: float = 1.0) -> dict[str, float]:
-    """Return the figures of the map and of both rules for a traffic of `cars` per hour and road,
-    over `seeds`.
-    """
+    """Return the figures of the map and of both rules for a traffic of `cars` per hour and road."""
     towns = []
     for seed in seeds:
         rng = np.random.default_rng([seed, 37])
@@ -208,7 +215,7 @@ def measure_rate(cars: int, seeds: range, demand: float = 1.0) -> dict[str, floa
 
 
 def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
-    """Return all figures of this module; `log_line` gets the progress."""
+    """Return all figures of this module; `log_line` is called with lines about the progress."""
     out: dict[str, float] = {}
     for cars in CARS:
         out |= {
