@@ -1,4 +1,4 @@
-"""Fixtures for tests with a router."""
+"""Fixtures for tests that need a Zenoh router."""
 
 from __future__ import annotations
 
@@ -19,6 +19,6 @@ def router() -> Iterator[Router]:
 
 @pytest.fixture
 def service(router: Router) -> Iterator[Service]:
-    """Yield a service that acknowledges."""
+    """Yield a simulated service that acknowledges every batch."""
     with Service(router) as service:
         yield service

@@ -1,4 +1,4 @@
-"""Synthetic positions, estimates and logs for tests of input and output that run no filter."""
+"""Synthetic positions, estimates and logs for tests of input and output, which run no filter."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ START_NS = 1_767_225_600_000_000_000  # 2026-01-01
 
 @dataclass(frozen=True)
 class MadeUp:
-    """Arbitrary estimates that depend on no signal."""
+    """Arbitrary estimates that do not depend on signals."""
 
     vx: FloatArray
     vy: FloatArray
@@ -48,7 +48,7 @@ class MadeUp:
     jumps: NDArray[np.bool_] | None = None
 
     def part(self, rows: slice) -> MadeUp:
-        """Return the estimates of some samples."""
+        """Return the estimates of a slice of the samples."""
         cut = {f.name: v[rows] for f in fields(self) if (v := getattr(self, f.name)) is not None}
         return replace(self, **cut)
 
@@ -56,8 +56,8 @@ class MadeUp:
 def estimates(
     samples: int, vehicles: int, seed: int = 0, mu: float | None = None, used: float = 0.1
 ) -> MadeUp:
-    """Return random estimates, or estimates of one mu with a narrow interval; every sample has
-    evidence.
+    """Return random estimates, or with `mu` estimates of this friction with a narrow interval.
+    Every sample has evidence.
     """
     rng = np.random.default_rng(seed)
     shape = (samples, vehicles)
@@ -74,8 +74,8 @@ def estimates(
 def ground(
     east: Lengths, north: Lengths, yaw: Lengths, *, rate_hz: float = 10.0, fix_every: int = 1
 ) -> Block:
-    """A block of vehicles at (east, north) [m] heading for yaw, shape (T, N), with a fix every
-    few samples.
+    """Return a block of vehicles at positions (east, north) [m] with headings `yaw` [rad], all of
+    shape (T, N). Every `fix_every`-th sample has a position.
     """
     shape = east.shape
     t = np.repeat(np.arange(shape[0])[:, None] / rate_hz, shape[1], axis=1)
@@ -89,7 +89,9 @@ def ground(
 
 
 def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
-    """Vehicles that turn at random, lose their fixes now and then, some without yaw."""
+    """Return a block of vehicles that turn at random and lose their positions now and then; some
+    have no yaw.
+    """
     rng = np.random.default_rng(seed)
     yaw = np.cumsum(rng.normal(0.0, 0.1, (samples, vehicles)), axis=0)
     step = rng.uniform(0.0, 3.0, (samples, vehicles))
@@ -105,7 +107,7 @@ def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
 
 @dataclass
 class Watch:
-    """Tracks and open visits of a test's vehicles."""
+    """Tracks and open visits of the vehicles of a test."""
 
     tracks: RecordArray
     open: OpenVisits
@@ -117,7 +119,7 @@ class Watch:
         return Watch(new_tracks(vehicles), OpenVisits.before_any(vehicles), config or AgentConfig())
 
     def step(self, block: Block, output: MadeUp) -> tuple[Located, RecordBlock, RecordBlock]:
-        """Return estimates for one block."""
+        """Process one block. Return located vehicles, observations and states."""
         self.tracks, located = locate_vehicles(self.tracks, block.t, block.signals)
         reported = cast("Estimates", output)  # which has more, of what nobody reads here
         self.open, observations, states = build_records(
@@ -127,14 +129,12 @@ class Watch:
 
 
 def part(block: Block, rows: slice) -> Block:
-    """Return some samples of a block."""
+    """Return a slice of the samples of a block."""
     return Block(block.t[rows], block.time[rows], block.signals[rows])
 
 
 def a_log(samples: int) -> dict[str, Any]:
-    """Columns of a log at 100 Hz with every channel, of random numbers; rolling straight ahead
-    would look like this.
-    """
+    """Return random columns of a log at 100 Hz with every channel, similar to straight coasting."""
     rng = np.random.default_rng(4)
     columns: dict[str, Any] = {name: rng.normal(0.0, 0.1, samples) for name in CHANNELS}
     columns |= {
@@ -145,8 +145,8 @@ def a_log(samples: int) -> dict[str, Any]:
 
 
 def make_log_writer(**changes: object) -> Callable[[Path], object]:
-    """Writes a log of five samples with some columns replaced, or left out where the change is
-    None.
+    """Return a function that writes a log of five samples. `changes` replaces columns, or removes
+    those that are None.
     """
 
     def write(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A router on a free port and a small service that keeps batches and acknowledges them, over
+"""Router on a free port, and a simulated service that stores batches and acknowledges them, over
 real Zenoh sessions.
 """
 
@@ -21,7 +21,7 @@ DEADLINE_S = 120.0  # the first start after a change compiles the kernels
 
 
 class Router:
-    """A Zenoh router of this process; `stop` and `start` keep the address."""
+    """Zenoh router in this process. After `stop` and `start` it has the same address."""
 
     def __init__(self) -> None:
         self.endpoint = "tcp/127.0.0.1:0"
@@ -58,8 +58,8 @@ class Router:
 
 @dataclass
 class Service:
-    """A service that keeps the messages it receives; it acknowledges them when `answer` is set;
-    `refuse(batch)` gives a reason to reject.
+    """Simulated service that stores received messages. It acknowledges them while `answer` is set;
+    `refuse(batch)` may return a reason to reject a batch.
     """
 
     router: Router
@@ -103,7 +103,7 @@ class Service:
         self.session.put(keys.ack_key(vehicle), payload, encoding=ACK_ENCODING)
 
     def wait(self, condition: Callable[[list[Batch]], bool]) -> None:
-        """Wait until the received batches are as expected."""
+        """Wait until the condition holds for the received batches."""
         with self._changed:
             assert self._changed.wait_for(lambda: condition(self.batches), DEADLINE_S), (
                 f"{len(self.batches)} batches"

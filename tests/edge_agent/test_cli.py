@@ -1,4 +1,4 @@
-"""Command line: written files, published messages, and one line per error."""
+"""Tests of the command line: written files, published messages, and one line per error."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Output = pytest.CaptureFixture[str]
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with log.parquet and vehicle.json of a double lane change on a wet road."""
+    """Return a folder with log.parquet and vehicle.json of a double lane change on a wet road."""
     folder = tmp_path_factory.mktemp("drive")
     name = next(name for name in MANOEUVRES if "lane" in name)
     arguments = ["simulate", name, "--mu", "0.5", "--speed", "15", "--duration", "8", "--seed", "3"]
@@ -174,7 +174,7 @@ IMPATIENT = (
 def test_replay_with_a_hanging_session_keeps_its_estimates(
     drive: Path, tmp_path: Path, well: bool
 ) -> None:
-    """A frozen router accepts the connection and never answers."""
+    """A frozen router accepts the connection but never answers."""
     router = Part(
         "router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], tmp_path
     )
@@ -514,7 +514,7 @@ def test_help_imports_nothing_heavy() -> None:
 
 
 def test_estimates_of_a_split_or_odd_log_stay_finite(drive: Path, tmp_path: Path) -> None:
-    """Remove torque, rear steering and half of the wheel speeds."""
+    """The log has no torque, no rear steering and only half of the wheel speeds."""
     log = pq.read_table(drive / "log.parquet")
     gone = [n for n in log.column_names if n.startswith(("torque", "delta_r", "true"))]
     holes = pa.array(

@@ -1,6 +1,6 @@
-"""Every public option is seen to matter: change it, and something that a user can see changes.
+"""Tests that every public option has a visible effect: if it is changed, some output changes.
 
-One table per place where options are declared; a test says when an option is in none of them.
+There is one table per module that declares options. A test fails if an option is in no table.
 """
 
 from __future__ import annotations
@@ -251,7 +251,9 @@ def test_every_option_of_every_command_is_in_a_table() -> None:
 
 
 def test_the_tests_that_show_an_option_give_it_to_the_command() -> None:
-    """In their module, with another value or with none elsewhere; that is read, not run."""
+    """Some options are tested in other modules. This test reads the source of those tests, and
+    checks that they use the option.
+    """
     texts = [
         path.read_text()
         for path in sorted(Path(__file__).parent.rglob("test_*.py"))
@@ -270,7 +272,7 @@ def test_the_tests_that_show_an_option_give_it_to_the_command() -> None:
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two drives with their vehicles, and a configuration."""
+    """Return a folder with two drives, their vehicle files, memberships and a configuration."""
     folder = tmp_path_factory.mktemp("given")
     for k in (0, 1):
         files = ["--out", str(folder / f"{k}.parquet"), "--vehicle-out", str(folder / f"{k}.json")]
@@ -281,8 +283,8 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def record_arguments(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> object:
-    """Record the arguments that a live command passes to the loop: vehicles, names, signals,
-    settings, estimator, duration; and its files.
+    """Run a live command with a recorded loop. Return the arguments that the loop received:
+    vehicles, names, signals, settings, estimator, duration, and files.
     """
     seen: list[object] = []
 
@@ -330,7 +332,9 @@ def test_every_option_of_a_live_command_changes_what_is_driven(
 
 @cache
 def run_search(folder: Path, *words: str) -> tuple[object, list[str]]:
-    """The memberships, scores and budget of a quick search, and the files that it wrote."""
+    """Run a quick search. Return its memberships, scores and budget, and the names of the files
+    that it wrote.
+    """
     folder.mkdir(parents=True)
     with contextlib.chdir(folder):
         assert main([*USUAL["tune"], *words]) == 0
@@ -395,7 +399,7 @@ def test_replay_depends_on_log_vehicle_estimator_and_configuration(tmp_path: Pat
 def record_blocks(
     scenario: str = "test", seed: int = 4, rate: float = 50.0, seconds: float = 12.0
 ) -> tuple[Block, SimulatedFleet]:
-    """Blocks of a small fleet as one, and the fleet."""
+    """Return the blocks of a small fleet joined into one, and the fleet."""
     fleet = SimulatedFleet(scenario, vehicles=2, seed=seed, rate_hz=rate)
     source = blocks(fleet, rate)
     parts = [next(source) for _ in range(round(10 * seconds))]
@@ -454,8 +458,8 @@ def test_waiting_time_and_rows_of_a_batch_change_the_batches(flush_s: float, row
 def test_every_number_of_the_vehicle_file_changes_what_is_estimated(
     estimator: str, name: str
 ) -> None:
-    """Increase the number by a fifth; `name` is the name under which a vehicle publishes, and 002
-    drives every wheel by its own motor.
+    """The test increases the number `name` of the vehicle file by a fifth and compares the
+    estimates.
     """
     t, signals, vehicle = drive("pulses", 0.6, seconds=3.0)
     broken = signals.copy()

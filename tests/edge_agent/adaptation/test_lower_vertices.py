@@ -1,4 +1,4 @@
-"""Fuzzy sets with free lower vertices."""
+"""Tests of fuzzy sets whose lower corners are free parameters."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Fuzzy rules: memberships rise between foot and peak, and each rule has the effect that its table
-states.
+"""Tests of the fuzzy rules: memberships rise between foot and peak, and each rule has the effect
+that its table states.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The rule table of paper 001 and the weighted window of paper 002."""
+"""Tests of the rule table of paper 001 and of the weighted window of paper 002."""
 
 from __future__ import annotations
 

@@ -21,15 +21,20 @@ HOME = Pose(57.7, 11.97, 0.3, 14.0, NOW)
 def line(
     length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Return latitude and longitude [deg] of a straight road that starts at the car, one point per
-    metre.
+    """Return latitude and longitude [deg] of points of a straight road through the car's position,
+    one point per metre.
+
+    Args:
+        length: distance of the last point from the car [m].
+        yaw: direction of the road [rad].
+        start: distance of the first point from the car [m].
     """
     s = np.arange(start, length)
     return path.to_degrees(s * math.cos(yaw), s * math.sin(yaw), HOME)
 
 
 def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) -> IntArray:
-    """Return the cells of that road in order, each once."""
+    """Return the keys (cell · 4 + sector) along the road of `line`, in order, each once."""
     key = grid.cell_of(*line(length, yaw, start)) * grid.SECTORS + int(grid.sector_of(yaw))
     return key[np.sort(np.unique(key, return_index=True)[1])]
 
@@ -37,7 +42,7 @@ def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) ->
 def cells(
     key: IntArray, mu: float, *, width: float = 0.1, basis: int = local_map.MEASURED, at: int = NOW
 ) -> ReceivedCells:
-    """Return HeardCells with one friction."""
+    """Return received cells that all have the friction `mu` with an interval of ± `width`."""
     said = np.full(len(key), mu)
     slippery = np.full(len(key), 1.0 if mu + width < 0.4 else 0.0 if mu - width > 0.4 else 0.5)
     belief = local_map.belief_of(said - width, said, said + width, slippery)
@@ -52,7 +57,7 @@ def cells(
 
 
 def make_local_map(parts: list[ReceivedCells]) -> LocalMap:
-    """Return a map cache that contains these cells."""
+    """Return the car's map cache with these cells."""
     cache = LocalMap()
     for part in parts:
         for tile in np.unique(grid.tile_of(part.key // grid.SECTORS)).tolist():
@@ -62,7 +67,7 @@ def make_local_map(parts: list[ReceivedCells]) -> LocalMap:
 
 
 def alert(key: int, *, raised: bool = True, time: int = NOW) -> Alert:
-    """Return an ice alert at a place."""
+    """Return an ice alert for a key (cell · 4 + sector)."""
     cell, sector = divmod(int(key), grid.SECTORS)
     latitude, longitude = grid.centre(cell)
     return Alert(

@@ -1,5 +1,5 @@
-"""Listening cars over real sessions: warnings by alerts and by the map, after a lost router, and
-none from forged messages.
+"""Tests of cars that receive the map over real sessions: warnings from alerts and from the map,
+also after a lost router, and no warning from forged messages.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ DAY = 86_400 * NS
 
 
 class Driving:
-    """A car at the beginning of a road that reports 14 m/s and looks ahead along the road."""
+    """Car at the beginning of a road. It drives at 14 m/s and looks ahead along the road."""
 
     def __init__(self, router: Router) -> None:
         self.metre = 0.0
@@ -51,13 +51,15 @@ class Driving:
         self.lookout.start()
 
     def report_pose(self, *, later_s: float = 0.0) -> None:
-        """Update the position."""
+        """Report the car's pose to the lookout, dated `later_s` after the present."""
         latitude, longitude = line(self.metre + 2.0, start=self.metre)
         now = time.time_ns() + round(later_s * NS)
         self.lookout.see([Pose(float(latitude[0]), float(longitude[0]), HOME.yaw, 14.0, now)])
 
     def drive_until(self, condition: Callable[[Outlook], object]) -> Outlook:
-        """Report its position until the outlook meets the condition."""
+        """Report the car's pose repeatedly until the outlook meets the condition, and return this
+        outlook.
+        """
 
         def has_outlook() -> bool:
             self.report_pose()
@@ -91,7 +93,7 @@ def driving(router: Router) -> Iterator[Driving]:
 
 @pytest.fixture
 def town(router: Router) -> Iterator[MadeUpService]:
-    """The service's end of the connection, without ice at first."""
+    """Yield a simulated fleet service, without ice at first."""
     with MadeUpService(router.settings, time.time_ns()) as town:
         yield town
 
@@ -239,7 +241,9 @@ def test_what_was_observed_yesterday_says_how_old_it_is(router: Router) -> None:
 
 
 def test_a_map_of_yesterday_neither_warns_nor_replaces_that_of_today(router: Router) -> None:
-    """Yesterday's map of ice causes no warning, and does not replace today's map of ice."""
+    """A map of ice from yesterday causes no warning, and a map from yesterday does not replace
+    today's.
+    """
     yesterday = {int(key): 0.85 for key in keys_on()} | {int(key): 0.15 for key in ICE}
     with driving(router) as car:
         with MadeUpService(router.settings, time.time_ns() - DAY, yesterday, kept=True):
@@ -345,7 +349,9 @@ def test_bytes_that_are_no_tile_are_refused(payload: bytes) -> None:
 
 
 class Liar(MadeUpService):
-    """Answer map queries with invalid tiles in turn, and with an empty tile."""
+    """Simulated service that answers map queries with invalid tiles in turn, and then with an empty
+    tile.
+    """
 
     said = 0
 

@@ -1,4 +1,6 @@
-"""Limit for a planner: safe entry to ice, hysteresis, and bytes that a ROS decoder reads."""
+"""Tests of the speed limit for a planner: safe entry onto ice, hysteresis, and bytes that a ROS
+decoder reads.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,9 @@ def test_a_ros_decoder_reads_the_message(limit: float) -> None:
 
 
 def enter_ice(speed: float, mu: float, metres: int, *, limited: bool) -> float:
-    """Return the speed [m/s] with which a car that starts `metres` before ice enters it."""
+    """Return the speed [m/s] with which a car that starts `metres` before ice enters it, with or
+    without the limit.
+    """
     safe = np.full(metres + 50, np.nan)
     safe[metres:] = stopping_speed(mu, SIGHT_M)
     at = 0.0

@@ -1,4 +1,4 @@
-"""The map as a prior: used at entry to a cell, dropped if it is wrong, and never part of a
+"""Tests of the map as a prior: used at entry to a cell, dropped if it is wrong, and never part of a
 published report.
 """
 
@@ -24,13 +24,13 @@ FLAT = np.zeros((1, mugrid.BINS))
 
 
 def sharp(mu: float, std: float = 0.06) -> FloatArray:
-    """Return the map's belief of a cell."""
+    """Return the map's belief of a cell, (32,), with median `mu` and standard deviation `std`."""
     said = (np.array([value]) for value in (mu - 1.6 * std, mu, mu + 1.6 * std, float(mu < 0.4)))
     return np.asarray(belief_of(*said)[0])
 
 
 def saying(mu: float, std: float = 0.08) -> FloatArray:
-    """Return the log-likelihood of measurements, (1, 32)."""
+    """Return a Gaussian log-likelihood of μ on the friction grid, (1, 32)."""
     log = -0.5 * ((mugrid.CENTRES - mu) / std) ** 2
     return np.asarray((log - log.max())[None])
 
@@ -93,7 +93,7 @@ def test_a_wrong_map_is_abandoned_quickly_and_trusted_less_in_next_cells() -> No
 
 
 def test_a_map_says_nothing_twice() -> None:
-    """Several cells with the same belief do not strengthen it beyond that of one cell."""
+    """Many cells with the same belief give the same interval as one cell."""
     prior = MapPrior(1)
     widths = []
     for cell in range(30):

@@ -1,4 +1,4 @@
-"""Route files of common programs, and files that are not routes."""
+"""Tests with route files of common programs, and with files that are not routes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Warnings: given once and early enough to stop at the lower end of grip, updated, ended, and never
-without reason.
+"""Tests of warnings: each is given once and early enough to stop at the lower end of grip, then
+updated and ended; there are no false warnings.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ ROAD = 600.0
 
 
 class Car:
-    """A car that drives along the road and hears of warnings."""
+    """Car that drives along the road and collects its warnings."""
 
     def __init__(self, cache: LocalMap, speed: float = 14.0) -> None:
         self.cache = cache
@@ -115,7 +115,9 @@ def test_one_vehicle_alone_warns_nobody() -> None:
 
 
 def test_alert_over_a_mere_bound_is_exported_with_its_own_grip() -> None:
-    """Ice fades on the map before its alert ends; the former value is then only a bound."""
+    """On the map the belief of ice ages before its alert ends, so that only a lower bound is left.
+    The warning must then have the friction of the alert.
+    """
     cache = make_local_map([cells(icy(), 0.1, basis=BOUND)])
     for key in icy():
         cache.store_alert(alert(key, time=NOW - NS), NOW)

@@ -1,5 +1,5 @@
-"""Many recorded drives: each is written to its own file, several run at a time, and a bad drive
-does not stop the others.
+"""Tests of the replay of many recorded drives: each is written to its own file, several run at a
+time, and a bad drive does not stop the others.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ DRIVES = 3
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of drives, each with its vehicle file next to it."""
+    """Return a folder of drives, each with its vehicle file."""
     folder = tmp_path_factory.mktemp("drives")
     for seed in range(DRIVES):
         files = [
@@ -55,8 +55,8 @@ def test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes(
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_so_many_drives_are_under_way_at_once(drives: Path, tmp_path: Path, jobs: int) -> None:
-    """Use pipes as vehicle files: a drive waits at its pipe until something is written or the
-    writer closes it.
+    """The vehicle files are named pipes, so each started drive waits until its pipe is written or
+    closed. The test counts the waiting drives.
     """
     tasks = [
         task._replace(vehicle=tmp_path / task.vehicle.name)

@@ -1,4 +1,4 @@
-"""Banks by name: where the memberships come from."""
+"""Tests of banks created by name: the source of their memberships."""
 
 from __future__ import annotations
 

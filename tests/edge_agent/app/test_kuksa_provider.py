@@ -1,5 +1,5 @@
-"""Provider of a Kuksa databroker against a gRPC server: values, clearing, refusals, an absent
-broker.
+"""Tests of the provider for a Kuksa databroker with a gRPC server: values, clearing of unknown
+values, refusals, an absent broker.
 """
 
 from __future__ import annotations

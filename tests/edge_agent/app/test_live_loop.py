@@ -1,5 +1,5 @@
-"""Pipeline and live loop: visits are closed at the end, lag behind real time is counted, and the
-loop stops on request.
+"""Tests of the pipeline and the live loop: visits are closed at the end, delay behind real time is
+counted, and the loop stops on request.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ RATE = 50.0
 
 
 class Basket:
-    """A receiver that stores everything that the loop offers."""
+    """Simulated publisher that stores all records that the loop offers."""
 
     is_broken = False
 
@@ -125,8 +125,8 @@ def run(
 def test_a_simulated_source_hands_its_context_to_the_observations(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """Return signals of three cars: the first brakes with ABS now and then, the ABS flag of the
-    second is always on, the third has none.
+    """There are three cars: the first brakes with ABS now and then, the ABS flag of the second is
+    always on, and the third has no flag.
     """
     fleet, parts = fleet_blocks(300)
     for place, block in enumerate(parts):

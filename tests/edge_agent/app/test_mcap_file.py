@@ -1,4 +1,4 @@
-"""Estimates as MCAP: the reference reader of the format finds every sample and value."""
+"""Test of estimates as MCAP: the format's reference reader finds every sample and value."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Metrics of an agent for its operator: reports sent, settled and waiting, and its lag."""
+"""Tests of an agent's metrics: reports sent, settled and waiting, and the delay behind
+real time.
+"""
 
 from __future__ import annotations
 

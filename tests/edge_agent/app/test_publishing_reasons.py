@@ -1,4 +1,6 @@
-"""Reasons why nothing is published: each planted cause is named within five seconds, and once."""
+"""Tests of the reasons why an agent publishes nothing: each cause is printed once, within five
+seconds.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ REFUSED = Counts(rejected={Kind.OBSERVATION: 3})
 
 @dataclass
 class State:
-    """State of a publisher."""
+    """Simulated state of a publisher."""
 
     links: int = 1
     cut_off: bool = False
@@ -30,7 +32,7 @@ class State:
 
 
 class Clock:
-    """Clock that a test moves."""
+    """Clock that the test sets."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -68,7 +70,7 @@ CAUSES: dict[str, tuple[Block, State, list[str], str]] = {
 def told_within(
     source: Block, find: Callable[[SignalWatch], list[str]], seconds: float
 ) -> list[str]:
-    """Return the lines that are printed in so many seconds."""
+    """Return the lines that are printed in `seconds` of simulated time."""
     clock = Clock()
     lines = list[str]()
     watch = SignalWatch(clock)

@@ -1,4 +1,4 @@
-"""The option of `edge-agent replay` that compares estimators in a report."""
+"""Test of the option of `edge-agent replay` that compares estimators in a report."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from edge_agent.cli import main
 
 @pytest.fixture
 def drive(tmp_path: Path) -> Path:
-    """A drive of two seconds with its vehicle file."""
+    """Return the log of a simulated drive of two seconds; its vehicle file lies next to it."""
     log = tmp_path / "drive.parquet"
     vehicle = ["--vehicle-out", str(tmp_path / "drive.json")]
     assert main(["simulate", "slalom", "--duration", "2", "--out", str(log), *vehicle]) == 0

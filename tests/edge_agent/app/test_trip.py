@@ -1,5 +1,5 @@
-"""A live trip: nothing is published before the doctor has passed, and the next trip uses the
-calibration that this one learned.
+"""Tests of a live trip: nothing is published before the signals have passed the doctor, and the
+next trip uses the calibration that this trip learned.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ def source(drive: Recorded) -> Generator[Block]:
 
 
 def drive_trip(trip: Trip, drive: Recorded) -> tuple[list[bool], list[Block]]:
-    """Return whether each block was admitted, and the estimator's input; wait for the doctor."""
+    """Drive a trip and wait for the doctor's result. Return for each block whether it was admitted,
+    and the estimator's input.
+    """
     admitted = []
     blocks = []
     for block in trip.corrected_blocks(source(drive), lambda: np.full(ROWS, np.nan)):

@@ -1,5 +1,5 @@
-"""Files of tuned memberships: they state their origin, and an invalid one is refused with the name
-of the field.
+"""Tests of files with tuned memberships: they state their origin, and an invalid file is refused
+with the name of the field.
 """
 
 import json
@@ -29,7 +29,7 @@ Change = Callable[[dict[str, Any]], object]
 
 
 def document(memberships: Memberships | None = None) -> dict[str, Any]:
-    """Return a complete document as parsed JSON."""
+    """Return a complete file of tuned memberships, as parsed JSON."""
     score = {"interval_score": 0.5, "coverage": 0.9, "log_likelihood": 1.5, "nis_ratio": 0.9}
     return {
         "estimator": "aco-fckf",
@@ -58,7 +58,7 @@ def test_memberships_and_provenance_survive_the_way_through_a_file(tmp_path: Pat
 
 
 def broken(change: Change) -> str:
-    """Return the document as text after `change` has made it invalid."""
+    """Return a file's text after `change` has made it invalid."""
     spoiled = document()
     change(spoiled)
     return json.dumps(spoiled)
@@ -157,7 +157,9 @@ def test_memberships_of_the_papers_filter_gain_on_held_out_drives() -> None:
 
 @pytest.mark.campaign
 def test_scores_in_the_shipped_file_are_those_of_the_filter_as_it_is() -> None:
-    """Fail if the filter changed after the tuning. Then run the command in the file again."""
+    """This test fails if the filter changed after the tuning. Then run the command in the file
+    again.
+    """
     document = load_tuned(FOLDER / "aco-fckf.json").document
     found = scores_of(
         shipped_memberships("aco-fckf"), record_all("held_out", DURATION_S), "aco-fckf"

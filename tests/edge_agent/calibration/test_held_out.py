@@ -1,4 +1,4 @@
-"""Validation of a calibration on drives that it was not learned from."""
+"""Tests of the validation of a calibration on drives that were not used for learning."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from schemas.vehicle import Calibration, Vehicle
 
 @pytest.fixture(scope="module")
 def drive() -> Recorded:
-    """Two minutes of a car whose accelerometer is tilted."""
+    """Return two minutes of a car whose accelerometer is tilted."""
     return offset_columns([S.AX], 0.5)(drives(1, 31, rough=False, seconds=120)[0])
 
 
 def offset_judge(vehicle: Vehicle, drive: Drive) -> Prediction:
-    """Return a likelihood that only the offset of a_x improves and that radii make worse on every
-    drive.
+    """Return a made-up prediction score on a drive: the offset of a_x improves the likelihood, and
+    wheel radii make it worse.
     """
     known = vehicle.calibration
     if known is None:

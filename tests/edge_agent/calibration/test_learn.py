@@ -1,4 +1,6 @@
-"""Calibration: errors put into a simulated car's devices are found from its drives and corrected."""
+"""Tests of the calibration: errors that were put into a simulated car's sensors are found from its
+drives and corrected.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,7 @@ OFF = {"ax": 0.5, "yaw_rate": 0.012, "steer_offset": 0.012, "radius_fl": 0.012}
 
 @pytest.fixture(scope="module")
 def smooth() -> Recorded:
-    """Three minutes of a car whose devices are well mounted, on a plane."""
+    """Return three minutes of a car with well mounted sensors, on level ground."""
     return drives(1, 31, rough=False, seconds=180)[0]
 
 
@@ -100,8 +102,8 @@ def test_what_is_hardly_known_is_drawn_to_what_cars_usually_have(smooth: Recorde
 
 
 def test_the_driven_axle_is_not_taken_for_a_smaller_one() -> None:
-    """On the same drives, a file without the driven axle gives wrong radii and a larger stated
-    uncertainty.
+    """The slip of driven wheels looks like a smaller radius. If the vehicle file does not name the
+    driven axle, radii are wrong and their stated uncertainty is larger.
     """
     drive = drives(3, 32, rough=False, seconds=300)[2]  # a van: its rear wheels drive
     assert drive.vehicle.drive_split_front == 0.0

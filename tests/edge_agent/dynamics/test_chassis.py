@@ -1,4 +1,4 @@
-"""The body on four tyres, the brush curve and the electric drive wheel."""
+"""Tests of the body on four tyres, of the brush tyre curve and of the electric drive wheel."""
 
 from __future__ import annotations
 

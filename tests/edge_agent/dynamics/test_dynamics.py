@@ -1,4 +1,4 @@
-"""Identities of the vehicle equations."""
+"""Tests of identities that the vehicle equations must satisfy."""
 
 from __future__ import annotations
 

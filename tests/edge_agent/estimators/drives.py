@@ -1,4 +1,4 @@
-"""Drives for the tests of the estimators, simulated once."""
+"""Simulated drives for the tests of the estimators; each is simulated once and cached."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ OMEGA = slice(S.OMEGA, S.OMEGA + 4)
 def drive(
     name: str, mu: float | None, seed: int = 1, seconds: float | None = None
 ) -> tuple[FloatArray, FloatArray, Vehicle]:
-    """Return t (T,) [s], signals (T, 18) and nominal vehicle of a manoeuvre with ordinary sensors.
-    `mu` None means the manoeuvre's own friction.
+    """Return times t (T,) [s], signals (T, 18) and nominal vehicle of a manoeuvre with ordinary
+    sensors. With `mu` None the manoeuvre has its own friction.
     """
     log, vehicle = simulate_manoeuvre(name, mu=mu, seed=seed, duration_s=seconds, sensors="mems")
     return (
@@ -31,7 +31,7 @@ def drive(
 
 
 def join_drives(*parts: tuple[FloatArray, FloatArray, Vehicle]) -> tuple[FloatArray, FloatArray]:
-    """Join drives into one, with 10 ms between them."""
+    """Return times (T,) and signals (T, 18) of several drives in succession, 10 ms apart."""
     clock = []
     rows = []
     end = 0.0
@@ -43,10 +43,10 @@ def join_drives(*parts: tuple[FloatArray, FloatArray, Vehicle]) -> tuple[FloatAr
 
 
 def drive_over_joints() -> tuple[FloatArray, FloatArray, Vehicle]:
-    """A gentle pull over joints in a dry motorway, without torque: the wheels of an axle jump by 3
-    to 4 % for 50 ms.
+    """Return a drive of gentle acceleration over joints in a dry motorway, without torque signals.
+    At each joint the wheel speeds of an axle jump by 3 to 4 % for 50 ms.
 
-    As in the minute of tests/data/rav4.blf, at 1.7 and 38.4 s.
+    The recorded minute tests/data/rav4.blf has such jumps at 1.7 and 38.4 s.
     """
     vehicle = drive("straight", 0.85)[2]
     rng = np.random.default_rng(4)

@@ -1,5 +1,5 @@
-"""Promises of every estimator of the bank: causality, bit-equality, honesty without excitation,
-no NaN.
+"""Tests of properties that every estimator of the bank must have: causality, equal bits for any
+division into calls, wide intervals without excitation, no NaN.
 """
 
 from __future__ import annotations
@@ -265,8 +265,8 @@ def test_on_a_road_of_one_friction_the_wheels_have_it() -> None:
 
 @pytest.mark.parametrize("name", ["gaining-lane-changes", "gaining-slalom"])
 def test_gaining_speed_gently_tells_no_ice(name: str) -> None:
-    """Four wheels that slide a little would explain the slip as well, with a stiffness or an
-    offset to match.
+    """During gentle acceleration no ice may be reported, although four sliding wheels with a
+    suitable stiffness or sensor offset would also explain the slip.
     """
     for seed in range(6):
         t, signals, vehicle = drive(name, 0.9, seed)

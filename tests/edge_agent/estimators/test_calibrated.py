@@ -1,4 +1,6 @@
-"""A calibrated vehicle file narrows the priors of its states, and nothing else."""
+"""Tests that a calibrated vehicle file narrows the priors of the calibrated states, and changes
+nothing else.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Every constant of the default's table moves the quantity that it is for, in the direction and by
-the size that its reason states.
+"""Tests of every constant of the default estimator: a changed value changes a figure of a drive in
+the direction and by the size that the constant's stated reason implies.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SHORT: dict[str, float | None] = {
 
 
 class Move(NamedTuple):
-    """Change of a figure of a drive when a constant is changed."""
+    """Expected change of a figure of a drive when a constant is multiplied by `times`."""
 
     figure: str
     drive: str
@@ -191,7 +191,7 @@ MOVES = {
 
 @cache
 def make_drive(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
-    """t (T,), signals (T, 18) and vehicle of a drive."""
+    """Return times t (T,) [s], signals (T, 18) and vehicle of a drive by name."""
     if name in SHORT:
         t, signals, vehicle = drive(name, SHORT[name])
         t = t[:SAMPLES]
@@ -226,8 +226,8 @@ def make_drive(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
 
 
 def made_up(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
-    """Return synthetic drives that the plant cannot make: a stop on slipping wheels, a standing
-    car, and side force without yaw.
+    """Return a drive with signals that the simulator cannot produce: a stop with slipping wheels, a
+    standing car, or side force without yaw.
     """
     t = np.arange(0.0, 4.0 if name == "stopping" else 20.0, 0.01)
     signals = np.zeros((len(t), len(CHANNELS)))
@@ -264,7 +264,7 @@ def figures(place: str, name: str | None, times: float) -> dict[str, float]:
 
 
 def summarize_reports(estimates: Estimates) -> dict[str, float]:
-    """Return figures of the reports of one drive."""
+    """Return figures of an estimator's output for one drive."""
     mean = {
         "width": estimates.mu_upper - estimates.mu_lower,
         "lower": estimates.mu_lower,
@@ -279,7 +279,7 @@ def summarize_reports(estimates: Estimates) -> dict[str, float]:
 
 
 def inside(filters: np.ndarray) -> dict[str, float]:
-    """Return figures of the filter during one drive."""
+    """Return figures of the filter's internal states during one drive."""
     weight = filters["weight"]
     split = filters["split"]
     chain = weight[:, :NODES]
@@ -316,13 +316,13 @@ def inside(filters: np.ndarray) -> dict[str, float]:
 
 
 def mean_of_known(values: FloatArray, where: FloatArray) -> float:
-    """Return the mean of the reported values, 0 without any."""
+    """Return the mean of the values at which `where` is finite, or 0 without any."""
     there = np.isfinite(where)
     return float(values[there].mean()) if there.any() else 0.0
 
 
 def geometric(values: FloatArray) -> float:
-    """Return the geometric mean of probabilities; 0 if there are none."""
+    """Return the geometric mean of probabilities, or 0 if there are none."""
     return float(np.exp(np.log(np.maximum(values, 1e-12)).mean())) if values.size else 0.0
 
 

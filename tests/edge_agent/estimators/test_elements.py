@@ -1,4 +1,6 @@
-"""Lists of the papers' elements: each deviation has a reason, and each place in the code exists."""
+"""Tests of the lists of the papers' equations, tables and figures: each deviation has a reason, and
+each named place in the code exists.
+"""
 
 from __future__ import annotations
 

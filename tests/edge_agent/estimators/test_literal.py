@@ -1,5 +1,6 @@
-"""Friction filters of papers 000 and 003 as printed: printed errors, precision, and the tyre that
-they need."""
+"""Tests of the friction filters of papers 000 and 003 as printed: printed errors, numerical
+precision, and the tyre model that they need.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +26,14 @@ SHORT_S = 2.0
 
 @pytest.fixture(scope="module")
 def turn() -> tuple[GivenMotion, FloatArray]:
-    """A turn on snow, and the true friction of its wheels."""
+    """Return the motion of a turn on snow, and the true friction of its wheels (T, 4)."""
     spec = replace(MATCHED["003.turn"], duration_s=SHORT_S)
     batch = ideal(spec)
     return given_motion(batch, spec.vehicle), batch.mu_wheel[:, 0]
 
 
 def one_sample(speed: float) -> GivenMotion:
-    """One sample with slip at all wheels."""
+    """Return one sample of motion with slip at all wheels."""
     signals = np.zeros((1, len(CHANNELS)))
     signals[0, [S.AX, S.AY, S.YAW_RATE]] = 1.0, 2.0, 0.2
     signals[0, S.DELTA : S.DELTA + 2] = 0.05

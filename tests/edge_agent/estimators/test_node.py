@@ -1,4 +1,6 @@
-"""Parts of a friction node compared with textbooks: sequential update and tyre curve."""
+"""Tests that compare parts of a friction node with textbook formulas: sequential update and tyre
+curve.
+"""
 
 from __future__ import annotations
 

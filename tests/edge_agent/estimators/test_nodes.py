@@ -1,4 +1,4 @@
-"""Identities of the friction mixture: prior, road change, quantiles, evidence."""
+"""Tests of identities of the friction mixture: prior, road change, quantiles, evidence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Novelty of a block: force or lateral slip that differs from its usual value."""
+"""Tests of the novelty of a block: force or lateral slip that differs from its usual value."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ ICE = 0.18
 
 
 class Bend:
-    """A car in a steady left bend, whose axles slip as the test says."""
+    """Car in a steady left bend, whose axles slip as the test sets."""
 
     def __init__(self) -> None:
-        """Begin with the slip of a road with grip, until it is usual."""
+        """Create a car that has driven on a road with grip until its slip is the usual value."""
         context = records(MixtureContext, 1)
         put_record(context["design"][0], design_of(Memberships(), adaptive=True))
         self.mu = context["design"]["mu"][0]
@@ -40,13 +40,15 @@ class Bend:
         self.drive_block(BEND, seconds=20.0)
 
     def believe_in(self, mu: float) -> None:
-        """Give all weight to one node of friction."""
+        """Give all probability to the friction node nearest to `mu`."""
         self.memory["weight"][0] = 0.0
         self.memory["weight"][0, np.argmin(np.abs(self.mu - mu))] = 1.0
         self.memory["friction"]["median"] = mu
 
     def drive_block(self, slip: float, *, force: float = BEND, seconds: float = BLOCK_S) -> float:
-        """Drive with lateral slip and force over load; return the membership in "new"."""
+        """Drive for `seconds` with a lateral slip and a lateral force (as a share of the load).
+        Return the membership of the last block in the fuzzy set "new".
+        """
         slope = self.memory["row"][0, Parameter.SLOPE_Y]
         across = -slip / slope * SPEED_M_S
         self.features["side"] = force
@@ -63,7 +65,7 @@ class Bend:
 
     @property
     def ice_ended(self) -> float:
-        """Return the membership in "the ice has ended"."""
+        """Return the membership in the fuzzy set "the ice has ended"."""
         return float(self.memory["slip"]["axle_ended"][0])
 
 

@@ -1,4 +1,4 @@
-"""The papers' estimators: the interface, causality, no NaN, and what each of them does on a
+"""Tests of the papers' estimators: interface, causality, no NaN, and the behaviour of each on a
 short drive.
 """
 

@@ -1,4 +1,4 @@
-"""Promises of the default estimator on roads and in cars that are not level, aligned or
+"""Tests of the default estimator on sloping roads, and with sensors that are misaligned or not
 synchronous.
 """
 

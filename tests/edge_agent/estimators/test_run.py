@@ -1,4 +1,4 @@
-"""The shared loop of the papers' filters: it is compiled once for all processes."""
+"""Test of the shared loop of the papers' filters: it is compiled once for all processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Several threads share a bank's vehicles without changing a bit."""
+"""Test that the results of a bank do not change by one bit if several threads share its
+vehicles.
+"""
 
 from __future__ import annotations
 

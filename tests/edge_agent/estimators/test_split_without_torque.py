@@ -1,5 +1,5 @@
-"""Roads with different sides in a car without wheel torque: the yaw balance shows which side is
-slippery.
+"""Tests on roads with different friction on the two sides in a car without wheel torque: the yaw
+balance shows which side is slippery.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ SNOW = 0.3
 
 
 def stop(seed: int, *, mirrored: bool) -> tuple[FloatArray, Estimates]:
-    """Return true v_x (T,) and the estimates of a stop on a split road without torque; mirrored:
-    snow on the left.
+    """Return true v_x (T,) [m/s] and the estimates of a stop on a split road without torque
+    signals. If `mirrored`, the snow is on the left.
     """
     log, vehicle = simulate_manoeuvre("split-braking", seed=seed)
     signals = np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(float)

@@ -1,4 +1,6 @@
-"""Reported interval of friction: its levels, and the effect of ice patches on it."""
+"""Tests of the reported interval of friction: its quantile levels, and the effect of ice patches on
+it.
+"""
 
 from __future__ import annotations
 
@@ -45,8 +47,12 @@ def _tell(
 def find_told_interval(
     weight: FloatArray, patch: float = 0.0, likeness: float = 0.0
 ) -> tuple[float, float, float]:
-    """Return lower end, median and upper end of a belief, for a share of ice patches and a degree
-    of agreement with the vehicle file.
+    """Return lower end, median and upper end of the interval reported for a belief.
+
+    Args:
+        weight: probabilities of the friction nodes.
+        patch: probability of an ice patch.
+        likeness: degree of agreement with the vehicle file.
     """
     contexts = records(MixtureContext, 1)
     put_record(contexts["design"][0], DESIGN)
@@ -60,7 +66,7 @@ def find_told_interval(
 
 
 def about(mu: float, width: float) -> FloatArray:
-    """Return a belief around this friction."""
+    """Return node probabilities centred on the friction `mu`."""
     weight = DESIGN.prior * np.exp(-0.5 * ((DESIGN.mu - mu) / width) ** 2)
     return np.asarray(weight / weight.sum())
 

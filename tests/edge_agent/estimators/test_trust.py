@@ -1,5 +1,5 @@
-"""Model strain separates cars that match their file from others; contradiction is found per axle,
-and ice does not cause it.
+"""Tests of strain and contradiction: model strain separates cars that match their file from others;
+contradiction is found per axle, and ice does not cause it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Reported grip in use, and torque that is known on one axle only."""
+"""Tests of the reported grip in use, also if torque is known on one axle only."""
 
 from __future__ import annotations
 
@@ -24,14 +24,18 @@ SLACK_M_S = 0.02
 
 @cache
 def stop(mu: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return times (T,), signals (T, 18) and true v_x (T,) of a stop with anti-lock control."""
+    """Return times (T,) [s], signals (T, 18) and true v_x (T,) [m/s] of a stop with anti-lock
+    brakes.
+    """
     log, _ = simulate_manoeuvre("braking", mu=mu, seed=2, sensors="mems")
     signals = np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(float)
     return log["t"].to_numpy(), signals, log["true_vx"].to_numpy()
 
 
 def speed_error(mu: float, missing: slice, *, engine_only: bool = False) -> float:
-    """Return the error of v_x [m/s] in a stop, rms; engine_only: known torque has no brakes."""
+    """Return the RMS error of v_x [m/s] in a stop. If `engine_only`, the known torque does not
+    include the brakes.
+    """
     t, signals, vx = stop(mu)
     signals = signals.copy()
     signals[:, missing] = np.nan
@@ -43,7 +47,7 @@ def speed_error(mu: float, missing: slice, *, engine_only: bool = False) -> floa
 
 
 def drive_without_torque(name: str, mu: float) -> tuple[FloatArray, Estimates]:
-    """Return signals (T, 18) and estimates of a manoeuvre."""
+    """Return signals (T, 18) and estimates of a manoeuvre without torque signals."""
     t, signals, vehicle = drive(name, mu)
     signals = signals.copy()
     signals[:, TORQUE] = np.nan

@@ -1,4 +1,6 @@
-"""A visit during which friction jumps is reported in two parts; any other visit in one."""
+"""Tests that a visit during which friction jumps is reported in two parts, and any other visit in
+one.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ DEFAULT = "aco-fckf"
 
 
 def one_visit(name: str, mu: float | None, seed: int) -> tuple[np.ndarray, Estimates]:
-    """Return times (T,) and estimates of a drive within one cell."""
+    """Return times (T,) [s] and estimates of a drive within one cell."""
     t, signals, vehicle = drive(name, mu, seed)
     closes = np.zeros((len(t), 1), np.bool_)
     closes[0] = closes[-1] = True

@@ -1,4 +1,6 @@
-"""The cubature filter with columns equals the one with rows: same points, same prediction."""
+"""Tests that the cubature filter with points in columns equals the one with points in rows: same
+points, same prediction.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Federated filters: information sharing, fusion, downdates, and points by singular values, tested
-by identities and linear oracles.
+"""Tests of federated filters by identities and linear filters: information sharing, fusion,
+downdates, and points by singular values.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def covariance(n: int, seed: int) -> FloatArray:
 
 
 def root_of(cov: FloatArray) -> FloatArray:
-    """Return the lower triangular factor."""
+    """Return the lower triangular factor of a covariance."""
     return np.asarray(np.linalg.cholesky(cov), np.float64)
 
 
@@ -32,7 +32,7 @@ System = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 def textbook(
     mean: FloatArray, cov: FloatArray, system: System, z: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Run one step of the Kalman filter with full covariances."""
+    """Return mean and covariance after one step of the Kalman filter with full covariances."""
     f, q, h, noise = system
     mean = f @ mean
     cov = f @ cov @ f.T + q
@@ -71,8 +71,8 @@ def test_fusing_adds_information() -> None:
 
 
 def test_federated_filter_with_halved_shared_rows_is_the_kalman_filter() -> None:
-    """Two sub-filters, [z1, z2] and [z2], over ten steps of a linear system: the oracle is the
-    textbook filter.
+    """Two sub-filters with measurements [z1, z2] and [z2] run ten steps of a linear system. The
+    result must equal the textbook Kalman filter.
     """
     rng = np.random.default_rng(3)
     n = 3
@@ -236,7 +236,7 @@ def test_downdate_filter_is_the_textbook_filter_on_a_linear_system() -> None:
 
 
 def test_where_the_downdate_refuses_the_orthogonal_update_does_the_work() -> None:
-    """Noise so small that rounding leaves no variance in the measured direction."""
+    """The noise is so small that rounding leaves no variance in the measured direction."""
     (mean, other, cov, other_cov), told = _make_update(12, 1e-9)
     assert told[3]
     assert np.array_equal(mean, other)

@@ -1,4 +1,6 @@
-"""Theorems of the sigma rules and oracles of the square-root core."""
+"""Tests of the sigma-point rules by theorems, and of the square-root filter by comparison with
+textbook filters.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +82,7 @@ def test_a_covariance_keeps_a_centimetre_at_an_offset_of_5400_kilometres(rule: S
 
 
 def factor_of(cov: FloatArray) -> FloatArray:
-    """Lower-triangular factor of a covariance."""
+    """Return the lower-triangular factor of a covariance."""
     return np.asarray(np.linalg.cholesky(cov), np.float64)
 
 
@@ -187,7 +189,9 @@ def test_square_root_filter_is_textbook_for_a_nonlinear_measurement() -> None:
 def _textbook(
     rule: SigmaRule, mean: FloatArray, cov: FloatArray, q: FloatArray, r: FloatArray, z: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Run one step of the cubature filter with full covariances, for the pendulum below."""
+    """Return mean and covariance after one step of the cubature filter with full covariances, for
+    the pendulum below.
+    """
     points = swing(mean + rule.xi @ np.linalg.cholesky(cov).T)
     mean = points.mean(axis=0)
     cov = (points - mean).T @ (points - mean) / len(points) + q
@@ -200,12 +204,12 @@ def _textbook(
 
 
 def swing(x: FloatArray) -> FloatArray:
-    """A damped pendulum of angle and rate over 50 ms."""
+    """Return the states (n, 2), angle and rate, of a damped pendulum after 50 ms."""
     return np.stack([x[:, 0] + 0.05 * x[:, 1], 0.99 * x[:, 1] - 0.5 * np.sin(x[:, 0])], axis=1)
 
 
 def look(x: FloatArray) -> FloatArray:
-    """Return the measurement: its shadow, and its rate times its height."""
+    """Return the measurements (n, 2) of a pendulum: horizontal position, and rate times height."""
     return np.stack([np.sin(x[:, 0]), x[:, 1] * np.cos(x[:, 0])], axis=1)
 
 

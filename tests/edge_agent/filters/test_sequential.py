@@ -1,5 +1,5 @@
-"""Cholesky factors, and updates of a square root by one scalar after the other, against textbook
-and orthogonal.
+"""Tests that compare Cholesky factors, and square-root updates by one scalar after the other, with
+textbook and orthogonal algorithms.
 """
 
 from __future__ import annotations

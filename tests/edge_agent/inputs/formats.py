@@ -1,4 +1,4 @@
-"""The recorded minute of tests/data, and its CAN frames."""
+"""The recorded minute in tests/data, and its CAN frames."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ VEHICLE = DATA / "rav4.json"
 
 
 def frames(most: int | None = None) -> list[can.Message]:
-    """Return the first frames of the recorded minute with times in whole microseconds, as most
-    loggers store them.
+    """Return the first `most` frames of the recorded minute, with times in whole microseconds as
+    most loggers store them.
     """
     with can.BLFReader(BLF) as reader:
         found = [message for _, message in zip(range(most or 10**9), reader, strict=False)]

@@ -1,5 +1,5 @@
-"""Corrections that a replay takes from the signal doctor: late devices, a locked rear axle,
-radii of the axles.
+"""Tests of corrections that a replay takes from the signal doctor: late sensors, a locked rear
+axle, wheel radii of the axles.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ RATE_HZ = 100
 
 @pytest.fixture(scope="module")
 def drive() -> Recorded:
-    """Two minutes and a half of a car with exact devices."""
+    """Return two and a half minutes of a car with exact sensors."""
     return drives(1, 31, rough=False)[0]
 
 

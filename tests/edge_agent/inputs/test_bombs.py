@@ -1,5 +1,5 @@
-"""A small compressed recording that expands to a very large one is refused with an error and does
-not exhaust memory.
+"""Tests that a small compressed recording that expands to a very large one is refused with an error
+and does not exhaust memory.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ def text(words: str) -> bytes:
 
 
 def write_mcap_bomb(path: Path) -> Path:
-    """Return a bag with one message and a compressed chunk that holds LARGE zeros."""
+    """Write a ROS bag with one message and a compressed chunk of LARGE zeros, and
+    return its path.
+    """
     lz4 = pytest.importorskip("lz4.frame")
     second = 10**9
     schema = struct.pack("<H", 1) + text("std_msgs/msg/Float64") + text("ros2msg")
@@ -58,7 +60,7 @@ def write_mcap_bomb(path: Path) -> Path:
 
 
 def write_mdf_bomb(path: Path) -> Path:
-    """A measurement of LARGE zeros in compressed (DZ) blocks."""
+    """Write a measurement of LARGE zeros in compressed (DZ) blocks, and return its path."""
     asammdf = pytest.importorskip("asammdf")
     values = np.zeros(LARGE // 16)
     with asammdf.MDF(version="4.10") as file:

@@ -1,4 +1,4 @@
-"""Detection of exchanged front and rear wheels from bumps of the road."""
+"""Tests of the detection of exchanged front and rear wheels from bumps of the road."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ SPEED = 20.0
 
 
 def uneven_drive(bumps: float) -> tuple[FloatArray, FloatArray]:
-    """A minute at 20 m/s: both axles roll over one road, with noise of their own."""
+    """Return times (T,) and signals (T, 18) of a minute at 20 m/s. Both axles roll over the same
+    road, each with its own noise.
+    """
     rng = np.random.default_rng(4)
     t = np.arange(0.0, 60.0, 0.01)
     road = np.convolve(rng.normal(0.0, 1.0, 30_000), np.ones(12) / 12.0, "same")  # every 5 cm

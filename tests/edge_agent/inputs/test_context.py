@@ -1,5 +1,5 @@
-"""Context signals: each kind of source fills them, old logs stay unchanged, and a value that is too
-old is unknown.
+"""Tests of context signals (controllers, temperature, wipers): each kind of source fills them, old
+logs stay unchanged, and a value that is too old is unknown.
 """
 
 from __future__ import annotations
@@ -67,13 +67,15 @@ SLOW = {"FATC11", "CGW1", "Kombi_02", "Gateway_72"}  # once a second
 
 
 def told_at(t: float) -> dict[str, float]:
-    """Return the truth at a time."""
+    """Return the true context values at a time."""
     flags = {name: float(first <= t < last) for name, (first, last) in FLAGS_AT.items()}
     return flags | {"air_temperature": AIR, "wiper": WIPES}
 
 
 def frames_of(name: str) -> list[can.Message]:
-    """A drive on the bus of a shipped profile's car, all messages of its database."""
+    """Return the CAN frames of a drive of a shipped profile's car, with all messages of its
+    database.
+    """
     cantools = pytest.importorskip("cantools")
     database = cantools.database.load_file(FOLDER / f"{name}.dbc", strict=False)
     frames = []
@@ -102,7 +104,7 @@ def frames_of(name: str) -> list[can.Message]:
 
 
 def import_log(path: Path, profile: Profile, out: Path) -> SignalLog:
-    """Import a source as a log, without checking the signals that an estimator needs."""
+    """Import a source as a log, without checking that signals needed by an estimator exist."""
     database = None if profile.dbc is None else read_dbc(FOLDER / profile.dbc)
     merged = merge_recordings(
         [read_source(path, profile, database)], profile, wheel_radius=0.3, steering_ratio=16.0
@@ -118,7 +120,7 @@ def import_log(path: Path, profile: Profile, out: Path) -> SignalLog:
 
 
 def assert_filled(log: SignalLog) -> None:
-    """Assert that all context is there and has its true values."""
+    """Assert that a log contains all context signals with their true values."""
     assert log.context is not None
     assert len(log.t) > 500
     assert (np.isfinite(log.context).mean(axis=0) >= ENOUGH).all(), np.isfinite(log.context).mean(
@@ -149,7 +151,9 @@ def test_a_bus_fills_the_context_that_its_profile_reads(
 
 
 def plain_profile(names: dict[str, str]) -> Profile:
-    """A profile that reads context, and one wheel, under these names."""
+    """Return a profile that reads context channels, and one wheel, from signals with
+    these names.
+    """
     return Profile(
         name="p", channels={channel: Channel(signal=signal) for channel, signal in names.items()}
     )
@@ -223,8 +227,8 @@ def test_a_table_fills_the_context_and_keeps_its_rows(tmp_path: Path) -> None:
 
 
 def live_blocks(values: dict[str, float], every: int, blocks: int, profile: Profile) -> FloatArray:
-    """Return context (T, 5) of live rows of a 50 Hz source that sends `values` in every `every`-th
-    message.
+    """Return context (T, 5) of live rows from a 50 Hz source that sends `values` in every
+    `every`-th message.
     """
     clock = Steered()
     feed = Scripted("bus", clock)

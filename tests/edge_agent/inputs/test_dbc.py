@@ -1,4 +1,6 @@
-"""CAN decoding compared with cantools frame by frame, and databases with small errors."""
+"""Tests of CAN decoding: comparison with cantools frame by frame, and databases with
+small errors.
+"""
 
 from __future__ import annotations
 

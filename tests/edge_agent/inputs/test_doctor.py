@@ -1,5 +1,5 @@
-"""Signal doctor: it names planted mistakes, accepts correct drives and the recorded minute, and
-proposes right corrections.
+"""Tests of the signal doctor: it names deliberate faults, accepts correct drives and the recorded
+minute, and proposes right corrections.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Output = pytest.CaptureFixture[str]
 
 @pytest.fixture(scope="module")
 def rough() -> Recorded:
-    """Two minutes and a half of a car whose devices are as in real cars, on hills."""
+    """Return two and a half minutes on hills of a car with realistic sensor errors."""
     return drives(1, 23, rough=True)[0]
 
 
@@ -114,7 +114,7 @@ def test_slides_and_constant_speed_accuse_no_sensor(manoeuvre: str, mu: float | 
 
 @pytest.fixture(scope="module")
 def winter() -> Recorded:
-    """Two minutes and a half on ice and snow."""
+    """Return two and a half minutes on ice and snow."""
     return winter_drives(1, 23)[0]
 
 
@@ -133,7 +133,7 @@ def test_a_mistake_is_named_on_ice_too(winter: Recorded, name: str) -> None:
 
 @pytest.mark.timeout(600)  # the kernels of the default estimator may have to be compiled
 def test_the_first_drive(tmp_path: Path, router: Router, service: Service, capsys: Output) -> None:
-    """Run the five lines of the README on the recorded minute."""
+    """Run the commands of the tutorial on the recorded minute."""
     log, page, out = (
         str(tmp_path / name) for name in ("drive.parquet", "check.html", "estimates.parquet")
     )

@@ -1,4 +1,6 @@
-"""Files of other programs: each is read with the right units, or refused with the right reason."""
+"""Tests with files of other programs: each is read with the right units, or refused with the right
+reason.
+"""
 
 from __future__ import annotations
 

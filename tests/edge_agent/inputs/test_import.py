@@ -1,5 +1,5 @@
-"""`edge-agent import`: a drive in any format becomes the same log, clocks are merged, and damaged
-files cause no crash.
+"""Tests of `edge-agent import`: a drive in any format becomes the same log, clocks are aligned, and
+damaged files cause no crash.
 """
 
 from __future__ import annotations
@@ -356,7 +356,7 @@ def test_a_validity_bit_and_a_sign_bit_are_heeded(tmp_path: Path) -> None:
 
 
 def broken(data: bytes, kind: str, rng: np.random.Generator) -> bytes:
-    """Return a file damaged by a hostile or failing recorder."""
+    """Return the bytes of a file, damaged as by a failing or hostile recorder."""
     if kind == "cut":
         return data[: int(rng.integers(len(data)))]
     if kind == "full":

@@ -1,4 +1,4 @@
-"""Live sources: their readings arrive on one clock, losses are reported, and no error ends the
+"""Tests of live sources: their readings share one clock, losses are reported, and no error ends the
 program.
 """
 

@@ -1,5 +1,5 @@
-"""Live rows: one clock for all sources, interpolated readings, late fixes moved to their time, and
-lost sources opened again.
+"""Tests of live rows: one clock for all sources, interpolated readings, late positions assigned to
+their time, and lost sources opened again.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ CAR = PRESETS["sedan"].vehicle
 
 
 class Steered(HostClock):
-    """A host's clock that stands until it is moved."""
+    """Simulated clock that stands still until the test sets it."""
 
     def __init__(self) -> None:
         super().__init__(start_ns=1_700_000_000 * NS)
@@ -39,7 +39,7 @@ class Steered(HostClock):
 
 
 class Scripted(Feed):
-    """A source that delivers a given script of readings."""
+    """Source that delivers readings given by the test."""
 
     def listen(self) -> None:
         self.stopping.wait()
@@ -180,7 +180,7 @@ def test_the_receivers_date_holds_where_the_hosts_is_wrong(clock: Steered) -> No
 
 
 class Failing(Scripted):
-    """A driver that raises, then ends, then works."""
+    """Source whose driver first raises an error, then ends, and then works."""
 
     tries = 0
 
@@ -229,7 +229,7 @@ def test_rows_wait_for_a_slow_source_and_count_late_readings(
 
 
 class Hanging(Scripted):
-    """A source whose driver becomes available when the test decides."""
+    """Source whose driver becomes available when the test decides."""
 
     def __init__(self, name: str, clock: Steered) -> None:
         super().__init__(name, clock)

@@ -1,5 +1,5 @@
-"""Reading a signal log: required columns, optional columns, and a one-line error that names the
-fault.
+"""Tests of reading a signal log: required columns, optional columns, and a one-line error that
+names the fault.
 """
 
 from __future__ import annotations

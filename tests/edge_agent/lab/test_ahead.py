@@ -1,4 +1,4 @@
-"""The campaign of the road ahead on a small scale."""
+"""Tests of the campaign on warnings ahead, on a small scale."""
 
 from __future__ import annotations
 

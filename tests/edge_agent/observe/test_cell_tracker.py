@@ -1,4 +1,6 @@
-"""Visits: one cell and sector after the other, robust to jitter, none without a fix."""
+"""Tests of visits: one cell and sector after the other, robust to jitter, and no visit without a
+position.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ CELL_M = 10.2  # side of a cell at this latitude
 
 
 def straight(samples: int, speed: float = 10.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """East along a line, 10 samples a second."""
+    """Return east, north and yaw (T, 1) of a drive east along a line, 10 samples a second."""
     east = (np.arange(samples) * speed / 10.0)[:, None]
     return east, np.zeros_like(east), np.zeros_like(east)
 
@@ -42,7 +44,7 @@ def test_the_visited_cell_is_that_of_the_position_but_for_the_margin() -> None:
 
 
 def test_jitter_at_a_border_does_not_start_a_visit_with_every_fix() -> None:
-    """A car stands on the border of two cells; the receiver scatters by 0.3 m."""
+    """A car stands on the border of two cells, and its receiver scatters by 0.3 m."""
     rng = np.random.default_rng(3)
     west, south, _, north = (float(v) for v in grid.bounds(grid.cell_of(57.70, 11.97)))
     block = ground(np.zeros((600, 1)), np.zeros((600, 1)), np.zeros((600, 1)))

@@ -1,4 +1,4 @@
-"""Implausible controller flags have no weight; others are passed on unchanged."""
+"""Tests of controller flags: implausible flags have no weight, others are passed on unchanged."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RATE = 100
 def drive(
     on: FloatArray, omega: FloatArray | float = 50.0
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Times, signals and context of one car whose ABS flag is `on` (T,)."""
+    """Return times, signals and context of one car whose ABS flag is `on` (T,)."""
     t = np.arange(len(on))[:, None] / RATE
     signals = np.full((len(on), 1, len(CHANNELS)), np.nan)
     signals[..., S.OMEGA : S.OMEGA + 4] = np.broadcast_to(omega, len(on))[:, None, None]
@@ -34,7 +34,7 @@ def drive(
 
 
 def seconds(*parts: tuple[float, float]) -> FloatArray:
-    """A flag of so many seconds at each value."""
+    """Return a flag (T,) that has each value for the given number of seconds."""
     return np.concatenate([np.full(round(length * RATE), value) for length, value in parts])
 
 

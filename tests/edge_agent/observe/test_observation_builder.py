@@ -1,5 +1,5 @@
-"""Observation builder: one observation per visit and states in their time slots, for any division
-into blocks.
+"""Tests of the observation builder: one observation per visit and states in their time slots, for
+any division into blocks.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 
 
 def join_records(records: list[RecordBlock]) -> dict[str, np.ndarray]:
-    """Columns of several blocks, one after the other, with vehicle and urgent."""
+    """Return the columns of several blocks, one after the other, with the columns `vehicle` and
+    `urgent`.
+    """
     columns = {
         name: np.concatenate([r.columns[name] for r in records]) for name in records[0].columns
     }
@@ -70,8 +72,8 @@ def test_any_split_of_the_samples_gives_the_same_records(seed: int) -> None:
 
 
 def test_an_observation_tells_its_visit() -> None:
-    """East through three cells at 10 m/s: times, pose, speed and the friction at the end of the
-    second visit.
+    """A car drives east through three cells at 10 m/s. The test checks times, pose, speed and the
+    friction at the end of the second visit.
     """
     samples = 25
     east = np.arange(samples)[:, None] * 1.0
@@ -133,7 +135,7 @@ def test_a_visit_that_the_bank_could_not_follow_is_flat() -> None:
     ids=["upper bound slippery", "only the median", "median with excitation", "dry"],
 )
 def test_only_slippery_visits_are_urgent(mu: float, used: float, urgent: bool) -> None:
-    """The interval is mu ± 0.05, and slippery means below 0.4."""
+    """The reported interval is mu ± 0.05, and slippery means below 0.4."""
     _, observations, states = Watch.of(3).step(
         wanderers(150, 3), estimates(150, 3, mu=mu, used=used)
     )
@@ -142,7 +144,9 @@ def test_only_slippery_visits_are_urgent(mu: float, used: float, urgent: bool) -
 
 
 def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
-    """Braking ends just before the border; the estimator's window still shows it for a second."""
+    """Braking ends just before the border, but it remains in the estimator's window for
+    a second.
+    """
     samples = 60
     east = np.arange(samples)[:, None] * 0.5
     block = ground(east, np.zeros_like(east), np.zeros_like(east))
@@ -158,8 +162,8 @@ def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
 
 
 def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
-    """At 14 m/s a cell is crossed in less than the window, so braking on dry road before must not
-    count for the ice.
+    """At 14 m/s a car crosses a cell in less time than the window. Braking on dry road before the
+    cell must not count for ice in the cell.
     """
     samples = 30
     east = np.arange(samples)[:, None] * 1.4
@@ -180,8 +184,8 @@ def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
 
 
 def observe_grip(observed: np.ndarray, east: np.ndarray) -> list[float]:
-    """Return the grip reported for the visits of a car that drives east along `east` (T, 1) [m] at
-    100 Hz and measures `observed` (T,) g.
+    """Return the grip reported for each visit of a car that drives east along `east` (T, 1) [m] at
+    100 Hz and uses a grip of `observed` (T,).
     """
     flat = np.zeros_like(east)
     block = ground(east, flat, flat, rate_hz=100.0, fix_every=10)
@@ -197,8 +201,8 @@ def observe_grip(observed: np.ndarray, east: np.ndarray) -> list[float]:
 
 
 def test_grip_felt_at_the_border_of_a_cell_may_be_of_its_neighbour() -> None:
-    """Braking within the error of a fix from the border counts for neither cell; braking further
-    inside counts for its own.
+    """Braking that is closer to the border than the position error counts for neither cell. Braking
+    further inside counts for its own cell.
     """
     east = np.arange(450)[:, None] * 0.1
     flat = np.zeros_like(east)
@@ -229,8 +233,10 @@ def test_the_noise_of_accelerometers_is_no_grip() -> None:
 def test_visit_with_a_friction_jump_reports_both_and_grip_of_the_lesser(
     cut: int | None,
 ) -> None:
-    """From ice to dry road within the second visit: it was one or the other, and no more than the
-    ice is told as used, though the brakes took .7 before the change was seen."""
+    """The road changes from ice to dry within the second visit. The observation must allow both
+    frictions. Its used grip must be that of the ice, although the brakes used .7 before the change
+    was detected.
+    """
     samples = 40
     east = np.arange(samples)[:, None] * 0.5
     block = ground(east, np.zeros_like(east), np.zeros_like(east))
@@ -279,8 +285,8 @@ def test_without_position_there_is_no_state() -> None:
 
 
 def test_observation_contains_controller_flags_and_context_of_its_visit() -> None:
-    """East through cells at 10 m/s; the first visit has an intervention, the second hardly any
-    reading.
+    """A car drives east through cells at 10 m/s. A controller intervenes in the first visit; the
+    second visit has hardly any reading.
     """
     samples = 40
     east = np.arange(samples)[:, None] * 1.0

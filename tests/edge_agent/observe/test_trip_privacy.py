@@ -1,5 +1,5 @@
-"""Trip privacy: nothing is published near the start and the end of a trip, and everything in
-between is.
+"""Tests of trip privacy: nothing is published near the start and the end of a trip, and everything
+in between.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def states(time: IntArray, vehicle: int = 0) -> RecordBlock:
 
 
 def list_passed_times(ends: TripEnds, seconds: int, block_s: float = 0.5) -> list[float]:
-    """Times [s] of the states that pass, one a second, of a trip at SPEED."""
+    """Return the times [s] of the published states of a trip at SPEED with one state per second."""
     out = []
     steps = round(1.0 / 0.1 * block_s)
     for block in range(round(seconds / block_s)):

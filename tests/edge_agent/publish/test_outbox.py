@@ -1,5 +1,5 @@
-"""Outbox: consecutive numbers, disk first, settlement by ranges, retries with back-off, a limit,
-and one agent only.
+"""Tests of the outbox: consecutive numbers, storage on disk first, settlement by ranges, retries
+with back-off, a size limit, and one agent only.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def test_an_acknowledgement_of_what_is_not_held_changes_nothing(path: Path) -> N
 
 
 def test_stored_batches_survive_a_kill_and_are_due_under_their_name(path: Path) -> None:
-    """Store batches in a child process that reports this and is then killed."""
+    """A child process stores batches, reports this, and is then killed."""
     script = f"""
 import os, pathlib, signal
 from edge_agent.publish.batching import Draft
@@ -141,7 +141,9 @@ def test_unsettled_batches_are_resent_oldest_first_at_growing_intervals(path: Pa
 
 
 def silence_route(outbox: Outbox, now: float = 0.0) -> float:
-    """Put a batch and let nobody answer until the route is silent; returns the time then."""
+    """Store batches without any answer until the route counts as silent, and return the time then
+    [s].
+    """
     outbox.store([draft()], now)
     while outbox.store([draft()], now)[0].fresh:
         now += 0.5
@@ -277,7 +279,7 @@ def test_what_was_given_up_does_not_come_back_after_a_restart(path: Path) -> Non
 
 
 def test_a_settled_batch_that_a_crash_brings_back_is_offered_again(path: Path) -> None:
-    """Nothing is lost: the service knows the batch and acknowledges it again."""
+    """Nothing is lost, because the service knows the batch and acknowledges it again."""
     script = f"""
 import os, pathlib, signal
 from edge_agent.publish.batching import Draft
@@ -351,7 +353,7 @@ def test_an_unanswered_batch_is_given_up_before_it_blocks_its_stream(
 
 @pytest.mark.campaign
 def test_waiting_batches_take_little_memory_and_leave_none_behind(path: Path) -> None:
-    """A day of a vehicle is 170 000 batches."""
+    """The reports of one vehicle in a day are 170 000 batches."""
     count = 20_000
     outbox = Outbox(path, boot=BOOT)
     outbox.store(

@@ -1,5 +1,5 @@
-"""Publisher on real sessions: every record arrives once under its vehicle's name and is settled by
-an answer.
+"""Tests of the publisher on real sessions: every record arrives once under its vehicle's name and
+is settled by an answer.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Make = Callable[..., Publisher]
 
 
 def drive(seed: int = 0, samples: int = 200) -> tuple[RecordBlock, RecordBlock]:
-    """Observations and states of a random drive of three vehicles."""
+    """Return observations and states of a random drive of three vehicles."""
     _, observations, states = Watch.of(3).step(
         wanderers(samples, 3, seed), estimates(samples, 3, seed, mu=0.8)
     )
@@ -39,7 +39,9 @@ def drive(seed: int = 0, samples: int = 200) -> tuple[RecordBlock, RecordBlock]:
 
 
 def rows(batches: list[Batch], kind: Kind) -> int:
-    """Return the received records, each identity once."""
+    """Return the number of received records of a kind; a batch that arrives repeatedly
+    counts once.
+    """
     return sum(
         {(b.vehicle, b.boot, b.region, b.seq): b.rows for b in batches if b.kind is kind}.values()
     )
@@ -242,7 +244,7 @@ def test_a_service_that_tells_its_time_shows_that_the_clock_is_off(
 def test_a_full_disk_is_waited_for(
     router: Router, service: Service, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Prevent SQLite from growing its file, then allow it."""
+    """SQLite is prevented from growing its file, and later allowed."""
     config = settings(router, tmp_path)
     outbox = Outbox(config.spool)
     database = outbox._database
@@ -291,7 +293,7 @@ def batches_of(batcher: Batcher, now: float, everything: bool = False) -> list[t
 
 
 def one_vehicle(records: int, urgent: bool = False) -> RecordBlock:
-    """The first records of one drive, of the first vehicle and in one region."""
+    """Return the first records of one vehicle, changed to lie in one cell."""
     observations, _ = drive(samples=3000)
     chosen = np.flatnonzero(observations.vehicle == 0)[:records]
     assert len(chosen) == records

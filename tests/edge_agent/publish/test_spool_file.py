@@ -1,5 +1,5 @@
-"""A damaged spool is set aside and counted, its readable rows are recovered, and the agent
-continues.
+"""Tests of a damaged outbox file: it is set aside and counted, its readable rows are recovered, and
+the agent continues.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ BATCHES = 120
 
 
 def store_batches(path: Path) -> dict[int, bytes]:
-    """Some hundred batches on disk, by seq."""
+    """Store some hundred batches on disk, and return their payloads by seq."""
     random_ = random.Random(7)
     payloads = [random_.randbytes(random_.choice((60, 190, 900))) for _ in range(BATCHES)]
     outbox = Outbox(path, boot=5)

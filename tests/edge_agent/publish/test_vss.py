@@ -1,5 +1,5 @@
-"""Friction at the vehicle as VSS signals: percent, limited to the range, absent if unknown; over a
-session and by the command.
+"""Tests of friction as VSS signals: percent, limited to the range, absent if unknown; published
+over a session and printed by the command.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""The detection judge: definitions on made-up drives, and one small town through the whole
-pipeline.
+"""Tests of the detection figures: definitions on synthetic drives, and one small town through the
+whole pipeline.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SAMPLES = 1200  # 2 s dry, 4 s of ice with a slide of 1 s, 6 s dry
 
 
 def drive_saying(lower: float, upper: float) -> DetectionDrive:
-    """Return a drive of one car over ice, and an estimator that always reports the same
+    """Return a drive of one car over ice with an estimator that always reports the same
     interval.
     """
     ones = np.ones((SAMPLES, 1), np.float32)

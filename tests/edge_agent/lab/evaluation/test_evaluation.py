@@ -1,5 +1,5 @@
-"""The campaign: all names and bars exist, measures are correct on small cases, and the report is
-made from figures alone.
+"""Tests of the campaign: all names and targets exist, measures are correct on small cases, and the
+report is made only from figures.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def fake(mu: float, lower: float, upper: float, like: DriveSet) -> Estimates:
 
 @pytest.fixture(scope="module")
 def jumping() -> DriveSet:
-    """Two drives whose friction falls from .85 to .5."""
+    """Return two drives whose friction falls from .85 to .5."""
     return realistic(replace(PAPERS["003.jump"], duration_s=5.0), range(2))
 
 

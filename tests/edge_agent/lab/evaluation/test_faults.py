@@ -1,5 +1,5 @@
-"""Sensor faults: no estimate is lost, health reports the fault, and the default's interval stays
-calibrated.
+"""Tests of sensor faults: estimates continue, health flags report the fault, and the default's
+interval stays calibrated.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`edge-agent evaluate --paper`: tables, plots, page and exit code."""
+"""Tests of `edge-agent evaluate --paper`: tables, plots, page and exit code."""
 
 from __future__ import annotations
 

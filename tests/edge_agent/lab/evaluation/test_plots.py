@@ -1,4 +1,4 @@
-"""Plots have captions, and an estimator has the same colour in all of them."""
+"""Tests that plots have captions, and that an estimator has the same colour in all of them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from schemas.runtime.palette import line_of
 
 @pytest.fixture(scope="module")
 def drives() -> dict[str, PlottedDrive]:
-    """Two estimators on a double lane change."""
+    """Return the estimates of two estimators on a double lane change, by name."""
     batch = realistic(plots.SCENARIOS["004.dlc"], [FIGURES])
     return {
         name: PlottedDrive(batch, estimates(bank_of(name, batch.vehicles), batch))

@@ -1,4 +1,6 @@
-"""Recorded drives in a folder are judged against the known part of their truth."""
+"""Tests of the evaluation of recorded drives in a folder against the measured part of their true
+states.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +34,8 @@ def judge(
     health: int = 0,
     used: float = 0.0,
 ) -> LogFigures:
-    """Ten seconds at 20 m/s with an interval from .4 to .8 after a wide first one; NaN: friction
-    is not measured.
+    """Return the figures of ten seconds at 20 m/s with a reported interval from .4 to .8 (wider at
+    the first sample). With `friction` NaN the true friction is not measured.
     """
     t = np.arange(0.0, 10.0, 0.01)
     signals = np.full((len(t), len(CHANNELS)), np.nan)

@@ -1,4 +1,4 @@
-"""The rough world's figures are correct, on seeds that are not used for tuning."""
+"""Tests of the figures of the rough world, on seeds that are not used for tuning."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ from schemas.thresholds import GRAVITY, SURFACES
 
 @pytest.fixture(scope="module")
 def driven() -> tuple[DriveSet, FloatArray]:
-    """Return six cars with realistic errors that drive for forty seconds in a town of the figures."""
+    """Return six cars with realistic sensor errors that drive for forty seconds in a town, and
+    their friction.
+    """
     return real_world.town(FIGURES, 6, 40.0)
 
 
@@ -143,8 +145,8 @@ def test_cars_stand_on_the_slope_they_were_put_on() -> None:
 
 
 def test_the_oracle_knows_what_is_told_and_misses_what_is_unknown() -> None:
-    """Most of the oracle's error of speed comes from the wheel radius in the file; its error of
-    friction is a few hundredths.
+    """Most of the oracle's error of speed comes from the wheel radius in the vehicle file. Its
+    error of friction is a few hundredths.
     """
     seeds = range(FIGURES, FIGURES + 4)
     speeds = oracle.speed(seeds)

@@ -1,4 +1,6 @@
-"""Reliability and consistency figures on estimates with a known error, and on the estimators."""
+"""Tests of the figures of reliability and consistency, on estimates with a known error and on the
+estimators.
+"""
 
 from __future__ import annotations
 
@@ -82,7 +84,9 @@ def test_watching_a_drive_changes_nothing_that_is_said_of_it(
 def test_posterior_of_the_default_has_its_reported_quantiles(
     turning: DriveSet,
 ) -> None:
-    """Interval ends are reported at calibrated levels, and ice patches lower the lower end."""
+    """The ends of the interval are reported at calibrated quantile levels, and ice patches lower
+    the lower end.
+    """
     reported, _ = estimate_with_ranks(bank_of("aco-fckf", turning.vehicles), turning)
     for least, most, output in (
         (0.0, LOWER_END, reported.mu_lower),

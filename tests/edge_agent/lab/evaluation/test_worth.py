@@ -1,5 +1,5 @@
-"""Benefit of fuzzy inference and of the ant colony, measured on drives that are not used for
-tuning.
+"""Tests of the benefit of fuzzy inference and of the ant colony, measured on drives that are not
+used for tuning.
 """
 
 import numpy as np

@@ -1,5 +1,5 @@
-"""Simulated fleets: results do not depend on the number of vehicles or on blocks, cars stay on the
-road, and grip is used where intended.
+"""Tests of simulated fleets: results do not depend on the number of vehicles or on blocks, cars
+stay on the road, and they use grip where intended.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from schemas.signals import CHANNELS, S
 
 @pytest.fixture(scope="module")
 def drive() -> tuple[SimulatedFleet, FloatArray, FloatArray, Truth]:
-    """Two minutes of thirty vehicles in the demonstration, with ideal sensors."""
+    """Return two minutes of thirty vehicles in the demonstration with ideal sensors: fleet, times,
+    signals, and true states.
+    """
     fleet = SimulatedFleet("demo", 30, seed=11, rate_hz=50.0, sensors="ideal")
     t, signals = fleet.step(120 * 50)
     return fleet, t, signals, fleet.truth
@@ -160,7 +162,7 @@ def test_a_block_needs_at_least_one_sample() -> None:
 
 
 def test_warned_driver_slows_down_only_for_the_stretch() -> None:
-    """Simulate the same driver from the same start with and without a warning."""
+    """The same driver drives from the same start with and without a warning."""
     speeds = []
     for warned in (False, True):
         fleet = SimulatedFleet("demo", 1, 3, 50.0)

@@ -1,4 +1,4 @@
-"""Manoeuvres: each drives, excites the tyres as intended, and is reproducible."""
+"""Tests of manoeuvres: each is driven, uses grip as intended, and is reproducible."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Options of plant and drive for the papers: tyres, friction in time, motors, noise by channel."""
+"""Tests of options of the simulated vehicle and drive for the papers: tyres, friction over time,
+motors, noise per channel.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ def test_dugoff_curve_of_the_plant_is_that_of_the_filters(theta: float) -> None:
 
 
 def slip_per_force(vehicle: TrueVehicle, mu: float) -> float:
-    """Return the slip of a wheel over its utilised share of friction, accelerating gently."""
+    """Return the slip of a wheel in gentle acceleration, divided by the share of friction that it
+    uses.
+    """
     log, file = simulate_manoeuvre(
         "throttle", mu=mu, vehicle=replace(vehicle, power=400e3), sensors="ideal", duration_s=2.0
     )

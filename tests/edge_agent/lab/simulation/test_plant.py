@@ -1,5 +1,5 @@
-"""The plant compared with mechanics: Newton's laws, friction circle, energy, circles and signs;
-then its limits.
+"""Tests of the simulated vehicle (plant) against mechanics: Newton's laws, friction circle, energy,
+circles and signs; then its limits.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def some_instant(
 def rolling(
     speed: float, mu: float, vehicle: TrueVehicle | None = None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """State, parameters and inputs of a vehicle rolling straight on."""
+    """Return state, parameters and inputs of a vehicle that rolls straight ahead."""
     p = (vehicle or PRESETS["sedan"]).row()
     x = np.zeros(STATES)
     u = np.zeros((len(Control), 4))
@@ -65,7 +65,9 @@ def rolling(
 def run(
     x: FloatArray, p: FloatArray, u: FloatArray, seconds: float, dt: float = 1e-3
 ) -> FloatArray:
-    """Return the wheels after this many seconds with constant inputs."""
+    """Simulate `seconds` with constant inputs, and return the wheels' output (columns of `Wheel`,
+    4).
+    """
     w = np.zeros((len(Wheel), 4))
     advance(x, p, u, w, dt, round(seconds / dt))
     return w
@@ -145,8 +147,8 @@ def test_steering_left_turns_left_and_loads_the_right_wheels() -> None:
 
 @pytest.mark.parametrize("share", [-0.4, 0.3])
 def test_rear_wheels_that_steer_keep_the_circle_and_swing_the_tail(share: float) -> None:
-    """At walking pace the directions of the wheels determine the yaw rate, for every share of rear
-    steering.
+    """At walking pace the yaw rate follows from the directions of the wheels, for every share of
+    rear steering.
     """
     circles = []
     for rear in (0.0, share):
@@ -229,8 +231,8 @@ def test_a_stopped_vehicle_stays_where_it_is() -> None:
 
 
 def test_a_wheel_has_the_inertia_that_it_has() -> None:
-    """An estimator computes the force from J ω̇ = T − R F_x, so the integrator must not add to J,
-    even at low speed.
+    """An estimator computes the force from J ω̇ = T − R F_x. Therefore the integrator must not add
+    to the inertia J, even at low speed.
     """
     vehicle = replace(PRESETS["sedan"], drag=0.0, rolling=0.0)
     for speed in (4.0, 20.0):

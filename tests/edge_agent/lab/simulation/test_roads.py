@@ -1,4 +1,6 @@
-"""Roads and friction: geometry, endless driving, and the surface at every place and time."""
+"""Tests of roads and friction: geometry, endless driving, and the surface at every
+place and time.
+"""
 
 from __future__ import annotations
 
@@ -165,8 +167,8 @@ def test_patches_that_cover_nothing_or_have_no_friction_are_refused() -> None:
 
 
 def test_vehicles_start_on_given_lanes_at_the_speed_of_traffic() -> None:
-    """Return two parallel straight lanes: one allows 13 m/s, the other 6 m/s, to a driver with 5
-    m/s².
+    """There are two parallel straight lanes. A driver who accepts 5 m/s² drives 13 m/s on one and 6
+    m/s on the other.
     """
     x = np.arange(0.0, 400.0)
     lanes = [np.column_stack([x, np.full(400, y)]) for y in (0.0, 50.0)]

@@ -1,5 +1,5 @@
-"""Slopes, banks, standing vehicles and misaligned devices: mechanics first, then the readings of
-the sensors.
+"""Tests of slopes, banks, standing vehicles and misaligned sensors: first the mechanics, then the
+readings of the sensors.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def sine(slope: float) -> float:
 def still(
     slope: float, bank: float = 0.0, mu: float = 0.85
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """State, parameters, inputs and wheels of a standing sedan."""
+    """Return state, parameters, inputs and wheels of a standing sedan."""
     p = PRESETS["sedan"].row()
     x = np.zeros(STATES)
     u = np.zeros((INPUTS, 4))
@@ -262,8 +262,8 @@ ONLY = {
 def two(
     manoeuvre: str, mounted: Misalignment
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray], FloatArray]:
-    """Channels of a drive with ideal sensors, of the same drive with misaligned ones, and their
-    row.
+    """Return the channels of a drive with ideal sensors, those of the same drive with misaligned
+    sensors, and the parameters of the misalignment.
     """
     exact, _ = simulate_manoeuvre(manoeuvre, sensors="ideal")
     reported, _ = simulate_manoeuvre(manoeuvre, sensors=Sensors(mounted=mounted), seed=5)

@@ -1,4 +1,4 @@
-"""Sensors: the errors that they add to the truth are those of their table."""
+"""Tests of simulated sensors: their errors have the statistics in their table."""
 
 from __future__ import annotations
 

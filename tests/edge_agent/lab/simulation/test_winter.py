@@ -1,4 +1,6 @@
-"""Winter: controllers that work in cycles, tyres that relax, drag at lift-off, and winter roads."""
+"""Tests of winter equipment and roads: controllers that cycle, tyres with relaxation, drag at
+lift-off, and winter towns.
+"""
 
 from __future__ import annotations
 

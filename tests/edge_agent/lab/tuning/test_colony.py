@@ -1,4 +1,6 @@
-"""The colony as a search: its equations, its bounds, and its result compared with random search."""
+"""Tests of the ant colony as a search: its equations, its bounds, and its result compared with
+random search.
+"""
 
 from collections.abc import Callable
 
@@ -26,16 +28,16 @@ CHOICES = [np.linspace(0.0, 1.0, POSITIONS)] * VERTICES
 
 
 def bowl(seed: int) -> Objective:
-    """Separable objective: one parabola per vertex with its maximum at a random position; the
-    maximum is 0.
+    """Return a separable objective: one parabola per vertex with its maximum at a random position.
+    The maximum is 0.
     """
     top = np.random.default_rng(seed).integers(POSITIONS, size=VERTICES) / (POSITIONS - 1)
     return lambda vector: -float(np.sum((vector - top) ** 2))
 
 
 def decoy(seed: int) -> Objective:
-    """Deceptive objective: at every vertex the slope leads away from the best position; the maximum
-    is VERTICES.
+    """Return a deceptive objective: at every vertex the slope leads away from the best position.
+    The maximum is VERTICES.
     """
     top = np.random.default_rng(seed).integers(POSITIONS, size=VERTICES) / (POSITIONS - 1)
 
@@ -60,7 +62,7 @@ def run(search: object, objective: Objective, seed: int, **options: object) -> R
 def test_colony_beats_random_search_in_at_least_21_of_24_trials(
     family: Callable[[int], Objective],
 ) -> None:
-    """With equal searches, 21 wins of 24 have a probability of 1 in 7 000."""
+    """If both searches were equally good, 21 wins of 24 would have a probability of 1 in 7 000."""
     wins = 0
     for trial in range(TRIALS):
         ours = run(colony, family(trial), 1000 + trial)

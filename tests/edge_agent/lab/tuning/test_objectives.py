@@ -1,5 +1,5 @@
-"""The objective is a proper score and finite, its drives differ from those of the judge, and the
-command works from end to end.
+"""Tests of the tuning objective: it is a proper and finite score, its drives differ from the
+held-out drives, and the command works from end to end.
 """
 
 import argparse
@@ -37,7 +37,7 @@ ESTIMATOR = tune.ESTIMATOR
 
 @pytest.fixture(scope="module")
 def drives() -> TuningSet:
-    """Three short drives of the training set."""
+    """Return three short drives of the training set."""
     return record(TRAIN[:3], 4.0)
 
 
@@ -93,8 +93,8 @@ def test_interval_score_pays_for_width_and_twenty_times_for_a_miss() -> None:
 
 
 def test_interval_score_is_least_at_the_true_quantiles() -> None:
-    """A proper score: neither a wider nor a narrower interval does better on draws from a known
-    distribution.
+    """The interval score is proper: on draws from a known distribution, neither a wider nor a
+    narrower interval is better.
     """
     draws = np.random.default_rng(1).normal(size=200_000)
     scores = {
@@ -246,8 +246,8 @@ def test_another_drive_of_the_set_gives_another_worth(drives: TuningSet) -> None
 
 
 def test_drives_of_one_s_own_are_searched_on(tmp_path: Path) -> None:
-    """Without a truth, the prediction of the next measurement is the score, on the last third of
-    the recordings.
+    """Without true friction the score is the prediction of the next measurement, on the last third
+    of the recordings.
     """
     logs = []
     found = []

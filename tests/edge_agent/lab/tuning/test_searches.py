@@ -1,4 +1,4 @@
-"""Continuous searches, and the comparison with equal budgets."""
+"""Tests of the continuous searches, and of the comparison with equal budgets."""
 
 from __future__ import annotations
 

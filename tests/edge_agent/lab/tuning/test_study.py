@@ -1,5 +1,5 @@
-"""The study of paper 004's tuning: its conditions, its objective, and the command from end to
-end.
+"""Tests of the study of paper 004's tuning: its conditions, its objective, and the command from end
+to end.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ STILL = study_report.GIVEN["fixed"]
 
 @pytest.fixture(scope="module")
 def drives() -> StudySet:
-    """Two of the drives that are searched on, six seconds each."""
+    """Return two of the search drives, six seconds each."""
     return record(TRAIN[:2])
 
 
