@@ -1,1 +1,3 @@
-"""The contract of GripMap, for people and programs: messages, tables on disk, keys and queries."""
+"""The contract between vehicles, service and clients: messages, tables on disk, keys and
+queries.
+"""

@@ -108,8 +108,8 @@ class AgentConfig(MonitoringSettings):
     )
 
     def spool_of(self, name: str) -> Path:
-        """Return the path of the outbox of a vehicle, or of a process; `{name}` in the setting is
-        replaced.
+        """Return the file path of the outbox (stored unsent reports) of the vehicle or process
+        `name`; `{name}` in the setting is replaced.
         """
         return Path(str(self.spool).replace("{name}", name))
 

@@ -88,22 +88,22 @@ def cell_of(latitude: ArrayLike, longitude: ArrayLike, zoom: int = CELL_ZOOM) ->
 
 
 def parent(cell: ArrayLike, zoom: int, of: int = CELL_ZOOM) -> IntArray:
-    """Return the ancestor at `zoom` of a cell whose own zoom is `of`."""
+    """Return the grid square at `zoom` that contains a cell whose own zoom is `of`."""
     return np.asarray(cell, dtype=np.int64) >> (2 * (of - zoom))
 
 
 def tile_of(cell: ArrayLike) -> IntArray:
-    """Return the z14 tile of a cell."""
+    """Return the tile (zoom 14) that contains a cell."""
     return parent(cell, TILE_ZOOM)
 
 
 def region_of(cell: ArrayLike) -> IntArray:
-    """Return the z10 region of a cell."""
+    """Return the region (zoom 10) that contains a cell."""
     return parent(cell, REGION_ZOOM)
 
 
 def zone_of(cell: ArrayLike) -> IntArray:
-    """Return the z7 zone of a cell."""
+    """Return the zone (zoom 7) that contains a cell."""
     return parent(cell, ZONE_ZOOM)
 
 
@@ -153,8 +153,8 @@ def outline(cell: ArrayLike, sector: ArrayLike | None = None) -> tuple[FloatArra
 def touches(
     box: tuple[float, float, float, float], area: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
 ) -> NDArray[np.bool_]:
-    """Return True where areas and a box, each given as west, south, east, north [deg], share
-    more than a border.
+    """Return a mask of areas: True if the area and the box overlap in more than a border. Each is
+    given as west, south, east, north [deg].
     """
     west, south, east, north = (np.asarray(side) for side in area)
     return np.asarray((east > box[0]) & (north > box[1]) & (west < box[2]) & (south < box[3]))
@@ -191,8 +191,8 @@ def sector_of(yaw: ArrayLike) -> NDArray[np.int8]:
 
 
 def sectors_touched(yaw: ArrayLike) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-    """Return the sector of a yaw [rad], and the second sector if the yaw lies within 15° of its
-    edge, else -1.
+    """Return two arrays: the heading sector of each yaw [rad], and a second sector if the yaw lies
+    within 15° of its edge, else -1.
     """
     angle = np.asarray(yaw, dtype=np.float64)
     first = sector_of(angle)

@@ -106,27 +106,29 @@ def ahead_key(vehicle: str) -> str:
 
 
 def vss_key(vehicle: str) -> str:
-    """Return the key of a vehicle's friction as signals of the Vehicle Signal Specification."""
+    """Return the key under which a vehicle publishes its friction as signals of the Vehicle Signal
+    Specification (VSS).
+    """
     return f"{ROOT}/vss/{vehicle}"
 
 
 def private_keys(vehicle: str) -> list[str]:
-    """Return the keys that only a vehicle and its owner may read."""
+    """Return the keys of messages that only the vehicle and its owner may read."""
     return [ahead_key(vehicle), vss_key(vehicle)]
 
 
 def weather_key(region: int) -> str:
-    """Return the key of a region's weather."""
+    """Return the key under which the weather of a region is published."""
     return f"{ROOT}/weather/{chunks(region, grid.REGION_ZOOM)}"
 
 
 def alive_key(vehicle: str) -> str:
-    """Return the key of a vehicle's liveliness token."""
+    """Return the key of a vehicle's liveliness token, which shows that the vehicle is connected."""
     return f"{ROOT}/alive/{vehicle}"
 
 
 def shard_key(service: str) -> str:
-    """Return the key of a service's liveliness token."""
+    """Return the key of a service's liveliness token, which shows that the service is running."""
     return f"{ROOT}/shard/{service}"
 
 
@@ -182,11 +184,11 @@ class Parsed(NamedTuple):
 
 
 def parse(key: str) -> Parsed:
-    """Parse a concrete key.
+    """Parse a concrete key (without wildcards) into topic, area and name.
 
     Raises:
-        InputError: a wildcard, an unknown topic, a wrong number of chunks or digits, or an invalid
-            name.
+        InputError: the key has a wildcard, an unknown topic, a wrong number of chunks or digits, or
+            an invalid name.
     """
     head, _, rest = key.removeprefix(ROOT + "/").partition("/")
     topic = TOPICS.get(head)

@@ -36,7 +36,7 @@ class Format(StrEnum):
 
     @property
     def encoding(self) -> str:
-        """Zenoh encoding of the reply."""
+        """Name of the Zenoh encoding of a reply in this format."""
         return {"arrow": wire.ARROW, "geojson": wire.GEOJSON, "json": wire.JSON}[self.value]
 
 
@@ -90,10 +90,10 @@ class MapQuery(BaseModel):
 
 
 def parse(parameters: Mapping[str, str]) -> MapQuery:
-    """Parse the parameters of a selector.
+    """Parse the parameters of a map query.
 
     Raises:
-        InputError: a parameter is unknown or not valid; names it and the fix.
+        InputError: a parameter is unknown or not valid; the error names it and the fix.
     """
     if sum(len(name) + len(value) for name, value in parameters.items()) > MAX_TEXT:
         raise InputError("query", f"is longer than {MAX_TEXT} characters", "shorten the query")

@@ -26,7 +26,7 @@ Box = tuple[float, float, float, float]
 
 
 def overlap(one: str, other: str) -> bool:
-    """Return True if two expressions have a region in common."""
+    """Return True if two region expressions have a region in common."""
     return all(
         a == b or "*" in (a, b) for a, b in zip(one.split("/"), other.split("/"), strict=True)
     )
@@ -81,8 +81,8 @@ class Rank:
         self._place = {key: place for place, key in enumerate(keys_along(route).tolist())}
 
     def of(self, cell: int, sector: int) -> int:
-        """Return the position of a cell and sector along the route, a number for comparison
-        only.
+        """Return the position of a cell and sector along the route. The number serves only for
+        comparison with other positions.
         """
         return self._place.get(cell * grid.SECTORS + sector, len(self._place))
 

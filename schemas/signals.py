@@ -52,8 +52,8 @@ CONTEXT: Final = tuple(CONTEXT_UNITS)
 
 
 class C(IntEnum):
-    """Index of a context signal on the last axis of a context block. The flags come first, in the
-    order of FLAGS.
+    """Index of a context signal (controller flags, air temperature, wiper) on the last axis of an
+    array of context signals. The flags come first, in the order of FLAGS.
     """
 
     ABS = CONTEXT.index("abs_active")

@@ -10,7 +10,8 @@ from schemas.thresholds import GRAVITY, REACTION_S
 
 def stopping_speed(mu: FloatArray | float, sight_m: float) -> FloatArray:
     """Return the highest speed [m/s] from which a vehicle can stop within a sight distance [m] on a
-    level road. It reacts after REACTION_S and brakes with g·mu; 0 without grip.
+    level road. The driver reacts after REACTION_S, and the deceleration is g·mu. The result is 0
+    without grip.
 
     The speed v solves v·REACTION_S + v²/(2·g·mu) = sight_m.
     """

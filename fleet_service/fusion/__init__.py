@@ -1,5 +1,5 @@
-"""Fusion: the fleet's reports become one belief (probability distribution of friction) per cell and
-sector of the friction grid. The package is pure: it uses no clock, file or network.
+"""Fusion: the reports of many vehicles become one belief (probability distribution of friction) per
+map cell and heading sector. The package is pure: it uses no clock, file or network.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Belief about the friction of one cell, and its change by time and by a vote. All functions are
-compiled, and each works on one row of 32 bins.
+"""Belief about the friction of one cell (32 probabilities), and its change by ageing and by votes.
+A vote is the effect of one vehicle's visit. All functions are compiled.
 
 Legend
-    p    belief about the fleet's common reading of the road: probability per bin  (32,)
+    p    belief about the fleet's common reading of the road: probability per bin (32,)
     q    a belief in packed form: bins of 16 bits, the largest is 65 535          (32,)
     L    likelihood of one visit, from its bytes                                (32,)
     B    bias kernel: B[i, j] = P(the vehicle reads μ_j on a road of μ_i)  (32, 32), rows sum to 1
@@ -86,8 +86,8 @@ _TAPS: Final = _kernel_diagonals()
 
 @compiled
 def quantiles(belief: FloatArray, levels: tuple[float, ...]) -> FloatArray:
-    """Return the quantiles of beliefs (k, 32) at the given levels, (levels, k), in units of μ. The
-    results equal those of `mugrid.quantiles` bit for bit and take a tenth of the time.
+    """Return the quantiles [μ] of beliefs (k, 32) at the given levels, (levels, k). The results
+    equal those of `mugrid.quantiles` bit for bit and take a tenth of the time.
     """
     out = np.empty((len(levels), len(belief)))
     for k in range(len(belief)):
@@ -109,8 +109,8 @@ def quantiles(belief: FloatArray, levels: tuple[float, ...]) -> FloatArray:
 
 @refcount_free_inlined
 def sum_bins(p: Bins) -> float:
-    """Return the sum of 32 numbers. Eight partial sums that do not depend on each other run in
-    parallel.
+    """Return the sum of 32 numbers. Eight partial sums do not depend on each other, so the
+    processor computes them in parallel.
     """
     a = p[0]
     b = p[1]
@@ -134,7 +134,9 @@ def sum_bins(p: Bins) -> float:
 
 @refcount_free_inlined
 def largest_bin(p: Bins) -> float:
-    """Return the largest of 32 numbers; eight independent comparisons allow SIMD."""
+    """Return the largest of 32 numbers. Eight partial results do not depend on each other, so the
+    processor computes them in parallel (SIMD).
+    """
     a = p[0]
     b = p[1]
     d = p[2]
@@ -157,7 +159,9 @@ def largest_bin(p: Bins) -> float:
 
 @refcount_free_inlined
 def unpack_belief(belief: PackedArray, row: int, p: Bins) -> None:
-    """Fill `p` with the probabilities of a stored (packed) belief."""
+    """Unpack the stored belief in a row (16-bit integers) and fill `p` (32) with its
+    probabilities.
+    """
     whole = np.uint32(0)
     for i in range(_BINS):
         whole = np.uint32(whole + belief[row, i])
@@ -168,8 +172,8 @@ def unpack_belief(belief: PackedArray, row: int, p: Bins) -> None:
 
 @refcount_free_inlined
 def pack_belief(p: Bins, belief: PackedArray, row: int) -> None:
-    """Store a belief `p`, normalised or not, in packed form. Rounding preserves two properties: a
-    non-decreasing belief stays non-decreasing, and a uniform belief stays uniform.
+    """Store a belief `p` (32), normalised or not, as 16-bit integers. Rounding preserves two
+    properties: a non-decreasing belief stays non-decreasing, and a uniform belief stays uniform.
     """
     scale = np.float32(FULL) / np.float32(largest_bin(p))
     for i in range(_BINS):
@@ -178,7 +182,9 @@ def pack_belief(p: Bins, belief: PackedArray, row: int) -> None:
 
 @refcount_free_inlined
 def mix_prior(p: Bins, change: float, prior: Float32Array) -> None:
-    """Mix the prior into a belief in place: p ← (1 - h)·p + h·prior, where h is `change`."""
+    """Mix the prior into a belief in place: p ← (1 - h)·p + h·prior, where h = `change` is the
+    probability that the road changed.
+    """
     h = np.float32(change)
     for i in range(_BINS):
         p[i] += h * (prior[i] - p[i])
@@ -208,9 +214,9 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
 
 @refcount_free_inlined
 def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
-    """Raise the probability of a sudden road change to CHANGE_LEAST·`power` if `forget` over
-    `change_s` [s] applied less. `power` is the share of the vote that is new information. `p` is
-    changed in place.
+    """Mix the prior into a belief `p` in place, so that the total probability of a sudden road
+    change is at least CHANGE_LEAST·`power`. `forget` has already applied the change over `change_s`
+    [s]. `power` is the share of the vote that is new information.
     """
     lacking = c.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / c.CHANGE_S)
     if lacking > 0.0:
@@ -258,8 +264,8 @@ def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> No
 
 @refcount_free_inlined
 def apply_vote(p: Bins, likelihood: Bins, strength: float) -> None:
-    """Multiply a belief in place by a vote of strength s: p ← p·(s·L̃ + 1 - s), without
-    normalising.
+    """Multiply a belief `p` in place by a vote of strength s: p ← p·(s·L̃ + 1 - s), where L̃ is the
+    likelihood. The result is not normalised.
     """
     s = np.float32(strength)
     rest = np.float32(1.0 - strength)
@@ -269,7 +275,9 @@ def apply_vote(p: Bins, likelihood: Bins, strength: float) -> None:
 
 @refcount_free_inlined
 def mean_of(likelihood: Bins) -> float:
-    """Return the posterior mean of μ under a uniform prior, for a likelihood whose mean is 1."""
+    """Return the posterior mean of μ under a uniform prior, for a likelihood (32) whose mean over
+    the bins is 1.
+    """
     a = np.float32(0.0)
     b = np.float32(0.0)
     d = np.float32(0.0)

@@ -100,8 +100,8 @@ class Fusion:
         self._shape = UNKNOWN_SHAPE
 
     def resume(self, epoch: int | None, vote_weights: list[VoteWeights], reports: Reports) -> None:
-        """Continue from a checkpoint: its epoch, vote weights and weather; the caller has set
-        `store`.
+        """Continue from a checkpoint, with its epoch, vote weights and weather. The caller must
+        have set `store` before.
         """
         self._epoch = epoch
         self.vote_weights = vote_weights
@@ -116,39 +116,41 @@ class Fusion:
 
     @property
     def live(self) -> Cells:
-        """The current cells; rows from `size` on are unused."""
+        """Current state of all cells as columns; rows from `size` on are unused."""
         return self.store.live
 
     @property
     def size(self) -> int:
-        """Number of slots in use."""
+        """Number of slots in use; a slot is the storage of one cell and sector."""
         return self.store.size
 
     @property
     def cell(self) -> IntArray:
-        """Cell of every slot, (size,)."""
+        """Cell number of every slot, (size,)."""
         return self.live.key[: self.size] // grid.SECTORS
 
     @property
     def sector(self) -> SmallArray:
-        """Sector of every slot, (size,)."""
+        """Heading sector of every slot, (size,)."""
         return (self.live.key[: self.size] % grid.SECTORS).astype(np.int8)
 
     @property
     def waiting(self) -> int:
-        """Number of observations in the lateness window; an observation that affects several cells
-        counts once per cell.
+        """Number of observations in the lateness window, in which late arrivals are still sorted
+        in. An observation that affects several cells counts once per cell.
         """
         return self.store.waiting
 
     @property
     def checkpoint(self) -> int | None:
-        """Time of the checkpoint [ns]; None before the first observation."""
+        """Time of the checkpoint [ns]: older observations are final. None before the first
+        observation.
+        """
         return None if self._epoch is None else self._epoch * c.EPOCH_NS - self._lateness_ns
 
     @property
     def next_epoch(self) -> int:
-        """Start [ns] of the first epoch that has not been fused yet; 0 before the first
+        """Start [ns] of the first epoch (minute) that has not been fused yet; 0 before the first
         observation.
         """
         return 0 if self._epoch is None else (self._epoch + 1) * c.EPOCH_NS
@@ -207,20 +209,20 @@ class Fusion:
         return Updated(late, late_by, used, distinct_values(np.concatenate(touched)))
 
     def untouched(self, before: int) -> BoolArray:
-        """Return a mask of slots (size,): True if the last visit was before `before` [ns] and no
-        other record refers to the slot. Such slots may be deleted with `drop`.
+        """Return a mask of slots (cells and sectors), (size,): True if the last visit was before
+        `before` [ns] and no other record refers to the slot. Such slots may be deleted with `drop`.
         """
         return self.store.untouched(before)
 
     def drop(self, dropped: BoolArray) -> IntArray:
-        """Delete the slots that the mask `dropped` (size,) selects; all must be `untouched`. Return
-        the new number of each slot, -1 for deleted ones.
+        """Delete the slots (cells and sectors) that the mask `dropped` (size,) selects; all must be
+        `untouched`. Return the new number of each slot, -1 for deleted ones.
         """
         return self.store.drop(dropped)
 
     def update_weather(self, reports: Reports) -> None:
-        """Add weather reports. Each must take effect at `next_epoch` or later, because otherwise
-        the map would depend on the time of arrival.
+        """Add weather reports. Each must take effect at `next_epoch` or later; otherwise the map
+        would depend on the time of arrival.
         """
         columns = (
             np.concatenate([getattr(r, f.name) for r in (self.reports, reports)])
@@ -234,22 +236,22 @@ class Fusion:
         self._weather = weather_of(self.reports)
 
     def beliefs(self, slots: IntArray, now: int, rows: Rows | None = None) -> FloatArray:
-        """Return the belief about the road of each slot, (k, 32), predicted to `now` [ns],
-        including the evidence of slippery neighbours. If `rows` is given, read this copy of the
-        live rows instead.
+        """Return the belief about the road for each slot (cell and sector), (k, 32), predicted to
+        `now` [ns], including the evidence of slippery neighbours. If `rows` is given, read this
+        copy of the state instead of the live one.
         """
         kernels = KERNELS[shape_class(self._shape.reader)]
         return self._read(kernels, slots, np.full(len(slots), now), rows)
 
     def beliefs_at_last_report(self, slots: IntArray) -> FloatArray:
-        """Return the belief about the road of each slot, (k, 32), at the time of the slot's last
-        observation.
+        """Return the belief about the road for each slot (cell and sector), (k, 32), at the time of
+        the slot's last observation.
         """
         return self._read(KERNELS[shape_class(self._shape.reader)], slots, self.live.time[slots])
 
     def slippery(self, slots: IntArray) -> FloatArray:
-        """Return P(slippery) of each slot, (k,), at the slot's last observation, from reports of
-        this cell alone (without neighbours).
+        """Return P(slippery) for each slot (cell and sector), (k,), at its last observation, from
+        reports of this cell alone (without neighbours).
         """
         return _slippery_probability(
             self.store.state.live, SLIPPERY_WEIGHTS[shape_class(self._shape.reader)], slots
@@ -271,13 +273,13 @@ class Fusion:
         return road_beliefs(rows, self.store.table, self._weather, kernels, slots, now)
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
-        """Return the slot of each pair of cell and sector, -1 if no vehicle has reported the
+        """Return the slot number of each pair of cell and sector; -1 if no vehicle has reported the
         pair.
         """
         return self.store.slots_of(cell * grid.SECTORS + sector)
 
     def trust(self, vehicle: int) -> float:
-        """Return the weight of a vehicle's next vote."""
+        """Return the weight that the next vote of a vehicle will have."""
         return float(self.vote_weights[-1].weights(self._index(vehicle))[0])
 
     def _index(self, vehicle: int) -> IntArray:
@@ -285,11 +287,11 @@ class Fusion:
         return np.where(index < 0, self.store.vehicles, index)
 
     def sources(self, slots: IntArray, side: int, since: IntArray | int) -> IntArray:
-        """Return the report times of the sources that corroborate slots (k,), newest first, (k,
-        SOURCES) [ns].
+        """Return the report times [ns] of the vehicles that corroborate ice or grip in each slot
+        (cell and sector), (k, SOURCES), newest first.
 
-        A source is a vehicle, still trusted, that reported `side` (GRIP or ICE) in the cell after
-        `since` [ns]. At most SOURCES are remembered; time 0 means no source.
+        Only vehicles count that are still trusted and reported `side` (GRIP or ICE) after `since`
+        [ns]. At most SOURCES are remembered; time 0 means no vehicle.
         """
         _, when = self.find_sources(slots, side, since)
         return -np.sort(-when, axis=1)
@@ -297,8 +299,8 @@ class Fusion:
     def find_sources(
         self, slots: IntArray, side: int, since: IntArray | int
     ) -> tuple[IntArray, IntArray]:
-        """Return the vehicle index and report time [ns] of each remembered source, two arrays (k,
-        SOURCES). The time is 0 if the source does not count (see `sources`).
+        """Return index and report time [ns] of each vehicle that corroborates `side` in the slots,
+        two arrays (k, SOURCES). The time is 0 if the vehicle does not count (see `sources`).
         """
         row = self.live.reporters[slots]
         reporters = self.store.state.live.reporters
@@ -316,8 +318,8 @@ class Fusion:
         )
 
     def _advance(self, epoch: int) -> None:
-        """Advance the latest time T to `epoch`. While the window has entries, advance by one epoch
-        at a time and commit the entries that the checkpoint passes.
+        """Advance the latest time T to `epoch`. While the lateness window is not empty, advance by
+        one epoch (minute) at a time, and commit the observations that the checkpoint passes.
         """
         if self._epoch is None:
             self._epoch = epoch
@@ -383,15 +385,17 @@ def _make_arrivals(
 
 
 def voted_keys(o: Observations) -> IntArray:
-    """Return the keys (cell · 4 + sector) that observations vote on, with repetitions."""
+    """Return the keys (cell · 4 + sector) of all cells and sectors that observations affect, with
+    repetitions.
+    """
     return _spread_votes(o, np.arange(len(o.time)))[1]
 
 
 def _spread_votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
     """Return the votes of the selected observations, sorted by time, as three arrays: row of the
-    observation, key, and share of the vote.
+    observation, key (cell and sector), and share of the vote.
 
-    Besides its own cell and sector, an observation may vote on a second sector and on neighbouring
+    Besides its own cell and sector, an observation may affect a second sector and neighbouring
     cells.
     """
     own = 1.0 - o.other_share[rows].sum(axis=1)

@@ -35,7 +35,7 @@ _FLOOR: Final = mugrid.FLOOR_STEPS
 
 
 def fused_at(time: IntArray, checkpoint: int) -> IntArray:
-    """Return the times [ns] at which late visits with end times `time` (n,) enter the window:
+    """Return the times [ns] at which late visits are fused, given their end times `time` (n,):
     within one second after the checkpoint, the newest first, in whole µs.
     """
     age = np.clip(checkpoint - time, 0, LATE_MOST_NS)
@@ -43,7 +43,9 @@ def fused_at(time: IntArray, checkpoint: int) -> IntArray:
 
 
 def delay_observations(o: Observations, late_by: IntArray, weather: Weather) -> Observations:
-    """Return the observations with times and evidence moved forward by `late_by` (n,) [ns]."""
+    """Return the observations with their times moved forward by `late_by` (n,) [ns], and with their
+    likelihoods aged accordingly.
+    """
     rows = np.flatnonzero(late_by)
     evidence = o.evidence.copy()
     evidence[rows] = aged_evidence(
@@ -60,8 +62,8 @@ def delay_observations(o: Observations, late_by: IntArray, weather: Weather) -> 
 def aged_evidence(
     evidence: ByteArray, key: IntArray, begin: IntArray, end: IntArray, weather: Weather
 ) -> ByteArray:
-    """Return aged evidence (n, 32), in steps: the likelihood of the roads `key` (n,) at time `end`
-    [ns] that follows from observations at time `begin` [ns].
+    """Return the log-likelihoods (n, 32), in steps of 1/16 nat, of the roads `key` (n,) at time
+    `end` [ns], given observations at time `begin` [ns].
     """
     out = np.empty_like(evidence)
     likelihood = np.empty(mugrid.BINS, np.float32)

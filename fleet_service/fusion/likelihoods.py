@@ -33,16 +33,16 @@ _USED_STEP: Final = 0.005
 
 def make_evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> Evidence:
     """Return the log-likelihood of each visit, (n, 32), in steps of 1/16 nat below its maximum, and
-    the values as reported.
+    a description of the reported values.
 
     Args:
         columns: `log_likelihood` (n, 32); `mu`, `mu_lower`, `mu_upper`, `mu_utilised`, each (n,),
             NaN where absent.
         with_likelihood: (n,) True if the sender gave a likelihood.
 
-    A likelihood that falls towards the highest friction is a value; any other is a lower bound, see
-    `level_above_used`. A posterior counts as a value where `mu_utilised ≥ 0.6·mu`. In all other
-    cases only the statement "μ is at least mu_utilised" is used. A visit without any of these
+    A likelihood that falls towards the highest friction is called a value; any other is a lower
+    bound, see `level_above_used`. A posterior counts as a value if `mu_utilised ≥ 0.6·mu`. In all
+    other cases only the statement "μ is at least mu_utilised" is used. A visit without any of these
     columns gives a flat likelihood.
     """
     sent = columns["log_likelihood"]
@@ -78,8 +78,8 @@ def bound_by_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
 
 @cache
 def _levelled_bounds() -> ByteArray:
-    """Return the table of lower bounds in steps, after `level_above_used`, (m, 32). Rows are the
-    grip used from 0 to UTILISED_MOST in steps of _USED_STEP.
+    """Return the table of log-likelihoods of lower bounds, (m, 32), in steps of 1/16 nat, after
+    `level_above_used`. Rows are the grip used from 0 to UTILISED_MOST in steps of _USED_STEP.
     """
     used = np.arange(0.0, c.UTILISED_MOST + 0.5 * _USED_STEP, _USED_STEP)
     return level_above_used(mugrid.encode_log_likelihood(at_least(used)), used)

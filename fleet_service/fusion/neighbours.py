@@ -87,8 +87,8 @@ def road_beliefs(
     slots: IntArray,
     now: IntArray,
 ) -> FloatArray:
-    """Return the belief about the road of each slot, (k, 32), at one time [ns] per slot. `table` is
-    the hash table that finds slots by key.
+    """Return the belief about the road for each slot (cell and sector), (k, 32), at one time [ns]
+    per slot. `table` is the hash table that finds slots by key.
     """
     out = np.empty((len(slots), _BINS))
     scratch = np.empty((3, SCRATCH))
@@ -153,8 +153,8 @@ def road_beliefs(
 
 @compiled
 def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
-    """Return each slot (k,) and the slots before and behind it that may belong to the same slippery
-    stretch, (k, 1 + 2·NEIGHBOURS). Positions without such a slot are NONE.
+    """Return each slot (cell and sector), and the slots before and behind it that may belong to the
+    same slippery stretch of road, (k, 1 + 2·NEIGHBOURS). Positions without such a slot are NONE.
 
     A stretch ends at a cell whose own reports make slippery road unlikely.
     """
@@ -199,8 +199,8 @@ def _stored_slippery(live: Rows, row: int) -> float:
 
 @refcount_free
 def _age_belief(live: Rows, weather: Weather, slot: int, now: int, scratch: Bins) -> int:
-    """Age a slot's belief to `now` [ns] and write it to the scratch memory; return the row of its
-    region's prior.
+    """Age the belief about a slot (cell and sector) to `now` [ns] and write it to `scratch`. Return
+    the row number of its region's prior.
     """
     cells = live.cells
     p = scratch[P]

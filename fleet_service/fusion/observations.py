@@ -66,7 +66,7 @@ class Observations:
     other_share: Float32Array
 
     def take(self, rows: IntArray | BoolArray | slice) -> Observations:
-        """Return the selected rows."""
+        """Return the observations that `rows` selects."""
         return Observations(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
 

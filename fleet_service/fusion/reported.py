@@ -1,5 +1,5 @@
-"""Values as vehicles reported them: mean, standard deviation and P(slippery) of a likelihood.
-Compiled, pure.
+"""Values of friction as vehicles reported them: mean, standard deviation and P(slippery) of a
+likelihood. Compiled, pure.
 
 Reported values decide three questions: whether vehicles agree, whether a report is new, and which
 vehicles an alert may name as sources. The belief uses a wider likelihood (`belief.convolve_bias`).
@@ -36,8 +36,8 @@ class Evidence(NamedTuple):
 
 
 def as_reported(steps: NDArray[Any]) -> Evidence:
-    """Return likelihoods (n, 32) in steps, with best step 0, together with mean, standard deviation
-    and P(slippery) of those that are values.
+    """Return two arrays: log-likelihoods (n, 32) in steps, shifted so that the smallest step is 0;
+    and mean, standard deviation and P(slippery) of each (n, 3), NaN for lower bounds.
     """
     out = steps.astype(np.uint8)
     reported = np.full((len(steps), 3), np.nan, np.float32)

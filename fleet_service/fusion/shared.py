@@ -92,12 +92,15 @@ class Shape(NamedTuple):
 
     @property
     def reader(self) -> float:
-        """Slope that the interval for a reader of the map allows for."""
+        """Slope (error per unit of unused grip) that the intervals for readers of the map allow
+        for.
+        """
         return self.slope + c.SHAPE_DOUBT
 
     @property
     def alarm(self) -> float:
-        """Slope that an alarm allows for: the upper end of its one-sided 95 % interval.
+        """Slope (error per unit of unused grip) that an alarm allows for: the upper end of its
+        one-sided 95 % interval.
 
         A new service assumes .5. A service that knows its fleet assumes little more than a reader.
         Missed ice on tuning seeds: with .5 for all, .044 of the icy cell-minutes of a clean fleet
@@ -113,8 +116,13 @@ UNKNOWN_SHAPE: Final = Shape(c.SHAPE_PRIOR, c.SHAPE_STD)
 def shared_kernel(
     used: float, kinds: float, stated: float, slope: float = UNKNOWN_SHAPE.reader
 ) -> FloatArray:
-    """Return the kernel K, (32, 32), for a mean grip used, an effective number of kinds of
-    manoeuvre and the shared part of the stated error (relative).
+    """Return the kernel K, (32, 32), which maps the fleet's common reading to the road.
+
+    Args:
+        used: mean grip used by the vehicles that gave values.
+        kinds: effective number of kinds of manoeuvre.
+        stated: shared part of the error that the vehicles state, relative.
+        slope: error per unit of unused grip.
     """
     centres = mugrid.CENTRES
     always = c.COMMON_ALWAYS**2 + c.COMMON_MANOEUVRE**2 / kinds
@@ -126,14 +134,16 @@ def shared_kernel(
 
 
 def base_kernel() -> FloatArray:
-    """Return the kernel K, (32, 32), of cells that have only lower bounds and no values."""
+    """Return the kernel K, (32, 32), for cells that have only lower bounds and no values of
+    friction.
+    """
     relative = c.COMMON_RELATIVE * mugrid.CENTRES
     return _two_sided(np.hypot(relative, c.COMMON_ABSOLUTE), np.hypot(relative, c.COMMON_HIGH))
 
 
 def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
-    """Return the kernel K, (32, 32), from two standard deviations per bin (32,): of readings below
-    the true friction and of readings above it.
+    """Return the kernel K, (32, 32), for an error with two standard deviations per bin (32,): of
+    readings that are too low, and of readings that are too high.
     """
     away = mugrid.CENTRES[None, :] - mugrid.CENTRES[:, None]
     kernel = np.exp(-0.5 * np.square(away / np.where(away < 0.0, below[:, None], above[:, None])))
@@ -165,7 +175,9 @@ def shape_class(slope: float) -> int:
 
 @refcount_free_inlined
 def kernel_of(cells: RecordArray, row: int) -> int:
-    """Return the index in the kernel table for a cell: row `row` of `cells`."""
+    """Return the index, in the table of kernels, of the kernel for the cell in row `row` of
+    `cells`.
+    """
     whole = 0.0
     squares = 0.0
     for k in range(MANOEUVRES):
@@ -211,8 +223,8 @@ def read_road(
 def note_value(
     cells: RecordArray, row: int, entries: RecordArray, entry: int, strength: float
 ) -> None:
-    """Add an entry's value to the means of its cell: kind of manoeuvre, grip used, and the error
-    that it shares with others.
+    """Add the value of an entry (an observation in one cell) to the running means of its cell: kind
+    of manoeuvre, grip used, and the error that it shares with others.
 
     The entry's weight is smaller if the vehicle used less grip or stated a wider interval.
     """
@@ -245,7 +257,7 @@ def _moving_mean(before: int, new: float, part: float) -> np.uint8:
 
 @refcount_free
 def fade_weights(cells: RecordArray, row: int, begin: int, end: int) -> None:
-    """Let two weights of a cell fade between the times `begin` and `end` [ns]: the weights of the
+    """Reduce two weights of a cell for the time from `begin` to `end` [ns]: the weights of the
     manoeuvres, and the number of votes by untrusted vehicles.
     """
     borders = min(end // TENTH_NS - begin // TENTH_NS, len(_FADES) - 1)

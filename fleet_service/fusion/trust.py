@@ -51,8 +51,8 @@ def compare_reports(
     entries: RecordArray,
     entry: int,
 ) -> None:
-    """Compare a vehicle's value with the recent values of other vehicles in the cell, then store it
-    there. The new value replaces the vehicle's earlier value, or else the oldest one.
+    """Compare a vehicle's value of friction with the recent values of other vehicles in the cell,
+    then store it there. The new value replaces the vehicle's earlier value, or else the oldest one.
 
     `names` (V,) are the vehicles' numbers, by index. No comparison is made if the value is late or
     probably belongs to another cell.
@@ -157,7 +157,9 @@ def _note_shape(
 
 @refcount_free
 def _own_variance(mean: float, std: float) -> float:
-    """Return the relative variance of a value without the variance of the vehicle's bias."""
+    """Return the relative variance of a reported value, without the part that the vehicle's
+    constant bias contributes.
+    """
     return max((std / max(mean, mugrid.LOWER)) ** 2 - c.BIAS_RELATIVE**2, _LEAST_VARIANCE)
 
 
@@ -166,9 +168,9 @@ def _pair_rank(vehicle: int, other: int) -> int:
     """Return a fixed pseudo-random number of a pair of vehicles. It depends on the two vehicle
     numbers and not on their order of arrival.
 
-    If several other vehicles compete for one place of the table, the pair with the lowest number
-    stays. So a rare companion is as likely to be kept as a frequent one; otherwise the vehicles
-    that report most would displace the others.
+    A vehicle's table of others has few places. If two others compete for a place, the pair with the
+    lower number keeps it. So a vehicle that was met rarely is as likely to be kept as one that was
+    met often; otherwise the vehicles that report most would displace the others.
     """
     mixed = np.uint64(vehicle) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(other) * np.uint64(
         0xBF58476D1CE4E5B9
@@ -250,12 +252,13 @@ def _update_weights(
 
 
 def heeded_flags(peers: RecordArray) -> BoolArray:
-    """Return a mask of vehicles (V,): True if the vehicle's slip controllers may support an alert.
+    """Return a mask of vehicles (V,): True if interventions of the vehicle's slip controllers
+    (flags) may support an alert.
 
-    The flags of a vehicle have a record of their own. It starts with TRUST_PRIOR_PEERS imagined
-    cells, in a share TRUST_PRIOR of which the flag was confirmed. Below a share of TRUST_NONE the
-    flags support no alert. A vehicle whose flag is always on is therefore excluded after two dry
-    cells.
+    The flags of each vehicle have a record. It starts with TRUST_PRIOR_PEERS imagined cells, in a
+    share TRUST_PRIOR of which the flag was confirmed. If the share of confirmations is below
+    TRUST_NONE, the flags support no alert. So a vehicle whose flag is always on is excluded after
+    two dry cells.
     """
     right = c.TRUST_PRIOR * c.TRUST_PRIOR_PEERS + peers["flags_confirmed"]
     whole = c.TRUST_PRIOR_PEERS + peers["flags_confirmed"] + peers["flags_contradicted"]

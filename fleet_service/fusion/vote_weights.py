@@ -1,4 +1,4 @@
-"""Weight of each vehicle's votes from an epoch on. Pure."""
+"""Weight of each vehicle's votes from an epoch (minute) on. Pure."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""A vote is the effect of one observation on one cell. This module computes how much of a vote is
-new information and updates the cell's row. Compiled.
+"""A vote is the effect of one observation on the belief about one cell. This module computes how
+much of a vote is new information, and updates the cell. Compiled.
 """
 
 from __future__ import annotations
@@ -67,8 +67,9 @@ _WITNESS_SLOPE: Final = UNKNOWN_SHAPE.alarm
 
 @refcount_free_inlined
 def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scratch: Bins) -> None:
-    """Set the kind of an entry's vote (VALUE or BOUND), its mean, standard deviation and
-    P(slippery); leave its likelihood in the scratch memory.
+    """Set the kind of an entry's vote (VALUE, or BOUND for a lower bound), its mean, standard
+    deviation and P(slippery). The likelihood is left in `scratch`. An entry is an observation in
+    one cell.
 
     If the vehicle reported a value (`reported` (3,) is not NaN), these numbers are taken from the
     report, even if only a part of its likelihood is used.
@@ -95,7 +96,9 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
 
 @refcount_free
 def load_likelihood(entries: RecordArray, entry: int, scratch: Bins) -> None:
-    """Compute the likelihood of a stored entry again and write it to `scratch`."""
+    """Compute the likelihood of a stored entry (an observation in one cell) again and write it to
+    `scratch`.
+    """
     _clear_padding(scratch)
     this = entries[entry]
     convolve_bias(this.evidence, int(this.kind), scratch[PADDED], scratch[LIKELIHOOD])
@@ -111,7 +114,7 @@ def _clear_padding(scratch: Bins) -> None:
 @refcount_free_inlined
 def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
     """Compute how much of a vote is new information, given the vehicle's earlier reports in this
-    cell. These are in the window, or in the record of reports before the checkpoint.
+    cell. Recent reports are in the lateness window, older ones in a record per vehicle and cell.
 
     All times are rounded to whole seconds, so that the result is the same for both sources.
     """
@@ -197,8 +200,8 @@ def update(
     weather: Weather,
     scratch: Bins,
 ) -> None:
-    """Update a row of cells by one entry, whose likelihood is in the scratch memory. `sources` is
-    the row of the cell's corroborating sources.
+    """Update the state of a cell, row `row`, with one entry (an observation), whose likelihood is
+    in `scratch`. `sources` is the row of the vehicles that corroborate ice or grip in this cell.
     """
     belief = rows.belief
     cells = rows.cells
@@ -286,7 +289,7 @@ def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
 
 @refcount_free_inlined
 def _remembered_parts(seconds: float) -> np.uint16:
-    """Return a time [s], limited to FORGET_S, as an integer in units of 1/AGED s."""
+    """Return a time [s], limited to FORGET_S, as an integer number of 1/AGED s."""
     return np.uint16(min(seconds, c.FORGET_S) * AGED + 0.5)
 
 
@@ -335,8 +338,8 @@ def ice_evidence(entries: RecordArray, entry: int) -> float:
 
 @refcount_free_inlined
 def needs_reporters(entries: RecordArray, entry: int) -> bool:
-    """Return True if the cell must keep a record of reporters for this entry: the entry is a value
-    or a source of grip, or a slip controller intervened.
+    """Return True if the cell needs a list of recent reporters for this entry: the entry is a value
+    or shows grip, or a slip controller intervened.
     """
     return bool(
         entries[entry].kind == VALUE
@@ -376,8 +379,8 @@ def _untrusted_weight(
 
 @refcount_free
 def _note_source(reporters: RecordArray, row: int, side: int, vehicle: int, time: int) -> None:
-    """Record a corroborating source: in the vehicle's own place if it has one, otherwise in place
-    of the oldest source.
+    """Record a vehicle that corroborates ice or grip in a cell. It replaces the vehicle's earlier
+    report, or else the oldest report.
     """
     source = reporters[row].source
     source_time = reporters[row].source_time

@@ -63,7 +63,7 @@ class Reports:
     prior: FloatArray
 
     def take(self, rows: IntArray | BoolArray) -> Reports:
-        """Return the selected rows."""
+        """Return the weather reports that `rows` selects."""
         return Reports(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
@@ -163,7 +163,7 @@ def _accumulate_clock(
 
 
 def no_reports() -> Reports:
-    """Return empty reports."""
+    """Return weather reports with zero rows."""
     nothing = np.zeros(0, np.int64)
     never = np.zeros(0)
     return Reports(nothing, nothing, never, never, never, np.zeros((0, mugrid.BINS)))
@@ -174,8 +174,8 @@ _SHIFT: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM) + 2  # from a slot's key
 
 @refcount_free
 def road_time(weather: Weather, key: int, begin: int, end: int) -> tuple[float, float, int]:
-    """Return the road time (weather-scaled age) of drift and of change between two times [ns] as
-    [s], and the row whose prior applies at the end; row 0 if no report applies.
+    """Return the road time (weather-scaled age) [s] of drift and of change that passes between two
+    times [ns], and the row whose prior applies at the end; row 0 if no report applies.
     """
     seconds = (end - begin) * 1e-9
     if len(weather.region) == 0:

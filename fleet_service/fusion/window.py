@@ -1,13 +1,13 @@
-"""The observations of the lateness window, per cell in order of time. The belief takes them in this
-order, whatever their order of arrival.
+"""The lateness window: recent observations, kept per cell in order of time. The belief takes them
+in this order, whatever their order of arrival.
 
-A slot's live row is its belief after all observations. While a slot has observations younger than
-the checkpoint it has a window: these observations, and the base, a copy of the row before them. An
-observation that is newer than all others updates the live row. An observation in between makes the
-window stale; after the batch all stale windows are computed again from their bases. A commit moves
-observations that the checkpoint has passed into the base. When the last has been moved, the base
-equals the live row and the window is freed. Both rows go through the same operations in the same
-order, so that they agree bit for bit.
+A slot is the storage of one cell and sector, and its live row is the belief after all observations.
+While a slot has observations younger than the checkpoint it has a window: these observations, and
+the base, a copy of the row before them. An observation that is newer than all others updates the
+live row. An observation in between makes the window stale; after the batch all stale windows are
+computed again from their bases. A commit moves observations that the checkpoint has passed into the
+base. When the last has been moved, the base equals the live row and the window is freed. Both rows
+go through the same operations in the same order, so that they agree bit for bit.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class Arrivals(NamedTuple):
 
 
 class Votes(NamedTuple):
-    """Votes of a batch, arrays of shape (k,): row of the observation, slot, and P(the vehicle was
-    in this cell).
+    """Votes of a batch, arrays of shape (k,): row of the observation, slot (cell and sector), and
+    P(the vehicle was in this cell).
 
     Among the votes of one observation, the vote for its own cell comes first.
     """
@@ -80,8 +80,8 @@ class Votes(NamedTuple):
 
 
 class Marks(NamedTuple):
-    """Marks of a batch: observations left out (n,), observations accepted (n,), windows that must
-    be computed again (k,).
+    """Marks that are made while a batch is processed: observations left out (n,), observations
+    accepted (n,), and windows that must be computed again (k,).
     """
 
     left_out: BoolArray
@@ -92,11 +92,11 @@ class Marks(NamedTuple):
 def absorb_votes(
     state: State, weather: Weather, arrivals: Arrivals, votes: Votes, most: int
 ) -> BoolArray:
-    """Add the votes of a batch to the windows of their slots, and update the beliefs.
+    """Add the votes of a batch to the lateness windows of their cells, and update the beliefs.
 
-    Every pool must have k free places. Return a mask of observations (n,) that were left out,
-    because `most` observations of their vehicle already wait in the same cell. For an observation
-    with several votes, its own cell decides.
+    Every memory pool must have space for k votes. Return a mask of observations (n,) that were left
+    out, because `most` observations of their vehicle already wait in the same cell. For an
+    observation that affects several cells, its own cell decides.
     """
     n = len(arrivals.time)
     k = len(votes.row)
@@ -117,7 +117,9 @@ def _absorb_votes(
     marks: Marks,
     scratch: Bins,
 ) -> int:
-    """Add the votes to the windows and fill the marks; return the number of stale windows."""
+    """Add the votes to the windows of their cells and fill the marks; return the number of stale
+    windows, which must be computed again.
+    """
     cells = state.live.cells
     windows = state.windows
     entries = state.entries
@@ -160,7 +162,7 @@ def _absorb_votes(
 
 @refcount_free_inlined
 def _fill_entry(state: State, arrivals: Arrivals, row: int) -> int:
-    """Fill a free entry with the data of an observation; return the row of the entry."""
+    """Copy an observation into a free window entry; return the row of the entry."""
     state.used[FREE_ENTRIES] -= 1
     entry = int(state.free_entries[state.used[FREE_ENTRIES]])
     new = state.entries[entry]
@@ -217,8 +219,8 @@ def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, begin: int, 
 
 @refcount_free_inlined
 def _open_window(state: State, slot: int) -> int:
-    """Open a window for a slot without one, with a copy of the slot's row; return the row of the
-    window.
+    """Open a lateness window for a slot (cell and sector) without one, with a copy of the slot's
+    row; return the row of the window.
     """
     state.used[FREE_WINDOWS] -= 1
     window = int(state.free_windows[state.used[FREE_WINDOWS]])
@@ -239,7 +241,9 @@ def _open_window(state: State, slot: int) -> int:
 
 @refcount_free
 def _open_reporters(state: State, slot: int, window: int) -> None:
-    """Allocate a row of reporters for a slot that has a window but no reporters yet."""
+    """Allocate a list of recent reporters for a slot (cell and sector) that has a window but no
+    such list yet.
+    """
     row = state.used[REPORTERS_USED]
     state.used[REPORTERS_USED] += 1
     state.live.cells[slot].reporters = row
@@ -276,8 +280,8 @@ def commit_windows(
     due_windows: IntArray,
     before: int,
 ) -> None:
-    """Advance the checkpoint of the windows (k,) to `before` [ns], one window after the other.
-    Older entries are committed to the base and removed from the window.
+    """Advance the checkpoint to `before` [ns] for the given windows (k,), one after the other.
+    Older observations are moved from the window into the base.
     """
     _commit_windows(
         state, weather, peers, names, due_windows, before, np.zeros((3, SCRATCH), np.float32)
@@ -286,8 +290,8 @@ def commit_windows(
 
 @refcount_free_inlined
 def _prefetch_due(state: State, due_windows: IntArray, begin: int, end: int) -> None:
-    """Prefetch the memory that the commit of the windows from `begin` to `end` will access, in the
-    same way as `_prefetch_votes`.
+    """Prefetch the memory that `commit_windows` will access for the windows from `begin` to `end`,
+    in the same way as `_prefetch_votes`.
     """
     live = state.live
     base = state.base
@@ -356,7 +360,7 @@ def _commit_windows(
 
 @refcount_free_inlined
 def _shorten_window(state: State, slot: int, window: int, entry: int) -> None:
-    """Make `entry` the first entry of a window; free the window if `entry` is NONE."""
+    """Make `entry` the first observation of a window; free the window if `entry` is NONE."""
     windows = state.windows
     windows[window].head = entry
     if entry == NONE:
@@ -371,8 +375,8 @@ def _shorten_window(state: State, slot: int, window: int, entry: int) -> None:
 
 @refcount_free_inlined
 def _link_entry(windows: RecordArray, entries: RecordArray, window: int, entry: int) -> None:
-    """Insert an entry into its window in order of time. The search starts at the newest entry,
-    because nearly all entries belong there.
+    """Insert an entry (an observation) into its window in order of time. The search starts at the
+    newest entry, because nearly all entries belong there.
     """
     after = windows[window].tail
     while after != NONE and comes_before(entries, entry, after):

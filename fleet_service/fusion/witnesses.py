@@ -15,14 +15,15 @@ from schemas.numeric import BoolArray, IntArray
 
 
 def stretch_slots(fusion: Fusion, slots: IntArray) -> IntArray:
-    """Return the slots of the slippery stretch around each slot (k,), the slot itself first;
-    positions without a slot are NONE.
+    """Return, for each slot (cell and sector), the slots of the slippery stretch of road around it,
+    the slot itself first; positions without a slot are NONE.
     """
     return stretches(fusion.store.state.live, fusion.store.table, slots)
 
 
 class StretchSources(NamedTuple):
-    """Vehicles that reported ice on the stretches around k slots, the newest first.
+    """Vehicles that reported ice on the slippery stretches around k slots (cells and sectors), the
+    newest first.
 
     Attributes:
         who: index of the vehicle, (k, n).
@@ -36,8 +37,8 @@ class StretchSources(NamedTuple):
 
 
 def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> StretchSources:
-    """Return the vehicles that reported ice on the stretches around slots (k,) after `since` (k,)
-    [ns]; each vehicle counts once per stretch.
+    """Return the vehicles that reported ice on the stretches around the slots (cells and sectors)
+    after `since` (k,) [ns]; each vehicle counts once per stretch.
     """
     along = stretch_slots(fusion, slots)
     places = along.shape[1]
@@ -52,8 +53,8 @@ def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> Stretch
 
 
 def witnesses_of(fusion: Fusion, slot: int, since: int) -> list[int]:
-    """Return the numbers of the vehicles that reported ice on the stretch around a slot after
-    `since` [ns].
+    """Return the numbers of the vehicles that reported ice on the stretch around a slot (cell and
+    sector) after `since` [ns].
     """
     who, when, _ = stretch_sources(fusion, np.array([slot]), np.array([since]))
     return [int(fusion.store.names["key"][index]) for index in who[0][when[0] > 0].tolist()]

@@ -1,3 +1,3 @@
-"""Technical modules that both packages use: compilation, records, sessions, metrics, process
+"""Technical modules that agent and service share: compilation, records, sessions, metrics, process
 set-up, figures.
 """

@@ -28,7 +28,9 @@ _NEGATIVE: Final = re.compile(r"^-[\d.]")
 
 
 class Command(NamedTuple):
-    """Subcommand; its module has `add_arguments(parser)` and `run(arguments) -> int`."""
+    """Subcommand of a command line: its name, module, help text and example. The module has
+    `add_arguments(parser)` and `run(arguments) -> int`.
+    """
 
     name: str
     module: str
@@ -78,7 +80,9 @@ def join_negative_numbers(argv: Sequence[str]) -> list[str]:
 
 
 def add_command(commands: Any, name: str, about: str, example: str) -> argparse.ArgumentParser:  # noqa: ANN401 argparse's own
-    """Add a subcommand with its example and the common options."""
+    """Add a subcommand with help text, example and the common options to a parser; return the
+    subcommand's parser.
+    """
     parser: argparse.ArgumentParser = commands.add_parser(
         name,
         help=about,
@@ -186,7 +190,8 @@ def report_write_errors(path: Path) -> Iterator[None]:
 
 
 def ending_of(field: str, path: Path, known: Sequence[str]) -> str:
-    """Return the ending of a path, which selects the format; the longest match wins.
+    """Return the ending of a file name, which selects the format. If several known endings match,
+    the longest is returned.
 
     Raises:
         InputError: the ending is unknown.

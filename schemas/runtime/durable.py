@@ -31,8 +31,8 @@ def open_durably(
 
     Args:
         path: path of the file; an existing file is replaced.
-        mode: permissions, which the draft has from its first byte on; the default permissions if
-            None.
+        mode: permissions of the file, which the draft has from the beginning; None for default
+            permissions.
         named: True to make the name durable too; otherwise the caller syncs the folder.
 
     Raises:

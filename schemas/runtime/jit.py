@@ -27,7 +27,7 @@ class _Told(event.Listener):
     """Listener that reports compilations to the user, because they take time."""
 
     def on_start(self, event: event.Event) -> None:
-        """Report the first compilation of the process."""
+        """Report a compilation as the current activity, and once per process as a message."""
         progress_messages.report_once(progress_messages.COMPILING)
         progress_messages.set_status(f"compiling {event.data['dispatcher'].__name__}")
 

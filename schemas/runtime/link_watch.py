@@ -65,7 +65,7 @@ class LinkWatch:
             return sorted(self._links.values())
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stop watching the session."""
         for listener in self._listeners:
             listener.undeclare()  # type: ignore[no-untyped-call]
 

@@ -19,8 +19,8 @@ _ALL: Final = f"{SERVES}/**"
 
 
 def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToken]:
-    """Return the service tokens that are active now and visible to this session. Another `root`
-    selects other kinds of tokens.
+    """Return the liveliness tokens of services that are active now and visible to this session.
+    Another `root` selects other kinds of tokens.
     """
     found = set[ServiceToken]()
     for reply in session.liveliness().get(f"{root}/**", timeout=ANSWER_S):
@@ -31,7 +31,7 @@ def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToke
 
 
 class PresenceTracker:
-    """Set of service tokens that is updated continuously."""
+    """Set of liveliness tokens of services, which is updated continuously."""
 
     def __init__(self) -> None:
         self._guard = Lock()

@@ -25,7 +25,7 @@ COMPILING: Final = (
 
 
 class _State:
-    """State of the progress messages; one per process."""
+    """State of the progress messages; there is one object per process."""
 
     def __init__(self) -> None:
         self.on = False

@@ -90,7 +90,7 @@ class Outlook(NamedTuple):
 
 
 def encode_ahead(outlook: Outlook) -> bytes:
-    """Return the Protobuf bytes of an outlook."""
+    """Return the protobuf bytes of a vehicle's outlook (warnings and horizon)."""
     columns: dict[str, Any] = {
         name: column.tolist() for name, column in outlook.runs._asdict().items()
     }

@@ -1,5 +1,5 @@
-"""Decoder of one batch of records, and the parts that all decoders share: heads, checks, and
-columns that a sender may leave out.
+"""Decoder of one batch of records, and the parts that all decoders share: heads (fields of a batch
+other than its records), checks, and columns that a sender may leave out.
 
 Missing columns are filled: floats with NaN, cell and sector from the pose, the leaving time with
 the entering time. The fleet service has its own decoder, which decodes many batches at once.
@@ -34,7 +34,7 @@ LIKELIHOOD: Final = "log_likelihood"
 
 
 class Head(NamedTuple):
-    """The fields of a batch other than its records."""
+    """Head of a batch: the fields other than its records."""
 
     kind: Kind
     vehicle: str
@@ -46,7 +46,7 @@ class Head(NamedTuple):
 
 
 class Heads(NamedTuple):
-    """Heads of k batches, one column per field."""
+    """Heads (fields other than records) of k batches, one column per field."""
 
     kind: Kind
     vehicle: list[str]
@@ -57,7 +57,7 @@ class Heads(NamedTuple):
     estimator: list[str]
 
     def at(self, index: int) -> Head:
-        """Return the head of the batch at an index."""
+        """Return the head (fields other than records) of the batch at an index."""
         return Head(
             self.kind,
             self.vehicle[index],
@@ -69,7 +69,9 @@ class Heads(NamedTuple):
         )
 
     def take(self, kept: BoolArray) -> Heads:
-        """Return the heads that the mask `kept` (k,) selects."""
+        """Return the heads (fields other than records) of the batches that the mask `kept` (k,)
+        selects.
+        """
         return Heads(
             self.kind,
             list(compress(self.vehicle, kept)),
@@ -103,12 +105,12 @@ class Decoded(NamedTuple):
 
 
 class PresentColumns(NamedTuple):
-    """Presence of columns in k batches.
+    """Record of which columns each of k batches contains.
 
     Attributes:
         kind: kind of all batches.
         sizes: number of records of each batch, (k,).
-        columns: name of every column → True for each batch that contains it, (k,).
+        columns: name of every column → mask (k,), True for each batch that contains it.
     """
 
     kind: Kind
@@ -133,8 +135,8 @@ def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN40
 
 
 def head_of(kind: Kind, payload: bytes, encoding: str) -> Head | None:
-    """Return the head of a batch whose records are invalid; None if the head cannot be read
-    either.
+    """Return the head (fields other than records) of a batch whose records are invalid; None if the
+    head cannot be read either.
     """
     try:
         found = parse(payload, encoding, MESSAGES[kind], ENCODING[kind])
@@ -287,8 +289,8 @@ def _derive_columns(columns: Columns, sent: PresentColumns, unplaced: BoolArray)
 
 
 def _with_regions(found: Decoded, columns: Columns) -> Heads:
-    """Return the heads of the batches. If a head has no region, it is taken from the first record
-    of the batch.
+    """Return the heads (fields other than records) of the batches. If a head has no region, the
+    region of the batch's first record is used.
     """
     heads = found.heads
     region_missing = found.heads.region == 0

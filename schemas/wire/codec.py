@@ -41,7 +41,7 @@ MAX_BYTES: Final = 64 * 1024  # fifty records take 8 kB as protobuf, 40 kB as JS
 
 
 class Kind(StrEnum):
-    """Kind of a batch: observations or states; the value is the chunk of the key that names it."""
+    """Kind of a batch: observations or states; the value is the part of the key that names it."""
 
     OBSERVATION = "obs"
     STATE = "state"
@@ -277,7 +277,7 @@ def decode_alert(payload: bytes) -> Alert:
 
 
 def encode_standing(alerts: Sequence[Alert]) -> bytes:
-    """Return the protobuf bytes of the active alerts of a tile."""
+    """Return the protobuf bytes of a message with the active alerts of a tile."""
     return pb.StandingAlerts(
         alerts=[pb.Alert(**vars(alert)) for alert in alerts]
     ).SerializeToString()

@@ -24,9 +24,9 @@ from schemas.runtime.records import RecordArray
 
 
 class Cells(NamedTuple):
-    """Stored state of each slot as columns (n,) with the fields of `records.CellRecord`;
-    `untrusted` is (n, 2), `manoeuvres` (n, 4). `belief` (n, 32) is packed in 16 bits, see
-    `belief.unpack_belief`.
+    """Stored state of each slot (cell and sector) as columns (n,) with the fields of
+    `records.CellRecord`; `untrusted` is (n, 2), `manoeuvres` (n, 4). `belief` (n, 32) is packed in
+    16 bits, see `belief.unpack_belief`.
     """
 
     belief: PackedArray
@@ -47,7 +47,7 @@ class Cells(NamedTuple):
 
 
 def cells_of(rows: Rows) -> Cells:
-    """Return the columns of rows as `Cells`."""
+    """Return the state of cells, stored as rows, as the columns of `Cells`."""
     return Cells(rows.belief, *(rows.cells[name] for name in CELL.names or ()))
 
 
@@ -68,7 +68,9 @@ def no_beliefs(rows: int) -> PackedArray:
 
 @refcount_free
 def begin_slot(live: Rows, slot: int, key: int) -> None:
-    """Initialise a slot for a key with the uniform prior."""
+    """Initialise the slot (storage) of a cell and sector, given by its key, with the uniform
+    prior.
+    """
     live.belief[slot] = FULL
     cell = live.cells[slot]
     cell.key = key
@@ -78,8 +80,8 @@ def begin_slot(live: Rows, slot: int, key: int) -> None:
 
 @refcount_free_inlined
 def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
-    """Copy the state of a slot from one row to another. The row numbers of the target's window and
-    reporters stay unchanged.
+    """Copy the state of a cell from one row to another. The references of the target row to its
+    window and reporters stay unchanged.
     """
     for i in range(mugrid.BINS):
         target.belief[to, i] = source.belief[at, i]
@@ -91,7 +93,7 @@ def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
 
 @refcount_free_inlined
 def copy_sources(source: RecordArray, at: int, target: RecordArray, to: int) -> None:
-    """Copy the corroborating sources of a slot from one row to another."""
+    """Copy, from one row to another, the vehicles that corroborate ice or grip in a cell."""
     for side in range(2):
         for k in range(SOURCES):
             target[to].source[side, k] = source[at].source[side, k]

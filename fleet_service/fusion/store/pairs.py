@@ -1,5 +1,5 @@
-"""Earlier reports of a vehicle in a cell: its linked entries in the window, and a record of the
-older reports.
+"""Earlier reports of one vehicle in one cell (a pair): linked entries in the lateness window, and a
+record of the older reports.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ _FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its
 
 @refcount_free_inlined
 def comes_before(entries: RecordArray, a: int, b: int) -> bool:
-    """Return True if entry `a` comes before `b`: by time, then by identity."""
+    """Return True if window entry `a` comes before `b`: ordered by time, then by vehicle, start and
+    sequence number.
+    """
     if entries[a].time != entries[b].time:
         return bool(entries[a].time < entries[b].time)
     if entries[a].number != entries[b].number:
@@ -31,7 +33,9 @@ def comes_before(entries: RecordArray, a: int, b: int) -> bool:
 
 @refcount_free_inlined
 def pair_of(pairs: RecordArray, used: IntArray, slot: int, vehicle: int) -> int:
-    """Return the row of the pair of `slot` and `vehicle`; create the pair if it does not exist."""
+    """Return the row of the pair of `slot` (cell and sector) and `vehicle`; create the pair if it
+    does not exist.
+    """
     pair = pair_place(pairs, slot, vehicle)
     if pairs[pair].slot == NONE:
         pairs[pair].slot = slot
@@ -67,8 +71,8 @@ def link_pair(entries: RecordArray, pairs: RecordArray, pair: int, entry: int) -
 
 @refcount_free_inlined
 def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
-    """Move an entry's report into the record of its vehicle's reports before the checkpoint, and
-    unlink the entry from later entries.
+    """Move an entry's report into the record of its vehicle's older reports, and unlink the entry
+    from later entries of the vehicle.
     """
     pair = int(entries[entry].pair)
     kind = int(entries[entry].kind)
@@ -86,16 +90,16 @@ def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 
 @refcount_free_inlined
 def _must_stay(pairs: RecordArray, place: int, least: int) -> bool:
-    """Return True if a pair reported at `least` [s] or later, or has entries in the window."""
+    """Return True if the record of a vehicle and cell must stay: the vehicle reported there at
+    `least` [s] or later, or has entries in the window.
+    """
     pair = pairs[place]
     return bool(pair.last != NONE or pair.time[0] >= least or pair.time[1] >= least)
 
 
 @compiled
 def count_staying(pairs: RecordArray, least: int) -> int:
-    """Return the number of pairs that must stay: they reported at `least` [s] or later, or have
-    entries in the window.
-    """
+    """Return the number of pairs (vehicle and cell) that must stay, see `_must_stay`."""
     count = 0
     for place in range(len(pairs)):
         count += pairs[place].slot != NONE and _must_stay(pairs, place, least)
@@ -104,8 +108,8 @@ def count_staying(pairs: RecordArray, least: int) -> int:
 
 @compiled
 def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: int) -> IntArray:
-    """Move the pairs that must stay (see `_must_stay`) to another table; return the rows of the
-    pairs that are dropped, in the old table.
+    """Move the pairs (vehicle and cell) that must stay to another table, see `_must_stay`. Return
+    the rows of the other pairs in the old table.
     """
     dropped = np.empty(len(old), np.int64)
     count = 0
@@ -140,8 +144,8 @@ def returning_bit(number: int) -> np.uint64:
 
 @compiled
 def mark_returned(state: State, slots: IntArray, numbers: IntArray) -> None:
-    """Mark in cells (k,) that vehicles (k,) have been there, because their reports are about to be
-    forgotten.
+    """Record in cells (k,) that vehicles (k,) have visited them, because the vehicles' reports
+    there are about to be forgotten.
     """
     for k in range(len(slots)):
         slot = slots[k]

@@ -144,14 +144,14 @@ class EntryRecord:
 
 
 class WindowRecord:
-    """The window of a slot.
+    """The lateness window of a slot (cell and sector).
 
     Attributes:
         slot: the slot; NONE if the window is not in use.
         head, tail: first and last entry.
         stale: 1 if the live row must be computed again.
         first: time of the first entry [ns].
-        values: number of entries that are values.
+        values: number of entries that are values (not only lower bounds).
     """
 
     slot: np.int32
@@ -187,8 +187,8 @@ class PairRecord:
 
 
 class SourcesRecord:
-    """The last SOURCES vehicles that reported grip, and those that reported ice, in a slot, with
-    the times of their reports [s].
+    """The last SOURCES vehicles that reported grip in a cell and sector, and the last that reported
+    ice, with the times of their reports [s].
     """
 
     source: Annotated[Int32Array, 2, SOURCES]
@@ -196,9 +196,9 @@ class SourcesRecord:
 
 
 class ReportersRecord:
-    """The recent reporters of a slot: the last REPORTERS vehicles that gave a value before the
-    checkpoint, with time [s], mean, standard deviation and grip used. The record also contains the
-    corroborating sources, as in `SourcesRecord`.
+    """The recent reporters of a cell and sector: the last REPORTERS vehicles that gave a value,
+    with time [s], mean, standard deviation and grip used. The record also contains the vehicles
+    that corroborate ice or grip, as in `SourcesRecord`.
     """
 
     reporter: Annotated[Int32Array, c.REPORTERS]
@@ -211,11 +211,12 @@ class ReportersRecord:
 
 
 class PeersRecord:
-    """Comparisons of one vehicle with others.
+    """Comparisons of one vehicle with others, and of its values with each other.
 
     Attributes:
         other: index of the other vehicle.
-        rank: pseudo-random rank of the pair, which decides between competing vehicles.
+        rank: pseudo-random rank of the pair, which decides between vehicles that compete for a
+            place.
         agreed, met: summed agreement, and number of comparisons.
         used_squares: weighted squares of the differences in grip used between two visits of the
             vehicle to one cell.
@@ -251,7 +252,7 @@ VEHICLE: Final = record_type(VehicleRecord)
 
 
 class Rows(NamedTuple):
-    """State of slots, in three arrays.
+    """State of slots (cells and sectors), in three arrays.
 
     Attributes:
         belief: packed beliefs, (n, 32).

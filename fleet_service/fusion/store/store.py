@@ -99,20 +99,20 @@ class Store:
 
     @property
     def live(self) -> Cells:
-        """All slots as columns."""
+        """State of all slots (cells and sectors) as columns."""
         return cells_of(self.state.live)
 
     @property
     def waiting(self) -> int:
-        """Number of window entries in use."""
+        """Number of entries (observations) in the lateness window."""
         return len(self.state.free_entries) - int(self.state.used[FREE_ENTRIES])
 
     def due_windows(self, before: int) -> tuple[IntArray, IntArray]:
-        """Return the windows with entries before `before` [ns]: first those without a value, then
-        those with a value, sorted by cell.
+        """Return the lateness windows with entries older than `before` [ns]: first those without a
+        value, then those with a value, sorted by cell.
 
-        Values that pass the checkpoint are compared with other values to compute trust. The order
-        of these comparisons must not depend on the order of arrival, so windows with values are
+        Values that leave the window are compared with other values to compute trust. The order of
+        these comparisons must not depend on the order of arrival, so windows with values are
         sorted. All others stay in the order of memory, which is faster.
         """
         plain, valued = find_due_windows(self.state.windows, before)
@@ -121,7 +121,7 @@ class Store:
         ]
 
     def slots_of(self, keys: IntArray) -> IntArray:
-        """Return the slot of each key; NONE if the key has no slot."""
+        """Return the slot of each key (cell and sector); NONE if the key has no slot."""
         return rows_of(self._slots, self.state.live.cells, np.asarray(keys, np.int64))
 
     @property
@@ -130,8 +130,8 @@ class Store:
         return self._slots
 
     def slots_for(self, keys: IntArray) -> IntArray:
-        """Return the slot of each key. An unknown key gets a new slot, which begins with the
-        prior.
+        """Return the slot of each key (cell and sector). An unknown key gets a new slot, which
+        begins with the prior.
         """
         slots = self.slots_of(keys)
         new = np.flatnonzero(slots == NONE)
@@ -155,7 +155,7 @@ class Store:
         return rows_of(self._known, self.names, vehicle)
 
     def vehicles_of(self, vehicle: IntArray) -> IntArray:
-        """Return the index of each vehicle; an unknown one gets the next index."""
+        """Return the index of each vehicle; an unknown vehicle gets the next free index."""
         index = self.known(vehicle)
         if not len(index) or index.min() != NONE:
             return index
@@ -172,7 +172,7 @@ class Store:
         return index
 
     def reserve(self, rows: int) -> None:
-        """Grow every pool so that it has free rows for `rows` more votes."""
+        """Enlarge every memory pool so that it has space for `rows` more votes."""
         used = self.state.used
         if used[FREE_ENTRIES] < rows:
             self._more_entries(self.waiting + rows)
@@ -206,9 +206,9 @@ class Store:
         self.state = old._replace(windows=windows, base=base, free_windows=free)
 
     def forget(self, checkpoint_s: int) -> None:
-        """Drop old records, once per hour of the checkpoint time: reports of vehicles older than
-        FORGOTTEN_S (`votes.discount_vote`), and reporters and sources older than an hour
-        (`trust.compare_reports`, `Fusion.sources`).
+        """Delete old data, once per hour of the checkpoint time: records of a vehicle in a cell
+        older than FORGOTTEN_S (`votes.discount_vote`), and lists of a cell's recent reporters older
+        than an hour (`trust.compare_reports`, `Fusion.sources`).
         """
         hour = checkpoint_s - checkpoint_s % _HOUR
         if hour != self.hour:
@@ -217,8 +217,8 @@ class Store:
             self._rebuild_reporters(hour - _HOUR - _AHEAD)
 
     def untouched(self, before: int) -> BoolArray:
-        """Return a mask of slots (size,): True if the last visit was before `before` [ns] and no
-        other record refers to the slot.
+        """Return a mask of slots (cells and sectors), (size,): True if the last visit was before
+        `before` [ns] and no other record refers to the slot.
         """
         cells = self.state.live.cells[: self.size]
         pairs = self.state.pairs
@@ -227,8 +227,8 @@ class Store:
         return np.asarray(found)
 
     def drop(self, gone: BoolArray) -> IntArray:
-        """Delete the slots that the mask `gone` (size,) selects; all must be `untouched`. Return
-        the new number of each slot, NONE for deleted ones.
+        """Delete the slots (cells and sectors) that the mask `gone` (size,) selects; all must be
+        `untouched`. Return the new number of each slot, NONE for deleted ones.
         """
         stay = np.flatnonzero(~gone)
         place = np.full(self.size, NONE, np.int64)
@@ -247,7 +247,9 @@ class Store:
         return place
 
     def _rebuild_pairs(self, least: int, most: int) -> None:
-        """Drop pairs that last reported before `least` [s], and make room for `most` pairs."""
+        """Delete the records of vehicles in cells whose last report was before `least` [s], and
+        make room for `most` such records.
+        """
         state = self.state
         old = state.pairs
         count = count_staying(old, least)
@@ -258,8 +260,8 @@ class Store:
         self.state = state._replace(pairs=new)
 
     def _rebuild_reporters(self, least: int) -> None:
-        """Drop reporters whose last report was before `least` [s]. Slots with a window keep their
-        reporters.
+        """Delete lists of recent reporters whose last report was before `least` [s]. Cells with a
+        lateness window keep their lists.
         """
         live = self.state.live
         cells = self.state.live.cells[: self.size]
@@ -278,8 +280,8 @@ class Store:
 
 @compiled
 def find_due_windows(windows: RecordArray, before: int) -> tuple[IntArray, IntArray]:
-    """Return two arrays: the windows without a value and the windows with a value, among those with
-    entries before `before` [ns].
+    """Return two arrays of lateness windows with entries older than `before` [ns]: those without a
+    value, and those with a value.
     """
     plain = np.empty(len(windows), np.int64)
     valued = np.empty(len(windows), np.int64)
@@ -297,7 +299,7 @@ def find_due_windows(windows: RecordArray, before: int) -> tuple[IntArray, IntAr
 
 
 def no_peers(vehicles: int) -> RecordArray:
-    """Return records of vehicles whose values have not been compared with others yet."""
+    """Return empty comparison records for vehicles that have not been compared with others yet."""
     peers = np.zeros(vehicles, PEER)
     peers["other"] = NOBODY
     return peers
@@ -329,8 +331,8 @@ def _grow_rows(old: Array, rows: int) -> Array:
 
 
 def _free_rows(old: Int32Array, used: IntArray, which: int, rows: int) -> Int32Array:
-    """Return the stack of free rows after a pool has grown to `rows`: the earlier free rows and the
-    new ones. The number of free rows is stored in `used[which]`.
+    """Return the stack of free rows of a memory pool after it has grown to `rows`: the earlier free
+    rows and the new ones. The number of free rows is stored in `used[which]`.
     """
     count = int(used[which])
     more = rows - len(old)

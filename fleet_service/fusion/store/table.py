@@ -45,25 +45,31 @@ def _hash_key(key: int | np.int64) -> np.uint64:
 
 @refcount_free_inlined
 def _first_place(mixed: np.uint64, places: int) -> int:
-    """Return the place at which the search for a key with hash `mixed` begins."""
+    """Return the place of the table at which the search for a key begins; `mixed` is the key's
+    hash.
+    """
     return int(np.int64(((mixed >> np.uint64(32)) * np.uint64(places)) >> np.uint64(32)))
 
 
 @refcount_free_inlined
 def _row_at(held: int) -> int:
-    """Return the row number in the content of a place; NONE if the place is free."""
+    """Return the row number that a place of the table contains; NONE if the place is free."""
     return int(np.int32(held & _LOWER))
 
 
 @refcount_free_inlined
 def _place_content(mixed: np.uint64, row: int) -> int:
-    """Return the content of a place for a key and its row; never NONE."""
+    """Return the integer that a place of the table must contain for a key and its row. It never
+    equals NONE.
+    """
     return int((np.int64(mixed & np.uint64(_TAG)) << 32) | row)
 
 
 @refcount_free_inlined
 def locate_key(table: IntArray, rows: RecordArray, key: int) -> int:
-    """Return the place of the row with `key`; if there is none, the free place where it belongs."""
+    """Return the place of the table that refers to the row with `key`; if there is no such row, the
+    free place where it belongs.
+    """
     mixed = _hash_key(key)
     place = _first_place(mixed, len(table))
     tag = np.int64(mixed & np.uint64(_TAG))
@@ -98,8 +104,8 @@ def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
 
 @compiled
 def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int) -> tuple[IntArray, int]:
-    """Return the slot of each key, (n,), and the number of slots in use afterwards. An unknown key
-    gets the next free slot; the table must have room for it.
+    """Return the slot of each key (cell and sector), (n,), and the number of slots in use
+    afterwards. An unknown key gets the next free slot; the table must have room for it.
     """
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
@@ -132,7 +138,7 @@ def assign_rows(
 
 @compiled
 def fill_table(table: IntArray, rows: RecordArray, used: int) -> None:
-    """Enter the first `used` rows into an empty table."""
+    """Enter the first `used` rows into an empty hash table."""
     for row in range(used):
         table[locate_key(table, rows, rows[row].key)] = _place_content(
             _hash_key(rows[row].key), row
@@ -141,14 +147,14 @@ def fill_table(table: IntArray, rows: RecordArray, used: int) -> None:
 
 @refcount_free_inlined
 def first_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
-    """Return the place at which the search for a pair begins."""
+    """Return the place of the table at which the search for a pair of slot and vehicle begins."""
     return _first_place(_hash_key((np.int64(slot) << np.int64(32)) | np.int64(vehicle)), len(pairs))
 
 
 @refcount_free_inlined
 def pair_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
-    """Return the place of a pair in a table that contains the pair records themselves; if the pair
-    is unknown, the free place (slot NONE) where it belongs.
+    """Return the place of a pair of slot and vehicle in a table that contains the pair records
+    themselves. If the pair is unknown, return the free place (slot NONE) where it belongs.
     """
     place = first_place(pairs, slot, vehicle)
     while pairs[place].slot != NONE and (
@@ -166,12 +172,13 @@ def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
 
 
 def places_for(entries: int, most: float) -> int:
-    """Return the number of places of a table for `entries` and 35 % more at a load of `most`. For
-    pairs, which live three hours, this is the growth of one more hour.
+    """Return the number of places of a table for 35 % more than `entries` at a load of `most`. For
+    records of vehicles in cells, which live three hours, this allows for the growth of another
+    hour.
     """
     return max(LEAST, int(1.35 * entries / most))
 
 
 def is_full(entries: int, places: int, most: float) -> bool:
-    """Return True if the entries fill more than a share `most` of the places."""
+    """Return True if the number of entries exceeds the share `most` of the number of places."""
     return entries > most * places
