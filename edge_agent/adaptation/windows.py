@@ -25,8 +25,10 @@ def push_innovation(window: FloatArray, innovation: float) -> None:
 def weighted_noise(
     window: FloatArray, predicted: float, nominal: float, least: float, largest: float
 ) -> float:
-    """Return R of a row from its window (N,), limited to [least, largest]*nominal. While the window
-    is not full, return `nominal`.
+    """Return the noise variance R of one measurement row from its window of innovations (N,),
+    limited to [least, largest]*nominal. While the window is not full, return `nominal`.
+
+    `predicted` is P, the variance of the predicted measurement.
     """
     weight = total = 0.0
     for error in window:

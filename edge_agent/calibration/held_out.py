@@ -31,7 +31,7 @@ WORSE: Final = 0.02  # [nat/s] below which a difference of predictions is roundi
 LONGER: Final = 0.005  # of the time in contradiction, likewise
 
 Drive: TypeAlias = tuple[FloatArray, FloatArray]
-"""Times (T,) [s] and signals (T, 18)."""
+"""A drive: times (T,) [s] and signals (T, 18)."""
 
 
 class Prediction(NamedTuple):
@@ -54,7 +54,7 @@ class HeldOut(NamedTuple):
 
 
 Judge: TypeAlias = Callable[[Vehicle, Drive], Prediction]
-"""Replays a drive with a vehicle."""
+"""Function that replays a drive with a vehicle and returns the predictive score."""
 
 
 def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> HeldOut:

@@ -105,8 +105,8 @@ ROLLING: Final = 0.008  # [1] rolling resistance over load
 BRAKED_FRONT: Final = 0.7  # [1] share of the front axle in braking
 
 DriveEstimates: TypeAlias = dict[str, float]
-"""Estimates of one drive by quantity; QUANTITY_std is the standard deviation that its regression
-states.
+"""Estimates of one drive, by the name of the quantity. The key QUANTITY_std has the standard
+deviation that the regression states for QUANTITY.
 """
 
 

@@ -123,7 +123,7 @@ def body_of(row: FloatArray) -> Body:
 
 
 Four: TypeAlias = tuple[float, float, float, float]
-"""A number of each wheel."""
+"""One number per wheel, in the order fl, fr, rl, rr."""
 
 
 @inlined

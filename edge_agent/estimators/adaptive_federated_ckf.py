@@ -87,11 +87,11 @@ AS_PRINTED: Final = AdaptiveSetting(
         wheel_speed=False,
     )
 )
-"""Q and R of section 4.3's first experiment, Q read per second squared: .01*T^2 is what a step
-adds.
+"""Q and R of the first experiment in section 4.3. The printed Q is interpreted as a variance per
+second squared, so a step adds .01*T^2.
 
-P_0 is 1e-6*I, because the paper begins at the truth: with the printed I the first samples move u,
-which nothing printed measures, by decimetres per second.
+P_0 is 1e-6*I, because the paper starts at the true state. With the printed P_0 = I, the first
+samples would change v_x by decimetres per second, because no printed measurement observes v_x.
 """
 
 
@@ -276,4 +276,4 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "section 5", "hardware in the loop", "left out", "the two drives are simulated instead"
     ),
 )
-"""Elements of the paper."""
+"""Elements of the paper, and the treatment of each one in the code."""

@@ -19,16 +19,19 @@ from schemas.runtime.jit import entry_point
 from schemas.runtime.records import RecordArray
 
 Part: TypeAlias = tuple[int, int, int]
-"""Which context a thread has to itself, and its vehicles [first, last)."""
+"""Part of a bank for one thread: index of the context that only this thread uses, and its range of
+vehicles [first, last).
+"""
 
 Kernel: TypeAlias = Callable[..., None]
-"""kernel(filters, contexts, t, signals, outputs, part), or with visits = (closes, evidence) before
-part.
+"""Compiled function that advances filters: kernel(filters, contexts, t, signals, outputs, part), or
+with visits = (closes, evidence) before `part`.
 
-Takes t (T, N) and signals (T, N, 18) of the vehicles of `part`, changes their filters (N,), writes
-outputs (T, N, …) indexed by Column and, where closes (T, N) says so and where friction jumps within
-a visit, evidence (T, N, 32); closes (0, N) is nowhere. A context holds the tables that all filters
-read, and arrays that a step writes before it reads them.
+It reads t (T, N) and signals (T, N, 18) of the vehicles of `part`, changes their filters (N,), and
+writes outputs (T, N, …), indexed by Column. It writes evidence (T, N, 32) where closes (T, N) is
+True and where friction jumps within a visit; closes with shape (0, N) means nowhere. A context
+contains the tables that all filters read, and scratch arrays that a step writes before it reads
+them.
 """
 
 

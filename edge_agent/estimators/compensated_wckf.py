@@ -443,4 +443,4 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "no data; the tables repeat those of the simulation digit for digit",
     ),
 )
-"""Elements of the paper."""
+"""Elements of the paper, and the treatment of each one in the code."""

@@ -347,4 +347,4 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         where="lab.evaluation.papers",
     ),
 )
-"""Elements of the paper."""
+"""Elements of the paper, and the treatment of each one in the code."""

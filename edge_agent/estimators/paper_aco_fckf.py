@@ -86,16 +86,17 @@ class Setting(NamedTuple):
 AT_THE_TRUTH = Setting(
     start=(1e-6, 1e-6, 1e-3, 1e-3, 1e-6, 1e-6), noise=(0.05, 0.05, 0.05), mu=0.85, straight=True
 )
-"""The paper's experiments: R known, and the start (section IV.A) so well known that the printed
-mu error can be met.
+"""Setting for the paper's experiments: R is known, and the initial state (section IV.A) is so
+accurate that the printed error of mu can be reached.
 """
 
 
 AS_PRINTED = AT_THE_TRUTH._replace(process=(0.1 * STEP_S**2,) * STATES, start=(0.2,) * STATES)
-"""The printed P_0 = .2*I and R = .05*I, and Q = .1*I read per second squared: .1*T^2 is what a step
-adds.
+"""Setting as printed: P_0 = .2*I, R = .05*I, and Q = .1*I, interpreted as a variance per second
+squared, so a step adds .1*T^2.
 
-With Q = .1*I per step the yaw-rate error stays near .13 rad/s, which the printed tables contradict.
+With Q = .1*I per step, the error of the yaw rate stays near .13 rad/s, which contradicts the
+printed tables.
 """
 
 
@@ -419,4 +420,4 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "they show nothing that is measured",
     ),
 )
-"""Elements of the paper."""
+"""Elements of the paper, and the treatment of each one in the code."""

@@ -431,4 +431,4 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "figures 1 to 4", "sketches of model, tyre, filter and simulation", "left out", "no results"
     ),
 )
-"""Elements of the paper."""
+"""Elements of the paper, and the treatment of each one in the code."""

@@ -93,15 +93,14 @@ def context_block(
     Signals without a value are NaN (unknown). For sources without a profile, for example a
     simulation:
 
-        Block(t, time, signals, context_block(*t.shape, {"abs_active": truth.abs, "air_temperature":
-        -3.0}))
+        values = {"abs_active": truth.abs, "air_temperature": -3.0}
+        Block(t, time, signals, context_block(*t.shape, values))
 
     Args:
         samples: number T of samples.
         vehicles: number N of vehicles.
-        values: values by signal name (from CONTEXT); each has shape (T, N) or (N,), or is one
-            number;
-            flags may be boolean; NaN is unknown.
+        values: values by signal name (from CONTEXT), each of shape (T, N) or (N,), or one number.
+            Flags may be boolean; NaN is unknown.
 
     Raises:
         KeyError: a name is not one of CONTEXT.

@@ -46,8 +46,8 @@ def magic_formulas(theta: FloatArray, c: float, e: float) -> FloatArray:
 
 
 Curve: TypeAlias = Callable[[FloatArray], FloatArray]
-"""Force over mu*F_z of normalised slips theta >= 0: slope 1 at none, peak 1, and level or
-falling beyond.
+"""Tyre curve: force over mu*F_z as a function of normalised slips theta >= 0. Its slope is 1 at
+theta = 0 and its peak is 1; beyond the peak it is constant or falls.
 """
 
 

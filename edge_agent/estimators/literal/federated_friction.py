@@ -37,7 +37,7 @@ class FederatedSetting(NamedTuple):
 
 
 AS_PRINTED: Final = FederatedSetting()
-"""(57)."""
+"""Setting of the paper (equation 57)."""
 
 
 def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:

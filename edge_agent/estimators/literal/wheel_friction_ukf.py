@@ -52,8 +52,8 @@ class UnscentedSetting(NamedTuple):
 
 
 AS_PRINTED: Final = UnscentedSetting()
-"""The printed alpha, kappa and beta; Q, R and P_0 are lost in the text and of the size that it
-describes.
+"""Setting of the paper, with the printed alpha, kappa and beta. Q, R and P_0 are lost in the text
+copy; their sizes here follow its description.
 """
 UKF: Final = UnscentedSetting(square_root=False)
 UKF_SINGLE: Final = UnscentedSetting(square_root=False, single=True)

@@ -1,9 +1,12 @@
 """Comparison of pairs of quantities that are equal by physics: gain, offset, lag and confidence.
 
-identity left right checks lateral a_y v · r unit and sign of a_y, v, r longitudinal a_x dv/dt unit
-and sign of a_x, v steering δ · v L · r unit and sign of δ, v, r (plus a term understeer · v² r)
-axle r_w r which wheel is left, v, r ground v_g v unit of v: the wheels' radius turning d course r
-sign and unit of r
+    identity       left        right    checks
+    lateral        a_y         v · r    unit and sign of a_y, v, r
+    longitudinal   a_x         dv/dt    unit and sign of a_x, v
+    steering       δ · v       L · r    unit and sign of δ, v, r (plus a term understeer · v² r)
+    axle           r_w         r        which wheel is left, v, r
+    ground         v_g         v        unit of v: the wheels' radius
+    turning        d course    r        sign and unit of r
 
 Symbols: v speed and r_w yaw rate from the wheels, r yaw rate of the gyroscope, δ steering angle, L
 wheelbase, v_g speed over ground (see `drive`).

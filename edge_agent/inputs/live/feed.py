@@ -31,7 +31,7 @@ MOST_WAITING: Final = 200_000  # messages that wait for the loop, minutes of a b
 LEAVE_S: Final = 2.0
 
 Heard: TypeAlias = tuple[float, Any]
-"""When [s of the host], and what."""
+"""A received message: its time [s of the host's clock], and its content."""
 
 log = logging.getLogger(__name__)
 

@@ -55,8 +55,8 @@ Log: TypeAlias = dict[Key, Frames]
 
 
 Taker: TypeAlias = Callable[[set[int]], tuple[Log, float]]
-"""Frames of the wanted identifiers, and the time of the log's first frame [s since 1970 UTC, or
-since its start].
+"""Function that returns the frames with the wanted identifiers, and the time of the log's first
+frame [s since 1970 UTC, or since the start of the log].
 """
 
 

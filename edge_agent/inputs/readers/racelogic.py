@@ -1,8 +1,10 @@
 """Reader of Racelogic VBO files, and of tables with the same columns, with times, positions and
 units of that format.
 
-time hhmmss.ss UTC of the day lat, long minutes, west positive velocity km/h heading degrees,
-clockwise from north
+    time        hhmmss.ss UTC of the day
+    lat, long   minutes, west positive
+    velocity    km/h
+    heading     degrees, clockwise from north
 """
 
 from __future__ import annotations

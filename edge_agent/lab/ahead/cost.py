@@ -97,7 +97,12 @@ def cost_figures(seed: int, metres: float) -> list[Figure]:
 def drive_way(
     rng: np.random.Generator, known: IntArray, metres: float, *, routed: bool
 ) -> tuple[float, float]:
-    """Drive a random route; return (megabytes received, processor time over driving time)."""
+    """Drive a random route of `metres` through the city; return (megabytes received, processor time
+    over driving time).
+
+    `known` are the keys of all places that the service knows. With `routed`, the car knows its
+    route.
+    """
     corners = draw_way(rng, metres)
     run = BLOCK_M * np.arange(len(corners))
     route = GivenRoute(*to_degrees(corners[:, 0], corners[:, 1], CENTRE))

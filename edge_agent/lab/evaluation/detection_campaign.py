@@ -5,7 +5,6 @@ Half of the towns are winter towns, in which all cars have winter equipment. To 
 towns and print a table:
 
     python -m edge_agent.lab.evaluation.detection_campaign 50001:rough 50002:plain:900
-    50003:rough:120:winter
 
 Each town is SEED, SEED:KIND, SEED:KIND:SECONDS or SEED:KIND:SECONDS:winter.
 """

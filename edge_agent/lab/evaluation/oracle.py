@@ -131,8 +131,8 @@ def _speed(heard: OracleSignals, n: int, rho: float) -> float:
 
 
 def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-    """Return (|μ − truth| at the end of 003.accel, the oracle's expected error), one value per seed
-    each.
+    """Return two arrays with one value per seed: the oracle's error |μ − true value| at the end of
+    the drive 003.accel, and the error that the oracle itself expects.
     """
     scenario = PAPERS["003.accel"]
     exact = realistic(scenario, seeds[:1], "ideal")

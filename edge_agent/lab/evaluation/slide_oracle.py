@@ -79,8 +79,10 @@ def visit_evidence(
 def _evidence(
     force: FloatArray, slip: FloatArray, noise: FloatArray, tyres: FloatArray
 ) -> FloatArray:
-    """Return ln L (TYRES, BINS) for each of `tyres` (TYRES, 3). `noise` (T,) is the standard
-    deviation of q.
+    """Return ln L on the friction grid for each tyre of the sample, (TYRES, BINS).
+
+    force and slip are f and q with noise, (T, 4); noise (T,) is the standard deviation of q; tyres
+    (TYRES, 3) is the result of `tyres_drawn`.
     """
     out = np.zeros((tyres.shape[0], BINS))
     for j in range(tyres.shape[0]):

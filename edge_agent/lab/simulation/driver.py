@@ -29,7 +29,7 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
 Lanes: TypeAlias = tuple[FloatArray, IntArray, IntArray, FloatArray, IntArray]
-"""The arrays of a `Network`: points, first, size, spacing, ways."""
+"""The arrays of a `Network`, in this order: points, first, size, spacing, ways."""
 Key: TypeAlias = np.uint64
 KeyArray: TypeAlias = NDArray[np.uint64]
 

@@ -49,7 +49,9 @@ class Fault:
 
 
 Effect = Callable[[FloatArray, BoolArray, float], None]
-"""(values (T,) of one channel, changed in place; when (T,); size)."""
+"""Function that applies a fault. Its arguments are the values (T,) of one channel, which it changes
+in place; `when` (T,), which is True during the fault; and the size of the fault.
+"""
 
 
 def drop_readings(values: FloatArray, when: BoolArray, _size: float) -> None:

@@ -55,8 +55,8 @@ class TimedFriction(NamedTuple):
 
 
 Friction = float | Callable[[float, float], float] | TimedFriction
-"""Friction everywhere, or a function of (x along the track, y to the left) [m], evaluated at each
-wheel, or a function of time.
+"""Friction of the track: one value everywhere; or a function of (x along the track, y to the left)
+[m], evaluated at each wheel; or a value that changes at a time.
 """
 
 

@@ -186,7 +186,7 @@ ROADS: Final[dict[str, Callable[[int], Relief]]] = {
     "banked": banked_relief,
     "hilly": hilly_relief,
 }
-"""Test tracks by name; each is drawn by a seed."""
+"""Functions that return the relief of a test track for a seed, by name."""
 
 
 def road_named(name: str | Relief, seed: int, slope: float = 0.0) -> Relief:
