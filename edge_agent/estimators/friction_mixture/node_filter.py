@@ -242,12 +242,13 @@ def weigh_slopes(
 
 @compiled
 def slip_noise_correction(slope: float) -> float:
-    """Return the share of slip noise that does not enter a residual on a curve of this slope,
-    relative to the half that enters at slope 1.
+    """Return one half minus the share of the slip noise variance that enters a residual where the
+    tyre curve has this slope.
 
-    In the direction normal to a line of slope k, slip noise counts by k^2/(1 + k^2) (errors in
-    variables). If the noise counted equally on the flat and on the rising part of the curve, it
-    would favour nodes whose wheels slide, because slip noise does not enter their residuals.
+    A residual is the distance normal to the curve. On a line of slope k, the share k^2/(1 + k^2) of
+    the slip noise enters it (errors in variables); at slope 1 this is one half, which
+    features.noise_std already contains. A constant share would be too large on the flat part of the
+    curve, where hardly any slip noise enters, and would favour nodes whose wheels slide.
     """
     return 0.5 - slope * slope / (1.0 + slope * slope)
 

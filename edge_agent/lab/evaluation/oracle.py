@@ -67,7 +67,7 @@ class OracleSignals(NamedTuple):
 
 
 def speed(seeds: Sequence[int]) -> FloatArray:
-    """Return the RMSE of v_x [m/s] in 002.sine, one per seed."""
+    """Return the RMSE of the oracle's v_x [m/s] in the drive 002.sine, one value per seed."""
     scenario = PAPERS["002.sine"]
     car = scenario.vehicle
     batch = realistic(scenario, seeds)

@@ -1,7 +1,7 @@
 """The scenarios of the evaluation: the papers' manoeuvres with the papers' vehicles, those for the
 default estimator's targets, and other vehicles.
 
-Data that a paper does not give (tyres, wheel inertia, the vehicle of 003) are those of the
+Data that a paper does not give (tyres, wheel inertia, the vehicle of paper 003) are those of the
 simulator's sedan or of an ordinary car. All four wheels are driven, as in the papers.
 """
 
@@ -54,8 +54,8 @@ MATCHED: Final = matched_to_papers(
 
 
 def steered_behind(speed: float) -> TrueVehicle:
-    """Return the vehicle of 000 and 001 with the rear wheels steered for zero sideslip in a steady
-    turn at `speed` [m/s].
+    """Return the vehicle of papers 000 and 001 with the rear wheels steered for zero sideslip in a
+    steady turn at `speed` [m/s].
 
     Paper 001, equation 53: (K*m*a*v^2 - b) / (K*m*b*v^2 + a), K = 1/(axle stiffness*wheelbase), the
     same for both axles.
