@@ -1,8 +1,8 @@
-"""Segment log: queue of admitted rows that are written to disk as segments. A batch is acknowledged
-only after its rows are in a segment that is synced to disk.
+"""Segment log: queue of admitted rows that a thread writes to disk as segments (Parquet files). A
+batch is acknowledged only after its rows are in a segment that is synced to disk.
 
-A separate thread writes segments, so that messages can be processed meanwhile. Only batches that
-`end` returns may be acknowledged.
+Messages can be processed while a segment is written. Only batches that `end` returns may be
+acknowledged.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ Upload = Callable[[Sequence[Path]], None]
 
 
 class _Load(Generic[Batch]):
-    """Rows that are written together, by kind, and the batches to which they belong."""
+    """Rows that are written together, by kind (observations or states), and the batches to which
+    they belong.
+    """
 
     def __init__(self) -> None:
         self.waiting: dict[Kind, list[Rows]] = {kind: [] for kind in Kind}
@@ -37,14 +39,16 @@ class _Load(Generic[Batch]):
         return sum(len(part["row"]) for waiting in list(self.waiting.values()) for part in waiting)
 
     def take(self, other: _Load[Batch]) -> None:
-        """Append the waiting rows and the segments of another load."""
+        """Append the waiting rows, and the segments already written, of another load to this
+        one.
+        """
         for kind, waiting in other.waiting.items():
             self.waiting[kind] = self.waiting[kind] + waiting
         self.batches += other.batches
 
     def write(self, writer: Writer, upload: Upload | None) -> None:
-        """Write one segment per kind that has waiting rows, then make all segments durable, on disk
-        and with `upload`.
+        """Write one segment per kind (observations or states) that has waiting rows. Then make all
+        segments durable, on disk and with `upload`.
         """
         for kind, waiting in self.waiting.items():
             if waiting:
@@ -67,7 +71,7 @@ class SegmentLog(Generic[Batch]):
         shard: name of the service.
         upload: function that makes segments durable in a second place; if given, a batch is durable
             only when it is in both places.
-        epoch: smallest allowed epoch, from the lease.
+        epoch: smallest number that may be used as the epoch in segment names, from the lease.
     """
 
     def __init__(
@@ -95,7 +99,7 @@ class SegmentLog(Generic[Batch]):
 
     @property
     def rows(self) -> int:
-        """Return the number of rows that are not durable yet."""
+        """Return the number of rows that are not yet durable."""
         return self._next.rows + self._load.rows
 
     @property
@@ -109,7 +113,7 @@ class SegmentLog(Generic[Batch]):
         return self._written is not None and self._written.done()
 
     def add(self, kind: Kind, rows: Rows, batches: Sequence[Batch]) -> None:
-        """Queue rows, and the batches they belong to, for the next write."""
+        """Add rows, and the batches to which they belong, to the queue for the next write."""
         self._next.waiting[kind].append(rows)
         self._next.batches += batches
 

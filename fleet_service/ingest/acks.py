@@ -20,7 +20,9 @@ AckedStream = tuple[int, Kind, int]  # boot, kind, region
 
 
 class Acks:
-    """Acknowledgements that have not been sent yet, by stream."""
+    """Acknowledgements that have not been sent yet, by stream (batches of one vehicle, start, kind
+    and region).
+    """
 
     def __init__(self) -> None:
         self._durable: dict[SequenceTracker, list[int]] = defaultdict(list)
@@ -43,14 +45,16 @@ class Acks:
             self._late[stream].add(seq)
 
     def record_rejected(self, vehicle: str, batch: Head, row: int, reason: str) -> None:
-        """Record that a batch was rejected."""
+        """Record that a batch was rejected because of the row `row`, with the reason for the
+        sender.
+        """
         self._rejected[vehicle][batch.boot, batch.kind, batch.region].append(
             (batch.seq, row, reason)
         )
 
     def messages(self, time: int = 0) -> list[tuple[str, bytes]]:
-        """Return (vehicle, bytes of an `Ack` message) for everything collected, and reset the
-        collection. `time` is the service's clock [ns], which is part of the message.
+        """Return pairs of vehicle name and bytes of an `Ack` message for everything collected, and
+        clear the collection. `time` is the service's clock [ns], which is part of the message.
         """
         settled: dict[str, dict[AckedStream, list[int]]] = {
             vehicle: {} for vehicle in self._rejected

@@ -39,7 +39,9 @@ from schemas.wire.batches import (
 
 
 def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
-    """Decode batches of one kind, given as pairs of payload and encoding."""
+    """Decode messages with batches of one kind (observations or states), given as pairs of payload
+    and encoding.
+    """
     errors: list[tuple[int, WireError]] = []
     usual = {ENCODING[kind], *PLAIN}
     plain = [
@@ -86,7 +88,7 @@ def _reencode_message(kind: Kind, payload: bytes, encoding: str) -> bytes:
 
 
 class _Fields(NamedTuple):
-    """Positions of the fields of k messages."""
+    """Positions of the fields of k messages in their bytes."""
 
     kind: Kind
     data: NDArray[np.uint8]
@@ -107,8 +109,8 @@ class _Fields(NamedTuple):
         )
 
     def heads(self) -> Heads:
-        """Return the heads of the messages; a missing `first_held` is replaced with 1, the lowest
-        sequence number.
+        """Return the heads (fields other than records) of the messages. A missing `first_held` is
+        replaced with 1, the lowest sequence number.
         """
         data = self.data.tobytes()
         texts = {

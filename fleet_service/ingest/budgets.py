@@ -53,16 +53,16 @@ class Bucket:
 
 
 class NewCells:
-    """Limit on the number of cells that a vehicle may visit as the first vehicle."""
+    """Limit on how many cells each vehicle may report that no vehicle has reported before."""
 
     def __init__(self, at_once: float = NEW_CELLS_AT_ONCE) -> None:
         self._budgets = Bucket(at_once, NEW_CELLS_PER_HOUR)
         self._week = Bucket(NEW_CELLS_PER_WEEK, NEW_CELLS_PER_WEEK / WEEK_HOURS)
 
     def beyond(self, vehicle: IntArray, cell: IntArray, now: float) -> BoolArray:
-        """Return a mask of rows (n,), all in cells without earlier visits: True if the row is
-        beyond its vehicle's budget. The other rows are charged to the budget. `now` is the time
-        [s].
+        """Return a mask of rows (n,): True if the row is beyond its vehicle's limit on new cells.
+        All given rows must be in cells without earlier visits. The other rows are charged to the
+        limit. `now` is the time [s].
         """
         out = np.zeros(len(vehicle), bool)
         order = np.lexsort((cell, vehicle))

@@ -29,14 +29,14 @@ StreamKey = tuple[
 
 
 class SequenceTracker:
-    """Accepted batches of one stream.
+    """Accepted batches of one stream (vehicle, start, kind, region).
 
     Attributes:
         key: name of the stream.
         vehicle: enrolled name of the sender; empty until it sends.
-        boot: start of the vehicle as sent; 0 until it sends.
+        boot: identifier of the vehicle's start, as sent; 0 until it sends.
         witness: permanent number of the vehicle in the map; 0 until it sends.
-        low: watermark: every sequence number up to here is settled, or will never arrive.
+        low: watermark: every sequence number up to here is accepted, or will never arrive.
         seen: accepted sequence numbers above the watermark.
         newest: newest time of an accepted record [ns]; it decides when the stream is dropped.
     """
@@ -84,7 +84,7 @@ class SequenceTracker:
                 self.accept(seq)
 
     def raise_to(self, first_held: int) -> None:
-        """Raise the watermark: sequence numbers below `first_held` will never arrive."""
+        """Raise the watermark, because sequence numbers below `first_held` will never arrive."""
         if first_held - 1 > self.low:
             if isinstance(self.seen, set):
                 if first_held - self.low > len(self.seen):
@@ -107,7 +107,7 @@ BatchId = tuple[SequenceTracker, int]  # and seq
 
 
 class SequenceTrackers:
-    """All streams of one service."""
+    """Accepted batches of all streams (vehicle, start, kind, region) of one service."""
 
     def __init__(self) -> None:
         self._streams: dict[StreamKey, SequenceTracker] = {}
@@ -147,8 +147,9 @@ class SequenceTrackers:
         )
 
     def columns(self) -> tuple[dict[str, IntArray], IntArray]:
-        """Return all streams as columns (n,), and the sequence numbers above all watermarks in one
-        array. The column `above` is the number of items of this array that belong to each stream.
+        """Return two items: all streams as columns (n,), and the accepted sequence numbers above
+        the watermarks of all streams in one array. The column `above` is the number of items of
+        this array that belong to each stream.
         """
         streams = list(self._streams.values())
         above = [sorted(stream.seen) for stream in streams]
@@ -168,7 +169,9 @@ class SequenceTrackers:
 
     @staticmethod
     def of(columns: Mapping[str, IntArray], above: IntArray) -> SequenceTrackers:
-        """Return the streams that the result of `columns` describes."""
+        """Return the streams that are described by `columns` and `above`, the result of the method
+        `columns`.
+        """
         out = SequenceTrackers()
         at = 0
         seqs = above.tolist()
@@ -185,8 +188,8 @@ class SequenceTrackers:
         return out
 
     def forget(self, before: int) -> None:
-        """Drop streams whose newest record is older than `before` [ns]. No duplicate can be
-        accepted afterwards, because a repeated batch would be refused as too old.
+        """Drop streams whose newest record is older than `before` [ns]. Duplicates of their batches
+        are still not accepted, because they are refused as too old.
         """
         for key in [key for key, stream in self._streams.items() if stream.newest < before]:
             del self._streams[key]
@@ -201,8 +204,8 @@ class SequenceTrackers:
         first_held: IntArray,
         time: IntArray,
     ) -> None:
-        """Record rows of one kind from the archive, (n,), in any order; `time` [ns] is the time of
-        each record.
+        """Record the batches of archived rows of one kind, (n,), as accepted; rows may be in any
+        order. `time` [ns] is the time of each record.
         """
         if not len(seq):
             return

@@ -88,7 +88,9 @@ class Inbox:
         self._guard = Lock()
 
     def callback(self, kind: Kind) -> Callable[[zenoh.Sample], None]:
-        """Return the subscriber's callback for one kind."""
+        """Return the callback for a Zenoh subscriber that receives batches of one kind
+        (observations or states).
+        """
 
         def take(sample: zenoh.Sample) -> None:
             key = str(sample.key_expr)
@@ -135,8 +137,8 @@ class Inbox:
 
 
 class AcceptedBatches(NamedTuple):
-    """Accepted batches of one kind, and their rows for the archive (without `late` and
-    `weight`).
+    """Accepted batches of one kind (observations or states), and their rows for the archive
+    (without the columns `late` and `weight`).
     """
 
     batches: list[BatchId]
@@ -316,9 +318,9 @@ class BatchIntake:
     def _look_up(
         self, kind: Kind, name: tuple[str, int, int, int], time: int
     ) -> SequenceTracker | None:
-        """Return the stream of a (vehicle, boot, region, day). Return None if a key cannot be read,
-        or if the vehicle opens too many streams. The vehicle then keeps its batch until the disk
-        works again, or until the next hour.
+        """Return the stream of a (vehicle, start, region, day). Return None if a key cannot be
+        read, or if the vehicle opens too many streams. The vehicle then keeps its batch until the
+        disk works again, or until the next hour.
         """
         vehicle, boot, region, _ = name
         try:
@@ -390,8 +392,9 @@ class BatchIntake:
     def _refuse_unusable(
         self, kind: Kind, owner: Parsed, message: Message, error: InputError
     ) -> None:
-        """Refuse a batch whose records cannot be used. If its head can be read, send a rejection,
-        because otherwise the vehicle would send the batch for ever. If not, only count the refusal.
+        """Refuse a batch whose records cannot be used. If its sender and sequence number can be
+        read, send a rejection, because otherwise the vehicle would send the batch for ever. If not,
+        only count the refusal.
         """
         head = head_of(kind, message.payload, message.encoding)
         named = (
@@ -426,7 +429,9 @@ def _newest_times(time: IntArray, sizes: IntArray) -> IntArray:
 
 
 def _select_batches(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, IntArray]:
-    """Return rows, heads and sizes of the batches at the positions `indices` (ascending)."""
+    """Return rows, heads (other fields) and numbers of rows of the batches at the positions
+    `indices` (ascending).
+    """
     rows: Rows = {**found.columns, "with_likelihood": found.with_likelihood}
     if len(indices) == len(found.sizes):
         return rows, found.heads, found.sizes

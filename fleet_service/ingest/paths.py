@@ -36,7 +36,7 @@ _START: Final = 64  # vehicles for which there is room at first
 
 
 class VehiclePaths:
-    """Recent path of each vehicle since the start of the service."""
+    """Recent path (times and places) of each vehicle since the start of the service."""
 
     def __init__(self) -> None:
         self._rows: dict[int, int] = {}  # row in the arrays, by vehicle
@@ -154,9 +154,9 @@ def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: P
 
 @compiled
 def _least_needed(anchors: IntArray) -> int:
-    """Return the index of the anchor that can be dropped with the least loss, given the times
-    (ANCHORS,) [ns]. It is the inner anchor with the smallest gap between its neighbours, relative
-    to its age.
+    """Return the index of the path's anchor (time and place) that can be dropped with the least
+    loss, given the anchors' times (ANCHORS,) [ns]. It is the inner anchor with the smallest gap
+    between its neighbours, relative to its age.
     """
     newest = anchors[-1]
     best = 1
@@ -171,8 +171,8 @@ def _least_needed(anchors: IntArray) -> int:
 
 @compiled
 def _excess_distance(apart: int, there: Float32Array, here: FloatArray) -> float:
-    """Return the distance [m] between two places (2,) [deg] that exceeds what FASTEST covers in the
-    time `apart` [ns].
+    """Return how far two places (2,) [deg] are apart beyond the distance that a vehicle covers at
+    the speed FASTEST in the time `apart` [ns]. The result is in metres, at least 0.
     """
     return max(_distance_m(there, here) - FASTEST * apart / NS, 0.0)
 

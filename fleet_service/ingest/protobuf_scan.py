@@ -167,8 +167,8 @@ def _read_varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
 
 @refcount_free
 def _scan_fields(scan: _Scan, ends: IntArray, first: int) -> None:
-    """Fill the result for all messages; `first` is the column whose length gives the number of
-    records.
+    """Find the fields of all messages and fill the result `scan.out`; `first` is the column whose
+    length gives the number of records.
     """
     data = scan.data
     layout = scan.layout

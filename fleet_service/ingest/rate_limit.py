@@ -76,8 +76,8 @@ class RateLimiter:
         return len(self._buckets)
 
     def _forget(self, now: float) -> bool:
-        """Drop full buckets, at most once per refill time; return True if there is room for another
-        bucket now.
+        """Drop the token buckets that are full (vehicles that have not sent recently), at most once
+        per refill time. Return True if there is room for another bucket.
         """
         rate = self._rate
         burst = self._burst

@@ -76,7 +76,7 @@ class Clock(NamedTuple):
 
 
 class Refusal(NamedTuple):
-    """Reason for a refusal: the rule (for counting), the row number, and the text for the
+    """Reason for refusing a batch: the rule (for counting), the row number, and the text for the
     sender.
     """
 
@@ -162,7 +162,9 @@ def _is_estimator(name: str) -> bool:
 
 @lru_cache(KEYS_REMEMBERED)
 def owner_of(key: str) -> keys.Parsed | None:
-    """Return vehicle and region of a key; None if it is not a concrete key of a vehicle."""
+    """Return the vehicle and region that a key names; None if it is not a concrete key of a
+    vehicle.
+    """
     try:
         parsed = keys.parse(key)
     except InputError:

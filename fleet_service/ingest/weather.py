@@ -192,7 +192,8 @@ def weather_files(root: Path) -> list[Path]:
 
 
 def join_daily_files(root: Path, damaged: Damaged = skip_damaged) -> int:
-    """Join the reports of each day into one file; return the number of files saved.
+    """Join the weather reports of each day into one file; return by how many the number of files
+    was reduced.
 
     Raises:
         InputError: a file has a newer major version.

@@ -96,7 +96,7 @@ class ObjectBucket:
             ) from error
 
     def put(self, name: str, content: bytes | Path) -> None:
-        """Upload an object; an existing one is replaced.
+        """Upload an object; an existing object of this name is replaced.
 
         Raises:
             CopyError: it is unknown whether the upload succeeded.

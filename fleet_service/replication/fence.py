@@ -27,8 +27,8 @@ FOLDER: Final = "fence"
 
 
 class Term(NamedTuple):
-    """Ownership of the copy by one service: the lease number, and the epoch in the service's file
-    names.
+    """Term: ownership of the copy by one service. It consists of the lease number and the epoch in
+    the service's file names.
     """
 
     number: int
@@ -36,22 +36,22 @@ class Term(NamedTuple):
 
 
 class Fence(NamedTuple):
-    """Valid objects of a bucket: all objects from `epoch` on, and the objects of former terms with
-    these names.
+    """Fence of a bucket: the list of valid objects. Objects are valid if they have the epoch
+    `epoch` or a later one, or if they are in `names`.
     """
 
     epoch: int
     names: frozenset[str]
 
     def counts_object(self, name: str) -> bool:
-        """Return True if an object is valid."""
+        """Return True if the object with this name is valid according to the fence."""
         epoch = layout.term_of(name)
         return epoch is None or epoch >= self.epoch or name in self.names
 
 
 def put_fence(bucket: ObjectBucket, number: int, turn: int, fence: Fence) -> None:
-    """Write the fence. Each turn (renewal of the lease) has a name of its own, so that a delayed
-    upload never replaces a later one.
+    """Upload the fence (list of valid objects) to the bucket. Each renewal (`turn`) of the lease
+    has a file name of its own, so that a delayed upload never replaces a later fence.
 
     Raises:
         CopyError: it is unknown whether the upload succeeded.
@@ -61,8 +61,8 @@ def put_fence(bucket: ObjectBucket, number: int, turn: int, fence: Fence) -> Non
 
 
 def fence_of(bucket: ObjectBucket) -> Fence:
-    """Return the fence of the last owner; if there is none, return a fence for which all objects
-    are valid.
+    """Return the last owner's fence (list of valid objects) from the bucket. If there is none,
+    return a fence for which all objects are valid.
 
     Raises:
         CopyError: the fence cannot be read.

@@ -118,7 +118,9 @@ class LeaseRecord(NamedTuple):
 
 
 class Standby(NamedTuple):
-    """Functions that a waiting (standby) service provides to the lease."""
+    """Functions that a waiting (standby) service gives to the lease; see the comments of the
+    fields.
+    """
 
     may: Callable[[], bool]  # whether it would be heard if it took over now
     stands: Callable[[str], bool]  # whether a service's token stands
@@ -167,7 +169,7 @@ class Lease:
 
     @property
     def former_holders(self) -> tuple[str, ...]:
-        """Return the names of the services that held the lease earlier."""
+        """Return the names of the services that had the lease earlier."""
         return () if self._mine is None else self._mine.before
 
     @property
@@ -276,8 +278,9 @@ class Lease:
         self._thread.start()
 
     def release(self, to: str = "") -> None:
-        """Release the lease if this service still has it, for the service named `to` or for any.
-        This service must not acknowledge anything afterwards.
+        """Release the lease if this service still has it. Then the service named `to` may take over
+        at once, or any service if `to` is empty. This service must not acknowledge anything
+        afterwards.
         """
         self._stop.set()
         if self._thread is not None:
@@ -299,7 +302,8 @@ class Lease:
         return Lease(self._holder, self._bucket, self.service, self._lease_s)
 
     def renew(self) -> None:
-        """Write the next turn; the renewal is valid if no higher number exists afterwards.
+        """Renew the lease: write its object with the next turn number. The renewal is valid if no
+        higher lease number exists afterwards.
 
         Raises:
             CopyError: it is unknown whether the renewal is valid.
@@ -323,7 +327,7 @@ class Lease:
                 return
 
     def _was_held_here(self, found: LeaseRecord) -> bool:
-        """Return True if an earlier start of this folder held the lease."""
+        """Return True if an earlier start of the service on this folder had the lease."""
         return found.holder == self._holder
 
     def _read_newest(self) -> LeaseRecord | None:

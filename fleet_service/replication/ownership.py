@@ -46,7 +46,7 @@ class Ownership:
 
     @property
     def smallest_epoch(self) -> int:
-        """Return the smallest epoch that new segment names may use."""
+        """Return the smallest number that may be used as the epoch in new segment names."""
         return 0 if self.lease is None else self.lease.term.epoch
 
     @property
@@ -72,7 +72,9 @@ class Ownership:
         return () if self.lease is None else (*self.lease.former_holders, self.lease.service)
 
     def mark_lost(self) -> None:
-        """Record that another service has taken over, because its tokens have appeared."""
+        """Record that another service has taken over; the caller knows this from the other
+        service's liveliness tokens.
+        """
         if self.lease is not None:
             self.lease.lost = True
 
@@ -243,7 +245,7 @@ def _sync_folder(
 
 
 class _BusyError(Exception):
-    """Error: another process is working in the folder."""
+    """Error: another process is using the compacted files of the folder."""
 
 
 def _wait_for_compaction(root: Path) -> BinaryIO:

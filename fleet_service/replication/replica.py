@@ -173,7 +173,7 @@ class BucketReplica:
         return got
 
     def largest_epoch(self) -> int:
-        """Return the largest epoch in the file names of folder and bucket, or 0.
+        """Return the largest epoch (lease term) in the file names of folder and bucket, or 0.
 
         Raises:
             CopyError: the bucket cannot be listed.
@@ -191,8 +191,8 @@ class BucketReplica:
         self._download_missing(self._select_counted(self._slow.list_sizes()))
 
     def _raise_fence(self, term: Term) -> None:
-        """Write a fence for this term: objects that appear later are valid only with the epoch of
-        the term. Delete objects that are not valid.
+        """Write a fence (list of valid objects) for this term of ownership: objects that appear
+        later are valid only with the epoch of the term. Delete objects that are not valid.
         """
         names = [
             name
@@ -224,7 +224,9 @@ class BucketReplica:
         return self._download_missing(there)
 
     def _select_counted(self, there: Mapping[str, int]) -> dict[str, int]:
-        """Return names and sizes of the valid objects according to the fence."""
+        """Return names and sizes of those objects in `there` that are valid according to the
+        bucket's fence.
+        """
         fence = fence_of(self._slow)
         return {name: size for name, size in there.items() if fence.counts_object(name)}
 

@@ -30,7 +30,7 @@ class Stamp(NamedTuple):
 
 
 def stamp_of(path: Path) -> Stamp:
-    """Return the stamp of a file.
+    """Return the stamp (size and time of the last write) of a file.
 
     Raises:
         FileNotFoundError: the file no longer exists.
@@ -69,30 +69,32 @@ class UploadJournal:
         self._file = path.open("ab", buffering=0)
 
     def copy_stamps(self) -> dict[str, Stamp]:
-        """Return the names of the files in the copy, each with its stamp at the upload. The result
-        does not change with later uploads.
+        """Return the stamp (size and time) at the upload of each file in the copy, by name. The
+        result does not change with later uploads.
         """
         with self._guard:
             return dict(self._stamps)
 
     def find_stamp(self, name: str) -> Stamp | None:
-        """Return the stamp that a file had at its upload; None if it was not uploaded."""
+        """Return the stamp (size and time) that a file had at its upload; None if it was not
+        uploaded.
+        """
         return self._stamps.get(name)
 
     def add(self, name: str, stamp: Stamp) -> None:
-        """Record an upload."""
+        """Record that a file was uploaded."""
         with self._guard:
             self._file.write(f"{json.dumps([name, *stamp])}\n".encode())
             self._stamps[name] = stamp
 
     def remove(self, name: str) -> None:
-        """Record a deletion."""
+        """Record that a file was deleted from the copy."""
         with self._guard:
             self._file.write(f"{json.dumps([name])}\n".encode())
             self._stamps.pop(name, None)
 
     def sync(self) -> None:
-        """Make the records durable."""
+        """Make the recorded lines durable (fsync)."""
         os.fsync(self._file.fileno())
 
     def close(self) -> None:

@@ -81,14 +81,15 @@ class Alerts:
         }
 
     def renumber(self, place: IntArray) -> None:
-        """Update the slot numbers after the fusion renumbered them; `place` contains the new number
-        of each slot. The fusion must not have removed a slot with an active alert.
+        """Update the slot numbers of active alerts after the fusion renumbered its slots (cells and
+        sectors); `place` contains the new number of each slot. The fusion must not have removed a
+        slot with an active alert.
         """
         self._standing = {int(place[slot]): alert for slot, alert in self._standing.items()}
 
     def update(self, slots: IntArray) -> list[Alert]:
-        """Return the alerts that are raised or cleared because the cells `slots` (k,) were
-        updated.
+        """Return the alerts that are raised or cleared because the given slots (cells and sectors),
+        (k,), were updated.
         """
         time = self._fusion.live.time[slots]
         slippery = self._fusion.slippery(slots)
@@ -125,8 +126,9 @@ class Alerts:
         )
 
     def _suspects(self, slots: IntArray) -> IntArray:
-        """Return the slots with enough sources of ice: among the updated slots (k,) and the others
-        on their slippery stretches. A source is a vehicle whose report supports an alert.
+        """Return the slots (cells and sectors) in which enough vehicles support an alert.
+        Candidates are the updated slots (k,) and the other slots on their slippery stretches. A
+        "source" is a vehicle whose report supports an alert.
 
         Neighbouring cells can confirm ice in a cell, but they are not enough alone. Each returned
         slot either has a source of its own and is likely slippery by its own reports, or lies
@@ -149,22 +151,23 @@ class Alerts:
         return np.asarray(near[enough & (accused | along.around)])
 
     def _own_sources(self, slots: IntArray, side: int) -> IntArray:
-        """Return the times [ns] of the sources for one side (ice or grip) of slots (k,), (k,
-        SOURCES), within the hour before the slot's last report; see `Fusion.sources`.
+        """Return the report times [ns] of the vehicles that support one side (ice or grip) in slots
+        (k,), (k, SOURCES), within the hour before the slot's last report; see `Fusion.sources`.
         """
         return self._fusion.sources(slots, side, self._fusion.live.time[slots] - SOURCE_NS)
 
     def _can_clear(self, slots: IntArray) -> BoolArray:
-        """Return a mask of slots (k,): True if sources of grip outnumber sources of ice by two
-        within the hour, or if there are as many sources of grip as the fusion remembers.
+        """Return a mask of slots (cells and sectors), (k,): True if the alert may be cleared.
+        Within the hour, two more vehicles must have reported grip than ice, or as many vehicles
+        grip as the fusion remembers.
         """
         grip = (self._own_sources(slots, GRIP) > 0).sum(axis=1)
         ice = (self._own_sources(slots, ICE) > 0).sum(axis=1)
         return np.asarray(grip >= np.minimum(ice + 2, SOURCES))
 
     def expire(self, now: int) -> list[Alert]:
-        """Return the end messages of alerts that expire by `now` [ns]: slippery road is less likely
-        than not, and no source has confirmed it for QUIET_NS.
+        """Return the end messages of alerts that expire by `now` [ns], because a slippery road is
+        less likely than not and no vehicle has confirmed it for QUIET_NS.
         """
         slots = np.array(sorted(self._standing), np.int64)
         forgotten = self._fusion.sources(slots, ICE, now - QUIET_NS)[:, 0] == 0

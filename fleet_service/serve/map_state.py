@@ -33,7 +33,9 @@ class MapState:
         self.change = 0  # how often anything changed
 
     def mark_changed(self, slots: IntArray) -> None:
-        """Record that cells (slots) were updated, so that their tiles count as changed."""
+        """Record that slots (cells and sectors) were updated, so that their tiles count as
+        changed.
+        """
         self._index()
         self.change += 1
         tiles = distinct_values(tile_of(self.fusion, slots)).tolist()
@@ -58,7 +60,7 @@ class MapState:
         return sorted(self._slots)
 
     def slots(self, tile: int) -> IntArray:
-        """Return the slots of a tile, in the order of their first visit."""
+        """Return the slots (cells and sectors) of a tile, in the order of their first visit."""
         self._index()
         if tile not in self._slots:
             return np.zeros(0, np.int64)
@@ -67,11 +69,11 @@ class MapState:
         return parts[0].astype(np.int64)
 
     def count(self, tile: int) -> int:
-        """Return the number of slots of a tile."""
+        """Return the number of slots (cells and sectors) of a tile."""
         return sum(map(len, self._slots.get(tile, ())))
 
     def rebuild(self) -> None:
-        """Discard the index, so that it is built again; call this after the fusion renumbered its
+        """Discard the index, so that it is built again. Call this after the fusion renumbered its
         slots.
         """
         self._slots.clear()
@@ -95,5 +97,5 @@ class MapState:
 
 
 def tile_of(fusion: Fusion, slots: IntArray) -> IntArray:
-    """Return the tile of each slot."""
+    """Return the tile of each slot (cell and sector)."""
     return grid.tile_of(fusion.live.key[slots] // grid.SECTORS)

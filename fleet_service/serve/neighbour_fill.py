@@ -86,8 +86,9 @@ def impute_cells(
 def _route_gaps(
     source: Readable, route: IntArray, tile: int, known: IntArray
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return the unvisited keys of a route in a tile, the slots of the nearest visited keys before
-    and behind each, and the share of each.
+    """Return three arrays for the unvisited parts of a route in a tile: the keys (cell and sector),
+    the slots of the nearest visited keys before or behind each, and the share of that neighbour in
+    the estimate.
 
     A key appears once for each side on which a visited key is within REACH. Directly adjacent keys
     are excluded, because they are handled as neighbours.

@@ -90,8 +90,8 @@ class PublicCells:
         return cells_of(self._rows)
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
-        """Return the belief about the road of each slot, (k, 32), as readers see it at `now`
-        [ns].
+        """Return the belief about the road for each slot (cell and sector), (k, 32), as readers may
+        see it at `now` [ns].
         """
         self._add_slots()
         return self._fusion.beliefs(slots, now, self._rows)
@@ -102,7 +102,7 @@ class PublicCells:
 
     @contextmanager
     def follow(self, o: Observations) -> Iterator[None]:
-        """Update the public copy for observations that the caller fuses inside this context."""
+        """Update the public copy after observations that the caller fuses inside this context."""
         now = int(o.time.max(initial=0))
         self.publish(now)
         yield
@@ -122,19 +122,19 @@ class PublicCells:
         self._copy_more_slippery(voted[voted >= 0], now)
 
     def select(self, slots: IntArray, now: int) -> IntArray:
-        """Return the slots that are public at `now` [ns]."""
+        """Return those of the slots (cells and sectors) that are public at `now` [ns]."""
         self.publish(now)
         return slots[self._shown[slots]]
 
     def take_published(self) -> IntArray:
-        """Return the slots that were published since the last call."""
+        """Return the slots (cells and sectors) that were published since the last call."""
         found = np.concatenate([np.zeros(0, np.int64), *self._published])
         self._published.clear()
         return found
 
     def renumber(self, place: IntArray) -> None:
-        """Update the slot numbers after the fusion renumbered them; `place` contains the new
-        numbers, -1 for removed slots.
+        """Update the slot numbers after the fusion renumbered its slots (cells and sectors);
+        `place` contains the new numbers, -1 for removed slots.
         """
         self.visitors.renumber(place)
         stay = np.flatnonzero(place[: self._size] >= 0)
@@ -169,9 +169,9 @@ class PublicCells:
             self._published.append(slots)
 
     def columns(self) -> dict[str, dict[str, IntArray]]:
-        """Return the state as tables of columns for a checkpoint, without the visitors. The tables
-        contain the rows that differ from the fusion's rows, encoded as integers, and the vehicles
-        of each tile.
+        """Return the state as tables of integer columns for a checkpoint. They contain the cells
+        whose public copy differs from the fusion, and the recent vehicles of each tile. The
+        visitors are not included.
         """
         self._add_slots()
         used = slice(self._size)
@@ -210,7 +210,9 @@ class PublicCells:
         self._period = int(present["period"].max(initial=0))
 
     def _copy_more_slippery(self, slots: IntArray, now: int) -> None:
-        """Copy those of the slots that have become clearly more slippery than readers see."""
+        """Copy those of the slots (cells and sectors) that have become clearly more slippery than
+        readers see.
+        """
         current = self._fusion.beliefs(slots, now)
         shown = self.beliefs(slots, now)
         worse = (current - shown) @ SLIPPERY_SHARE >= MORE_SLIPPERY
@@ -226,8 +228,8 @@ class PublicCells:
         self._rows.cells[slots] = live.cells[slots]
 
     def _add_slots(self) -> None:
-        """Add the fusion's new slots, in the state of an unvisited cell. The memory is doubled when
-        it is full, so that this is rare.
+        """Add the fusion's new slots (cells and sectors), in the state of an unvisited cell. The
+        memory is doubled when it is full, so that this is rare.
         """
         if self._size == self._fusion.size:
             return
@@ -241,7 +243,7 @@ class PublicCells:
         self._size = self._fusion.size
 
     def _take_rows(self, slots: IntArray, room: int | None = None) -> None:
-        """Reduce the copy to these rows, in arrays with room for `room` rows."""
+        """Keep only the given rows of the public copy, in arrays with room for `room` rows."""
         room = len(slots) if room is None else room
         rows = Rows(no_beliefs(room), rows_of_lines(room, CELL), self._rows.reporters)
         rows.belief[: len(slots)] = self._rows.belief[slots]

@@ -52,7 +52,7 @@ def answer_query(
 
 
 class AnswerSize(NamedTuple):
-    """Upper bound of the size of an answer: number of cells and number of tiles."""
+    """Upper bounds of the size of an answer: number of cells and number of tiles."""
 
     cells: int
     tiles: int

@@ -115,7 +115,7 @@ class TileCache:
         return made
 
     def seen(self, slots: IntArray, now: int) -> CellView:
-        """Return the cells of public slots as readers see them."""
+        """Return the cells of public slots in the form that readers see."""
         return self.coarse(view_cells(self.source, slots, now))
 
     @property
@@ -130,7 +130,7 @@ class TileCache:
         return cells if self._public is None else coarsen_cells(cells)
 
     def public(self, slots: IntArray, now: int) -> IntArray:
-        """Return those of the slots that are public at `now` [ns]."""
+        """Return those of the slots (cells and sectors) that are public at `now` [ns]."""
         slots = slots[self.state.fusion.live.vehicles[slots] >= self._least]
         return slots if self._public is None else self._public.select(slots, now)
 
@@ -168,5 +168,5 @@ def _common_bounds(
 
 
 def selected_by(cells: pa.RecordBatch) -> dict[str, NDArray[Any]]:
-    """Return the columns by which a query selects cells."""
+    """Return the columns by which queries select cells, as arrays by name."""
     return {name: cells[name].to_numpy() for name in SELECTED_BY}

@@ -58,18 +58,20 @@ class Readable(Protocol):
 
     @property
     def live(self) -> Cells:
-        """Return the cells by columns."""
+        """Return the present state of the cells as columns."""
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
-        """Return the belief about the road of each slot, (k, 32), predicted to `now` [ns]."""
+        """Return the belief about the road for each slot (cell and sector), (k, 32), predicted to
+        `now` [ns].
+        """
 
     def slots_of(self, cell: IntArray, sector: IntArray) -> IntArray:
         """Return the slot of each cell and sector; -1 if there is none."""
 
 
 def view_cells(source: Readable, slots: IntArray, now: int) -> CellView:
-    """Return a view of the cells of `slots` with beliefs for the time `now` [ns]. The data are
-    copied, so that the fusion may continue.
+    """Return a copy of the state of `slots` (cells and sectors), with beliefs for the time `now`
+    [ns]. The fusion may continue afterwards without changing the copy.
     """
     live = source.live
     key = live.key[slots]
@@ -104,7 +106,7 @@ def coarse_counts(counts: IntArray) -> IntArray:
 
 
 def join_views(*views: CellView) -> CellView:
-    """Return several views joined into one."""
+    """Return several views of cells joined into one."""
     return CellView(*(np.concatenate(columns) for columns in zip(*views, strict=True)))
 
 

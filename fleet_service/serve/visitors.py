@@ -27,8 +27,8 @@ _SHIFT: Final = np.uint64(58)
 
 
 class Visitors:
-    """Recent vehicles of each slot of a fusion. Each vehicle is one bit of 64, in each part of a
-    time window.
+    """Recent vehicles of each slot (cell and sector) of a fusion. Each vehicle is one bit of 64, in
+    each part of a time window.
 
     Args:
         fusion: owner of the slots; it must process observations before they are passed to `add`.
@@ -40,7 +40,7 @@ class Visitors:
         self._part = 0  # the newest that was heard of
 
     def add(self, o: Observations) -> None:
-        """Record which vehicles were in which cells."""
+        """Record which vehicles the observations report in which cells."""
         self._grow()
         part = o.time // PART_NS
         self._move_on(int(part.max(initial=self._part)))
@@ -57,8 +57,8 @@ class Visitors:
         return self._part * PART_NS
 
     def count(self, slots: IntArray, now: int) -> IntArray:
-        """Return the number of distinct vehicles of each slot (k,) within the time window that ends
-        at `now` [ns].
+        """Return the number of distinct vehicles in each slot (cell and sector), (k,), within the
+        time window that ends at `now` [ns].
         """
         self._grow()
         ago = max(now // PART_NS - self._part, 0)
@@ -66,8 +66,8 @@ class Visitors:
         return np.asarray(np.bitwise_count(np.bitwise_or.reduce(within, axis=1)), np.int64)
 
     def renumber(self, place: IntArray) -> None:
-        """Update the slot numbers after the fusion renumbered them; `place` contains the new
-        numbers, -1 for removed slots.
+        """Update the slot numbers after the fusion renumbered its slots (cells and sectors);
+        `place` contains the new numbers, -1 for removed slots.
         """
         stay = np.flatnonzero(place >= 0)
         longer = np.zeros((len(place), PARTS), np.uint64)
@@ -75,7 +75,7 @@ class Visitors:
         self._bits = longer[stay]
 
     def columns(self) -> dict[str, IntArray]:
-        """Return the columns from which `of` restores this object."""
+        """Return the state as columns, from which `of` restores this object."""
         self._grow()
         return {
             "bits": self._bits[: self._fusion.size].reshape(-1).view(np.int64),
@@ -84,7 +84,7 @@ class Visitors:
 
     @staticmethod
     def of(fusion: Fusion, columns: dict[str, IntArray]) -> Visitors:
-        """Return the visitors that `columns` describes; empty if the columns do not match the
+        """Return the visitors that `columns` describe; empty if the columns do not match the
         fusion.
         """
         made = Visitors(fusion)
@@ -95,7 +95,9 @@ class Visitors:
         return made
 
     def _grow(self) -> None:
-        """Make room for new slots. The memory is doubled when it is full, so that this is rare."""
+        """Enlarge the memory for the fusion's new slots. The memory is doubled when it is full, so
+        that this is rare.
+        """
         if len(self._bits) < self._fusion.size:
             longer = np.zeros((2 * self._fusion.size, PARTS), np.uint64)
             longer[: len(self._bits)] = self._bits
@@ -111,5 +113,7 @@ class Visitors:
 
 
 def bit_of(vehicle: IntArray) -> NDArray[np.uint64]:
-    """Return one bit of 64 for each vehicle; two vehicles may share a bit."""
+    """Return an integer with one of 64 bits set for each vehicle; two vehicles may have the same
+    bit.
+    """
     return np.uint64(1) << ((vehicle.astype(np.uint64) * _FIBONACCI) >> _SHIFT)

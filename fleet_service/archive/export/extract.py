@@ -43,7 +43,7 @@ class Extract(NamedTuple):
 
 
 def read_observations(root: Path, part: Extract) -> pa.Table:
-    """Return the selected observations as points; rows that are not compacted yet are included."""
+    """Return the selected observations as points; new rows in the inbox are included."""
     where = [_time_filter("leave_time", part)]
     if part.bbox is not None:
         west, south, east, north = part.bbox
@@ -60,7 +60,7 @@ def read_observations(root: Path, part: Extract) -> pa.Table:
 
 
 def snapshot_time(root: Path, part: Extract) -> int:
-    """Return the time [ns] of the last map snapshot before the end of the time range."""
+    """Return the time [ns] of the last map snapshot before the end of the selected time range."""
     return snapshots.time_of(_find_snapshot(root, part))
 
 
@@ -81,8 +81,8 @@ def with_vehicles(table: pa.Table, vehicles: int) -> pa.Table:
 
 
 def map_then(root: Path, part: Extract) -> pa.Table:
-    """Return the last map snapshot before the end of the time range, limited to the box, with cell
-    polygons.
+    """Return the last map snapshot before the end of the selected time range, limited to the
+    selected box, with cell polygons.
     """
     path = _find_snapshot(root, part)
     table = load(path, tables.MAP_ARCHIVE)
@@ -95,8 +95,8 @@ def map_then(root: Path, part: Extract) -> pa.Table:
 
 
 def mask_unmeasured(table: pa.Table, names: Sequence[str], known: BoolArray) -> pa.Table:
-    """Return the table with nulls in the columns `names` where `known` (n,) is False. There no
-    value was measured, and a mere lower bound must not be shown with a colour.
+    """Return the table with nulls in the columns `names` where `known` (n,) is False. In these rows
+    only a lower bound is known, which must not be shown with a colour.
     """
     for name in names:
         column = table[name]
@@ -132,14 +132,14 @@ WHAT: Final[dict[str, Callable[[Path, Extract], pa.Table]]] = {
 
 
 def _time_filter(column: str, part: Extract) -> ValueRange:
-    """Return a filter for rows within the time range: start included, end excluded."""
+    """Return a filter for rows within the selected time range: start included, end excluded."""
     return ValueRange(
         column, -(-part.since // tables.US_STEP), -(-part.until // tables.US_STEP) - 1
     )
 
 
 def _cells_in_box(table: pa.Table, bbox: Box | None) -> pa.Table:
-    """Return the rows whose cells touch the box."""
+    """Return the rows of the table whose cells touch the box; all rows if the box is None."""
     if bbox is None:
         return table
     return table.filter(pa.array(grid.touches(bbox, grid.bounds(table["cell"].to_numpy()))))

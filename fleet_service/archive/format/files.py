@@ -75,11 +75,12 @@ def write_table(
     changes.
 
     Args:
-        table: the rows.
+        table: rows to write.
         path: path of the file; an existing file is replaced.
         encoding: encoding of the columns.
         footer: key-value pairs for the footer, in addition to version and digest.
-        named: True to make the name durable too; otherwise the caller syncs the folder.
+        named: True to sync the folder too, so that the file name is durable; False if the caller
+            syncs the folder.
 
     Raises:
         OSError: the disk is full or read-only; no draft is left.
@@ -134,7 +135,7 @@ def sync_tree(root: Path, folders: Iterable[Path]) -> None:
 
 
 def lock_archive(root: Path) -> BinaryIO:
-    """Lock the archive for this process; the lock is released when the returned file is closed or
+    """Lock the archive for this process. The lock is released when the returned file is closed or
     the process ends.
 
     Raises:

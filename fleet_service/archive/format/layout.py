@@ -58,8 +58,8 @@ _DAY: Final = re.compile(
 
 
 class Cut(NamedTuple):
-    """Position in the sequence of segments: everything up to and including this segment. Names only
-    increase, independent of the clock.
+    """Position in the sequence of segments (files of new rows). It stands for all rows up to and
+    including this segment. Positions only increase, independent of the clock.
     """
 
     epoch: int
@@ -67,14 +67,16 @@ class Cut(NamedTuple):
 
 
 class Partition(NamedTuple):
-    """Folder of compacted rows: day (days since 1970) and z7 zone."""
+    """Partition of the compacted (sorted) files: day (days since 1970) and zone (a map square of
+    zoom 7).
+    """
 
     day: int
     zone: int
 
     def folder(self, root: Path, table: str) -> Path:
-        """Return the partition's folder. A letter precedes the zone, so that readers do not parse
-        it as a number.
+        """Return the partition's folder. A letter precedes the zone's digits in its name, so that
+        readers do not parse them as a number.
         """
         zone = f"zone=q{grid.quadkey(self.zone, grid.ZONE_ZOOM)}"
         return root / table / f"date={date_of(self.day)}" / zone
@@ -104,7 +106,9 @@ def require_archive(root: Path) -> None:
 
 
 def partitions_of(time: IntArray, cell: IntArray) -> tuple[IntArray, IntArray]:
-    """Return day and zone of rows, two arrays (n,), from their times [ns] and cells."""
+    """Return day (days since 1970) and zone of rows, two arrays (n,), from their times [ns] and
+    cells.
+    """
     return time // DAY_NS, grid.zone_of(cell)
 
 
@@ -119,7 +123,7 @@ def day_of(folder: Path) -> int:
 
 
 def partition_of(path: Path) -> Partition:
-    """Return the partition in whose folder a file lies."""
+    """Return the partition (day and zone) of a compacted file, from the folder in which it lies."""
     return Partition(
         day_of(path.parents[1]), grid.from_quadkey(path.parent.name.removeprefix("zone=q"))
     )
@@ -128,8 +132,8 @@ def partition_of(path: Path) -> Partition:
 def compacted_files(
     root: Path, kind: Kind, since_day: int | None = None, until_day: int | None = None
 ) -> Iterator[Path]:
-    """Yield the compacted files of a kind, sorted by date, zone and age. The first and the last day
-    are included.
+    """Yield the compacted files of a kind (observations or states), sorted by date, zone and age.
+    The first and the last day are included.
     """
     for folder in day_folders(root, TABLES[kind], since_day, until_day):
         yield from sorted(folder.glob("zone=*/*.parquet"))
@@ -154,16 +158,17 @@ def segment_name(prefix: str, number: int) -> str:
 
 
 def with_term(name: str, term: int) -> str:
-    """Return the first part of a file name with the term (lease epoch) of the writing service. An
-    earlier term in the name is replaced, so that the new file replaces no other file. Without terms
-    (0), return the name unchanged.
+    """Return the first part of a file name with the term (lease epoch) of the service that writes
+    the file. A term of an earlier writer in the name is replaced. So the new file does not
+    overwrite a file of another service. Without a lease (term 0), the name is returned without a
+    term.
     """
     return f"{_TERM.sub('', name)}.{term:010d}" if term else name
 
 
 def compacted_name(name: str, term: int) -> str:
     """Return the name of a compacted file, made from the name of its newest segment and the term
-    (lease epoch) of the compacting service; 0 without terms.
+    (lease epoch) of the compacting service; the term is 0 without a lease.
     """
     shard, epoch, number = name.rsplit("-", 2)
     return f"{with_term(shard, term)}-{epoch}-{number}"
@@ -184,20 +189,24 @@ def term_of(name: str) -> int | None:
 
 
 def age_key(name: str) -> tuple[int, int, str]:
-    """Return a key that sorts segments or compacted files from old to new: epoch, number, shard."""
+    """Return a key that sorts segments, or compacted files, from old to new: epoch, number, name of
+    the service.
+    """
     shard, epoch, number = Path(name).stem.rsplit("-", 2)
     return int(epoch), int(number), shard
 
 
 def read_epoch(root: Path) -> int:
-    """Return the epoch of the service that owns an archive folder; 0 without terms."""
+    """Return the epoch of the service that owns an archive folder; 0 if the archive is used without
+    a lease.
+    """
     with suppress(OSError, ValueError):
         return int((root / EPOCH_FILE).read_text())
     return 0
 
 
 def write_epoch(root: Path, epoch: int) -> None:
-    """Store the epoch that the names of compacted files contain from now on.
+    """Store the epoch that the names of files compacted from now on must contain.
 
     Raises:
         OSError: the file cannot be written.

@@ -59,13 +59,15 @@ Damaged = Callable[[Path, str], None]
 
 
 def skip_damaged(path: Path, problem: str) -> None:
-    """Log a warning about a damaged file and leave it in place; for readers."""
+    """Log a warning about a damaged file and leave it in place; programs that only read an archive
+    use this.
+    """
     log.warning("%s is damaged and is ignored: %s", path, problem)
 
 
 def set_aside(path: Path, problem: str) -> None:
-    """Rename a damaged file so that it is not read again, and log a warning; for the writer of
-    the archive.
+    """Rename a damaged file so that it is not read again, and log a warning. Only the service that
+    writes the archive may do this.
     """
     log.warning("%s is damaged and was set aside: %s", path, problem)
     with suppress(FileNotFoundError):  # another reader of this process saw it at the same time
@@ -136,11 +138,11 @@ def load_groups(
     take: Callable[[pa.Table], None],
     damaged: Damaged = skip_damaged,
 ) -> bool:
-    """Read a file like `load`, but pass the rows to `take` one row group at a time.
+    """Read a file like `load`, but pass the matching rows to `take`, one row group at a time.
 
     This saves memory: reading a complete file takes several times the memory of its rows. In a row
-    group without a match, only the columns of `where` are read. The result is False if the file is
-    damaged; the caller must then discard the rows taken from it.
+    group without a matching row, only the columns of `where` are read. The result is False if the
+    file is damaged; the caller must then discard the rows passed to `take`.
 
     Raises:
         the same errors as `load`.

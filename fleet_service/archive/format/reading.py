@@ -40,8 +40,8 @@ class Wanted(NamedTuple):
         columns: columns to read; None for all.
         where: filter on rows.
         days: first and last day of measurement, both included.
-        after: read only files that were written after this position. A compacted file is read as a
-            whole, so it may contain older rows too.
+        after: read only files that were written after this position in the sequence of segments. A
+            compacted file is read as a whole, so it may contain older rows too.
         until: read no segment of the inbox that was written after this position.
         box: read only compacted files of zones that touch this box (west, south, east, north
             [deg]).
@@ -56,7 +56,7 @@ class Wanted(NamedTuple):
 
     def newer(self, path: Path) -> bool:
         """Return True if a file was written after the position `after`. The file is a segment, or a
-        compacted file, whose name contains its newest segment.
+        compacted file, which is named after its newest segment.
         """
         return self.after is None or layout.age_key(path.name)[:2] > self.after
 
@@ -130,8 +130,9 @@ class Listing:
             )
 
     def load_groups(self, path: Path, where: Where, take: Callable[[pa.Table], None]) -> bool:
-        """Read a file like `load`, but pass the rows to `take` one row group at a time. Return
-        False if the file is damaged or missing; the caller must then discard the rows taken.
+        """Read a file like `load`, but pass the matching rows to `take`, one row group at a time.
+        Return False if the file is damaged or missing; the caller must then discard the rows passed
+        to `take`.
         """
         both = [*(self._wanted.where or ()), *where]
         try:
@@ -182,11 +183,11 @@ def _read_inbox(
 
 
 def compacted_partitions(files: Iterable[Path], names: set[str]) -> dict[str, set[Partition]]:
-    """Return, for each segment name, the partitions whose rows of this segment are already
-    compacted.
+    """Return, for each segment (file of new rows), the partitions whose rows from this segment are
+    already in compacted files.
 
-    A file is named after its newest segment. Therefore files older than all segments need not be
-    opened.
+    A compacted file is named after its newest segment. Therefore files older than all given
+    segments need not be opened.
     """
     done: dict[str, set[Partition]] = {}
     if not names:
@@ -200,7 +201,9 @@ def compacted_partitions(files: Iterable[Path], names: set[str]) -> dict[str, se
 
 
 def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Table:
-    """Return the rows that are in none of the partitions `done`."""
+    """Return the rows that do not belong to the partitions `done`, because rows of these partitions
+    are already in compacted files.
+    """
     if not done or not table.num_rows:
         return table
     day, zone = layout.partitions_of(

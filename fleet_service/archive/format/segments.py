@@ -42,19 +42,21 @@ def segment_folder(root: Path, kind: Kind) -> Path:
 
 
 def list_segments(root: Path, kind: Kind) -> list[Path]:
-    """Return the segments of a kind, sorted from old to new by epoch and number."""
+    """Return the segments of a kind (observations or states), sorted from old to new by epoch and
+    number.
+    """
     return sorted(
         segment_folder(root, kind).glob("*.parquet"), key=lambda path: layout.age_key(path.name)
     )
 
 
 class Writer:
-    """Writer of the segments of one run of one service.
+    """Writer of segments (files of new rows) during one run of one service.
 
     Args:
         root: folder of the archive.
         shard: name of the service.
-        epoch: smallest allowed epoch, from the lease.
+        epoch: smallest number that may be used as the epoch in segment names, from the lease.
     """
 
     def __init__(self, root: Path, shard: str, epoch: int = 0) -> None:
@@ -108,8 +110,8 @@ class Writer:
         return path
 
     def sync(self) -> None:
-        """Make the names of the written segments durable. After a failure of this call, repeat only
-        this call.
+        """Make the names of the written segments durable. If this fails, call it again; the
+        segments need not be written again.
 
         Raises:
             OSError: a folder cannot be synced.
@@ -138,7 +140,7 @@ def to_nanoseconds(times: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
 
 
 def table_of(kind: Kind, rows: Rows) -> pa.Table:
-    """Return columns as an Arrow table with the archive's schema for this kind."""
+    """Return columns as an Arrow table with the archive's schema for observations or states."""
     return pa.Table.from_arrays(
         [_make_column(f, rows) for f in SCHEMAS[kind]], schema=SCHEMAS[kind]
     )

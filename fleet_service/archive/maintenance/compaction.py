@@ -35,7 +35,7 @@ ROUND_ROWS: Final = 1_000_000
 
 
 class CompactionResult(NamedTuple):
-    """Result of a compaction: rows moved, segments deleted, files added."""
+    """Result of a compaction: numbers of rows moved, of segments deleted, and of files added."""
 
     rows: int
     segments: int
@@ -168,7 +168,9 @@ def join_versions(tables: list[pa.Table], known: pa.Schema) -> pa.Table:
 def _place_files(
     root: Path, kind: Kind, name: str, table: pa.Table, footer: Mapping[str, str]
 ) -> int:
-    """Write the files of a round and rename them into place; return their number."""
+    """Write the compacted files of a round as drafts, then rename them into place; return their
+    number.
+    """
     drafts: list[tuple[Path, Path]] = []
     for partition, part in split_by_partition(table, kind):
         path = partition.folder(root, layout.TABLES[kind]) / name
@@ -183,8 +185,8 @@ def _place_files(
 
 
 def consecutive_runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
-    """Return segment names, given in order of age, as runs of consecutive numbers: (SHARD-EPOCH,
-    first, last).
+    """Return runs of consecutive segment numbers, as (SHARD-EPOCH, first, last), from segment names
+    in order of age.
     """
     out: list[tuple[str, int, int]] = []
     for name in names:

@@ -167,7 +167,9 @@ def _open_catalog(place: Place) -> Catalog:
 
 
 def _open_table(catalog: Catalog, place: Place, kind: Kind) -> Table:
-    """Return the Iceberg table of a kind; create it or add missing columns if necessary."""
+    """Return the Iceberg table of observations or of states; create it or add missing columns if
+    necessary.
+    """
     from pyiceberg.transforms import DayTransform
 
     name = (place.namespace, layout.TABLES[kind])
@@ -190,7 +192,9 @@ def _plain_schema(schema: pa.Schema) -> pa.Schema:
 
 
 def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> RegistrationResult:
-    """Update a table in one commit: remove missing and changed files, and add new files."""
+    """Bring an Iceberg table up to date in one commit: remove missing and changed files, and add
+    new files.
+    """
     there = {_file_url(root, place, path): path for path in layout.compacted_files(root, kind)}
     mine = {
         name: file
@@ -212,7 +216,7 @@ def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registrat
 
 
 def _commit_files(table: Table, removed: list[Any], added: list[str]) -> None:
-    """Remove files from a table and add others, as one atomic change."""
+    """Remove files from an Iceberg table and add others, as one atomic change."""
     if not removed and not added:
         return
     with table.transaction() as change:
@@ -225,7 +229,7 @@ def _commit_files(table: Table, removed: list[Any], added: list[str]) -> None:
 
 
 def _files_by_name(table: Table) -> dict[str, Any]:
-    """Return the files of a table, by URL."""
+    """Return the files to which an Iceberg table refers, by URL."""
     return {task.file.file_path: task.file for task in table.scan().plan_files()}
 
 

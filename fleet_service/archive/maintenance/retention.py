@@ -111,8 +111,8 @@ def forget_period(root: Path, month: str) -> None:
 
 
 def destroy_key(root: Path, month: str, newest: int) -> None:
-    """Destroy the key like `forget_period`. The caller must have locked the archive and must not
-    have data of the month in memory.
+    """Destroy the key of a month like `forget_period`. The caller must have locked the archive and
+    must not have data of the month in memory.
 
     Measurements of the month up to `newest` [ns], the newest in the archive, are not accepted
     again.
@@ -131,8 +131,8 @@ def destroy_key(root: Path, month: str, newest: int) -> None:
 def _newest_first_time(
     root: Path, days: tuple[int, int | None], where: Where = (), until: float = math.inf
 ) -> int:
-    """Return the start time [ns] of the record of these days that starts last; -1 if there is no
-    record. The search stops early at a time of `until` or later.
+    """Return the latest start time [ns] among the records of these days; -1 if there is no record.
+    The search stops early when it finds a start time of `until` or later.
     """
     newest = -1
     for kind, name in layout.FIRST_TIME.items():
@@ -237,8 +237,9 @@ def _pseudonym_of(root: Path, vehicle: str, month: str) -> str:
 
 
 def _thin_snapshot(root: Path, path: Path, cells: set[int]) -> bool:
-    """Remove the lines of these cells with fewer than ANONYMOUS vehicles from a snapshot, and round
-    the times in their other lines to hours. Return True if the snapshot was changed.
+    """Remove from a map snapshot the rows of the given cells that have fewer than ANONYMOUS
+    vehicles. In the other rows of these cells, round times to hours. Return True if the snapshot
+    was changed.
     """
     found = read_content(path, _refuse_damaged)
     if found is None:
@@ -275,8 +276,8 @@ def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
 
 
 def drop_checkpoints(root: Path) -> None:
-    """Remove all checkpoints, because the data from which they were made change. A restarted
-    service then replays the stored rows.
+    """Delete all checkpoints (saved states of the service), because rows that they include are
+    about to be removed. A restarted service then computes its state from the stored rows.
 
     Raises:
         OSError: a checkpoint cannot be removed.
@@ -320,7 +321,7 @@ def _refuse_damaged(path: Path, problem: str) -> None:
 
 
 def key_of(root: Path, month: str) -> Path:
-    """Return the path of a month's key file.
+    """Return the path of the file with a month's pseudonym key.
 
     Raises:
         InputError: the file does not exist.

@@ -46,15 +46,15 @@ _BITS: Final = 64
 
 
 def part_of(path: Path, below: Path | None = None) -> Path:
-    """Return the path of the roll-up part that belongs to a compacted file of observations. With
-    `below`, the path is below that folder instead of the archive.
+    """Return the path of the hourly statistics (roll-up part) that belong to a compacted file of
+    observations. With `below`, the path is below that folder instead of the archive.
     """
     root = path.parents[3] if below is None else below
     return root / TABLE / path.parents[1].name / path.parent.name / path.name
 
 
 def complete_parts(root: Path, until_day: int | None = None) -> int:
-    """Compute missing roll-up parts; return their number.
+    """Compute the missing hourly statistics (roll-up parts); return the number of files written.
 
     Raises:
         OSError: a file cannot be read or written.
@@ -70,7 +70,8 @@ def complete_parts(root: Path, until_day: int | None = None) -> int:
 
 
 def make_part(root: Path, path: Path) -> None:
-    """Compute and write the roll-up part of one compacted file; an existing part is replaced.
+    """Compute and write the hourly statistics (roll-up part) of one compacted file; existing
+    statistics are replaced.
 
     Raises:
         OSError: a file cannot be read or written.
@@ -81,8 +82,8 @@ def make_part(root: Path, path: Path) -> None:
 
 
 def compute_part(path: Path, damaged: Damaged) -> pa.Table | None:
-    """Return the roll-up part of one compacted file as a table. Return None if the file is damaged,
-    after calling `damaged`.
+    """Return the hourly statistics (roll-up part) of one compacted file as a table. If the file is
+    damaged, call `damaged` and return None.
 
     Raises:
         OSError: the file cannot be read.
