@@ -1,5 +1,5 @@
-"""The clients of `deploy/examples/clients` in other languages: built where their tools are, and run
-against a router and a service.
+"""The clients in other languages in `deploy/examples/clients`: built if their tools are installed,
+and run with a router and a service.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LIBRARIES: Final = {"zenohpico": ["-DZENOH_LINUX"], "zenohc": ["-DUSE_ZENOH_C"]}
 
 
 def missing_tool(language: str) -> str:
-    """Return the reason why a client cannot be built or run here; "" if it can."""
+    """Return the reason why a client cannot be built or run on this machine, or "" if it can."""
     if language == "c":
         for tool in ("cc", "pkg-config"):
             if shutil.which(tool) is None:
@@ -59,10 +59,10 @@ def _library() -> str:
 
 
 def build_client(language: str, folder: Path) -> list[str]:
-    """Build a client in a folder; return its command without arguments.
+    """Build a client in a folder, and return its command without arguments.
 
     Raises:
-        RuntimeError: it cannot be built.
+        RuntimeError: the client cannot be built.
     """
     folder = folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
@@ -92,7 +92,7 @@ def _run(words: list[str], folder: Path) -> str:
 
 @contextmanager
 def served_map(folder: Path) -> Iterator[str]:
-    """Endpoint of a router with a service, both in processes of their own."""
+    """Yield the endpoint of a router with a service, both in separate processes."""
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     config = folder / "service.json"
     config.write_text(json.dumps({"zenoh": {"connect": endpoints}, "segment_s": 0.1, "put_s": 0.1}))
@@ -114,7 +114,7 @@ def served_map(folder: Path) -> Iterator[str]:
 
 
 def report_ice(endpoint: str, vehicle: str, place: tuple[float, float]) -> None:
-    """Report the ice of a place by a further vehicle, since an alert needs two."""
+    """Publish a second vehicle's report of ice at a place, because an alert needs two vehicles."""
     region = int(grid.region_of(int(grid.cell_of(*place))))
     now = time.time_ns()
     given = {"latitude": place[0], "longitude": place[1], "yaw": 1.57, "mu": 0.2}
@@ -135,10 +135,10 @@ def report_ice(endpoint: str, vehicle: str, place: tuple[float, float]) -> None:
 
 
 def run_client(command: list[str], language: str, endpoint: str) -> dict[str, Any]:
-    """Run a built client at its place; return its line of JSON.
+    """Run a built client at its own place, and return the JSON that it prints.
 
     Raises:
-        RuntimeError: it failed.
+        RuntimeError: the client failed.
     """
     place = PLACES[language]
     report_ice(endpoint, f"witness-of-{language}", place)

@@ -1,13 +1,13 @@
-"""The manifests of deploy/kubernetes: built by kustomize, held against Kubernetes' schemas, and
-their pods started.
+"""Check of the manifests in deploy/kubernetes: they are built by kustomize and validated against
+Kubernetes' schemas, and the commands of their pods are started.
 
     python -m tests.deploy.kubernetes        writes .kube/figures.json: kube.invalid,
                                              kube.commands_failed
 
-A pod is its containers as processes with command, environment and mounts of the manifest; each path
-of a mount lies below a folder of that pod, and names of pods and their ports are those of this
-machine. Nothing is applied to a cluster: what only a cluster has (volumes' kinds, policies, load
-balancers) is looked at in the text.
+A pod is simulated by processes, one per container, with the command, environment and mounts of the
+manifest. Each mounted path lies in a folder of the pod, and pod names and ports are replaced by
+addresses of this machine. Nothing is applied to a cluster. Objects that only a cluster has (kinds
+of volumes, policies, load balancers) are only checked in the text.
 """
 
 from __future__ import annotations
@@ -50,14 +50,16 @@ Manifest = dict[str, Any]
 
 
 def build_overlay(overlay: str) -> list[Manifest]:
-    """The objects that `kubectl apply -k` would send."""
+    """Return the objects that `kubectl apply -k` would send."""
     words = ["kubectl", "kustomize", str(FOLDER / overlay)]
     done = subprocess.run(words, check=True, capture_output=True, text=True)
     return [dict(one) for one in YAML(typ="safe").load_all(done.stdout) if one]
 
 
 def find_schema_errors(objects: list[Manifest]) -> list[str]:
-    """Return the errors by Kubernetes' schemas, strictly: unknown fields too."""
+    """Return the errors of a strict check against Kubernetes' schemas, which also reports unknown
+    fields.
+    """
     import kubernetes_validate
 
     found = []
@@ -76,7 +78,7 @@ def of_kind(objects: list[Manifest], kind: str) -> list[Manifest]:
 
 @dataclass
 class Pod:
-    """One pod of a StatefulSet; its mounts are below `root`."""
+    """Pod of a StatefulSet, simulated on this machine; its mounts lie below `root`."""
 
     name: str
     template: Manifest
@@ -88,7 +90,7 @@ class Pod:
 
     @property
     def containers(self) -> list[Manifest]:
-        """Return the containers that keep running."""
+        """Return the containers that keep running, without the init containers."""
         return list(self.template["spec"]["containers"])
 
     @property
@@ -97,13 +99,13 @@ class Pod:
         return float(self.template["spec"]["terminationGracePeriodSeconds"])
 
     def port_of(self, container: Manifest, named: str | int) -> int:
-        """A container's port, by name or number, on this machine."""
+        """Return the port on this machine for a container's port, given by name or number."""
         numbers = {one["name"]: one["containerPort"] for one in container.get("ports", [])}
         return self.ports[numbers.get(named, named)]
 
 
 def make_pods(objects: list[Manifest], root: Path) -> list[Pod]:
-    """Every pod of every StatefulSet, with free ports."""
+    """Return every pod of every StatefulSet, with free ports of this machine."""
     found = []
     for one in of_kind(objects, "StatefulSet"):
         claims = [
@@ -121,7 +123,7 @@ def make_pods(objects: list[Manifest], root: Path) -> list[Pod]:
 
 
 class Cluster:
-    """An overlay's pods on this machine."""
+    """Pods of an overlay, simulated on this machine."""
 
     def __init__(self, overlay: str, root: Path) -> None:
         self.overlay = overlay
@@ -153,7 +155,7 @@ class Cluster:
             assert fleet_service(["certs", *words]) == 0
 
     def _localize_addresses(self, name: str, text: str) -> str:
-        """Return a file's text with the addresses of this machine."""
+        """Return a file's text with the addresses of pods replaced by those of this machine."""
         for pod in self.pods:
             for number, port in pod.ports.items():
                 text = text.replace(f"{pod.name}.routers:{number}", f"127.0.0.1:{port}")
@@ -189,7 +191,7 @@ class Cluster:
         return pod.root / str(mount["name"])
 
     def _fill_volumes(self, pod: Pod) -> None:
-        """Fill the volumes of a pod."""
+        """Write the files into the mounted volumes of a pod."""
         volumes = {one["name"]: one for one in pod.template["spec"]["volumes"]}
         for container in [*pod.template["spec"].get("initContainers", []), *pod.containers]:
             for mount in container.get("volumeMounts", []):
@@ -205,7 +207,7 @@ class Cluster:
                     self._unpack_certificates(pod, container, folder)
 
     def _unpack_certificates(self, pod: Pod, container: Manifest, folder: Path) -> None:
-        """Return the files that the documented command puts into a secret of certificates."""
+        """Write the files that the documented command puts into a secret of certificates."""
         of = pod.name.rpartition("-")[0]
         for path in [*self.certificates.glob(f"{of}-*.*"), self.certificates / "trust.pem"]:
             (folder / path.name).write_text(self._localize_paths(pod, container, path.read_text()))
@@ -284,7 +286,7 @@ class Cluster:
     def _await_probes(
         self, pod: Pod, container: Manifest, process: subprocess.Popen[bytes]
     ) -> None:
-        """Wait until its probes hold: the one of the start first, as a kubelet would."""
+        """Wait until the container's probes succeed, the startup probe first, as a kubelet does."""
         names = [
             name
             for name in ("startupProbe", "readinessProbe", "livenessProbe")
@@ -306,8 +308,8 @@ class Cluster:
                 return
 
     def fetch_page(self, pod: Pod, path: str) -> str:
-        """Return a page of a pod's metrics server; empty while a standby that takes over replaces
-        its server by that of the service.
+        """Return a page of a pod's metrics server. The text is empty while a standby takes over,
+        because it then replaces its own server by that of the service.
         """
         (container,) = pod.containers
         address = f"http://127.0.0.1:{pod.port_of(container, 'metrics')}{path}"
@@ -349,7 +351,7 @@ def _bucket_environment(bucket: BucketServer) -> dict[str, str]:
 
 @contextmanager
 def open_cluster(overlay: str, root: Path) -> Iterator[Cluster]:
-    """Run an overlay, with a bucket next to it if its pods need one."""
+    """Yield a running overlay, with a bucket if its pods need one."""
     made = Cluster(overlay, root)
     wanted = any("envFrom" in container for pod in made.pods for container in pod.containers)
     with ExitStack() as stack:
@@ -359,7 +361,7 @@ def open_cluster(overlay: str, root: Path) -> Iterator[Cluster]:
 
 
 def main() -> int:
-    """Validate and start every overlay. Return 1 if a bar does not hold."""
+    """Validate and start every overlay. Return 1 if a figure misses its target, otherwise 0."""
     wrong = list[str]()
     failed = list[str]()
     objects = 0

@@ -1,8 +1,8 @@
-"""The part of the remote-api plug-in of `zenohd` that a client needs to publish, subscribe and
-query: its messages over WebSocket, passed to a Zenoh session.
+"""Substitute for the remote-api plug-in of `zenohd`: the messages with which a client publishes,
+subscribes and queries over WebSocket, passed to a Zenoh session.
 
-The plug-in itself is a library that `zenohd` loads, so the Python router cannot have it. The layout
-of the messages is that of zenoh-ts 1.10 (`message.ts`), in Zenoh's serialization format.
+The plug-in is a library that `zenohd` loads, so the Python router cannot use it. The layout of the
+messages is that of zenoh-ts 1.10 (`message.ts`), in Zenoh's serialization format.
 """
 
 from __future__ import annotations
@@ -47,20 +47,20 @@ CUSTOM: Final = 0xFFFF  # encoding whose whole name is its schema
 
 
 class SerializedReader:
-    """Numbers, texts and bytes in Zenoh's serialization format."""
+    """Reader of numbers, texts and bytes in Zenoh's serialization format."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
         self._at = 0
 
     def read_number(self, layout: str) -> int:
-        """Return a little-endian number with a layout of `struct`."""
+        """Return a little-endian number, read with a layout of `struct`."""
         (found,) = struct.unpack_from("<" + layout, self._data, self._at)
         self._at += struct.calcsize("<" + layout)
         return int(found)
 
     def read_bytes(self) -> bytes:
-        """Return bytes after their length in LEB128."""
+        """Return bytes that follow their length in LEB128."""
         size = 0
         for shift in range(0, 63, 7):
             byte = self.read_number("B")
@@ -71,11 +71,11 @@ class SerializedReader:
         return self._data[self._at - size : self._at]
 
     def read_text(self) -> str:
-        """Return a text."""
+        """Return a UTF-8 text that follows its length."""
         return self.read_bytes().decode()
 
     def read_encoding(self) -> zenoh.Encoding:
-        """Return an encoding: number of its name, and schema."""
+        """Return an encoding, stored as the number of its name and a schema."""
         name = ENCODINGS.get(self.read_number("H"), "")
         schema = self.read_text()
         return zenoh.Encoding(";".join(part for part in (name, schema) if part))
@@ -99,7 +99,7 @@ def _encoding(encoding: zenoh.Encoding) -> bytes:
 
 
 def _sample(sample: zenoh.Sample) -> bytes:
-    """Return a sample without attachment and timestamp."""
+    """Return a serialized sample without attachment and timestamp."""
     congestion = int(sample.congestion_control == zenoh.CongestionControl.BLOCK)
     priority = 1 + PRIORITIES.index(sample.priority)
     quality = priority | congestion << 3 | int(sample.express) << 4
@@ -108,7 +108,7 @@ def _sample(sample: zenoh.Sample) -> bytes:
 
 
 class RemoteClient:
-    """One connection of a client, and its session."""
+    """WebSocket connection of a client, with its Zenoh session."""
 
     def __init__(self, link: ServerConnection, session: zenoh.Session) -> None:
         self._link = link
@@ -116,7 +116,7 @@ class RemoteClient:
         self._subscribers: dict[int, zenoh.Subscriber[None]] = {}
 
     def run(self) -> None:
-        """Answer messages until the client leaves."""
+        """Answer the client's messages until it disconnects."""
         for message in self._link:
             assert isinstance(message, bytes)
             reader = SerializedReader(message)
@@ -191,7 +191,7 @@ class RemoteClient:
 
 @contextmanager
 def serve_remote_api(endpoint: str) -> Iterator[str]:
-    """Serve clients of a router; yield the locator that zenoh-ts connects to."""
+    """Serve clients of a router over WebSocket. Yield the locator to which zenoh-ts connects."""
 
     def answer(link: ServerConnection) -> None:
         session = open_session(ZenohSettings(connect=[endpoint]))

@@ -1,4 +1,6 @@
-"""Clients in other languages publish, are acknowledged and warned, and receive a tile."""
+"""Tests that clients in other languages publish, receive acknowledgements and warnings, and receive
+a tile.
+"""
 
 from __future__ import annotations
 

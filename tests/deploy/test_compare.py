@@ -1,4 +1,4 @@
-"""Figures of the demo on small cases."""
+"""Tests of the demo's figures on small cases."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ S = 1_000_000_000
 
 
 def make_visits(*rows: tuple[str, float, int, float, float]) -> pa.Table:
-    """Visits (vehicle, second, cell, mu, utilisation), each half a second long, sector 0."""
+    """Return a table of visits (vehicle, second, cell, mu, utilisation), each half a second long,
+    in sector 0.
+    """
     vehicle, at, cell, mu, used = zip(*rows, strict=True)
     enter = np.array([int(second * S) for second in at])
     return pa.table(
@@ -162,8 +164,8 @@ def test_demo_page_opens_in_a_browser_with_both_maps_and_figures(tmp_path: Path)
 def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Count two warned passes and one unwarned pass since the first alert; earlier ones do not
-    count.
+    """Since the first alert there are two warned passes and one unwarned pass. Earlier passes do
+    not count.
     """
     driven = make_visits(
         ("sim-001", 1.0, 7, 0.9, 0.5),

@@ -1,5 +1,5 @@
-"""The dashboard and the alert rules use only metrics that a service or an agent exports, and the
-handbook explains each rule.
+"""Tests that the dashboard and the alert rules use only metrics that a service or an agent exports,
+and that the handbook explains each rule.
 """
 
 from __future__ import annotations

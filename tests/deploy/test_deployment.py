@@ -1,8 +1,7 @@
-"""The shipped units, compose file and configurations: checked by their own tools, and started as
-they are written.
+"""Tests of the shipped units, compose file and configurations: they are checked by their own tools,
+and their commands are started.
 
-Only folders and ports are others than in a deployment: the files' text is taken as it is but for
-these.
+The files' texts are used without change, except for folders and ports.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ START_S = 300.0  # the first start compiles the kernels, on a busy machine
 
 
 class Site:
-    """The folders of a deployment below another root, with other ports."""
+    """Folders of a deployment below another root, with other ports."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -61,7 +60,7 @@ class Site:
             path.write_text(json.dumps(json.loads(path.read_text()) | changed))
 
     def localize_paths(self, text: str) -> str:
-        """A text with the folders and ports of this site."""
+        """Return a text with folders and ports replaced by those of this site."""
         places = {"/etc/gripmap": "etc", "/var/lib/gripmap": "lib", "/var/cache/gripmap": "cache"}
         for place, folder in places.items():
             text = text.replace(place, str(self.root / folder))
@@ -76,7 +75,7 @@ class Site:
         return text.replace("/opt/gripmap/bin", str(BIN))
 
     def read_unit(self, unit: Path, instance: str) -> configparser.SectionProxy:
-        """The service section of a unit."""
+        """Return the [Service] section of a systemd unit."""
         parser = configparser.ConfigParser(strict=False, interpolation=None)
         parser.optionxform = str  # type: ignore[assignment,method-assign]
         parser.read_string(self.localize_paths(unit.read_text()).replace("%i", instance))
@@ -162,7 +161,7 @@ def test_systemd_accepts_a_standby_with_one_more_word(site: Site, tmp_path: Path
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd on this machine")
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
 def test_each_unit_is_shut_in(unit: Path, tmp_path: Path) -> None:
-    """The exposure that systemd itself finds: 0 is a sealed box, 10 an open one."""
+    """systemd itself scores the exposure of a unit from 0 (isolated) to 10 (unprotected)."""
     instance = INSTANCES[unit.stem][0]
     file = tmp_path / unit.name.replace("@.", f"@{instance}.")
     file.write_text(unit.read_text())
@@ -264,7 +263,9 @@ def test_every_configuration_is_for_a_name_on_the_list() -> None:
 @pytest.mark.timeout(400)
 @pytest.mark.campaign
 def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> None:
-    """Certificates, two routers, service, agent, reader; then each is stopped as systemd would."""
+    """Certificates are issued, and two routers, service, agent and reader are started. Then each
+    process is stopped as systemd does.
+    """
     etc = site.root / "etc"
     enrol = [
         str(BIN / "fleet-service"),

@@ -1,4 +1,6 @@
-"""The pages of the docs' folder: their examples run, their tables are those of the contract."""
+"""Tests of the documentation pages: their examples run, and their tables agree with the
+contract.
+"""
 
 from __future__ import annotations
 
@@ -40,8 +42,8 @@ def test_the_examples_of_the_reference_run_in_their_order(
 
 
 def test_every_page_stands_in_the_contents_of_the_site() -> None:
-    """A page that is not in the table of contents is a warning of Sphinx, and `make docs` treats
-    warnings as errors.
+    """Sphinx warns of a page that is not in the table of contents, and `make docs` treats warnings
+    as errors.
     """
     tables = re.findall(r"```\{toctree\}\n(.*?)```", (DOCS / "index.md").read_text(), re.DOTALL)
     entries = [

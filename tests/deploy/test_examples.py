@@ -1,4 +1,4 @@
-"""Every example runs as it stands, and says what its page says."""
+"""Tests that every example runs as it is, and prints what its page says."""
 
 from __future__ import annotations
 
@@ -57,7 +57,9 @@ def test_an_estimator_of_one_s_own_says_at_least_what_was_used(capsys: Output) -
 
 @contextmanager
 def serve_ice(folder: Path) -> Iterator[str]:
-    """Yield the endpoint of a router whose service knows of ice that three vehicles reported."""
+    """Yield the endpoint of a router whose service has received reports of ice from
+    three vehicles.
+    """
     session, endpoints = open_router(listen="tcp/127.0.0.1:0")
     settings = ZenohSettings(connect=endpoints)
     with session, running(settings, folder):
@@ -78,7 +80,7 @@ def test_the_map_is_asked_and_a_tile_decoded(tmp_path: Path, capsys: Output) -> 
 
 
 def test_a_car_is_warned_of_what_three_others_found(tmp_path: Path, capsys: Output) -> None:
-    """Run router, service, reports, alert and an approaching car, all of them real."""
+    """Router, service, reports, alert and an approaching car are all real."""
     before = LONGITUDE - 60.0 / 111e3 / math.cos(math.radians(LATITUDE))
     with serve_ice(tmp_path) as endpoint:
         warned = be_warned.main(endpoint, LATITUDE, before)

@@ -1,5 +1,5 @@
-"""The manifests for Kubernetes follow its schemas, every reference resolves, and the pods' commands
-run.
+"""Tests of the manifests for Kubernetes: they follow its schemas, every reference resolves, and the
+pods' commands run.
 
 `tests.deploy.kubernetes` starts the commands. Nothing is applied to a cluster.
 """
@@ -90,8 +90,8 @@ def test_every_reference_leads_to_what_is_there(overlay: str) -> None:
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
 def test_network_policies_reach_routers_but_never_services(overlay: str) -> None:
-    """Apply the policies as a cluster does: a pod may do everything that any policy selecting it
-    allows.
+    """The policies are evaluated as a cluster does: a pod may do everything that any policy
+    selecting it allows.
     """
     objects = build_overlay(overlay)
     policies = [one["spec"] for one in of_kind(objects, "NetworkPolicy")]
@@ -113,8 +113,8 @@ def test_network_policies_reach_routers_but_never_services(overlay: str) -> None
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
 def test_every_container_is_shut_in_and_bounded(overlay: str) -> None:
-    """The restricted profile of the pod security standards, which the namespace enforces, and
-    more.
+    """The containers satisfy the restricted profile of the pod security standards, which the
+    namespace enforces, and have further limits.
     """
     for template in list_templates(build_overlay(overlay)):
         pod = template["spec"]
@@ -210,7 +210,9 @@ def read_settings(running: Cluster, pod: str) -> str:
 
 
 def open_reader(running: Cluster) -> zenoh.Session:
-    """Yield a reader's session at the routers, with its own certificate if they require one."""
+    """Return a reader's session at the routers, with its own certificate if the routers require
+    one.
+    """
     name = next(pod.name for pod in running.pods if "router" not in pod.name)
     shipped = ServiceConfig.model_validate_json(read_settings(running, name)).zenoh
     config = {"connect": shipped.connect}

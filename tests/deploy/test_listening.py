@@ -1,5 +1,5 @@
-"""The town of the demo with listening cars: such a car does not publish reports of others, and its
-figures are correct.
+"""Tests of the demo's town with cars that receive the map: such a car does not publish reports of
+others, and its figures are correct.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from edge_agent.lab.simulation.listeners import WarnedDrivers
 def test_a_town_that_hears_its_own_map_makes_the_same_map_bit_for_bit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Compare drivers who do not react to warnings, because a driver who reacts produces other
+    """The drivers in this test do not react to warnings, because a driver who reacts produces other
     measurements.
     """
     monkeypatch.setattr(listening, "ASKED_S", 4.0)

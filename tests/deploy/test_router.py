@@ -1,4 +1,6 @@
-"""The router is a process of Python alone, and the shipped configurations fit the contract."""
+"""Tests that the router runs in a process of Python alone, and that the shipped configurations
+follow the contract.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fixtures: a router of this process, a running service, a client, a bucket."""
+"""Fixtures: a router in this process, a running service, a client, a bucket."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PUT_S = 0.1
 
 @dataclass
 class Running:
-    """A service in a thread of this process."""
+    """Service that runs in a thread of this process."""
 
     service: Service
     lines: list[str]
@@ -42,7 +42,7 @@ class Running:
 
 @pytest.fixture(scope="session")
 def router() -> Iterator[ZenohSettings]:
-    """Settings for a router of this process."""
+    """Yield the settings of a session to a router in this process."""
     session, endpoints = open_router(listen="tcp/127.0.0.1:0")
     with session:
         yield ZenohSettings(connect=endpoints)
@@ -50,7 +50,7 @@ def router() -> Iterator[ZenohSettings]:
 
 @pytest.fixture
 def session(router: ZenohSettings) -> Iterator[zenoh.Session]:
-    """A client's session."""
+    """Yield a client's session."""
     opened = open_session(router)
     assert opened is not None
     with opened:
@@ -59,7 +59,7 @@ def session(router: ZenohSettings) -> Iterator[zenoh.Session]:
 
 @contextmanager
 def running(router: ZenohSettings, root: Path, **changed: object) -> Iterator[Running]:
-    """Yield a service on an archive; it is stopped after the block."""
+    """Yield a running service on an archive, and stop it after the block."""
     config = ServiceConfig(zenoh=router, put_s=PUT_S, segment_s=0.1, **changed)  # type: ignore[arg-type]
     lines: list[str] = []
     service = Service(config, root, lines.append)
@@ -76,20 +76,20 @@ def running(router: ZenohSettings, root: Path, **changed: object) -> Iterator[Ru
 
 @pytest.fixture
 def service(router: ZenohSettings, tmp_path: Path) -> Iterator[Running]:
-    """A service on an empty archive."""
+    """Yield a running service on an empty archive."""
     with running(router, tmp_path / "archive") as run:
         yield run
 
 
 @pytest.fixture
 def start(router: ZenohSettings) -> Callable[..., object]:
-    """Start a service on a given archive: `with start(root): ...`."""
+    """Return a function that starts a service on an archive: `with start(root): ...`."""
     return lambda root, **changed: running(router, root, **changed)
 
 
 @pytest.fixture
 def bucket(tmp_path: Path) -> Iterator[BucketServer]:
-    """An S3 server that is a process of its own."""
+    """Yield an S3 server that runs in a separate process."""
     pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
     with bucket_server(tmp_path / "objects") as server:
         yield server

@@ -1,4 +1,4 @@
-"""Observations and batches made by hand, and the resulting belief of a cell."""
+"""Observations and batches for tests, and functions that read the resulting belief of a cell."""
 
 from __future__ import annotations
 
@@ -28,12 +28,14 @@ Numbers: TypeAlias = Sequence[float] | NDArray[np.floating[Any]] | NDArray[np.in
 
 
 def value(mu: Numbers, std: float = STD) -> FloatArray:
-    """Return log-likelihoods of visits that measured μ, (n, 32)."""
+    """Return log-likelihoods (n, 32) of visits that measured the friction `mu`."""
     return np.asarray(-0.5 * np.square((mugrid.CENTRES - np.asarray(mu, float)[:, None]) / std))
 
 
 def at_least(used: Numbers) -> FloatArray:
-    """Return log-likelihoods of visits that only used this much grip, (n, 32)."""
+    """Return log-likelihoods (n, 32) of visits that used the grip `used` and measured no upper
+    limit.
+    """
     return np.where(np.asarray(used, float)[:, None] > mugrid.CENTRES, -8.0, 0.0)
 
 
@@ -44,7 +46,7 @@ def observations(
     cell: int | Numbers = CELL,
     second: int = -1,
 ) -> Observations:
-    """Return visits at START + seconds, numbered in their order."""
+    """Return visits at the times START + seconds, numbered in their order."""
     n = len(seconds)
     whole = np.zeros(n, np.int64)
     time = START + (np.asarray(seconds, float) * SECOND).astype(np.int64)
@@ -69,7 +71,9 @@ def observations(
 
 
 def posterior_evidence(mu: float, lower: float, upper: float, used: float) -> FloatArray:
-    """Return the log-likelihood (32,) for a sender that sends none."""
+    """Return the log-likelihood (32,) that the service assumes for a report without a
+    likelihood.
+    """
     names = ("mu", "mu_lower", "mu_upper", "mu_utilised")
     columns: dict[str, NDArray[Any]] = dict(
         zip(names, (np.array([v]) for v in (mu, lower, upper, used)), strict=True)
@@ -81,7 +85,7 @@ def posterior_evidence(mu: float, lower: float, upper: float, used: float) -> Fl
 
 
 def belief(fusion: Fusion, cell: int = CELL, sector: int = 0, now: int | None = None) -> FloatArray:
-    """Belief of one cell (32,) at its last observation, or at `now`."""
+    """Return the belief (32,) of one cell at the time of its last observation, or at `now`."""
     slot = fusion.slots_of(np.array([cell]), np.array([sector]))
     assert slot[0] >= 0, "nobody was there"
     return np.asarray(
@@ -90,12 +94,12 @@ def belief(fusion: Fusion, cell: int = CELL, sector: int = 0, now: int | None = 
 
 
 def interval(p: FloatArray) -> tuple[float, float]:
-    """Return the 5 % and 95 % quantiles."""
+    """Return the 5 % and 95 % quantiles of a belief."""
     return float(mugrid.quantiles(p, 0.05)), float(mugrid.quantiles(p, 0.95))
 
 
 def slippery(p: FloatArray) -> float:
-    """Return P(μ < 0.4)."""
+    """Return P(μ < 0.4) of a belief."""
     return float(p @ SLIPPERY_SHARE)
 
 
@@ -110,10 +114,10 @@ def batch(
     used: float | None = None,
     **changed: object,
 ) -> Batch:
-    """A batch of visits in one cell, one second apart and ending at `now`; `changed` overrides its
-    columns.
+    """Return a batch of visits in one cell, one second apart and ending at `now` [ns]. `changed`
+    replaces columns.
 
-    Without `used` they used all of the grip: less says little of it.
+    Without `used` the visits used all of the grip, so that they are measurements.
     """
     n = len(mu)
     leave = now - np.arange(n)[::-1] * SECOND
@@ -144,13 +148,13 @@ def batch(
 
 
 def key(vehicle: str) -> str:
-    """The observation key of a vehicle in the region of the examples."""
+    """Return the observation key of a vehicle in the region of the examples."""
     return keys.observation_key(REGION, vehicle)
 
 
 def send(session: zenoh.Session, sent: Batch, place: str | None = None) -> None:
-    """Put a batch on its vehicle's key, or another. By default Zenoh drops what waits a
-    millisecond for a busy link.
+    """Publish a batch on its vehicle's key, or on `place`. The call waits for a busy link, because
+    by default Zenoh would drop the message after a millisecond.
     """
     session.put(
         place or key(sent.vehicle),

@@ -1,4 +1,6 @@
-"""Alerts as stretches with length, direction, id and life cycle, and delivery by webhook."""
+"""Tests of alerts per road section, with length, direction, id and life cycle, and of their
+delivery by webhook.
+"""
 
 from __future__ import annotations
 
@@ -113,7 +115,9 @@ def test_a_stretch_keeps_its_id_while_it_grows_joins_falls_apart_and_ends() -> N
 
 @contextmanager
 def receiver(refuse: int = 0) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """A real HTTP server that accepts webhooks after a number of refusals."""
+    """Yield the address of a real HTTP server, and the webhooks that it received. It first refuses
+    `refuse` requests.
+    """
     heard: list[dict[str, Any]] = []
     left = [refuse]
 

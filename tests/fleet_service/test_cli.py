@@ -1,4 +1,4 @@
-"""The commands of `fleet-service`, run as processes."""
+"""Tests of the commands of `fleet-service`, run as processes."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_help_comes_without_what_commands_need() -> None:
 
 @pytest.fixture
 def fed(service: Running, session: zenoh.Session) -> Fleet:
-    """A service with three cars on ice."""
+    """Return a fleet of three cars whose reports of ice the service has acknowledged."""
     fleet = Fleet(session).await_services()
     fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3)))
     return fleet

@@ -1,5 +1,5 @@
-"""Every option of the commands has an effect: the test changes it, runs the command, and requires
-another result than before.
+"""Tests that every option of the commands has an effect: a test changes the option, runs the
+command, and requires another result than before.
 
 A command runs on copies of the reference archive. Its result is its output, its exit code and every
 file below its folder. Each command gives the same result twice, so that a difference comes from the
@@ -227,7 +227,9 @@ class Done(NamedTuple):
 
 
 def place(folder: Path) -> dict[str, str]:
-    """Create two different archives, and files that commands take."""
+    """Create two different archives, and the files that commands need. Return their
+    paths by name.
+    """
     names = {name: folder / name for name in ("a", "b", "out", "fleet", "fleet2", "warm", "cold")}
     for name in ("a", "b"):
         shutil.copytree(DATA / "v1.0" / "archive", names[name])
@@ -247,7 +249,7 @@ def place(folder: Path) -> dict[str, str]:
 
 
 def content(path: Path, folder: Path) -> str:
-    """Return the reproducible content of a file."""
+    """Return the reproducible part of a file's content."""
     if path.suffix == ".key" or path.name.startswith("README"):
         return ""
     if path.suffix == ".pem":
@@ -257,7 +259,7 @@ def content(path: Path, folder: Path) -> str:
 
 
 def run_command(words: list[str], folder: Path, capsys: Capture) -> Done:
-    """Run a command in a new folder."""
+    """Run a command in a new folder, and return its result."""
     names = place(folder)
     code = main([word.format(**names) for word in words])
     said = capsys.readouterr()
@@ -271,7 +273,7 @@ def run_command(words: list[str], folder: Path, capsys: Capture) -> Done:
 
 
 def options(command: Command) -> set[str]:
-    """Return the options of a command."""
+    """Return the names of the options of a command."""
     parser = argparse.ArgumentParser(add_help=False)
     importlib.import_module(command.module).add_arguments(parser)
     return {
@@ -288,8 +290,8 @@ def test_every_option_of_every_command_is_in_a_table() -> None:
 
 @pytest.mark.parametrize("command", SHOWN_BELOW)
 def test_the_tests_that_show_an_option_give_it_to_the_command(command: str) -> None:
-    """Read the tests instead of running them: each option must occur in its test module or below
-    the tables of this module.
+    """This test reads other tests instead of running them: each option must occur in its test
+    module or below the tables of this module.
     """
     own = Path(__file__)
     texts = [(own.parent / f"{name}.py").read_text() for name in GIVEN_IN[command]]
@@ -410,7 +412,7 @@ FAR: Final = (LATITUDE, LONGITUDE + 0.05)
 
 
 def there(name: str, mu: float) -> wire.Batch:
-    """A batch of another tile in the same region."""
+    """Return a batch of another tile in the same region."""
     cell = int(grid.cell_of(*FAR))
     return batch(
         name, 2, time.time_ns() - SECOND, [mu], latitude=[FAR[0]], longitude=[FAR[1]], cell=[cell]
@@ -419,7 +421,9 @@ def there(name: str, mu: float) -> wire.Batch:
 
 @pytest.fixture
 def fed(service: Running, session: zenoh.Session) -> Fleet:
-    """A service with three cars on ice, and one on a dry road elsewhere later."""
+    """Return a fleet whose reports the service has acknowledged: three cars on ice, and later one
+    on a dry road elsewhere.
+    """
     fleet = Fleet(session).await_services()
     fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3)))
     fleet.settle(there("sim-009", 0.8))

@@ -1,4 +1,4 @@
-"""Queries of an empty map and of a map without a service; answers as files."""
+"""Tests of queries of an empty map and of a map without a service, and of answers as files."""
 
 from __future__ import annotations
 

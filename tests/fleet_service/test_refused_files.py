@@ -1,4 +1,4 @@
-"""Commands refuse files that do not exist, with any other options."""
+"""Tests that commands refuse files that do not exist, whatever the other options are."""
 
 from __future__ import annotations
 

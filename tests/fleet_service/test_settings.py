@@ -1,4 +1,6 @@
-"""Every setting of the service has an effect: the test changes it, and requires another behaviour."""
+"""Tests that every setting of the service has an effect: a test changes the setting, and requires
+another behaviour.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +35,8 @@ Show = Callable[[ServiceConfig, Path], object]
 
 
 def open_engine(config: ServiceConfig, root: Path) -> Iterator[Engine]:
-    """An engine that has taken two cars' reports: one now, one of ten minutes ago, and one of a
-    minute ahead.
+    """Yield an engine that has ingested reports of three cars: of now and of minutes ago, of ten
+    minutes ago, and of a minute ahead.
     """
     with closing(Engine(config, root)) as engine:
         now = time.time_ns()
@@ -81,7 +83,9 @@ def of_service(look: Callable[[Service], object]) -> Show:
 
 
 def let_in(made: Service) -> list[bool]:
-    """Return which of thirty messages of 40 kB from two vehicles are decoded."""
+    """Return for each of 60 messages of 40 kB from each of two vehicles whether it passes the rate
+    limit.
+    """
     return [
         made.inbox._limits.allows(key(name), 40_000)
         for name in ("car-1", "car-2")
@@ -96,7 +100,7 @@ def count_queued(made: Service) -> int:
 
 
 def turns(made: Service) -> tuple[int, int]:
-    """Count segments and rounds of tiles in ten turns of .3 s each."""
+    """Return the numbers of segments and of rounds of tiles in ten simulated turns of .3 s each."""
     clock = [time.monotonic()]
     calls = {"begin_flush": 0, "take_dirty": 0}
 
@@ -121,7 +125,9 @@ def turns(made: Service) -> tuple[int, int]:
 
 
 def count_far_moves(config: ServiceConfig, root: Path) -> int:
-    """Reports of one sender that is at two distant places at once, and is refused at one."""
+    """Return the number of implausible moves that are refused when one sender reports two distant
+    places at once.
+    """
     now = time.time_ns()
     with closing(Engine(config, root)) as engine:
         for seq, latitude in enumerate((57.7, 58.7), 1):

@@ -1,5 +1,5 @@
-"""Batches that the tests of the contract share; also how the kept bytes of version 1 were made
-(see __main__).
+"""Batches that the tests of the contract share. Run as a program, this module writes the recorded
+messages of version 1 (see `__main__`).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def batch(kind: Kind, rows: int = 3) -> Batch:
 
 
 def batch_of_version_1(kind: Kind) -> Batch:
-    """Return the batch without the columns that later versions added."""
+    """Return the batch of `batch` without the columns that later versions added."""
     whole = batch(kind)
     return replace(
         whole, columns={name: c for name, c in whole.columns.items() if name not in LATER}
@@ -65,7 +65,7 @@ def make_acknowledgement() -> tuple[str, list[StreamAck]]:
 
 
 def make_alert() -> Alert:
-    """Return an alert whose floats are exact in 32 bits."""
+    """Return an alert whose floating-point numbers are exact in 32 bits."""
     return Alert(
         1_664_484_383_910,
         2,

@@ -1,4 +1,4 @@
-"""Keys, the friction grid, configuration, vehicle file and queries."""
+"""Tests of the contract: keys, the friction grid, configuration, vehicle file and queries."""
 
 from __future__ import annotations
 

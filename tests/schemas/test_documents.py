@@ -1,4 +1,6 @@
-"""Statements of the .proto and the README for other languages agree with the code."""
+"""Tests that statements of the .proto file and the README for other languages agree
+with the code.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +105,7 @@ IN_README = (
 
 
 def to_plain_letters(text: str) -> str:
-    """Return a text in the letters of the .proto file."""
+    """Return a text with Greek letters and symbols written as in the .proto file."""
     letters = {"·`mu`": " mu", "`": "", "≥": ">=", "μ": "mu", " degrees of": "° of"}
     for letter, replacement in letters.items():
         text = text.replace(letter, replacement)

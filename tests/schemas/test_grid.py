@@ -1,4 +1,4 @@
-"""Cells, tiles and sectors: the theorems of the grid, then its edges."""
+"""Tests of cells, tiles and sectors: first the theorems of the grid, then its borders."""
 
 from __future__ import annotations
 

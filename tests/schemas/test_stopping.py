@@ -1,4 +1,4 @@
-"""Largest speed from which a vehicle can stop within the known distance."""
+"""Tests of the largest speed from which a vehicle can stop within the known distance."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""A third party can take part with the contract alone: without compiler, science library, agent or
-service.
+"""Tests that a third party can take part with the contract alone: without compiler, science
+library, agent or service.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ pytestmark = pytest.mark.timeout(
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
-    """Return the results of a third party's process, with a router and a service in processes of
-    their own.
+    """Yield the results of a third party's process, with a router and a service in separate
+    processes.
     """
     folder = tmp_path_factory.mktemp("third-party")
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")

@@ -1,4 +1,4 @@
-"""Understeer that follows from the axles of a vehicle file."""
+"""Tests of the understeer that follows from the axles of a vehicle file."""
 
 from __future__ import annotations
 

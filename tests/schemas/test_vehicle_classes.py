@@ -1,4 +1,4 @@
-"""Vehicle files of common classes."""
+"""Tests of the vehicle files of common classes."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""A third party: `schemas`, eclipse-zenoh, protobuf and pyarrow, in a process that can load nothing
-else of GripMap.
+"""Third party with only `schemas`, eclipse-zenoh, protobuf and pyarrow, in a process that cannot
+import any other part of GripMap.
 
-python -m tests.schemas.third_party ENDPOINT: reports ice by two vehicles, one in protobuf and one
-in JSON, reads its acknowledgements, the reports, the tile, the alerts and the map's answers, and
-prints the results as one line of JSON. Run it only as a program: importing it would block GripMap's
-modules in the importing process too.
+`python -m tests.schemas.third_party ENDPOINT` reports ice by two vehicles, one in protobuf and one
+in JSON. It reads acknowledgements, reports, the tile, alerts and the map's answers, and prints the
+results as one line of JSON. Run it only as a program: importing it would also block GripMap's
+modules in the importing process.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def protobuf_batch(now: int) -> bytes:
 
 
 def json_batch(now: int) -> bytes:
-    """Return the same visits as handwritten JSON; cell, sector and region follow from the pose."""
+    """Return the same visits as handwritten JSON without cell, sector and region."""
     times = [str(now - SECOND * k) for k in reversed(range(VISITS))]
     numbers = {
         "latitude": LATITUDE,
@@ -108,7 +108,7 @@ def open_session(endpoint: str) -> zenoh.Session:
 
 
 class Heard:
-    """Messages decoded by subscribers, by topic; an unreadable message is stored as its error."""
+    """Messages decoded by subscribers, by topic. For an unreadable message the error is stored."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.acks: dict[str, list[wire.StreamAck]] = {}
@@ -138,7 +138,9 @@ class Heard:
 
 
 def query_replies(session: zenoh.Session, selector: str) -> list[tuple[str, bytes]]:
-    """Return encoding and payload of every reply; for an error reply its text."""
+    """Return (encoding, payload) of every reply to a query. An error reply gives ("error", its
+    text).
+    """
     return [
         (str(reply.ok.encoding), reply.ok.payload.to_bytes())
         if reply.ok is not None
@@ -159,7 +161,7 @@ def find_blocked() -> list[str]:
 
 
 def main(endpoint: str) -> None:
-    """Publish, hear, ask, and print what came of it."""
+    """Publish, receive, query, and print the results."""
     with open_session(endpoint) as session:
         heard = Heard(session)
         sent = {

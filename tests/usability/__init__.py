@@ -1,1 +1,1 @@
-"""Usability campaign: the first hour of a new user as figures. `make usability`."""
+"""Usability campaign `make usability`: figures about a new user's first hour."""

@@ -1,7 +1,7 @@
-"""`make usability`: every figure of the first hour, measured; writes `.usability/figures.json`.
+"""`make usability`: measure all figures of a new user's first hour, and write
+`.usability/figures.json`.
 
---only NAME ... measures these; other figures are not in the file, and a missing figure is a
-failure.
+--only NAME ... measures only these parts. A figure that is missing in the file counts as a failure.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ DAY: Final = ("--from", "2026-01-27", "--to", "2026-01-28")
 
 
 class House:
-    """Folder with an archive, and the figures with their notes."""
+    """Folder with an archive, shared by all measurements, and the printed notes."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -69,7 +69,9 @@ class House:
 
 
 def readme_commands_failed(house: House) -> float:
-    """Count commands of the tutorials that fail, in a network of their own."""
+    """Return the number of commands of the tutorials that fail, run in a separate network
+    namespace.
+    """
     folder = house.folder / "readme"
     folder.mkdir()
     line = f"ip link set lo up && exec {sys.executable} -m tests.usability.readme {folder}"
@@ -84,7 +86,9 @@ def readme_commands_failed(house: House) -> float:
 
 
 def pages_with_errors(house: House) -> float:
-    """Count pages that report an error, request an external file, or stay empty in Chromium."""
+    """Return the number of HTML pages that report an error, request an external file, or stay empty
+    in Chromium.
+    """
     pages = []
     for words in PAGES:
         out = house.folder / f"{words.replace(' ', '')}.html"
@@ -116,7 +120,9 @@ def pages_with_errors(house: House) -> float:
 
 
 def live_page(house: House) -> tuple[str, list[str], list[str]] | None:
-    """Return the faults of the live page with a service and cars on ice; None if there are none."""
+    """Return the faults of the live page with a service and cars on ice, or None if
+    there are none.
+    """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     connection = ZenohSettings(connect=endpoints)
     with router, running(connection, house.folder / "live"), page_of(connection) as address:
@@ -130,7 +136,7 @@ def live_page(house: House) -> tuple[str, list[str], list[str]] | None:
 
 
 def service_ready_s(house: House) -> float:
-    """Return the time from the command to `ready:` of a service on an empty archive, with the
+    """Return the time [s] from the command to `ready:` of a service on an empty archive, with the
     kernels of `make setup`.
     """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
@@ -154,7 +160,9 @@ def service_ready_s(house: House) -> float:
 
 
 def bound_painted(house: House) -> float:
-    """Count outputs in which a cell with only a bound has a number that could be coloured."""
+    """Return the number of outputs in which a cell with only a lower bound has a number that could
+    be shown as a colour.
+    """
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "tests/test_bounds_unpainted.py"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     counts = {
@@ -170,8 +178,8 @@ def bound_painted(house: House) -> float:
 
 
 def colour_distance(house: House) -> float:
-    """Return the smallest CIEDE2000 distance between surfaces, and between lines, for four kinds of
-    colour vision.
+    """Return the smallest CIEDE2000 difference between the colours of surfaces, and between those
+    of lines, for four kinds of colour vision.
     """
     surfaces = [shade(mu, *GRIP_RANGE) for mu in SURFACES.values()]
     lines = [style.colour for style in (*ESTIMATORS.values(), TRUTH)]
@@ -188,28 +196,28 @@ def colour_distance(house: House) -> float:
 
 
 def wrong_logs_unnoticed(house: House) -> float:
-    """Count planted mistakes in a recording that `replay` does not mention."""
+    """Return the number of deliberate faults in a recording that `replay` does not mention."""
     found = find_unnoticed(house.folder, WRONG, SEED)
     house.print_measured("wrong logs", f"{len(WRONG)} planted, unnoticed: {found}")
     return float(len(found))
 
 
 def count_tracebacks(house: House) -> float:
-    """Count mistakes at the command line that end in a traceback or in success."""
+    """Return the number of mistakes at the command line that end in a traceback or in success."""
     count, bad = mistakes.find_tracebacks(house.folder, house.archive)
     house.print_measured("mistakes", f"{count} made, bad: {bad}")
     return float(len(bad)) if count >= 60 else float("nan")
 
 
 def silent_seconds(house: House) -> float:
-    """Return the longest time without output on a terminal."""
+    """Return the longest time [s] in which a command prints nothing on a terminal."""
     found = waiting.silent_seconds(house.folder, house.archive)
     house.print_measured("silence", found)
     return max(found.values())
 
 
 def build_wheel(house: House) -> Path:
-    """Return the wheel of this tree; it is built once."""
+    """Build the wheel of this source tree once, and return its path."""
     built = house.folder / "dist"
     if not list(built.glob("*.whl")):
         build = [sys.executable, "-m", "build", "--wheel", "--outdir", str(built), str(ROOT)]
@@ -219,7 +227,9 @@ def build_wheel(house: House) -> Path:
 
 
 def install_demo(house: House) -> Path:
-    """Return an environment with what `gripmap demo` needs; it is made once."""
+    """Create an environment with all packages that `gripmap demo` needs once, and return its
+    folder.
+    """
     place = house.folder / "demo-venv"
     if not place.exists():
         wheel = build_wheel(house)
@@ -231,7 +241,7 @@ def install_demo(house: House) -> Path:
 
 
 def install_mb(house: House) -> float:
-    """Size of an environment that runs the demo, without the pip in it."""
+    """Return the size [MB] of an environment that runs the demo, without pip."""
     site = next(install_demo(house).glob("lib/*/site-packages"))
     ignored = ("pip", "pip-", "setuptools", "_distutils_hack", "pkg_resources")
     files = (
@@ -244,7 +254,9 @@ def install_mb(house: House) -> float:
 
 
 def install_packages(house: House) -> float:
-    """Number of packages in that environment, this one included, pip and setuptools not."""
+    """Return the number of packages in the demo's environment, including this one, without pip and
+    setuptools.
+    """
     site = next(install_demo(house).glob("lib/*/site-packages"))
     names = {path.name.partition("-")[0].lower() for path in site.glob("*.dist-info")}
     house.print_measured("packages", sorted(names))
@@ -252,7 +264,9 @@ def install_packages(house: House) -> float:
 
 
 def silent_reasons(house: House) -> float:
-    """Return how many planted causes why nothing is published are named within five seconds."""
+    """Return the number of causes for which an agent publishes nothing and that it names within
+    five seconds.
+    """
     path = "tests/edge_agent/app/test_publishing_reasons.py"
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "-k", "planted_cause", path]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -262,7 +276,7 @@ def silent_reasons(house: House) -> float:
 
 
 def install_to_first_map_s(house: House) -> float:
-    """Measure the way from an empty environment and a wheel to a map in a browser."""
+    """Return the time [s] from an empty environment and a wheel to a map in a browser."""
     wheel = build_wheel(house)
     began = time.monotonic()
     place = house.folder / "venv"
@@ -289,21 +303,21 @@ def install_to_first_map_s(house: House) -> float:
 
 
 def options_undocumented(house: House) -> float:
-    """Count options without a help text."""
+    """Return the number of options without a help text."""
     found = reference_pages.undocumented_options()
     house.print_measured("undocumented", found)
     return float(len(found))
 
 
 def figures_stale(house: House) -> float:
-    """Count pages of figures that are not those of the files in deploy/figures."""
+    """Return the number of pages that do not agree with the figures in deploy/figures."""
     found = results.find_stale()
     house.print_measured("stale", found)
     return float(len(found))
 
 
 def alerts_per_stretch(house: House) -> float:
-    """Return the alerts per stretch of the last demo."""
+    """Return the number of alerts per slippery road section in the last demo."""
     path = ROOT / ".demo" / "figures.json"
     rows = json.loads(path.read_text()) if path.exists() else []
     values = {row["name"]: row["value"] for row in rows if "name" in row}
@@ -313,12 +327,16 @@ def alerts_per_stretch(house: House) -> float:
 
 
 def first_drive_commands(_: House) -> float:
-    """Count the commands of the first drive, from the installation to the map."""
+    """Return the number of commands of the tutorial's first drive, from the installation to the
+    map.
+    """
     return float(len(read_commands()))
 
 
 def first_drive_alerts(house: House) -> float:
-    """Count alerts that a real minute on a dry motorway raises when published under three names."""
+    """Return the number of alerts that a recorded minute on a dry motorway raises when published
+    under three names.
+    """
     folder = house.folder / "minute"
     folder.mkdir()
     cells, alerts = map_first_drive(folder)
@@ -358,7 +376,7 @@ PARTS: Final[dict[str, tuple[Callable[[House], float], str, float, str]]] = {
 
 
 def main() -> int:
-    """Measure; 1 where a bar does not hold or a figure is missing."""
+    """Measure the figures. Return 1 if a figure misses its target or is missing, otherwise 0."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.usability", description=(__doc__ or "").splitlines()[0]
     )

@@ -1,5 +1,5 @@
-"""Mistakes at the command line: each ends with one line and exit code 2, or with an error of
-argparse, and never with a traceback.
+"""Typical mistakes at the command line: each must end with one line and exit code 2, or with an
+error of argparse, and never with a traceback.
 """
 
 from __future__ import annotations
@@ -145,8 +145,8 @@ def prepare_files(folder: Path) -> None:
 
 
 def find_tracebacks(folder: Path, archive: Path) -> tuple[int, list[str]]:
-    """Return how many mistakes were made, and those answered with a traceback or with exit code
-    0.
+    """Return the number of mistakes, and the command lines answered with a traceback or with exit
+    code 0.
     """
     bad = []
     lines: list[tuple[Callable[[list[str]], int], str]] = [

@@ -1,8 +1,8 @@
-"""Run the commands of the tutorials, as written and in order, in a network of their own and an
+"""Run the commands of the tutorials as written and in order, in a separate network namespace and an
 empty folder.
 
-Commands that stay (router, service, agent, watch, page) are started and must still run at the end.
-`pip install` is not run.
+Commands that keep running (router, service, agent, watch, page) are started and must still run at
+the end. `pip install` is not run.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def list_commands(text: str) -> list[str]:
 
 
 def run_all(folder: Path) -> list[str]:
-    """Run all; returns those that failed, with the last line they said."""
+    """Run all commands. Return those that failed, with the last line that they printed."""
     for name in ("deploy", "tests/data"):
         shutil.copytree(
             ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "*.py")
@@ -112,7 +112,7 @@ def run_all(folder: Path) -> list[str]:
 
 
 def _run_to_end(line: list[str], folder: Path, log: Path, environment: dict[str, str]) -> int | str:
-    """Return the exit code of a command, or report that it did not end."""
+    """Return the exit code of a command, or a message that it did not end in time."""
     with log.open("wb") as out:
         try:
             done = subprocess.run(
@@ -159,7 +159,9 @@ def _last_line(log: Path) -> str:
 
 
 def main() -> int:
-    """Print what failed, as JSON: for a process in a network of its own."""
+    """Run all commands in a folder, and print the failed ones as JSON. The process must have its
+    own network namespace.
+    """
     print(json.dumps(run_all(Path(sys.argv[1]))))
     return 0
 

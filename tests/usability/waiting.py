@@ -1,4 +1,4 @@
-"""Longest silence of a command on a terminal."""
+"""Measurement of the longest time in which a command prints nothing on a terminal."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ LASTING: Final = (
 
 
 def longest_silence(command: list[str], cache: Path, ready: bytes | None = None) -> float:
-    """Return the longest time [s] between two outputs of a command on a terminal, start and end
-    included. A command that prints `ready` is interrupted there.
+    """Return the longest time [s] between two outputs of a command on a terminal, including start
+    and end.
 
-    One that is `ready` with a word is interrupted there, and its end does not count.
+    A command that prints `ready` is interrupted then, and the time until its end does not count.
     """
     here, there = pty.openpty()
     environment = {**os.environ, "XDG_CACHE_HOME": str(cache), "TERM": "xterm"}
@@ -87,7 +87,9 @@ def longest_silence(command: list[str], cache: Path, ready: bytes | None = None)
 
 
 def silent_seconds(folder: Path, archive: Path) -> dict[str, float]:
-    """Return the longest silence of each command with an empty cache of kernels."""
+    """Return for each command the longest time [s] without output, with an empty cache
+    of kernels.
+    """
     found = {}
     for command in COMMANDS:
         words = [word.format(d=folder, a=archive) for word in command]

@@ -1,4 +1,4 @@
-"""Recordings with a planted mistake, estimated as a new user does. Each mistake must be mentioned."""
+"""Recordings with a deliberate fault, replayed as by a new user. Each fault must be mentioned."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ WRONG: Final = (  # those that gave sure ice, or the wrong place, in silence onc
 
 
 def find_unnoticed(folder: Path, names: Sequence[str], seed: int) -> list[str]:
-    """Return the mistakes that `edge-agent replay` does not mention. It must not complain about the
-    correct drive.
+    """Return the faults that `edge-agent replay` does not mention, plus a message if it complains
+    about the correct drive.
     """
     drive = drives(1, seed, rough=False)[0]
     out = [] if not _has_warned(folder, drive) else ["the sound drive is suspected"]

@@ -1,4 +1,6 @@
-"""Comparison of two engines' answers: the same rows, floats within the stated error."""
+"""Comparison of the answers of two query engines: the same rows, floating-point numbers within the
+stated error.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ Order: TypeAlias = list[tuple[str, Literal["ascending", "descending"]]]
 
 
 def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
-    """Return the difference, or None."""
+    """Return a description of the difference between two answers, or None if they agree."""
     if one.schema.names != other.schema.names or one.num_rows != other.num_rows:
         return (
             f"{one.num_rows} rows of {one.schema.names}, {other.num_rows} of {other.schema.names}"
@@ -60,8 +62,8 @@ def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
 
 
 def roads_along(cells: IntArray) -> pa.Table:
-    """Links of forty cells along every row of cells, and one where nobody was, as `fleet-service
-    roads` writes them.
+    """Return a road network with links of forty cells along every row of cells, and one link that
+    no vehicle visited, in the columns of `fleet-service roads`.
     """
     x, y = grid.deinterleave(cells)
     found = []

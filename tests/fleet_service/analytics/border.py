@@ -1,5 +1,5 @@
-"""An archive whose roads cross the border of two zones, with a third zone far away; for tests of a
-rebuild by zone.
+"""Synthetic archive for tests of a rebuild by zone: its roads cross the border of two zones, and a
+third zone lies far away.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NUMBERS: Final = ("mu", "mu_lower", "mu_upper", "p_slippery", "vehicles", "obser
 
 
 def fill(root: Path, world: SyntheticFleet) -> None:
-    """Make the archive, of one day, compacted and rolled up."""
+    """Write the archive of one day, compact it, and compute its roll-ups."""
     step = 360.0 / (1 << grid.CELL_ZOOM)
     shift = BORDER - synthetic.LONGITUDE - world.length // 2 * step
     writer = segments.Writer(root, "shard-0")
@@ -44,7 +44,7 @@ def fill(root: Path, world: SyntheticFleet) -> None:
 
 
 def rebuilt_map(out: Path) -> pa.Table:
-    """Return all zones of a rebuilt map in the order of a map."""
+    """Return all zones of a rebuilt map as one table, sorted like a map."""
     parts = [
         pq.read_table(path, partitioning=None)
         for path in sorted((out / "map").glob("*/*/*.parquet"))
@@ -54,8 +54,8 @@ def rebuilt_map(out: Path) -> pa.Table:
 
 
 def difference(ours: pa.Table, theirs: pa.Table) -> float:
-    """Return the largest difference of a number of two maps; infinite where their cells, or their
-    nulls, are not the same.
+    """Return the largest difference of a number in two maps, or infinity if their cells or their
+    nulls differ.
     """
     if not all(
         ours[name].equals(theirs[name])
@@ -72,7 +72,7 @@ def difference(ours: pa.Table, theirs: pa.Table) -> float:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Return every file below a folder."""
+    """Return the content of every file below a folder, by relative path."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in folder.rglob("*")

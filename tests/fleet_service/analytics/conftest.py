@@ -1,4 +1,6 @@
-"""A small synthetic archive, and its rows in pandas as the oracle of the questions."""
+"""Fixtures: a small synthetic archive, and its rows in pandas, from which tests compute the
+expected answers.
+"""
 
 from __future__ import annotations
 
@@ -35,13 +37,13 @@ HOUR_NS = 3600 * 10**9
 
 
 def find_visited(fusion: Fusion) -> IntArray:
-    """Return the slots that a vehicle visited."""
+    """Return the slots of the cells that a vehicle visited."""
     return np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)
 
 
 @pytest.fixture(scope="session")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the archive, compacted, with a snapshot of the map every twelve hours."""
+    """Return a compacted archive with a snapshot of the map every twelve hours."""
     root = tmp_path_factory.mktemp("analytics") / "archive"
     synthetic.write_archive(root, WORLD, 4000)
     compact(root)
@@ -57,8 +59,8 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def rows(archive: Path) -> pd.DataFrame:
-    """Return all rows, with `time` in whole seconds and `value` True if mu was measured as the
-    contract defines it.
+    """Return all rows of the archive. `time` is in whole seconds, and `value` is True if mu was
+    measured as the contract defines it.
     """
     frame = (
         pa.concat_tables(reading.read_tables(archive, Kind.OBSERVATION))
@@ -73,7 +75,7 @@ def rows(archive: Path) -> pd.DataFrame:
 
 @pytest.fixture(scope="session")
 def stations(archive: Path) -> Path:
-    """Hourly readings of two stations."""
+    """Return a file with hourly readings of two weather stations."""
     hours = np.arange(WORLD.days * 24)
     inland = 5.0 - 8.0 * synthetic.night_factor(np.asarray(hours * 3600.0, float))
     columns: dict[str, Any] = {
@@ -90,7 +92,9 @@ def stations(archive: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def links(rows: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The roads of the synthetic archive as links of forty cells, and one where nobody was."""
+    """Return a file with the roads of the archive as links of forty cells, and one link that no
+    vehicle visited.
+    """
     path = tmp_path_factory.mktemp("roads") / "roads.parquet"
     pq.write_table(roads_along(rows["cell"].to_numpy()), path)
     return path
@@ -98,7 +102,7 @@ def links(rows: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def asked(archive: Path) -> Callable[..., pa.Table]:
-    """Ask a question: `asked("grip", at=...)`."""
+    """Return a function that answers a question: `asked("grip", at=...)`."""
 
     def ask(name: str, engine: str = "duckdb", part: Extract = PART, **options: object) -> pa.Table:
         said: list[str] = []

@@ -1,4 +1,4 @@
-"""The command as a person types it, and the files that it writes."""
+"""Tests of the command `analyze` as a person types it, and of the files that it writes."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ MAP = {
 
 
 def list_explained(question: str) -> set[str]:
-    """Return the columns of an answer that the documentation explains."""
+    """Return the columns of a question's answer that the documentation explains."""
     page = (ROOT / "deploy" / "docs" / "reference" / "questions.md").read_text(encoding="utf-8")
     rows = [line.split("|") for line in page.splitlines() if line.startswith(f"| `{question}` |")]
     assert all(row[4].strip() for row in rows)
@@ -94,7 +94,9 @@ def test_roads_name_the_roads_of_an_answer(
 
 
 def test_trend_compares_months_in_the_same_cells() -> None:
-    """One cell becomes 0.2 more slippery; another cell, seen in one month only, does not count."""
+    """One cell becomes 0.2 more slippery. Another cell has reports of only one month and does not
+    count.
+    """
     rows = [
         ("2026-01-10", 1, "a", 0.8),
         ("2026-01-11", 1, "b", 0.9),

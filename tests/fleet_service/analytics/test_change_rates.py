@@ -1,5 +1,5 @@
-"""Rates of change: the fit finds the rates of a known process, its interval is calibrated, and
-pairs are counted correctly.
+"""Tests of the question `change-rates`: the fit finds the rates of a known process, its interval is
+calibrated, and pairs are counted correctly.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ PI = 0.3  # slippery share of roads
 
 
 def pairs_of_a_day(rng: np.random.Generator, rate: float, count: int) -> FloatArray:
-    """(bins, 4) counts of pairs of readings of a road that becomes another one at `rate`."""
+    """Return counts (bins, 4) of simulated pairs of readings of a road that changes at a rate
+    `rate` [1/s].
+    """
     apart = np.exp(rng.uniform(0.0, np.log(LONGEST_S), count))
     first = rng.random(count) < PI
     second = np.where(rng.random(count) < -np.expm1(-rate * apart), rng.random(count) < PI, first)
@@ -58,7 +60,7 @@ NAMES = ("pairs", "unlike", "slippery", "seconds")
 
 @pytest.mark.campaign
 def test_the_interval_holds_as_often_as_it_says_when_days_differ() -> None:
-    """Return days with very different rates of mean RATE: pairs of the same day are not
+    """Days have very different rates with mean RATE, so pairs of the same day are not
     independent.
     """
     held = 0
@@ -97,8 +99,8 @@ def test_pairs_are_values_in_a_row_by_different_vehicles(asked: Ask, rows: pd.Da
 
 
 def test_roads_change_faster_where_ice_comes_and_goes(asked: Ask, stations: Path) -> None:
-    """The synthetic roads freeze at four and thaw at eight; the rate is found below freezing and
-    not in the afternoon.
+    """The synthetic roads freeze at four o'clock and thaw at eight. A rate must be found below
+    freezing, and no rate in the afternoon.
     """
     for options in ({}, {"stations": stations}):
         found = asked("change-rates", **options).to_pandas().set_index(["by", "class"])

@@ -1,4 +1,4 @@
-"""The example on the documentation page runs as described."""
+"""Test that the example of the documentation runs as described."""
 
 from __future__ import annotations
 

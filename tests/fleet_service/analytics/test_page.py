@@ -1,4 +1,4 @@
-"""HTML maps of answers in a real browser, used by mouse, touch and keyboard."""
+"""Tests of HTML maps of answers in a real browser, used by mouse, touch and keyboard."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ PLACED = [name for name, question in QUESTIONS.items() if question.colour]
 
 @pytest.fixture(scope="module")
 def pages(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Every answer with a place, as a page; of `replay` a day in frames, too."""
+    """Return the HTML page of every question whose answer has cells, by name. `frames` is a day of
+    `replay` in frames.
+    """
     folder = tmp_path_factory.mktemp("pages")
     more: dict[str, list[str]] = {name: [] for name in PLACED} | {"frames": ["--step", "21600"]}
     for name, words in more.items():

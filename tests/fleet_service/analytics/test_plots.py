@@ -1,5 +1,5 @@
-"""Plots of answers show the parts that a reader needs: roads, days, moments, names, and the line of
-the contract.
+"""Tests that plots of answers show the parts needed by a reader: roads, days, times, names, and the
+contracted level as a line.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Each question against an oracle in pandas or plain Python, and against the events planted in the
-synthetic archive.
+"""Tests of each question: the answer equals one computed in pandas or plain Python, and finds the
+events that the synthetic archive contains.
 """
 
 from __future__ import annotations

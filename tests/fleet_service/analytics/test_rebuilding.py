@@ -1,5 +1,5 @@
-"""An archive rebuilt zone by zone equals a replay of everything, and its roll-ups equal the stored
-ones.
+"""Tests that an archive rebuilt zone by zone equals a replay of everything, and that its roll-ups
+equal the stored ones.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""`make spark-test`: Spark reads the archive, and answers every question as DuckDB does. Takes a
-Java and a minute.
+"""`make spark-test`: tests that Spark reads the archive and answers every question as DuckDB does.
+They need Java and take a minute.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Standing alerts are repeated, so that a client that was away, or behind a router that was
-restarted, receives them.
+"""Tests that active alerts are published again, so that a client receives them after its own or its
+router's outage.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Jumps of the system clock: honest vehicles are not refused because of them, before and after a
-restart.
+"""Tests of jumps of the system clock: honest vehicles are not refused because of a jump, before and
+after a restart.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ YEAR = 365 * 86_400 * SECOND
 
 @dataclass
 class System:
-    """Simulated clocks of a machine."""
+    """Simulated clocks of a machine: wall clock and elapsed time."""
 
     wall: int
     steady: int = 0

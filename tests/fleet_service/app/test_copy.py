@@ -1,5 +1,5 @@
-"""An acknowledged report is in two places: tests with a lost disk, an absent bucket, and a service
-killed between the two writes.
+"""Tests that an acknowledged report is stored on disk and in the bucket: with a lost disk, a bucket
+that does not answer, and a service killed between the two writes.
 """
 
 from __future__ import annotations
@@ -168,8 +168,8 @@ def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(
 def service(
     router: ZenohSettings, folder: Path, bucket: BucketServer
 ) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """A service process with a copy that is ready, and its health's address; it is gone after
-    the block.
+    """Yield a service process with a bucket copy that is ready, and the address of its health page.
+    The process is ended after the block.
     """
     config = folder / "service.json"
     archive = {"path": str(folder / "archive"), **bucket.settings}
@@ -203,7 +203,9 @@ def health(address: str) -> str:
 
 
 def drive(fleet: Fleet, sent: list[Batch]) -> bool:
-    """Send unacknowledged batches again, as spools do; return True if all are acknowledged."""
+    """Send unacknowledged batches again, as outboxes do. Return True if all batches are
+    acknowledged.
+    """
     for one in fleet.list_unsettled(sent)[:20]:
         fleet.publish(one)
     return not fleet.list_unsettled(sent)

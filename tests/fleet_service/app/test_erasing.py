@@ -1,5 +1,5 @@
-"""A vehicle is erased while the service runs and the vehicle drives on: no data of it remains, and
-no data of others is lost.
+"""Tests of the erasure of a vehicle while the service runs and the vehicle drives on: no data of
+this vehicle remains, and no data of others is lost.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ MONTH = f"{datetime.now(UTC):%Y-%m}"
 
 
 def sent_by(vehicle: str, seq: int) -> Batch:
-    """Return two visits: one where all vehicles drive, and one where only the vehicle to erase
-    drives.
+    """Return a batch with two visits: one where all vehicles drive, and one where only the vehicle
+    to erase drives.
     """
     now = time.time_ns() - SECOND
     latitude = np.array([LATITUDE, ALONE if vehicle == GONE else LATITUDE])
@@ -61,7 +61,7 @@ def pseudonyms_of(root: Path) -> list[str]:
 
 
 def count_shown(session: zenoh.Session) -> dict[int, int]:
-    """Return observations by cell."""
+    """Return the number of observations of each published cell."""
     found: dict[int, int] = {}
     for reply in session.get(keys.map_key(TILE)):
         if reply.ok is not None:
@@ -147,7 +147,7 @@ def fill_engine(root: Path, *names: str) -> Engine:
 
 
 def answer_requests(engine: Engine, root: Path) -> None:
-    """Carry out the requests, with a worker."""
+    """Carry out the erasure requests in a thread, while the service's worker continues."""
     thread = threading.Thread(
         target=erasing.handle_requests, args=(engine, ServiceConfig(), root, threading.Event())
     )

@@ -1,4 +1,4 @@
-"""Past maps are rebuilt in a subprocess from a limited number of rows, or refused."""
+"""Tests that past maps are rebuilt in a subprocess from a limited number of rows, or refused."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NEAR = f"{LONGITUDE - 0.1},{LATITUDE - 0.1},{LONGITUDE + 0.1},{LATITUDE + 0.1}"
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Some compacted rows of one place."""
+    """Return an archive with some compacted rows of one cell."""
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for seq in range(1, 5):
@@ -134,7 +134,7 @@ def test_the_answer_of_the_other_process_is_that_of_this_one(
 
 @pytest.fixture
 def begun(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
-    """Return the processes that were started."""
+    """Return a list that receives every process that is started."""
     found: list[subprocess.Popen[bytes]] = []
 
     real = subprocess.Popen

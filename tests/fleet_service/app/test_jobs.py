@@ -1,4 +1,4 @@
-"""Background jobs of a running service."""
+"""Tests of the background jobs of a running service."""
 
 from __future__ import annotations
 

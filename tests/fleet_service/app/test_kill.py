@@ -1,4 +1,6 @@
-"""Kill -9 of the service while vehicles publish: every acknowledged batch is kept, none twice."""
+"""Tests of kill -9 of the service while vehicles publish: every acknowledged batch is stored
+exactly once.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,7 @@ KILLS = 3
 
 @contextmanager
 def service(router: ZenohSettings, folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """A service process that is ready; it is gone after the block."""
+    """Yield a service process that is ready, and end it after the block."""
     config = folder / "service.json"
     config.write_text(json.dumps({"zenoh": {"connect": router.connect}, "segment_s": 0.05}))
     words = ["run", "--config", str(config), "--archive", str(folder / "archive")]
@@ -79,7 +81,7 @@ def test_killed_service_keeps_acknowledged_reports_and_doubles_none(
 
 
 def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
-    """Return boot (as archived), seq and row of every acknowledged row."""
+    """Return (boot as archived, seq, row) of every acknowledged row."""
     pseudonyms = Pseudonyms(folder / "archive" / "keys")
     now = time.time_ns()
     boots = {
@@ -94,7 +96,7 @@ def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
 
 
 def list_archived(folder: Path) -> list[tuple[int, int, int]]:
-    """Return boot, seq and row of every row in the segments."""
+    """Return (boot, seq, row) of every row in the archive."""
     table = pa.concat_tables(
         reading.read_tables(folder / "archive", Kind.OBSERVATION, ["boot", "seq", "row"])
     )

@@ -1,4 +1,6 @@
-"""Metrics of a running service: refusals by reason, the queue, waiting batches, and health."""
+"""Tests of the metrics of a running service: refusals by reason, the queue, waiting batches, and
+health.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Nothing is compiled any more once the service is ready: vehicles would wait for it."""
+"""Tests that no kernel is compiled after the service is ready, because vehicles would
+have to wait.
+"""
 
 from __future__ import annotations
 

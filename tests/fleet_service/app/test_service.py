@@ -1,4 +1,6 @@
-"""The running service over real Zenoh sessions: what vehicles, clients and operators see of it."""
+"""Tests of the running service over real Zenoh sessions, from the view of vehicles, clients and
+operators.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ VEHICLES = ("sim-001", "sim-002", "sim-003")
 
 
 class Fleet:
-    """A client that publishes batches and stores acknowledgements, tiles and alerts."""
+    """Client that publishes batches and stores the acknowledgements, tiles and alerts that it
+    receives.
+    """
 
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
@@ -54,7 +58,9 @@ class Fleet:
         session.declare_subscriber(f"{keys.ROOT}/alert/**", self._record_alert)
 
     def await_services(self, *regions: int) -> Fleet:
-        """Wait until services for the regions receive published messages and queries."""
+        """Wait until services for the regions receive published messages and queries. Return the
+        fleet.
+        """
         for region in regions or (REGION,):
             for name in (
                 keys.observation_key(region, "sim-000"),
@@ -98,7 +104,7 @@ class Fleet:
         return [one for one in sent if one.seq not in self.durable[one.vehicle]]
 
     def settle(self, *sent: Batch) -> None:
-        """Publish and wait until all of it is acknowledged."""
+        """Publish batches, and wait until all of them are acknowledged."""
         for one in sent:
             self.publish(one)
         until(lambda: all(one.seq in self.durable[one.vehicle] for one in sent))
@@ -112,7 +118,9 @@ def fleet(service: Running, session: zenoh.Session) -> Fleet:
 def ask(
     session: zenoh.Session, parameters: str = "", where: str = "**"
 ) -> list[tuple[str, str, bytes]]:
-    """Key, encoding and payload of every reply; an error reply fails."""
+    """Return key, encoding and payload of every reply to a map query. An error reply fails the
+    test.
+    """
     replies = list(
         session.get(f"{keys.ROOT}/map/{where}" + (f"?{parameters}" if parameters else ""))
     )
@@ -125,7 +133,7 @@ def ask(
 
 
 def alive(session: zenoh.Session) -> list[str]:
-    """Return the presence tokens of the services."""
+    """Return the liveliness tokens of the services."""
     return [
         str(reply.ok.key_expr)
         for reply in session.liveliness().get(f"{keys.ROOT}/shard/*")
@@ -225,8 +233,8 @@ def test_what_is_not_ours_is_counted_and_the_service_goes_on(
 
 
 def seconds() -> Iterator[int]:
-    """Return times one second apart, as of vehicles that follow each other; the last is not in the
-    future.
+    """Return times [ns] one second apart, for vehicles that follow each other. The last time is not
+    in the future.
     """
     return iter(range(now() - 30 * SECOND, now(), SECOND))
 
@@ -253,7 +261,7 @@ def test_ice_raises_an_alert_after_few_passes_and_grip_clears_it(fleet: Fleet) -
 
 
 def standing(session: zenoh.Session) -> list[wire.Alert]:
-    """Return the alerts that a late client receives."""
+    """Return the active alerts that a late client receives."""
     replies = [reply.ok for reply in session.get(f"{keys.ROOT}/alert/**") if reply.ok]
     assert all(str(reply.encoding) == wire.STANDING_ENCODING for reply in replies)
     return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]

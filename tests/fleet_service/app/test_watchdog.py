@@ -1,4 +1,4 @@
-"""Watchdog signals of a service, until something hangs next to its worker."""
+"""Tests of the watchdog signals of a service: they stop when something next to the worker hangs."""
 
 from __future__ import annotations
 

@@ -1,15 +1,15 @@
-"""A reference archive: every kind of file that a service writes, small, and the map that belonged
-to it when it was made.
+"""Reference archive: a small archive with every kind of file that a service writes, and the map
+that it gave when it was written.
 
-    python -m tests.fleet_service.archive.kept FOLDER      a new archive and its map, by the code of
-                                                           today
+    python -m tests.fleet_service.archive.kept FOLDER      write a new archive and its map with
+                                                           the present code
 
-`data/v1.0` was made so by commit 1f90692, before any file had a version. A stored archive is never
-made again, because later code must go on reading it.
+Commit 1f90692 wrote `data/v1.0` in this way, before files had a version. A stored archive is never
+written again, because later code must still be able to read it.
 
-Eight vehicles in two zones, around a midnight: compacted rows with their roll-ups and a snapshot, a
-checkpoint, and segments that came after it; dry road and ice, rows with a value, with a bound only,
-and too late ones; one weather report; states.
+The archive has eight vehicles in two zones, around midnight. It contains compacted rows with
+roll-ups and a snapshot, a checkpoint, and later segments. The rows are of dry road and ice:
+measurements, lower bounds, and rows that came too late. There are also states and a weather report.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ COLUMNS: Final = (
 
 
 def now_of(turn: int) -> int:
-    """Return the time at which a round is received."""
+    """Return the time [ns] at which a round of messages is received."""
     return MIDNIGHT + (turn - ROUNDS // 2) * ROUND_NS
 
 
 def make_observations(turn: int, vehicle: int) -> Batch:
-    """Return the reports of a vehicle in a round: ice in every second cell, bounds from every
-    third vehicle.
+    """Return the observations of a vehicle in a round: ice in every second cell, and only lower
+    bounds from every third vehicle.
     """
     rng = np.random.default_rng([turn, vehicle])
     latitude, longitude = PLACES[vehicle % 2]
@@ -89,7 +89,7 @@ def make_observations(turn: int, vehicle: int) -> Batch:
 
 
 def make_state(turn: int, vehicle: int) -> Batch:
-    """The state that a vehicle sends in a round."""
+    """Return the state that a vehicle sends in a round."""
     latitude, longitude = PLACES[vehicle % 2]
     values = {
         "time": now_of(turn) - SECOND,
@@ -117,7 +117,7 @@ def messages(turn: int) -> Iterator[Message]:
 
 
 def take_checkpoint(engine: Engine) -> Any:  # noqa: ANN401 tables and a time
-    """Take a checkpoint as the service does: one thread requests it, the worker writes it."""
+    """Write a checkpoint as the service does: one thread requests it, and the worker writes it."""
     found: list[object] = []
     stop = threading.Event()
     thread = threading.Thread(target=lambda: found.append(engine.checkpoint(stop)))
@@ -136,7 +136,7 @@ def take_checkpoint(engine: Engine) -> Any:  # noqa: ANN401 tables and a time
 
 
 def map_of(engine: Engine, at: int) -> dict[str, Any]:
-    """The map at a time: every cell's line as the contract has it, and its belief; by cell and
+    """Return the map at a time: for every cell its columns and its belief, sorted by cell and
     sector.
     """
     fusion = engine.state.fusion
@@ -150,7 +150,7 @@ def map_of(engine: Engine, at: int) -> dict[str, Any]:
 
 
 def make(root: Path) -> dict[str, Any]:
-    """Make the archive; returns the map of its end, alerts and rows."""
+    """Write the archive, and return its final map, alerts and rows."""
     with closing(Engine(ServiceConfig(), root)) as engine:
         for turn in range(ROUNDS):
             if turn == 2:

@@ -1,8 +1,7 @@
-"""Common tools that read an archive, each as a function that returns rows, mean of mu, rows with a
-likelihood, and zones. A tool that is not installed is left out. Spark has a test of its own,
-because it takes long.
+"""Common tools that read an archive. Each is a function that returns the number of rows, the mean
+of mu, the number of rows with a likelihood, and the zones.
 
-A reader that is not installed is left out. Spark has a test of its own, for it takes a Java and
+A tool that is not installed is left out. Spark has a separate test, because it needs Java and
 twenty seconds.
 """
 
@@ -17,7 +16,7 @@ from pyarrow import dataset
 
 
 class Seen(NamedTuple):
-    """Result of a tool that read the observations."""
+    """Result of a tool that has read the observations."""
 
     rows: int
     mu: float

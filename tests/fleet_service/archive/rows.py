@@ -1,4 +1,4 @@
-"""Rows of observations and states as the service would write them."""
+"""Synthetic rows of observations and states, as the service would write them."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ PLACES = ((57.7, 11.97), (48.1, 11.6))  # in two zones
 
 
 def rows_of(kind: Kind, count: int, seed: int = 0, vehicles: int = 5) -> Rows:
-    """Rows over twenty minutes around a midnight, in cells of two zones; (vehicle, seq, row) is
-    unique per seed.
+    """Return `count` rows within twenty minutes around midnight, in cells of two zones. For one
+    seed, (vehicle, seq, row) is unique.
     """
     rng = np.random.default_rng(seed)
     place = np.array(PLACES)[rng.integers(0, 2, count)] + rng.normal(0.0, 1e-4, (count, 2))
@@ -54,7 +54,7 @@ def rows_of(kind: Kind, count: int, seed: int = 0, vehicles: int = 5) -> Rows:
 
 
 def fill(root: Path, segments: int, count: int, seed: int = 0) -> Writer:
-    """Segments of both kinds with so many rows each."""
+    """Write segments of both kinds with `count` rows each, and return the writer."""
     writer = Writer(root, "shard-0")
     for k in range(segments):
         for kind in Kind:
@@ -63,7 +63,7 @@ def fill(root: Path, segments: int, count: int, seed: int = 0) -> Writer:
 
 
 def identities(root: Path, kind: Kind) -> list[tuple[int, int]]:
-    """(boot, seq) of all rows that a reader sees, sorted."""
+    """Return (boot, seq) of all rows that a reader finds, sorted."""
     return sorted(
         (row["boot"], row["seq"])
         for table in reading.read_tables(root, kind, ["boot", "seq"])

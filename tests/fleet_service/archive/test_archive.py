@@ -1,4 +1,6 @@
-"""The archive: order of fsync, rename and acknowledgement; faults of the disk; lock; pseudonyms."""
+"""Tests of the archive: order of fsync, rename and acknowledgement; faults of the disk; lock;
+pseudonyms.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,7 @@ def read_settled(acks: list[tuple[str, bytes]]) -> dict[str, list[tuple[int, int
 
 @pytest.fixture
 def engine(tmp_path: Path) -> Iterator[Engine]:
-    """Open a log on an empty archive."""
+    """Yield an engine on an empty archive."""
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         yield engine
 

@@ -1,4 +1,6 @@
-"""Compaction loses and doubles no row, wherever it is interrupted and whichever reader is used."""
+"""Tests that compaction loses and doubles no row, wherever it is interrupted and whichever program
+reads.
+"""
 
 from __future__ import annotations
 
@@ -35,11 +37,11 @@ ROWS = 50
 
 
 class DiedError(BaseException):
-    """Death of the process; no handler catches it."""
+    """Simulated death of the process, which no handler catches."""
 
 
 def public(root: Path, kind: Kind) -> list[tuple[int, int]]:
-    """Return (boot, seq) of the rows that another tool finds in the compacted files."""
+    """Return (boot, seq) of the rows that another program finds in the compacted files."""
     paths = list((root / layout.TABLES[kind]).rglob("*.parquet"))
     found = [pq.read_table(path, columns=["boot", "seq"], partitioning=None) for path in paths]
     return sorted((row["boot"], row["seq"]) for table in found for row in table.to_pylist())
@@ -100,7 +102,9 @@ def test_files_lie_by_date_and_zone_and_are_sorted_by_cell_and_time(tmp_path: Pa
 
 
 def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
-    """Count changes of the disk; die before the one with this number."""
+    """Record the operations that change the disk in a list, and die before the operation number
+    `die_at`.
+    """
     seen: list[str] = []
 
     def count_calls(name: str, real: Callable[..., object]) -> Callable[..., object]:

@@ -1,4 +1,4 @@
-"""GeoParquet files checked with an independent validator and GeoPandas."""
+"""Tests of GeoParquet files with an independent validator and GeoPandas."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.fleet_service.examples import CELL, START, observations, value
 
 
 def a_map(cells: int = 300) -> pa.Table:
-    """Return neighbouring cells as the service knows them."""
+    """Return the map table of neighbouring cells."""
     rng = np.random.default_rng(2)
     cell = CELL + rng.permutation(cells)
     fusion = Fusion(120.0)
@@ -38,8 +38,8 @@ def a_map(cells: int = 300) -> pa.Table:
 
 
 def failures(path: Path) -> list[str]:
-    """Return the names of the abstract tests that a file fails. Assert that the required tests were
-    applied.
+    """Return the names of the validator's tests that a file fails. Assert that the required tests
+    were applied.
     """
     report = geoparquet_validator.check(str(path))
     passed = [outcome["id"] for outcome in report["outcomes"] if outcome["status"] == "pass"]

@@ -1,4 +1,6 @@
-"""Segment log: nothing is settled before it is durable, and a failed write loses no row."""
+"""Tests of the segment log: nothing is settled before it is durable, and a failed write loses no
+row.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ def log(tmp_path: Path) -> Iterator[SegmentLog[str]]:
 
 
 def add(log: SegmentLog[str], name: str, seed: int, kind: Kind = Kind.OBSERVATION) -> None:
-    """Return three rows of a batch."""
+    """Add a batch of three rows to the log."""
     log.add(kind, rows_of(kind, 3, seed), [name])
 
 
@@ -87,7 +89,9 @@ def test_segment_order_does_not_depend_on_the_number_of_digits() -> None:
 
 
 def test_a_power_loss_after_the_first_key_was_given_never_takes_it_back(tmp_path: Path) -> None:
-    """If a batch is acknowledged under an erased key, it is admitted again under the next key."""
+    """If the key were lost, rows acknowledged under it could not be recognised, and would be
+    accepted again under a new key.
+    """
     for seed in range(20):
         live = tmp_path / f"live-{seed}"
         after = tmp_path / f"after-{seed}"

@@ -1,4 +1,4 @@
-"""The archive, unchanged, opened with common tools."""
+"""Tests that common tools open the archive without conversion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Removal of old raw rows, of keys and of one vehicle's rows, and the data that stays."""
+"""Tests of the removal of old raw rows, of keys and of one vehicle's rows, and of the data that
+must remain.
+"""
 
 from __future__ import annotations
 
@@ -158,7 +160,9 @@ ERASED = "time: the data of this month or vehicle were erased; delete the batch"
 
 
 def acknowledge_batch(engine: Engine, sent: Batch, now: int) -> list[str]:
-    """Return the acknowledgement of a batch, once a segment is written."""
+    """Ingest a batch, write a segment, and return the kinds of acknowledgement that the batch
+    received.
+    """
     engine.intake.ingest([Message(sent.kind, key(sent.vehicle), wire.encode(sent), "")], now)
     streams = [
         stream for _, data in engine.settlement.flush() for stream in wire.decode_ack(data)[1]
@@ -175,7 +179,7 @@ def rows_kept(root: Path) -> int:
 
 
 def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: Path) -> None:
-    """The record of an old batch is gone, but a spool may still hold the batch if its
+    """The archive no longer has the old batch, but an outbox may still have it if its
     acknowledgement was lost.
     """
     old = batch("car-001", 1, NOON, [0.8])
@@ -203,7 +207,7 @@ def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: 
 
 
 def test_a_forgotten_vehicles_measurements_stay_refused_over_restarts(tmp_path: Path) -> None:
-    """A spool restored from a backup may hold rows that were acknowledged long ago."""
+    """An outbox restored from a backup may contain rows that were acknowledged long ago."""
     old, other, late = (batch(f"car-00{k}", 1, NOON + k * SECOND, [0.8]) for k in (1, 2, 3))
     late = replace(late, vehicle="car-001", boot=2)
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:

@@ -1,4 +1,4 @@
-"""Roll-ups equal a direct sum over the rows, for every division into parts."""
+"""Tests that roll-ups equal a direct sum over the rows, for every division into parts."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ JOIN: dict[str, Callable[..., Any]] = {
 
 
 def merge_parts(root: Path) -> dict[tuple[int, int, int], dict[str, Any]]:
-    """Statistics of each cell, sector and hour: parts merged as their columns say."""
+    """Return the statistics of each (cell, sector, hour), merged from all parts of the roll-up."""
     out: dict[tuple[int, int, int], dict[str, Any]] = {}
     for path in (root / rollup.TABLE).rglob("*.parquet"):
         table = pq.read_table(path, partitioning=None)

@@ -1,5 +1,5 @@
-"""Versions of archive files: files of earlier versions stay readable, a file of an unknown version
-is refused but not treated as damaged, and a process that only reads changes no file.
+"""Tests of the versions of archive files: files of earlier versions stay readable, and a file of an
+unknown version is refused but not treated as damaged. A process that only reads changes no file.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ EVERYTHING = extract.Extract(0, 2**62)
 
 @pytest.fixture
 def old(tmp_path: Path) -> Path:
-    """A copy of the archive that was kept before files had versions."""
+    """Return a copy of the archive that was stored before files had versions."""
     return shutil.copytree(OLD / "archive", tmp_path / "old")
 
 
 def same(found: dict[str, Any], made: dict[str, Any]) -> None:
-    """Assert that the map equals the stored one, up to single precision and another machine's
+    """Assert that a map equals the stored one, up to single precision and another machine's
     logarithm.
 
-    Its beliefs are those that this fusion computes from the archive. A changed fusion must write
-    them again and give the reason.
+    The stored beliefs are those that the present fusion computes from the archive. A change of the
+    fusion must write them again and give the reason.
     """
     assert found["at"] == made["at"]
     np.testing.assert_allclose(found["beliefs"], made["beliefs"], rtol=0.0, atol=1e-6)
@@ -142,7 +142,7 @@ def _identities(root: Path, kind: Kind) -> list[tuple[str, int, int]]:
 def rewrite_file(
     path: Path, change: Callable[[pa.Table], pa.Table], said: str, encoding: Encoding = SEGMENT
 ) -> None:
-    """Let a file be one of another version."""
+    """Rewrite a file as one of another version, with its table changed by `change`."""
     found = read_content(path)
     assert found is not None
     write_table(change(found.table), path, encoding, {**found.entries, version.KEY: said})

@@ -1,5 +1,5 @@
-"""Slippery stretches as DATEX II: valid, versioned and ended. A stretch without new reports has not
-ended.
+"""Tests of slippery road sections as DATEX II: valid, versioned and ended. A section without new
+reports is not ended.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Access list of the routers: real sessions with real certificates against the generated list."""
+"""Tests of the routers' access list: real sessions with real certificates and the
+generated list.
+"""
 
 from __future__ import annotations
 
@@ -228,7 +230,7 @@ def test_a_certificate_that_is_not_there_is_said_by_name(tmp_path: Path) -> None
 
 
 def test_a_declared_publisher_of_a_vehicle_is_told_that_somebody_listens(running: Network) -> None:
-    """Without this rule the vehicle would send nothing, without any error."""
+    """Without this access rule the vehicle would send nothing and get no error."""
     received: list[bytes] = []
     with (
         running.open_session(SERVICE) as service,

@@ -1,4 +1,4 @@
-"""Results of `fleet-service certs` for any previous content of its folder."""
+"""Tests of `fleet-service certs` for any previous content of its folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EVERYONE = {*ROUTERS, SERVICE, READER, WEATHER, *VEHICLES}
 
 
 def at(folder: Path, days: float = 0.0, **terms: float) -> Registry:
-    """Return the registry some days later."""
+    """Return the registry of a folder as it would be opened `days` later."""
     return Registry(folder, Terms(**terms), NOW + timedelta(days=days))
 
 

@@ -1,4 +1,4 @@
-"""Theorems of one cell's belief: what time and votes can and cannot do to it."""
+"""Tests of the theorems of one cell's belief: how time and votes may change it."""
 
 from __future__ import annotations
 

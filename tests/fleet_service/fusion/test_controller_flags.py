@@ -1,5 +1,5 @@
-"""Slip controllers as witnesses: they support an alert but change no belief, and only if their
-record is good.
+"""Tests of slip-controller flags: they support an alert but change no belief, and count only if the
+vehicle's earlier flags agreed with values of other vehicles.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ def flags(o: Observations, limited: BoolArray, used: FloatArray) -> Observations
 
 
 def make_acquainted(claims_on_dry: bool) -> Fusion:
-    """Fusion after 30 minutes on dry cells.
+    """Return a fusion after 30 minutes of visits to dry cells.
 
-    FLAGGED brakes gently every second time, with its flag on if `claims_on_dry`; else it gives
-    values and is trusted.
+    The vehicle FLAGGED brakes gently every second time, with its flag on if `claims_on_dry`.
+    Otherwise it reports values and is trusted.
     """
     fusion = Fusion(120.0)
     for minute in range(30):
@@ -41,8 +41,8 @@ def make_acquainted(claims_on_dry: bool) -> Fusion:
 
 
 def ice_with(fusion: Fusion, *, flag: bool) -> bool:
-    """Return True if one value of ice and one gentle visit, with a flag or without, make an
-    alert.
+    """Return True if one value of ice and one gentle visit, with or without a flag,
+    raise an alert.
     """
     who = np.array([3, FLAGGED])
     likelihood = np.concatenate([value(np.array([ICY]), 0.02), at_least(np.array([0.1]))])

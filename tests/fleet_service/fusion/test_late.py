@@ -1,4 +1,4 @@
-"""A late report counts as an old report and is not dropped."""
+"""Tests of late reports: a late report counts as an old report and is not dropped."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ LIVE = observations([3600.0], [50], value([0.8]), cell=CELL + 9)  # somebody rep
 
 
 def late(order: np.ndarray, parts: int) -> tuple[Fusion, list[tuple[np.ndarray, Updated]]]:
-    """Return an hour's backlog after a live report."""
+    """Feed an hour's backlog after a live report, in an order and in `parts` parts. Return the
+    fusion, and for each part its rows and update.
+    """
     fusion = Fusion(120.0)
     fusion.update(LIVE)
     o = drive(7, 400, 3000.0)

@@ -1,4 +1,4 @@
-"""Influence of slippery neighbours on a cell, and its limits."""
+"""Tests of the influence of slippery neighbours on a cell, and of its limits."""
 
 from __future__ import annotations
 
@@ -31,13 +31,16 @@ UNTESTED = at_least([0.3] * 4)  # four gentle drivers
 
 
 def east(steps: int, north: int = 0) -> int:
-    """Return the cell this many steps east of CELL."""
+    """Return the cell `steps` east and `north` north of CELL."""
     return int(grid.interleave(np.array([X + steps]), np.array([Y - north]))[0])
 
 
 def road(found: dict[int, FloatArray], sector: int = 0) -> Fusion:
-    """Return a fusion after visits (n, 32) to cells this many steps east of CELL, each by new
-    vehicles.
+    """Return a fusion after visits to cells east of CELL.
+
+    Args:
+        found: log-likelihoods (n, 32) of the visits by steps east of CELL, each by new vehicles.
+        sector: sector of the visits.
     """
     fusion = Fusion(120.0)
     for steps, said in found.items():

@@ -1,4 +1,4 @@
-"""The normal distribution compared with a library's, far into both tails."""
+"""Test of the normal distribution by comparison with a library's, far into both tails."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Order and replay: within the lateness window no order of arrival matters, and a replay gives
-the same map.
+"""Tests of order and replay: within the lateness window the order of arrival has no effect, and a
+replay gives the same map.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ LATENESS_S = 120.0
 
 
 def drive(seed: int, n: int, duration_s: float) -> Observations:
-    """Visits of 12 vehicles, one of them a liar, to 6 cells; in order of time."""
+    """Return visits of 12 vehicles, one of which reports wrong values, to 6 cells, in order of
+    time.
+    """
     rng = np.random.default_rng(seed)
     vehicle = rng.integers(0, 12, n)
     mu = np.where(
@@ -53,7 +55,7 @@ def fold_in(
 
 
 def difference(a: Fusion, b: Fusion) -> float:
-    """Return the largest difference of a probability over all cells."""
+    """Return the largest difference of a probability in two fusions, over all cells."""
     assert a.size == b.size
     there = b.slots_of(a.cell[: a.size], a.sector[: a.size])
     now = int(max(a.live.time.max(), b.live.time.max()))

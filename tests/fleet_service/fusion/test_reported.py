@@ -1,4 +1,4 @@
-"""Reported values are described as they were received, before any correction."""
+"""Tests that reported values are described as they were received, before any correction."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.fleet_service.examples import CELL, observations, value
 
 
 def encode_value(mu: float, std: float = 0.05) -> np.ndarray:
-    """Return a value as bytes, (1, 32)."""
+    """Return the encoded log-likelihood (1, 32) of a measurement of `mu`."""
     return mugrid.encode_log_likelihood(-0.5 * np.square((mugrid.CENTRES - mu) / std))[None]
 
 

@@ -1,4 +1,4 @@
-"""Visits without a value: they end the knowledge of ice and never show grip."""
+"""Tests of visits without a value: they weaken a belief of ice, but never show grip."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ UNKNOWN = float(SLIPPERY_SHARE @ mugrid.PRIOR)
 
 
 def visited(noticed: FloatArray, *, limited: bool = False) -> Fusion:
-    """Return a fusion of one cell: vehicles with values of the frictions `noticed`, a minute apart,
-    then QUIET others that use .05.
+    """Return a fusion of one cell. Vehicles report values of the frictions `noticed`, a minute
+    apart; then QUIET others pass and use a grip of .05.
     """
     fusion = Fusion(120.0)
     n = len(noticed)

@@ -1,4 +1,4 @@
-"""A visit with an uncertain position is shared among cells and never counted twice."""
+"""Tests that a visit with an uncertain position is divided among cells and never counted twice."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def information(p: FloatArray) -> float:
 
 
 def read_beliefs(fusion: Fusion) -> FloatArray:
-    """Return the beliefs of all cells from their own reports only, (cells, 32)."""
+    """Return the beliefs (cells, 32) of all cells from their own reports, without neighbours."""
     kept = fusion.live.belief[: fusion.size].astype(float)
     return np.asarray(kept / kept.sum(axis=1, keepdims=True))
 

@@ -1,4 +1,6 @@
-"""Memory of the fusion: tables of any length find every stored key, and unused rows are freed."""
+"""Tests of the fusion's memory: hash tables of any length find every stored key, and unused rows
+are freed.
+"""
 
 from __future__ import annotations
 
@@ -63,8 +65,8 @@ def test_reporters_and_sources_of_hours_ago_are_dropped_and_reused() -> None:
 
 
 def test_old_cells_back_at_the_prior_are_dropped_without_other_effect() -> None:
-    """A fusion that dropped unused slots gives the same results for later observations as one that
-    kept them.
+    """A fusion that dropped unused slots must give the same results for later observations as one
+    that did not drop them.
     """
     fusion = Fusion(LATENESS_S)
     whole = Fusion(LATENESS_S)

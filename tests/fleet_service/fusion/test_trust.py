@@ -1,4 +1,4 @@
-"""Trust of vehicles: a group that agrees only with itself gains none."""
+"""Tests of trust in vehicles: a group that agrees only with itself gains no trust."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ LIARS = np.arange(100, 108)
 
 
 def drive_liars(private: int = 0, *, enrolled: bool = False) -> Fusion:
-    """Return a fusion with twenty honest vehicles and eight that claim .25 in four cells; the eight
-    also visit `private` other cells.
+    """Return a fusion with twenty honest vehicles and eight that report .25 in four cells. The
+    eight also visit `private` other cells.
     """
     rng = np.random.default_rng(4)
     fusion = Fusion(120.0, enrolled=enrolled)

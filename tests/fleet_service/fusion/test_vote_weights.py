@@ -1,5 +1,5 @@
-"""The fusion learns the weights of vehicles, and how much their values fall with the grip left
-unused.
+"""Tests of learned parameters of the fusion: the weights of vehicles, and how much their values
+fall with the grip left unused.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ VEHICLES = 30
 def make_acquainted(
     slope: float = 0.0, gain_std: float = 0.06, *, gain_in_use: bool = False
 ) -> Fusion:
-    """A fleet with gain errors after forty minutes in ten cells; a value is too low by `slope`
-    for each μ left.
+    """Return a fusion after forty minutes of a fleet with gain errors in ten cells. A value is too
+    low by `slope` times the unused part of μ.
     """
     rng = np.random.default_rng(5)
     fusion = Fusion(120.0)
@@ -61,14 +61,16 @@ def test_shape_of_nobody_is_the_prior() -> None:
 
 @pytest.mark.parametrize("gain_std", [0.05, 0.1])
 def test_gain_error_common_to_value_and_use_is_no_shape(gain_std: float) -> None:
-    """Between vehicles such errors look like a slope cov(value, use)/var(use) ≥ .3; within one
+    """Between vehicles such errors look like a slope cov(value, use)/var(use) ≥ .3. Within one
     vehicle they cancel.
     """
     assert learned_slope(make_acquainted(0.0, gain_std, gain_in_use=True)) < 0.12
 
 
 def road_after(slope: float, used: float) -> FloatArray:
-    """Belief of a new cell after three values of .5 that used `used`, in a fleet of that slope."""
+    """Return the belief of a new cell after three values of .5 that used a grip of `used`, in a
+    fleet with this slope.
+    """
     fusion = make_acquainted(slope)
     o = observations(2500.0 + np.arange(3.0), np.arange(3), value(np.full(3, 0.5)), cell=70)
     fusion.update(dataclasses.replace(o, used=np.full(3, used, np.float32)))
@@ -95,8 +97,8 @@ def test_shape_is_the_slope_and_a_doubt() -> None:
 
 
 def test_doubt_of_an_alarm_ends_once_the_shape_is_known() -> None:
-    """A service that knows no vehicle doubts a gentle value before an alert more than one that
-    knows its fleet.
+    """A service that knows no vehicle assumes a larger error of a gentle value before it raises an
+    alert than a service that knows its fleet.
     """
     unknown = shared.UNKNOWN_SHAPE
     assert unknown.alarm == pytest.approx(0.5, abs=0.01)
@@ -134,8 +136,8 @@ def test_gentle_value_a_little_below_grip_may_be_a_soft_tyre(used: float, witnes
 
 
 def count_witnesses(mu: float, used: float, tail: float) -> int:
-    """Count the sources of ice after one vehicle's value of `mu`, with a likelihood of `tail` on
-    dry road.
+    """Return the number of sources of ice after one vehicle's value of `mu`. For dry road its
+    likelihood is `tail` [nat].
     """
     fusion = Fusion(120.0)
     tailed = np.maximum(value([mu], 0.03), np.where(mugrid.CENTRES > 0.5, tail, -12.0))

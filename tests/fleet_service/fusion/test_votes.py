@@ -1,4 +1,4 @@
-"""Influence of votes on a cell: one vote per vehicle, many vehicles, change, trust."""
+"""Tests of the influence of votes on a cell: one vote per vehicle, many vehicles, change, trust."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Effect of weather on forgetting; the order in which reports of weather arrive does not matter."""
+"""Tests of the effect of weather on the ageing of beliefs. The order in which weather reports
+arrive has no effect.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,12 @@ STEADY = (15.0, np.nan, 0.0)
 
 
 def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGION) -> w.Reports:
-    """Return hourly reports after START with air temperature, road temperature and precipitation."""
+    """Return weather reports.
+
+    Args:
+        rows: (hours after START, (air temperature [°C], road temperature [°C], precipitation [mm/h])).
+        region: region of the reports.
+    """
     air, road, water = np.array([row[1] for row in rows]).T
     time = np.array([START + int(row[0] * HOUR) for row in rows])
     return w.Reports(
@@ -43,7 +50,7 @@ def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGIO
 
 
 def compute_road_time(weather: w.Weather, begin: float, end: float) -> tuple[float, float]:
-    """Hours of road time of drift and change."""
+    """Return the road time [h] of drift and of sudden change between two times [h after START]."""
     drift, change, _ = w.road_time(weather, KEY, START + int(begin * HOUR), START + int(end * HOUR))
     return drift / 3600.0, change / 3600.0
 

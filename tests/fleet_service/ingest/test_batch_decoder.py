@@ -1,5 +1,5 @@
-"""The compiled decoder compared with the protobuf module: a message that it accepts is decoded
-identically, to the last bit.
+"""Tests of the compiled decoder: it decodes every message that it accepts exactly like the protobuf
+module.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ def draw_message(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401
 
 
 def is_agreed(kind: Kind, payload: bytes) -> bool:
-    """Return True if the scanner understands the bytes; fail if it then reads something else
-    than the library.
+    """Return True if the compiled decoder accepts the bytes. Fail if it then decodes anything else
+    than the protobuf library.
     """
     data = np.frombuffer(payload, np.uint8)
     found = walk_fields(kind, data, np.array([len(payload)]))

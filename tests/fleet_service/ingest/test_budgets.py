@@ -1,4 +1,6 @@
-"""One valid car counts as one witness and cannot fill a service, whatever it sends."""
+"""Tests of the limits of one valid car: it counts as one vehicle and cannot fill a service,
+whatever it sends.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,9 @@ def engine(tmp_path: Path) -> Iterator[Engine]:
 
 
 def months(now: int) -> tuple[int, int]:
-    """The last second of a month and the first of the next, as near as they were [ns]."""
+    """Return the last second of a month and the first of the next [ns], at the month's border
+    before `now`.
+    """
     first = datetime.fromtimestamp(now / SECOND, UTC).replace(
         day=1, hour=0, minute=0, second=0, microsecond=0
     )
@@ -179,7 +183,7 @@ def test_who_a_vehicle_is_is_durable_before_it_is_acknowledged(
 
 
 def everywhere(seq: int, count: int, now: int) -> Batch:
-    """Visits to as many new cells side by side, one after the other at 12 m/s."""
+    """Return a batch with visits to `count` new adjacent cells, one after the other at 12 m/s."""
     at = np.arange(count) + seq * count
     latitude = 57.60 + 2e-4 * (at // 400)
     longitude = 11.75 + 2e-4 * (at % 400)

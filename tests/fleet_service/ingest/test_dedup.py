@@ -1,4 +1,6 @@
-"""Admitted batches against a plain set as oracle, and the bound on remembered batches."""
+"""Tests of dedup: admitted batches equal those found with a plain set, and the number of remembered
+batches is bounded.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The queue behind the subscribers: bounded by its content, and taken in steps."""
+"""Tests of the queue behind the subscribers: its content is bounded, and it is emptied in steps."""
 
 from __future__ import annotations
 

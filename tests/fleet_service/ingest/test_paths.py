@@ -1,4 +1,6 @@
-"""A vehicle's path is plausible over rows, batches, boots and regions, in any order of arrival."""
+"""Tests that a vehicle's path is checked over rows, batches, boots and regions, in any order of
+arrival.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,14 @@ CAR = 7
 def find(
     known: VehiclePaths, seconds: Iterable[float], east_m: Iterable[float], vehicle: int = CAR
 ) -> list[bool]:
-    """Return which reports on the equator are implausible."""
+    """Return for each report on the equator whether its position is implausible.
+
+    Args:
+        known: paths of the vehicles so far.
+        seconds: times after START [s].
+        east_m: positions [m].
+        vehicle: the vehicle's number.
+    """
     time = START + (np.array(list(seconds)) * SECOND).astype(np.int64)
     east = np.array(list(east_m), float) * METRE
     found = known.find_implausible(np.full(len(time), vehicle), time, np.zeros(len(time)), east)

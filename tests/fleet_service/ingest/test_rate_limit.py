@@ -1,4 +1,4 @@
-"""Rate limits: buckets against the clock, invented names, long acknowledgements."""
+"""Tests of rate limits: token buckets over time, invented names, long acknowledgements."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BURST = 50_000.0
 
 
 class Clock:
-    """A clock that is set by hand."""
+    """Clock that the test sets."""
 
     now = 0.0
 

@@ -1,4 +1,4 @@
-"""Validation: rules one by one, and malicious bytes."""
+"""Tests of validation: each rule, and malicious bytes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_ranges_hold_exactly_their_numbers(numbers: set[int]) -> None:
 
 
 class Desk:
-    """Return an intake without a service."""
+    """Intake of messages without a service."""
 
     def __init__(self, folder: Path) -> None:
         self.counts: Counter[str] = Counter()
@@ -44,7 +44,7 @@ class Desk:
         self.intake = BatchIntake(SequenceTrackers(), Pseudonyms(folder), self.counts, self.acks)
 
     def take(self, *messages: Message) -> int:
-        """Number of rows admitted."""
+        """Process messages, and return the number of admitted rows."""
         return sum(
             len(accepted.rows["row"]) for accepted in self.intake.accept(messages, CLOCK).values()
         )
@@ -77,7 +77,7 @@ FAR = int(grid.cell_of(LATITUDE, 12.02))
 
 
 def one(column: str, values: list[float]) -> dict[str, Any]:
-    """A change of one column."""
+    """Return a change of one column."""
     return {column: values}
 
 
@@ -219,7 +219,9 @@ def test_no_text_stops_the_intake(desk: Desk, payload: bytes) -> None:
 
 
 def test_unusable_records_are_rejected_if_the_head_can_be_read(desk: Desk) -> None:
-    """Otherwise the batch would be sent again for ever and stop its stream after 65 536 others."""
+    """Without a rejection the vehicle would send the batch for ever, and its stream would stop
+    after 65 536 later batches.
+    """
     pb = wire.parse(wire.encode(batch("sim-001", 7, NOW, [0.8, 0.8])), "", ObservationBatch, "")
     del pb.mu[1:]
     assert desk.take(message(batch("sim-001", 7, NOW, [0.8]), pb.SerializeToString())) == 0

@@ -1,5 +1,5 @@
-"""Weather input from a file and over Zenoh: refused with a reason, archived, and the same after a
-restart.
+"""Tests of weather input from a file and over Zenoh: invalid input is refused with a reason, valid
+input is archived and has the same effect after a restart.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def test_a_wrong_weather_file_is_refused_with_row_and_column(
 
 
 def drive(engine: Engine, begin: int, seq: int) -> None:
-    """Three vehicles, one visit each, at a time [ns]."""
+    """Ingest one visit of each of three vehicles at a time [ns]."""
     for k in range(3):
         sent = batch(f"sim-00{k}", seq, begin + k * SECOND, [0.8])
         engine.intake.ingest(

@@ -1,4 +1,6 @@
-"""End-to-end drives: the campaign reads the files of the vehicles and compares them with the truth."""
+"""Tests of the end-to-end campaign: it reads the files of the vehicles and compares the map with
+the true friction.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,11 @@ def test_a_figure_of_nothing_is_not_a_number_and_holds_no_bar() -> None:
 
 
 def visits(*rows: tuple[int, float, float]) -> pa.Table:
-    """Return visits to cells next to CELL, from seconds and friction."""
+    """Return a table of visits.
+
+    Args:
+        rows: (steps east of CELL, time [s], friction) of each visit.
+    """
     cell, seconds, mu = np.array(rows).T
     return pa.table(
         {

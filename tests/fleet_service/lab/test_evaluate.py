@@ -1,4 +1,6 @@
-"""The campaign on a small scale: every figure is there, and the parts work as documented."""
+"""Tests of the campaign on a small scale: every figure is present, and the parts work as
+documented.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ from schemas import mugrid
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A campaign of seconds: few minutes, few vehicles. Its values mean nothing."""
+    """Shrink the campaign to a few minutes and vehicles, so that it runs in seconds. Its figures
+    mean nothing.
+    """
     brief = tuple(fleet._replace(begin=0, minutes=6) for fleet in fleets.FLEETS)
     for module, name, value in (
         (fleets, "FLEETS", brief),

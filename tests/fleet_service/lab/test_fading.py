@@ -1,4 +1,6 @@
-"""Fading of a dry road: the lower end falls with time, and faster near freezing."""
+"""Tests of the ageing of a dry road's belief: the lower end falls with time, and faster near
+freezing.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Errors resampled from drives: of the same vehicle, on a similar road, scaled to the friction of
-the town.
+"""Tests of errors resampled from drives: each is of the same vehicle, on a similar road, and scaled
+to the friction of the town.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ MINUTES = 6
 
 
 def visits_on(mu: FloatArray, vehicle: IntArray, low: FloatArray) -> DrivenVisits:
-    """Excited and gentle visits in turn, of vehicles that read `low` times the road,
-    (vehicles,).
+    """Return visits that alternately use little grip and enough to measure μ. Vehicle k reads
+    `low[k]` times the true friction.
     """
     excited = np.arange(len(mu)) % 2 == 1
     reading = mu * low[vehicle]

@@ -1,5 +1,5 @@
-"""A fleet of another maker: its error model is as stated, and its figures match the answers of a
-map.
+"""Tests of the simulated fleet of another maker: its error model is as stated, and its figures
+match the answers of a map.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Value to users: road-hours, alerts and rules on towns whose truth is known."""
+"""Tests of the value to users: road-hours, alerts and simple rules in towns with known friction."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from schemas.numeric import FloatArray
 
 
 def town_that_freezes(minute: float) -> town.Town:
-    """A dry town whose first road turns to ice at a minute."""
+    """Return a dry town whose first road turns to ice at a minute."""
     mu: FloatArray = np.full((value.MINUTES + 1, town.CELLS), 0.8)
     mu[int(minute) :, : town.LENGTH] = 0.15
     changed = np.full(town.CELLS, np.inf)

@@ -1,4 +1,4 @@
-"""A page in this process with a router and a service, and a browser in front of it."""
+"""Fixtures: a live page in this process with a router and a service."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.waiting import until
 
 @dataclass
 class RunningPage:
-    """A running page with its folder and address."""
+    """Running page with its address, its service and its archive folder."""
 
     address: str
     service: Running | None
@@ -31,7 +31,9 @@ class RunningPage:
 
 @contextmanager
 def page_of(connection: ZenohSettings, **changed: object) -> Iterator[str]:
-    """The address of a page in a thread of this process; it ends with the block."""
+    """Yield the address of a page that runs in a thread of this process, and stop the page after
+    the block.
+    """
     stop = threading.Event()
     lines = list[str]()
     settings = PageSettings(connection, port=0, **changed)  # type: ignore[arg-type]
@@ -48,14 +50,14 @@ def page_of(connection: ZenohSettings, **changed: object) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def bare(router: ZenohSettings) -> Iterator[str]:
-    """Yield the address of a page without a service."""
+    """Yield the address of a page that has no service."""
     with page_of(router) as address:
         yield address
 
 
 @pytest.fixture
 def page(router: ZenohSettings, tmp_path: Path) -> Iterator[RunningPage]:
-    """A page next to a service that keeps a snapshot each second."""
+    """Yield a page with a service that writes a snapshot each second."""
     archive = tmp_path / "archive"
     with (
         running(router, archive, snapshot_s=1.0) as service,
@@ -69,7 +71,9 @@ Drive = Callable[..., None]
 
 @pytest.fixture
 def drive(session: zenoh.Session, page: RunningPage) -> Drive:
-    """Let the cars drive over parts of the crossing; returns when the service knows of it."""
+    """Return a function that lets the cars drive over parts of the crossing, and returns when the
+    service has their reports.
+    """
     seq = 1
 
     def go(*parts: str) -> None:

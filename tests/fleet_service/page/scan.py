@@ -1,4 +1,4 @@
-"""Accessibility scan of the page by axe-core: serious and critical findings in every panel."""
+"""Accessibility scan of the page with axe-core: serious and critical findings in every panel."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MISSING: Final = "no axe-core in .page/tools: make browser-test fetches it with 
 
 
 def findings(seen: Opened, tabs: tuple[str, ...] = TABS) -> list[str] | None:
-    """Return serious findings, one per line; None if axe-core is not installed."""
+    """Return the serious findings, one text per finding, or None if axe-core is not installed."""
     source = file_of("axe-core", "axe.min.js")
     if source is None:
         return None

@@ -1,4 +1,6 @@
-"""A crossing of two streets driven by six cars: dry, snow, ice, and a part where nobody used grip."""
+"""Crossing of two streets on which six cars drive: dry, snow, ice, and a part where no car uses
+much grip.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,8 @@ MIDDLE: Final = tuple(int(v) for v in grid.deinterleave(CELL))
 
 
 class Part(NamedTuple):
-    """Cells of a street, the headings they are driven in, and the friction found there; None: they
-    are only passed.
+    """Part of a street: its cells, the headings in which it is driven, and the friction measured
+    there (None if cars use little grip).
     """
 
     dx: range
@@ -46,7 +48,7 @@ PARTS: Final = {
 
 
 def cells(part: Part) -> IntArray:
-    """Cells of a part, (n,)."""
+    """Return the cells of a part, (n,)."""
     places = [(x, y) for x in part.dx for y in part.dy]
     x, y = (np.array(one, np.int64) for one in zip(*places, strict=True))
     return grid.interleave(MIDDLE[0] + x, MIDDLE[1] + y)
@@ -59,8 +61,8 @@ def put(
     first_seq: int = 1,
     cars: Sequence[str] = CARS,
 ) -> int:
-    """Let cars drive over parts, there and back, the last visit `now` [ns], and report; returns
-    the next free seq.
+    """Publish the visits of cars that drive over parts, there and back, with the last visit at
+    `now` [ns]. Return the next free seq.
     """
     place, heading, mu = _drive([PARTS[name] for name in parts])
     time = now - (len(place) - 1 - np.arange(len(place))) * VISIT_NS
@@ -105,7 +107,9 @@ def _report(
 
 
 def _drive(parts: Sequence[Part]) -> tuple[IntArray, IntArray, FloatArray]:
-    """Cell, heading and mu of each visit, in the order of a drive: east, west, north, south."""
+    """Return cell, heading and mu of each visit, in the order of a drive: east, west,
+    north, south.
+    """
     found = []
     for heading in (EAST, WEST, NORTH, SOUTH):
         way = [
@@ -120,5 +124,5 @@ def _drive(parts: Sequence[Part]) -> tuple[IntArray, IntArray, FloatArray]:
 
 
 def count_known(*parts: str) -> int:
-    """Return the number of cells and headings on the map after parts were driven."""
+    """Return the number of (cell, heading) pairs on the map after the named parts were driven."""
     return sum(len(cells(PARTS[name])) * len(PARTS[name].headings) for name in parts or PARTS)

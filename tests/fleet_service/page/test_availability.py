@@ -1,5 +1,5 @@
-"""One client cannot use up past maps, event streams or connections of a page so that others are
-shut out.
+"""Tests that one client cannot use up the page's past maps, event streams or connections, so that
+others would get none.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def test_full_page_takes_a_stream_from_the_client_with_most() -> None:
 
 
 class Transport:
-    """Connection that records that it was closed."""
+    """Simulated connection that records that it was closed."""
 
     def __init__(self, host: str) -> None:
         self._host = host
@@ -108,14 +108,14 @@ class Transport:
         self.is_aborted = True
 
     def get_extra_info(self, name: str) -> Any:  # noqa: ANN401 as asyncio has it
-        """Return the peer."""
+        """Return the address of the client."""
         return (self._host, 1) if name == "peername" else None
 
 
 def accept(
     open_ones: set[Any], timers: list[Any], host: str = ""
 ) -> tuple[BoundedProtocol, Transport]:
-    """Return a new connection of a server."""
+    """Return a new connection of a server, and its transport."""
     protocol = BoundedProtocol.__new__(BoundedProtocol)
 
     def call_later(seconds: float, call: Any, *args: Any) -> Any:  # noqa: ANN401 as asyncio has it

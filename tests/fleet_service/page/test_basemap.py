@@ -1,4 +1,6 @@
-"""Base map from a file of the operator: accepted files, refused files, and the rendered picture."""
+"""Tests of a base map from a file of the operator: accepted files, refused files, and the rendered
+picture.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ AT: Final = (57.7, 11.97)
 
 
 def png(colour: tuple[int, int, int], side: int = 256) -> bytes:
-    """A picture of one colour."""
+    """Return a PNG picture of one colour."""
 
     def part(name: bytes, body: bytes) -> bytes:
         return (
@@ -40,7 +42,9 @@ def png(colour: tuple[int, int, int], side: int = 256) -> bytes:
 
 
 def tiles_in(path: Path, tiles: Mapping[tuple[int, int, int], bytes], form: str = "png") -> Path:
-    """MBTiles of tiles by zoom, column and row from the north."""
+    """Write an MBTiles file with tiles by (zoom, column, row from the north), and
+    return its path.
+    """
     with closing(sqlite3.connect(path)) as table, table:
         table.execute("create table metadata (name text, value text)")
         table.execute(
@@ -53,7 +57,7 @@ def tiles_in(path: Path, tiles: Mapping[tuple[int, int, int], bytes], form: str 
 
 
 def town(path: Path) -> Path:
-    """One blue tile with AT in it."""
+    """Write an MBTiles file with one blue tile that contains the point AT, and return its path."""
     x, y = (int(v) for v in grid.deinterleave(grid.parent(int(grid.cell_of(*AT)), ZOOM)))
     return tiles_in(path, {(ZOOM, x, y): png(BLUE)})
 
@@ -108,8 +112,8 @@ def test_tiles_of_a_file_are_served_and_one_that_is_not_there_is_no_error(
 def test_a_person_sees_the_file_below_the_map_without_any_network(
     router: ZenohSettings, tmp_path: Path
 ) -> None:
-    """When zoomed in beyond the file's deepest level its tiles are enlarged; when zoomed out far no
-    tile is requested.
+    """Beyond the file's deepest zoom level its tiles are enlarged. At low zoom levels no tile is
+    requested.
     """
     with (
         page_of(router, base_map=base_map(str(town(tmp_path / "town.mbtiles")))) as address,

@@ -1,5 +1,5 @@
-"""Colours of the live page: distinguishable for every kind of colour vision, and none that promises
-grip.
+"""Tests of the colours of the live page: they are distinguishable for every kind of colour vision,
+and none of them looks like a promise of grip.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ DARK = (*DARK_FOUR, *DARK_TWO, DARK_LITTLE, DARK_GROUND)
 
 
 def in_danger(four: tuple[str, ...], two: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the colours of ice, snow, rather slippery, wet, rather not slippery, and good grip."""
+    """Return the colours in order of danger: ice, snow, rather slippery, wet, rather not slippery,
+    good grip.
+    """
     return (four[0], four[1], two[0], four[2], two[1], four[3])
 
 
@@ -52,8 +54,8 @@ def test_any_two_classes_and_the_ground_are_told_apart(
 
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_lightness_is_the_order_of_danger(sight: str) -> None:
-    """The most dangerous class is the darkest on light ground and the lightest on dark ground; the
-    order holds on grey paper.
+    """The most dangerous class is the darkest on a light background and the lightest on a dark
+    background. The order also holds when printed in grey.
     """
     for ladder, sign in ((in_danger(FOUR, TWO), 1.0), (in_danger(DARK_FOUR, DARK_TWO), -1.0)):
         light = [sign * float(to_lab(colour, sight)[0]) for colour in ladder]
@@ -92,7 +94,9 @@ def test_what_is_slippery_at_its_upper_end_keeps_its_colour() -> None:
 @pytest.mark.parametrize("sight", SIGHTS)
 @pytest.mark.parametrize("theme", [":root", '[data-theme="dark"]'])
 def test_text_and_map_classes_have_the_contrast_of_wcag_aa(sight: str, theme: str) -> None:
-    """Text 4.5 : 1 (1.4.3); fill or edge of a map class 3 : 1 against the ground (1.4.11)."""
+    """Text needs a contrast of 4.5 : 1 (WCAG 1.4.3). Fill or edge of a map class needs 3 : 1
+    against the background (1.4.11).
+    """
     static = ROOT / "fleet_service" / "page" / "static"
     style = (static / "style.css").read_text()
     block = style[style.index(theme) :].partition("}")[0]
@@ -110,7 +114,7 @@ def test_text_and_map_classes_have_the_contrast_of_wcag_aa(sight: str, theme: st
 
 
 def contrast(first: str, second: str, sight: str) -> float:
-    """Return the ratio of two relative luminances (WCAG 2.2), from CIE lightness."""
+    """Return the contrast ratio of two colours (WCAG 2.2), computed from CIE lightness."""
     light = [float(to_lab(colour, sight)[0]) for colour in (first, second)]
     low, high = sorted(((v + 16) / 116) ** 3 if v > 8 else v / 903.3 for v in light)
     return (high + 0.05) / (low + 0.05)

@@ -1,5 +1,5 @@
-"""DATEX II publication served by the page: equal to the alerts, continued after a restart, and
-valid.
+"""Tests of the DATEX II publication of the page: equal to the alerts, continued after a restart,
+and valid.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CELLS = [(TILE << 14) + k for k in range(3)]
 
 @contextmanager
 def made_up_service(session: zenoh.Session) -> Iterator[None]:
-    """Answers for one cell of the region, so that it has a service."""
+    """Answer map queries for one cell of the region, so that the region counts as served."""
     fusion = Fusion(120.0)
     fusion.update(observations([0.0], [1], value([0.3])))
     payload = arrow_stream(batch_of(view_cells(fusion, np.arange(1), START), START))
@@ -106,7 +106,7 @@ def test_what_is_pulled_follows_the_alerts_and_is_gone_on_with(
 
 
 def pull(address: str) -> Callable[[], bytes]:
-    """Return the page's answer; NOTHING while it has none yet."""
+    """Return a function that fetches the publication, or NOTHING while the page has none yet."""
 
     def fetch_publication() -> bytes:
         status, headers, body = ask(address, ROUTE)

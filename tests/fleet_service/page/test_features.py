@@ -1,4 +1,6 @@
-"""The map as OGC API Features: opened by GDAL's own client, queried by hand, and refused requests."""
+"""Tests of the map as OGC API Features: opened by GDAL's own client, queried directly, and refused
+requests.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,7 @@ READERS = {
 
 
 def opened_by(reader: str, address: str, folder: Path) -> Any:  # noqa: ANN401 geopandas is untyped
-    """Return the features as a third-party reader gets them."""
+    """Return the features as another program reads them."""
     out = folder / f"{reader}.parquet"
     script = f"{READERS[reader].format(address=address)}; found.to_parquet({str(out)!r})"
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
@@ -39,7 +41,7 @@ def opened_by(reader: str, address: str, folder: Path) -> Any:  # noqa: ANN401 g
 
 
 def fetch_document(page: RunningPage, path: str) -> dict[str, Any]:
-    """Return a document that must exist."""
+    """Return a JSON document of the page; fail if it does not exist."""
     status, headers, body = ask(page.address, path)
     assert status == 200, body
     assert "json" in headers["content-type"]
@@ -48,14 +50,14 @@ def fetch_document(page: RunningPage, path: str) -> dict[str, Any]:
 
 
 def drive_parts(page: RunningPage, drive: Drive, *parts: str) -> None:
-    """Drive parts of the street, and wait until the page shows them."""
+    """Let cars drive over parts of the street, and wait until the page shows these parts."""
     before = count(page)
     drive(*parts)
     until(lambda: count(page) >= before + street.count_known(*parts))
 
 
 def count(page: RunningPage) -> int:
-    """Return the number of features; 0 before the page knows of a service."""
+    """Return the number of features, or 0 while the page knows no service."""
     status, _, body = ask(page.address, ITEMS)
     assert status in (200, 503), body
     return int(json.loads(body)["numberReturned"]) if status == 200 else 0

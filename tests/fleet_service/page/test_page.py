@@ -1,4 +1,4 @@
-"""The page in a real browser, in front of a real service: views, actions, and warnings that must
+"""Tests of the page in a real browser, with a real service: views, actions, and warnings that must
 not be missed.
 """
 
@@ -29,7 +29,7 @@ ICE, SNOW, WET, DRY, RATHER, RATHER_NOT, LITTLE, HOLLOW = range(8)
 
 
 def look(seen: Opened, name: str) -> None:
-    """Store a screenshot for inspection by people."""
+    """Store a screenshot, so that a person can inspect it."""
     PICTURES.mkdir(exist_ok=True)
     seen.page.screenshot(path=PICTURES / f"{name}.png")
 
@@ -38,7 +38,9 @@ def look(seen: Opened, name: str) -> None:
 def open_map(
     page: RunningPage, state: str = "", *, phone: bool = False, errors: bool = False
 ) -> Iterator[Opened]:
-    """The page, when it is ready; no foreign request and nothing on the console when it is left."""
+    """Yield the page when it is ready. At the end assert that it made no request to another host
+    and wrote nothing to the console.
+    """
     with open_page(page.address + state, phone=phone) as seen:
         seen.page.wait_for_selector(READY, state="attached")
         yield seen
@@ -54,12 +56,12 @@ def data(seen: Opened, name: str) -> str:
 
 
 def kinds(seen: Opened) -> list[int]:
-    """Return the number of drawn places of each kind."""
+    """Return the number of drawn map records of each kind."""
     return [int(n) for n in data(seen, "kinds").split(",") if n] or [0] * 8
 
 
 def near(seen: Opened, cell: int, zoom: float = 18.0) -> None:
-    """Zoom in on a cell until headings are shown."""
+    """Zoom in on a cell until the headings are shown separately."""
     latitude, longitude = (float(v) for v in grid.centre(cell))
     seen.page.evaluate(
         "([x, y, z]) => { gripmap.goTo(x, y); gripmap.view.go(gripmap.view.x, gripmap.view.y, z) }",
@@ -68,7 +70,7 @@ def near(seen: Opened, cell: int, zoom: float = 18.0) -> None:
 
 
 def waits(seen: Opened, script: str) -> None:
-    """Return as soon as a script says true."""
+    """Wait until a script in the page returns true."""
     until(
         lambda: seen.page.evaluate(script)
     )  # the page's own policy forbids Playwright to poll inside it
@@ -79,7 +81,7 @@ def cell_of(part: str, index: int = 1) -> int:
 
 
 def read(seen: Opened, sector: int) -> dict[str, str]:
-    """Return the panel's text of one heading."""
+    """Return the panel's texts for one heading, by name of the value."""
     found: dict[str, str] = seen.page.evaluate(
         "s => Object.fromEntries([...document.querySelectorAll(`[data-sector='${s}'] dd`)]"
         ".map(one => [one.dataset.value, one.textContent]))",
@@ -313,7 +315,7 @@ def test_slider_shows_a_past_cell_and_two_moments_side_by_side(
 
 
 def list_snapshots(archive: Path) -> list[int]:
-    """The moments of the snapshots."""
+    """Return the times [s] of the map snapshots."""
     return sorted(
         snapshots.time_of(path) // 10**9 for path in archive.glob(f"{snapshots.TABLE}/*/*.parquet")
     )

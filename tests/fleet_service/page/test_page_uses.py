@@ -1,5 +1,5 @@
-"""Other uses of the page: replay of a night, sound, print, wall display, a dropped route, and
-screen reader.
+"""Tests of other uses of the page: replay of a night, sound, print, wall display, a dropped route
+file, and screen reader.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Painting: cells with an unknown part, seams, borrowed values, a route, and the map before a
-service answers.
+"""Tests of the map's drawing in a real browser: squares with a share of unknown cells, no gaps
+between neighbouring cells, values inferred from neighbours, a route, and the map before a service
+answers.
 """
 
 from __future__ import annotations
@@ -77,7 +78,9 @@ def test_neighbours_meet_without_a_gap_wherever_they_lie(page: RunningPage) -> N
 def test_a_guess_is_framed_by_a_thin_line_whatever_was_painted_before(
     page: RunningPage, drive: Drive
 ) -> None:
-    """Paint a tile that has changed since it was first received."""
+    """Inferred values have a thin dashed frame, also in a tile that has changed since it was first
+    received.
+    """
     drive("dry")
     with open_map(page) as seen:
         near(seen, cell_of("ice"))

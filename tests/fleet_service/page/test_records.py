@@ -1,5 +1,5 @@
-"""Map records equal the map and never show more grip; a parent tile has the worst value of its
-cells.
+"""Tests of the page's map records: they equal the map and never show more grip, and a parent tile
+has the worst value of its cells.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tests.fleet_service.examples import CELL, START, TILE, at_least, observatio
 
 @pytest.fixture(scope="module")
 def table() -> pa.Table:
-    """A tile of a thousand cells, some of them only passed."""
+    """Return a tile of a thousand cells, some with only a lower bound."""
     rng = np.random.default_rng(3)
     n = 1000
     fusion = Fusion(120.0)

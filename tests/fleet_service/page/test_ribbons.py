@@ -1,4 +1,6 @@
-"""Roads as ribbons in a real browser: clicks, alerts and the overview agree with the drawing."""
+"""Tests of roads as ribbons in a real browser: clicks, alerts and the overview agree with the
+drawing.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,7 @@ def road(name: str, part: str, aside: int) -> Line:
 
 @pytest.fixture
 def page(router: ZenohSettings, tmp_path: Path) -> Iterator[RunningPage]:
-    """A page with a road map that lies one cell north of the reported cells."""
+    """Yield a page with a road map whose roads lie one cell north of the reported cells."""
     archive = tmp_path / "archive"
     roads = RoadMap([road(STREET, "ice", ASIDE)], [("Testby", 11.97, 57.7)])
     with (

@@ -1,5 +1,5 @@
-"""Roads of the page: lines from a file, lines learned from cells, recent times, and areas with
-data.
+"""Tests of the roads of the page: lines from a file, lines derived from cells, recent times, and
+areas with data.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def test_nothing_is_kept_twice_while_nothing_changes() -> None:
 
 
 def test_cells_side_by_side_are_one_learned_line() -> None:
-    """The receiver's error spreads one lane over two or three rows of cells."""
+    """The position error spreads one lane over two or three rows of cells."""
     scattered = cells(
         *((k, (0, 2, 0, 1)[k % 4]) for k in range(24)), *((k, 2) for k in range(3, 9))
     )

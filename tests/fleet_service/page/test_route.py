@@ -1,5 +1,5 @@
-"""Grip along a route: an unknown part stays unknown, and the speed follows from the lower end of
-the interval.
+"""Tests of friction along a route: an unknown part stays unknown, and the speed follows from the
+lower end of the interval.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from tests.fleet_service.page import street
 
 
 def make_ice_table() -> pa.Table:
-    """Ice for five cells eastward, then cells that were only passed."""
+    """Return a map table with five cells of ice eastward, followed by cells with only a lower
+    bound.
+    """
     ice = street.cells(street.PARTS["ice"])
     passed = street.cells(street.PARTS["passed"])
     cells = np.concatenate([ice, passed])
@@ -33,7 +35,7 @@ def make_ice_table() -> pa.Table:
 
 
 def ends(first: int, last: int) -> list[tuple[float, float]]:
-    """From the middle of one cell of the street to that of another."""
+    """Return (longitude, latitude) of the middles of two cells of the street."""
     x = street.MIDDLE[0] + np.array([first, last])
     latitude, longitude = grid.centre(grid.interleave(x, np.array([street.MIDDLE[1]] * 2)))
     return list(zip(longitude.tolist(), latitude.tolist(), strict=True))

@@ -1,5 +1,5 @@
-"""The page's server: refused requests, messages at connect, number of watchers, and requests to
-reload.
+"""Tests of the page's server: refused requests, messages at connect, number of connected browsers,
+and requests to reload.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ WORLD: Final = View((-180.0, -90.0, 180.0, 90.0), 21)
 
 
 def ask(address: str, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    """Return status, headers and body of an answer."""
+    """Return status, headers and body of the answer to a request."""
     connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
@@ -61,7 +61,7 @@ def ask(address: str, path: str, **headers: str) -> tuple[int, dict[str, str], b
 
 @contextmanager
 def listening(address: str, path: str = "/events") -> Iterator[Iterator[tuple[str, Any]]]:
-    """Yield events as they arrive."""
+    """Yield an iterator over the events of an event stream."""
     connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
     connection.request("GET", path)
     answer = connection.getresponse()

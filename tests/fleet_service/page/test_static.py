@@ -1,5 +1,5 @@
-"""Static files of the page: all texts in one table, short modules, one bundle, and no external
-file.
+"""Tests of the page's static files: all texts in one table, short modules, one bundle, and no
+external file.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def test_every_word_stands_in_the_table_and_every_entry_is_used() -> None:
 
 
 def test_modules_joined_do_what_they_do_apart_each_with_names_of_its_own() -> None:
-    """An import becomes the exported value; a private name that two modules use stays two
-    variables.
+    """When modules are joined, an import becomes the exported value, and a private name used in two
+    modules becomes two variables.
     """
     modules = {
         "main": 'import { add as sum, ONE } from "./a.js";\nimport { two } from "./b.js";\nsay(sum(two(), ONE));\n',

@@ -1,5 +1,5 @@
-"""Vector tiles: numbers of PMTiles as its own library has them, a file read back, and tiles that
-the page can draw.
+"""Tests of vector tiles: numbers of PMTiles tiles equal those of its own library, a written file is
+read back, and the page can draw the tiles.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ TILES = {
 
 
 def write(path: Path, kind: int = 1) -> Path:
-    """A PMTiles file with leaf directories, by the library of the format."""
+    """Write a PMTiles file with leaf directories by the format's own library, and
+    return its path.
+    """
     with path.open("wb") as file:
         writer = pmtiles_writer.Writer(file)
         for (z, x, y), data in sorted(
@@ -84,7 +86,7 @@ def test_what_is_no_vector_pmtiles_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_tile_is_the_bytes_of_the_specification() -> None:
-    """The example of section 4.3.5 of the specification: a point at (25, 17), a line and a
+    """This is the example of section 4.3.5 of the specification: a point at (25, 17), a line and a
     polygon.
     """
     point = encode_tile({"p": [TileShape(POINT, [[(25, 17)]], {})]})

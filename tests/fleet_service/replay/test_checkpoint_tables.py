@@ -1,4 +1,4 @@
-"""A fusion restored from a checkpoint continues exactly as the original."""
+"""Tests that a fusion restored from a checkpoint continues exactly like the original."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.fleet_service.fusion.test_weather import RAIN, reports
 
 
 def store_tables(tables: dict[str, pa.Table]) -> dict[str, pa.Table]:
-    """Write a fusion as Parquet and read it again."""
+    """Write the tables of a fusion as Parquet, read them back, and return them."""
     out = {}
     for name, table in tables.items():
         buffer = io.BytesIO()

@@ -1,4 +1,6 @@
-"""Checkpoints: a restart from one equals a restart from the whole log and reads only later rows."""
+"""Tests of checkpoints: a restart from a checkpoint equals a restart from the whole log, and reads
+only later rows.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ def message(one: Batch) -> Message:
 
 
 def keep(engine: Engine, root: Path) -> Path:
-    """Take a checkpoint as the service does: asked by one thread, taken by the worker."""
+    """Write a checkpoint as the service does: one thread requests it, and the worker writes it.
+    Return its folder.
+    """
     taken: list[checkpoints.Taken | None] = []
     stop = threading.Event()
     thread = threading.Thread(target=lambda: taken.append(engine.checkpoint(stop)))
@@ -73,7 +77,7 @@ def beliefs(engine: Engine, at: int) -> FloatArray:
 
 @pytest.fixture
 def replayed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Rows that each replay reads."""
+    """Return a list that receives the number of rows read by each replay."""
     rows: list[int] = []
     in_order: Callable[..., Iterable[pa.Table]] = rebuild.in_order
 
@@ -118,7 +122,7 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(
 
 
 def read_state(engine: Engine) -> dict[str, NDArray[Any]]:
-    """Return everything from which a map is made, by cell and sector, and the time at which a
+    """Return all state from which a map is made, sorted by cell and sector, and the time at which a
     restart reads it.
     """
     fusion = engine.state.fusion
@@ -137,7 +141,7 @@ def read_state(engine: Engine) -> dict[str, NDArray[Any]]:
 def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
     tmp_path: Path, oldest_s: float
 ) -> None:
-    """Restart after a compaction that joined old and new rows in one file."""
+    """The restart follows a compaction that joined old and new rows in one file."""
     config = ServiceConfig(oldest_s=oldest_s)
     now = time.time_ns()
     old = now - int(30.5 * DAY_S * SECOND)
@@ -159,7 +163,7 @@ def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
 
 
 def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) -> None:
-    """The checkpoint is taken after late and unordered reports."""
+    """The checkpoint is written after late and unordered reports."""
     rng = np.random.default_rng(3)
     now = time.time_ns()
     sent = []
@@ -258,8 +262,8 @@ def _set() -> threading.Event:
 
 
 def test_rows_after_the_checkpoint_are_replayed_whatever_the_clock(tmp_path: Path) -> None:
-    """The clock was an hour ahead when the checkpoint was taken; it is then corrected, and ice is
-    reported.
+    """The clock is an hour ahead when the checkpoint is written. Then the clock is corrected, and
+    ice is reported.
     """
     ahead = time.time_ns() + 3600 * SECOND
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:

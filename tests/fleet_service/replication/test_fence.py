@@ -1,4 +1,6 @@
-"""Fencing: late uploads of a service that lost its lease replace no object of its successor."""
+"""Tests of fencing: late uploads of a service that lost its lease replace no object of its
+successor.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Lease: a service that ended, froze or was cut off is followed by another, which has every
-acknowledged row once.
+"""Tests of the lease: a service that ended, froze or was cut off is followed by another service,
+which has every acknowledged row exactly once.
 """
 
 from __future__ import annotations
@@ -94,7 +94,9 @@ def test_a_standby_goes_on_with_all_that_was_acknowledged(
 
 
 def make_driver(fleet: Fleet, sent: list[Batch]) -> Callable[[], bool]:
-    """Return True if all is acknowledged; the rest is sent again each second, as outboxes do."""
+    """Return a function that sends unacknowledged batches again each second, as outboxes do, and
+    returns True when all batches are acknowledged.
+    """
     last = [0.0]
 
     def is_done() -> bool:
@@ -143,7 +145,7 @@ def test_of_two_standbys_one_takes_over_and_the_other_waits_for_it(
 
 
 class Machine:
-    """A folder with a service in threads that a test can stop between any two steps."""
+    """Folder with a service in threads, which a test can stop between any two steps."""
 
     def __init__(
         self,
@@ -175,7 +177,7 @@ class Machine:
         return self.holding.copy
 
     def freeze(self) -> None:
-        """Stop renewals."""
+        """Stop the renewals of the lease."""
         assert self.holding.lease is not None
         self.holding.lease._stop.set()
 

@@ -1,5 +1,5 @@
-"""The lease object: it states the lease time, other versions are read, and a damaged object delays
-but never ends a service.
+"""Tests of the lease object: it states the lease time, other versions are read, and a damaged
+object delays but never ends a service.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def lease_on(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
 
 
 def standby_of(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
-    """Return the lease of a standby after it took over."""
+    """Let a standby take over, and return its lease."""
     standby = Standby(
         may=lambda: True, stands=lambda _: False, alive=lambda: None, get_ahead=lambda: None
     )
@@ -114,7 +114,7 @@ def test_holder_repairs_a_damaged_lease_and_keeps_it() -> None:
 
 
 def test_failed_renewal_uses_its_turn_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The write may take effect late, so the next renewal must differ from it."""
+    """The failed write may take effect late, so the next renewal must use another turn."""
     bucket = MemoryBucket()
     holder = lease_on(bucket, "one", 0.5)
     assert holder._create_next(None, lambda: 0, threading.Event())

@@ -1,4 +1,6 @@
-"""Bucket replica: it contains settled rows, follows deletions, and restores an empty disk."""
+"""Tests of the bucket replica: it contains settled rows, follows deletions, and restores an empty
+disk.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ Make = Callable[[Path], BucketReplica]
 
 @pytest.fixture
 def make(bucket: BucketServer) -> Iterator[Make]:
-    """A copy of an archive, which was begun."""
+    """Yield a function that starts a bucket copy of an archive; the copies are closed
+    at the end.
+    """
     made: list[BucketReplica] = []
 
     def begin_replica(root: Path) -> BucketReplica:
@@ -53,7 +57,7 @@ def there(bucket: BucketServer) -> dict[str, bytes]:
 
 
 def fill_log(root: Path, copy: BucketReplica | None, seeds: range = range(3)) -> SegmentLog[int]:
-    """A log with segments of both kinds, which are settled."""
+    """Return a log with settled segments of both kinds."""
     log: SegmentLog[int] = SegmentLog(root, NAME, None if copy is None else copy.upload_segments)
     Pseudonyms(root / "keys").of("sim-001", 0)
     for seed in seeds:

@@ -1,4 +1,4 @@
-"""Begin and end of alerts."""
+"""Tests of the beginning and end of alerts."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ COLUMN, ROW = (int(part[0]) for part in grid.deinterleave(np.array([CELL])))
 
 
 def icy(vehicles: list[int]) -> tuple[Fusion, Alerts, list[bool]]:
-    """Let vehicles report ice in a cell one after the other. Return the cell, and for each vehicle
-    whether it raised an alert.
+    """Let vehicles report ice in a cell one after the other. Return the fusion, its alerts, and for
+    each vehicle whether it raised an alert.
     """
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)
@@ -115,8 +115,9 @@ def test_old_ice_does_not_corroborate_new_ice() -> None:
 def report_in_turn(
     mu: float, vehicles: range, then: float, others: range, wait: float = 400.0
 ) -> tuple[Fusion, list[bool]]:
-    """A cell that `vehicles` called `mu` and `wait` s later each of `others` `then`; whether it
-    was under an alert.
+    """Let `vehicles` report the friction `mu` in a cell, and `wait` seconds later each of `others`
+    the friction `then`. Return the fusion, and whether the cell was under alert after each of
+    `others`.
     """
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)

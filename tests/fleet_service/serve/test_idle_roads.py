@@ -1,5 +1,5 @@
-"""Two vehicles alone raise alerts on idle roads only in a few places; traffic and a third
-vehicle lift the limit.
+"""Tests of the limit on idle roads: two vehicles alone raise alerts only in a few places; traffic
+or a third vehicle lifts the limit.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Cells with borrowed values: the influence falls with distance, the values are never more certain
-than their sources, and they are marked.
+"""Tests of values borrowed from neighbours: the influence falls with distance, the values are never
+more certain than their sources, and they are marked as borrowed.
 """
 
 from __future__ import annotations
@@ -21,8 +21,13 @@ ROUTE = EAST * grid.SECTORS
 
 
 def borrow_beliefs(visited: dict[int, float], route: IntArray | None = ROUTE) -> CellView:
-    """Return the beliefs that thirty cells in a row borrow, in all tiles, when three vehicles gave
-    a value of some of them."""
+    """Return the beliefs that a row of thirty cells borrows from cells in which three vehicles
+    measured friction.
+
+    Args:
+        visited: measured friction by index of the cell in the row.
+        route: the cells to fill; None for all cells of the tiles.
+    """
     fusion = Fusion(120.0)
     for place, mu in visited.items():
         o = observations(
@@ -37,7 +42,7 @@ def borrow_beliefs(visited: dict[int, float], route: IntArray | None = ROUTE) ->
 
 
 def widths(cells: CellView) -> dict[int, float]:
-    """Width of the interval by place in the row."""
+    """Return the width of the interval by index of the cell in the row."""
     lower, upper = (mugrid.quantiles(cells.belief, q) for q in (0.05, 0.95))
     return {
         int(np.flatnonzero(c == EAST)[0]): w for c, w in zip(cells.cell, upper - lower, strict=True)

@@ -1,4 +1,6 @@
-"""Public view: cells of enough vehicles, and their safe deceleration."""
+"""Tests of the public view: only cells with enough vehicles are shown, with their safe
+deceleration.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ MORE = tuple(
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """Return an engine that shows only cells with at least this many vehicles."""
+    """Yield a function that opens an engine which shows only cells with at least
+    `public` vehicles.
+    """
     opened: list[Engine] = []
 
     def begin(public: int) -> Engine:
@@ -58,7 +62,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 
 def hear(engine: Engine, *names: str, now: int | None = None) -> None:
-    """One visit of each."""
+    """Ingest one visit of each named vehicle."""
     now = time.time_ns() if now is None else now
     sent = [
         Message(Kind.OBSERVATION, key(n), wire.encode(batch(n, 1, now - SECOND, [0.8])), "")
@@ -69,12 +73,12 @@ def hear(engine: Engine, *names: str, now: int | None = None) -> None:
 
 
 def later() -> int:
-    """Return a time at which the visits of now are published."""
+    """Return a time [ns] at which the visits of now are published."""
     return time.time_ns() + PERIOD_NS
 
 
 def rows(engine: Engine, now: int | None = None, **parameters: str) -> list[dict[str, object]]:
-    """Cells of an answer."""
+    """Return the cells of the answer to a query."""
     tiles = engine.queries.answer(
         query.parse(parameters), lambda _: True, time.time_ns() if now is None else now
     )
@@ -112,7 +116,7 @@ def test_a_route_tells_the_deceleration_that_is_safe_at_95_percent(start: Start)
 
 
 def test_no_single_passage_shows_where_persons_are_kept_private(start: Start) -> None:
-    """Times and counts are coarse: a pass at night changes neither."""
+    """Times and counts are coarse, so that one pass changes neither of them."""
     engine = start(3)
     hear(engine, *(f"sim-{k:03}" for k in range(6)))
     (before,) = rows(engine, later())
@@ -147,7 +151,9 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
 
 
 def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Start) -> None:
-    """Only vehicles of the last hours make a cell public, in answers, routes, snapshots and tiles."""
+    """Only vehicles of the last hours make a cell public, in answers, routes, snapshots
+    and tiles.
+    """
     engine = start(3)
     day = (time.time_ns() // (2 * PART_NS) - 2) * 2 * PART_NS + 8 * 3600 * SECOND
     names = [f"sim-{k:03}" for k in range(6)]
@@ -193,7 +199,9 @@ def test_a_restart_knows_who_was_there_with_and_without_a_checkpoint(
 
 @pytest.mark.parametrize("basis", ["checkpoint", "log"])
 def test_a_restart_does_not_show_a_lone_vehicle(start: Start, tmp_path: Path, basis: str) -> None:
-    """Neither in a public cell nor as the vehicle that completes the count of another one."""
+    """The vehicle must not show in a public cell, nor complete the count of vehicles of another
+    cell.
+    """
     beside: dict[str, Any] = {
         "latitude": [LATITUDE + 0.002],
         "cell": [grid.cell_of(LATITUDE + 0.002, LONGITUDE)],
@@ -222,7 +230,7 @@ def test_a_restart_does_not_show_a_lone_vehicle(start: Start, tmp_path: Path, ba
 
 
 def taken_from(engine: Engine) -> checkpoints.Taken:
-    """A checkpoint, with a worker that flushes."""
+    """Return a checkpoint, taken while a worker flushes."""
     found: list[checkpoints.Taken | None] = []
     thread = threading.Thread(target=lambda: found.append(engine.checkpoint(threading.Event())))
     thread.start()
@@ -289,7 +297,7 @@ def test_cells_unvisited_for_a_week_are_dropped_live_and_by_restart(start: Start
 
 
 def hear_ice(engine: Engine, now: int) -> list[wire.Alert]:
-    """Let four vehicles find ice in separate cells, which raises an alert."""
+    """Let four vehicles report ice in one cell, which raises an alert. Return the alerts."""
     where: dict[str, Any] = {
         "latitude": [LATITUDE + 0.002] * 3,
         "cell": [grid.cell_of(LATITUDE + 0.002, LONGITUDE)] * 3,

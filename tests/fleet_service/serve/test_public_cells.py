@@ -1,4 +1,4 @@
-"""Where persons are kept private, a lone vehicle changes nothing that readers see, except towards
+"""Tests of privacy: a lone vehicle changes nothing that readers can see, except a change towards
 slippery.
 """
 
@@ -19,7 +19,7 @@ LATER_S = 2 * PERIOD_NS / SECOND
 
 
 class Map:
-    """A fusion and its public cells, of which readers see one."""
+    """Fusion with its public cells, the part that readers can see."""
 
     def __init__(self) -> None:
         self.fusion = Fusion(120.0)
@@ -33,7 +33,9 @@ class Map:
             self.fusion.update(o)
 
     def seen(self, second: float, cell: int = CELL) -> list[float]:
-        """Return lower end, upper end and P(slippery) of a cell; nothing if it is not public."""
+        """Return the published lower end, upper end and P(slippery) of a cell, or an empty list if
+        the cell is not public.
+        """
         now = START + int(second * SECOND)
         slot = self.public.select(self.slots(cell), now)
         if not len(slot):
@@ -48,7 +50,7 @@ class Map:
 
 @pytest.fixture
 def busy() -> Map:
-    """A cell that five vehicles visited, after its publication."""
+    """Return a map with a cell that five vehicles visited, after its publication."""
     made = Map()
     made.visit(0.0, 1, 2, 3, 4, 5)
     assert made.seen(1.0) == []

@@ -1,4 +1,6 @@
-"""Failed answers carry an error, because a client would take silence for a map without data."""
+"""Tests that failed answers carry an error, because a client would take no answer for a map without
+data.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,7 @@ FAILURES = (
 
 
 def texts(session: zenoh.Session, selector: str) -> list[str]:
-    """Return all replies and errors, sorted, because Zenoh gives them no order."""
+    """Return all replies and errors as texts, sorted because Zenoh does not order them."""
     return sorted(
         part.payload.to_string()
         for reply in session.get(selector)
@@ -96,7 +98,7 @@ def test_a_query_with_a_too_large_answer_is_refused_with_a_hint(session: zenoh.S
 def nothing(
     query: MapQuery, wanted: Callable[[int], bool], only: int | None
 ) -> Iterator[tuple[int, bytes]]:
-    """An answer without tiles."""
+    """Return an answer without tiles."""
     return iter(())
 
 
@@ -108,7 +110,7 @@ def nothing(
 def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(
     session: zenoh.Session, much: AnswerSize
 ) -> None:
-    """The heavy answer does not end before the light one has come; many tiles of a cell each are
+    """The heavy answer ends only after the light one has arrived. Many tiles of one cell each are
     heavy too.
     """
     key = keys.map_key(TILE)
@@ -143,7 +145,9 @@ COSTS = {2: MOST, 3: 2 * LIGHT, 4: LIGHT}  # by what is asked for; a question of
 
 
 class Half:
-    """Return answers of two tiles; the most expensive ones wait for `go` after the first tile."""
+    """Queryable that answers with two tiles. The most expensive answers wait for `go` after the
+    first tile.
+    """
 
     def __init__(self, session: zenoh.Session) -> None:
         self.counts = Counter[str]()
@@ -166,13 +170,13 @@ class Half:
         yield TILE, b"last"
 
     def ask(self, kind: int) -> list[str]:
-        """All replies: Zenoh hands over the last of a key, if it came."""
+        """Return all replies to a query. Zenoh returns only the last reply of a key."""
         return texts(self.session, f"{self.key}?min_vehicles={kind}")
 
 
 @pytest.fixture
 def half(session: zenoh.Session) -> Iterator[Half]:
-    """Yield such a queryable."""
+    """Yield a declared queryable of this kind."""
     made = Half(session)
     declared = session.declare_queryable(made.key, made.queryable, complete=True)
     querier = session.declare_querier(made.key)
@@ -193,7 +197,7 @@ def test_a_smaller_question_is_answered_amid_a_larger_one_that_came_before(half:
 
 
 def test_light_questions_beyond_their_share_are_still_answered(half: Half) -> None:
-    """A client with many small queries waits with the heavy ones; none of them is refused."""
+    """A client with many small queries waits behind the heavy queries, but no query is refused."""
     for _ in range(2 * int(LIGHT_PER_S / LIGHT)):
         assert half.ask(4) == ["last"]
     assert half.counts["queries"] > half.counts["heavy_queries"] > 0

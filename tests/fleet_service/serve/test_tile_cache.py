@@ -1,5 +1,5 @@
-"""A cached tile is served for at most a second, and never after an acknowledged report or an alert
-changed it.
+"""Tests of the tile cache: a cached tile is served for at most a second, and never after an
+acknowledged report or an alert has changed it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ NOW = START + 60 * SECOND
 
 
 def visit(state: MapState, vehicle: int, cell: int = TILE << 14) -> None:
-    """One visit, noted as the engine does."""
+    """Fuse one visit, and mark the cell as changed as the engine does."""
     state.mark_changed(
         state.fusion.update(observations([1.0], [vehicle], value([0.5]), cell)).slots
     )

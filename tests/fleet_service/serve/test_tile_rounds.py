@@ -1,4 +1,6 @@
-"""Rounds of tiles: regular, each tile in turn, and never more than a fixed share of a worker turn."""
+"""Tests of the rounds in which tiles are published: regular, each tile in turn, and never more than
+a fixed share of a worker turn.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ COST_S = SHARE_S / 2.0  # that a tile takes
 
 
 class Made:
-    """Tiles that change, a clock, and a list of the puts with their times."""
+    """Simulated tiles that change, a clock, and a list of the publications with their times."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -29,7 +31,9 @@ class Made:
         self.now += COST_S
 
     def turn(self, seconds: float = 0.0) -> int:
-        """A turn of the worker that takes so long without its tiles; how many of these it put."""
+        """Simulate a turn of the worker that takes `seconds` without its tiles. Return the number
+        of published tiles.
+        """
         self.now += seconds
         before = len(self.puts)
         self.rounds.begin()

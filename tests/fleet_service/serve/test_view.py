@@ -1,4 +1,4 @@
-"""Basis of a cell: a cell that is probably slippery is never shown as a bound."""
+"""Test of a cell's basis: a cell that is probably slippery is never shown as a lower bound."""
 
 from __future__ import annotations
 

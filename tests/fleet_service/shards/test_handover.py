@@ -1,4 +1,6 @@
-"""Live hand-over of a region between services: map, alerts, trust and batches move along."""
+"""Tests of the live hand-over of a region between services: the new service has the same map,
+alerts, trust and batches.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ EVERYWHERE = "*/*/*"
 
 
 class Machine:
-    """A service with --standby, in threads of this process."""
+    """Service with --standby, in threads of this process."""
 
     def __init__(self, name: str, router: ZenohSettings, bucket: BucketServer, root: Path) -> None:
         archive = {"path": str(root), **bucket.settings}

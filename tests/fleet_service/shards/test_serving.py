@@ -1,5 +1,5 @@
-"""Presence of regions: every client knows which regions are served. Three services run, and one of
-them stops.
+"""Tests of the presence of regions: every client knows which regions are served. Three services
+run, and one of them stops.
 """
 
 from __future__ import annotations
@@ -58,13 +58,15 @@ CARS = 3
 
 @pytest.fixture(autouse=True)
 def nobody(session: zenoh.Session) -> None:
-    """Begin with no token: the router may hear of the end of the test before after that test."""
+    """Wait until no service has a token, because the router may learn of the end of the previous
+    test late.
+    """
     until(lambda: not presence.active_tokens(session))
 
 
 def visits(vehicle: str) -> list[Batch]:
     """Return a batch for each place of the street, each by another car, because one car cannot be
-    at all places at once.
+    at several places at once.
     """
     now = time.time_ns() - 2 * SECOND
     out = list[Batch]()
@@ -270,7 +272,7 @@ def test_who_is_found_after_it_was_asked_is_asked_again(
 
 
 def drive_one(session: zenoh.Session, service: Running) -> None:
-    """A car's batches of the middle region."""
+    """Send a car's batches of the middle region, and wait until the service has them."""
     own = [made for made in visits("sim-000") if made.region == REGIONS[1]]
     for made in own:
         send(session, made, keys.observation_key(made.region, made.vehicle))

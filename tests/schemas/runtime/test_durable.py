@@ -1,5 +1,5 @@
-"""Durable writes: a file is complete or unchanged, has its permissions from the first byte on, and
-survives power loss.
+"""Tests of durable writing: a file is complete or unchanged, has its permissions from the first
+byte on, and survives power loss.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A figure holds its bar or not, and the file records which."""
+"""Tests of figures: a figure meets its target (bar) or misses it, and the file records which."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Install hints name the source of this distribution, because it is not in a package index."""
+"""Tests that install hints name the source of this distribution, because it is not in a package
+index.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compiled kernels are rebuilt when their sources change."""
+"""Tests that compiled kernels are rebuilt when their sources change."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def test_a_full_disk_under_the_cache_costs_only_the_cache(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("place", ["/proc/nowhere", ""])
 def test_without_a_writable_cache_kernels_compile_at_each_start(tmp_path: Path, place: str) -> None:
-    """A service account without a home and a read-only container cause no traceback and leave no
-    files elsewhere.
+    """A service account without a home folder and a read-only container must cause no traceback and
+    leave no files elsewhere.
     """
     (tmp_path / "kernels").mkdir()
     (tmp_path / "kernels" / "__init__.py").touch()

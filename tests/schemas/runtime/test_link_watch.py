@@ -1,4 +1,4 @@
-"""The watch of a session's links follows real routers that come and go."""
+"""Tests that the watch of a session's links follows real routers that are started and stopped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Metrics and health for a scraper and for programs: real HTTP on loopback, and lines of JSON."""
+"""Tests of metrics and health for a scraper and for programs: real HTTP on loopback, and lines of
+JSON.
+"""
 
 from __future__ import annotations
 
@@ -133,7 +135,7 @@ def test_request_that_arrives_drop_by_drop_is_cut_off(monkeypatch: pytest.Monkey
 
 
 def has_ended(connection: socket.socket) -> bool:
-    """Send a byte; return True if the server has ended the request, with or without an answer."""
+    """Send a byte. Return True if the server has ended the request, with or without an answer."""
     try:
         connection.send(b"G")
         connection.recv(1)

@@ -1,4 +1,4 @@
-"""Ports for servers that are started later."""
+"""Tests of the free ports for servers that are started later."""
 
 import socket
 from pathlib import Path

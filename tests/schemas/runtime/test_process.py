@@ -1,4 +1,4 @@
-"""Errors of standard output never end a process."""
+"""Tests that errors of standard output never end a process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Progress messages on a terminal."""
+"""Tests of progress messages on a terminal."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from tests.waiting import until
 
 
 class Terminal(io.StringIO):
-    """A terminal that collects its output."""
+    """Simulated terminal that collects its output."""
 
     def isatty(self) -> bool:
-        """Return True, as a terminal does."""
+        """Return True, because this stream acts as a terminal."""
         return True
 
 

@@ -1,4 +1,6 @@
-"""Records: the annotations of a class are the fields of an array, for Python and for a kernel."""
+"""Tests of records: the annotations of a class become the fields of an array, for Python and for a
+kernel.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ class Outer(NamedTuple):
 
 
 class Row:
-    """Change a record in a compiled kernel."""
+    """Record type whose fields the test changes in a compiled kernel."""
 
     begun: bool
     seen: int

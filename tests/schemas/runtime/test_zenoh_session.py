@@ -1,4 +1,4 @@
-"""A session that waits for its router prints the reason in plain words."""
+"""Tests that a session which waits for its router prints the reason in plain words."""
 
 from __future__ import annotations
 

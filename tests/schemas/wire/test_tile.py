@@ -1,4 +1,4 @@
-"""The tile decoder treats its input as untrusted."""
+"""Tests that the tile decoder treats its input as untrusted."""
 
 from __future__ import annotations
 

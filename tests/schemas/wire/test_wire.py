@@ -1,4 +1,4 @@
-"""Bytes and columns agree for every version of the messages that was ever sent."""
+"""Tests that bytes and columns agree for every version of the messages that was ever sent."""
 
 from __future__ import annotations
 

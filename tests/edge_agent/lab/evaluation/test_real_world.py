@@ -20,8 +20,8 @@ from schemas.thresholds import GRAVITY, SURFACES
 
 @pytest.fixture(scope="module")
 def driven() -> tuple[DriveSet, FloatArray]:
-    """Return six cars with realistic sensor errors that drive for forty seconds in a town, and
-    their friction.
+    """Return the drives of six cars with realistic sensor errors, forty seconds in a town, and the
+    largest share of the grip used by any wheel (T, 6).
     """
     return real_world.town(FIGURES, 6, 40.0)
 

@@ -1,5 +1,5 @@
-"""`contract`: shortest and longest possible time below the contracted grip. A place without
-measurements never counts as compliant.
+"""Tests of the question `contract`: shortest and longest possible time below the contracted
+friction. A road without measurements never counts as compliant.
 """
 
 from __future__ import annotations
@@ -189,8 +189,8 @@ def test_options_that_say_nothing_are_refused(
 
 
 def test_a_breach_lies_within_the_measurements() -> None:
-    """Half an hour of reports that begins in the middle of a slot: no breach begins earlier or
-    lasts longer than the reports.
+    """The reports cover half an hour and begin in the middle of a slot. No breach may begin earlier
+    or last longer than the reports.
     """
     begin = 100 * SLOT_S + 1300
     span = (begin, begin + 1897)

@@ -1,5 +1,5 @@
-"""Join of cells and sectors to links: the nearest link of the same direction; both links where one
-ends and the next begins.
+"""Tests of the join of cells and sectors to links: the nearest link with the same direction, or
+both links where one ends and the next begins.
 """
 
 from __future__ import annotations

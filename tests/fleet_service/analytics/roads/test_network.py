@@ -1,5 +1,5 @@
-"""Directed links from an extract of OpenStreetMap and from files of lines; other input is refused
-by name.
+"""Tests of reading directed links from an OpenStreetMap extract and from files of lines; other
+input is refused with its name.
 """
 
 from __future__ import annotations

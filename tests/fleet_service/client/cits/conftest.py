@@ -1,5 +1,5 @@
-"""Leave out the tests of C-ITS where the extra `cits` is missing: python-qpid-proton needs a C
-compiler to install.
+"""Skips the tests of C-ITS if the extra `cits` is not installed: python-qpid-proton needs a C
+compiler.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""An AMQP interchange that accepts every message it receives and delivers the messages that a test
-gives it.
+"""Simulated AMQP interchange that accepts every message and delivers the messages that a test gives
+it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from schemas.runtime.ports import free_ports
 
 @dataclass
 class Interchange:
-    """Messages that an interchange received, and its address."""
+    """Messages that the interchange received, and its address."""
 
     url: str
     received: list[tuple[bytes, dict[str, Any]]] = field(default_factory=list)
@@ -56,13 +56,13 @@ class _Handler(MessagingHandler):
 
 
 def free_url() -> str:
-    """Address at which nobody listens."""
+    """Return an AMQP address at which no server listens."""
     return f"amqp://127.0.0.1:{free_ports(1)[0]}"
 
 
 @contextmanager
 def interchange(url: str, offered: Sequence[proton.Message] = ()) -> Iterator[Interchange]:
-    """Listen at an address."""
+    """Yield an interchange that listens at an address and delivers the messages `offered`."""
     there = Interchange(url)
     injector = EventInjector()
     handler = _Handler(there, offered, injector)
@@ -79,7 +79,9 @@ def interchange(url: str, offered: Sequence[proton.Message] = ()) -> Iterator[In
 
 @contextmanager
 def separate_interchange(url: str) -> Iterator[Connection]:
-    """Listen in a process of its own; the connection answers each request with all messages."""
+    """Start an interchange in a separate process. The yielded connection answers each request with
+    all received messages.
+    """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(url, theirs), daemon=True)
@@ -98,5 +100,5 @@ def _serve(url: str, requests: Connection) -> None:
 
 
 def _plain(given: dict[str, Any]) -> dict[str, Any]:
-    """Return properties without the types of AMQP."""
+    """Return application properties with Python types instead of AMQP types."""
     return {name: int(value) if isinstance(value, int) else value for name, value in given.items()}

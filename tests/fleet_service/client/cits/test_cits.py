@@ -1,4 +1,6 @@
-"""DENM, their events over restarts, the interchange's properties, and foreign DENM as a witness."""
+"""Tests of DENM: encoding, event numbers over restarts, the interchange's properties, and foreign
+DENM as reports of one vehicle.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,7 @@ PLACE = (57.7, 11.97)
 
 
 def random_denm(draw: np.random.Generator) -> Denm:
-    """Return a DENM with every field that the gateway can set."""
+    """Return a random DENM with every field that the gateway can set."""
     position = (float(draw.uniform(-80, 80)), float(draw.uniform(-179, 179)))
     near = [
         (position[0] + float(draw.normal(0, 1e-3)), position[1] + float(draw.normal(0, 1e-3)))
@@ -92,7 +94,7 @@ bytes_of_causes = strategies.integers(0, 255)
 
 @strategies.composite
 def any_denm(draw: strategies.DrawFn) -> Denm:
-    """A DENM with any content that its fields allow."""
+    """Return a DENM with any content that its fields allow (Hypothesis strategy)."""
     position = (draw(latitudes), draw(longitudes))
 
     def points() -> tuple[tuple[float, float], ...]:
@@ -225,7 +227,7 @@ def stretch(
 
 
 class Run:
-    """An output with a clock of its own; `sent` are its messages, `settles` whether the
+    """Gateway output with a simulated clock. `sent` are its messages; `settles` is True if the
     interchange accepts them.
     """
 
@@ -357,7 +359,7 @@ def test_foreign_denm_alone_raise_no_alert(tmp_path: Path) -> None:
 
 
 def _yaws(denm: Denm) -> list[float]:
-    """Return the yaws of its reports [deg], each once."""
+    """Return the yaws [deg] of the reports made from a DENM, each once."""
     batches = [json.loads(body) for _, body in encode_reports(denm, "cits-se", 5, 1, START)]
     return sorted({round(math.degrees(yaw)) % 360 for batch in batches for yaw in batch["yaw"]})
 

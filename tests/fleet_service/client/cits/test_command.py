@@ -1,4 +1,4 @@
-"""The command `fleet-service cits` refuses what cannot work."""
+"""Tests that the command `fleet-service cits` refuses invalid arguments."""
 
 from __future__ import annotations
 
