@@ -28,14 +28,17 @@ ANY: Final = 1 << 61  # ns; how far a clock may be off of which nothing is known
 
 
 class TimeNow(NamedTuple):
-    """The service's time and its certainty, all in ns.
+    """Time of the service and how certain it is; all values in ns.
 
     Attributes:
         now: the time.
-        slack: how far beyond `now` the time of a report may be, given the times in the archive.
-        doubt: how much further a report may be without being refused for good.
+        slack: how far the time of a report may lie beyond `now`, because reports in the archive are
+            that late already.
+        doubt: how much further beyond `now` it may lie so that the report is only kept waiting, and
+            not refused for good.
         least: lower bound of the true time.
-        sure: True if the passing of time alone may end active alerts.
+        sure: True if active alerts may end only because time has passed; False while the clock may
+            be wrong.
     """
 
     now: int
@@ -87,7 +90,7 @@ class SteadyClock:
         return even
 
     def moment(self) -> TimeNow:
-        """Return the time and its certainty."""
+        """Return the time, together with how certain it is."""
         now = self.now()
         wall = self._wall()
         seen = self._seen + self._steady() - self._began
@@ -97,7 +100,9 @@ class SteadyClock:
         return TimeNow(now, slack, ANY, min(now, wall, seen) if self._seen else 0, self._sure)
 
     def record_reports(self, times: Mapping[str, int]) -> None:
-        """Record the times [ns] that vehicles just reported."""
+        """Record the time [ns] that each vehicle just reported. The clock compares these times with
+        the wall clock.
+        """
         now = self.now()
         wall = self._wall()
         if self._doubted is None:

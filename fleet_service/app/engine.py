@@ -48,7 +48,7 @@ class Engine:
     Attributes:
         alerts: active alerts.
         copy: bucket copy of the archive; None without one.
-        counts: counters of all parts.
+        counts: counters of events in all parts.
         holding: ownership of the archive.
         intake: admission and fusion of messages.
         queries: access to the map for readers.
@@ -110,18 +110,18 @@ class Engine:
             self.alerts.end_erased(standing)
 
     def drop_old(self) -> int:
-        """Drop old cells whose belief has returned to the prior; return their number. Use this only
-        inside `run_between_segments`.
+        """Drop old cells whose belief has returned to the prior (the belief before any
+        measurement); return their number. Use this only inside `run_between_segments`.
         """
         with self._shared.guard:
             return self.state.drop_old()
 
     def checkpoint(self, stop: threading.Event) -> Taken | None:
-        """Return a copy of the state and the last segment that it includes; None if `stop` is set
-        meanwhile.
+        """Return the content of a checkpoint: a copy of the state, and the last segment that it
+        includes. Return None if `stop` is set meanwhile.
 
-        Another thread calls this. The worker makes the copy directly after a segment, when all rows
-        in the state are on disk.
+        Another thread calls this. The worker makes the copy directly after a segment (a file of new
+        rows) was written, when all rows in the state are on disk.
         """
         return self.settlement.run_between_segments(self._image, stop)
 
@@ -130,8 +130,8 @@ class Engine:
             return self.state.image(self.settlement.newest_segment, weather_files(self._root))
 
     def mark_survived(self) -> None:
-        """Record that the service has run well for a while with the checkpoint from which it
-        started.
+        """Record that the service has run well for a while after starting from its checkpoint, so
+        that the next start may use it too.
         """
         checkpoints.mark_survived(self._root)
 

@@ -1,8 +1,8 @@
 """Maps of past moments, rebuilt in a separate process. Its memory is limited in advance and freed
 when it ends.
 
-This process (`past_process`) reads queries as lines of JSON. It writes the replies, each preceded
-by the tile number and the length. Tile -1 marks an error and -2 the end of an answer.
+This process (`past_process`) reads queries as lines of JSON. It writes the replies; each is
+preceded by a head of tile number and length. Tile -1 marks an error and -2 the end of an answer.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class PastQuery(NamedTuple):
         at: the moment [ns].
         lateness_s: allowed lateness of the service [s].
         only: the only selected tile; None for any.
-        public: minimum number of recent vehicles of a visible cell.
+        public: number of recent vehicles from which on readers may see a cell.
     """
 
     query: MapQuery
@@ -180,8 +180,8 @@ def box_of(question: PastQuery) -> Box | None:
 
 
 def replies_to(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
-    """Yield the tile number and the payload of every reply to a query; runs in the separate
-    process.
+    """Answer a query about a past map: yield the tile number and the payload of every reply. This
+    runs in the separate process.
 
     Raises:
         InputError: too many rows are in the box, or the archive cannot be read.

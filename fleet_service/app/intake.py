@@ -48,7 +48,8 @@ class Intake:
         acks: acknowledgements to send.
         batches: admission of batches; replaced by `reset`.
         now: time of the last `ingest` [ns].
-        report_lag_s: time [s] between the end of the newest visit and its arrival.
+        report_lag_s: time [s] between the end of the newest visit of a cell and the arrival of its
+            report.
         weather: queue of weather messages.
     """
 
@@ -76,8 +77,8 @@ class Intake:
             )
 
     def reset(self) -> None:
-        """Continue with a replaced state of the service: discard budgets and paths, which belong to
-        the old state.
+        """Continue with a replaced state of the service. The paths of vehicles and their budgets of
+        new cells belong to the old state and are discarded.
         """
         self._paths = VehiclePaths()
         self._places = NewCells()

@@ -44,8 +44,8 @@ _NICE: Final = 10  # the worker goes first
 
 
 class Job(NamedTuple):
-    """Periodic job. `work` returns a line for the operator, or None; a period `every_s` of 0 means
-    that the job never runs.
+    """Job that is repeated every `every_s` seconds; 0 means never. `work` does the job once and
+    returns a line for the operator, or None.
     """
 
     name: str

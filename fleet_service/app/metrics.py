@@ -45,9 +45,14 @@ _SINGLE: Final = {
 
 
 class Pulse(NamedTuple):
-    """Values that only the running service knows: time since the worker's last turn [s], queue
-    length, number of connected routers, clock lag [s], and duration of the current tile of an
-    answer [s].
+    """Values that only the running service knows.
+
+    Attributes:
+        turn_age_s: time since the worker's loop last began [s].
+        queued: number of messages that wait.
+        routers: number of connected routers.
+        clock_lag_s: how far the wall clock is behind the service's time [s].
+        answer_s: time for which the current tile of an answer has been in progress [s].
     """
 
     turn_age_s: float

@@ -49,8 +49,8 @@ def warm_up() -> None:
 
 
 def exercise_map() -> None:
-    """Call every compiled function with a small temporary map: update, grow, advance, update late
-    within the window, commit, and read beliefs.
+    """Call every compiled function once, with a small temporary map: update, grow, advance in time,
+    update with late visits, commit, and read beliefs.
     """
     fusion = Fusion(2 * EPOCH_NS * 1e-9)
     for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2)):

@@ -35,13 +35,15 @@ class Queries:
         self._past = HistoricalMaps(root)
 
     def tile(self, tile: int, now: int) -> bytes:
-        """Return the public cells of a tile as an Arrow stream; empty bytes if there are none."""
+        """Return the cells of a tile that readers may see, as an Arrow stream; empty bytes if there
+        are none.
+        """
         shown = self._shared.tiles.make(tile, now)
         return shown.payload if shown.cells.num_rows else b""
 
     def take_changed(self, now: int) -> list[int]:
-        """Return the tiles that changed for readers since the last call. With privacy on, these are
-        the tiles whose changes are published now.
+        """Return the numbers of the tiles that changed since the last call. If cells are hidden for
+        privacy, these are the tiles with newly published changes.
         """
         state = self._shared.state
         if state.public is not None:
@@ -58,8 +60,8 @@ class Queries:
         return [(tile, stream) for tile in changed if (stream := self.tile(tile, now))]
 
     def whole_map(self, now: int) -> pa.Table:
-        """Return all public cells as a table. The lock is held for a few cells at a time, so that
-        ingest continues.
+        """Return all cells that readers may see, as a table. The lock is held for a few cells at a
+        time, so that ingest continues.
         """
         tables = []
         shared = self._shared

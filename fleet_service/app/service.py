@@ -120,8 +120,8 @@ class Service:
 
     @property
     def exit_code(self) -> int:
-        """Return 0 if all admitted data are on disk and nothing failed, else 1. If another service
-        has taken over, the result is 1 too.
+        """Return 0 if all admitted data are on disk and nothing failed; 1 otherwise, or if another
+        service has taken over.
         """
         return (
             1
@@ -159,8 +159,9 @@ class Service:
                 raise
 
     def _has_lost_archive(self, came: Callable[[], bool]) -> bool:
-        """Return True if another service has taken over. The lease shows this; while the bucket
-        does not answer, liveliness tokens of another service show it.
+        """Return True if another service has taken over the archive. The lease in the bucket shows
+        this. While the bucket does not answer, the liveliness tokens with which another service
+        announces the regions show it.
         """
         holding = self.engine.holding
         if not holding.may_acknowledge and came():
@@ -180,8 +181,8 @@ class Service:
         return "upkeep has ended" if self._upkeep.has_ended else None
 
     def _works(self) -> bool:
-        """Return True if this service can serve its regions: a router is connected and the worker
-        is running.
+        """Return True if this service can serve its regions: a router is connected, and the worker
+        makes progress.
         """
         session = self._session
         turn_age_s = time.monotonic() - self._stepped_at
@@ -252,7 +253,9 @@ class Service:
         )
 
     def _standing(self, asked: zenoh.Query) -> None:
-        """Answer a query for the active alerts, which clients ask when they start late."""
+        """Answer a query for the active ("standing") alerts. Clients that start late ask for
+        them.
+        """
         expression = asked.key_expr
         with asked:
             for tile, alerts in self.engine.alerts.encode_tiles(

@@ -1,5 +1,5 @@
-"""Settlement of admitted batches: first write segments to disk (and to the bucket), then send
-acknowledgements.
+"""Settlement of admitted batches: their rows are first written to disk as segments (files of new
+rows), and to the bucket; then acknowledgements are sent.
 """
 
 from __future__ import annotations

@@ -51,8 +51,9 @@ class ServiceState(NamedTuple):
     """State of a service.
 
     Attributes:
-        fusion, map, alerts: result of all observations.
-        streams: record of admitted batches.
+        fusion, map, alerts: beliefs about the friction of all cells; the map and the active alerts
+            made from them.
+        streams: record of the batches that were admitted.
         weather: all weather reports used.
         refused: number of checkpoints that could not be loaded.
         public: cells that readers may see; None if they may see all cells.
@@ -67,8 +68,8 @@ class ServiceState(NamedTuple):
     public: PublicCells | None
 
     def drop_old(self) -> int:
-        """Drop cells that were not visited for KEPT_NS, whose belief has therefore returned to the
-        prior; return their number.
+        """Drop cells that were not visited for KEPT_NS. Their belief has returned to the prior, the
+        belief before any measurement. Return the number of dropped cells.
         """
         newest = self.fusion.checkpoint or 0
         stale = self.fusion.untouched(newest - KEPT_NS)
@@ -85,7 +86,7 @@ class ServiceState(NamedTuple):
 
     def image(self, cut: Cut, weather: Iterable[Path]) -> Taken:
         """Return the content of a checkpoint that includes everything up to the segment `cut`, and
-        these weather files.
+        the given weather files.
         """
         tables = image_of(self.fusion, self.alerts.standing_alerts, self.streams)
         if self.public is not None:
@@ -98,7 +99,7 @@ class SharedState:
 
     Args:
         state: state loaded from the archive.
-        public_vehicles: minimum number of vehicles of a public cell.
+        public_vehicles: number of vehicles from which on readers may see a cell.
 
     Attributes:
         guard: lock that is held while the map is changed or read.
@@ -118,8 +119,8 @@ class SharedState:
 
 
 def public_tables(public: PublicCells) -> dict[str, pa.Table]:
-    """Return the public cells as tables for a checkpoint. All columns of a table have the same
-    length.
+    """Return the cells that readers may see as tables for a checkpoint. All columns of a table have
+    the same length.
     """
     columns = public.visitors.columns()
     part = np.full(len(columns["bits"]), columns["part"][0])
@@ -136,7 +137,7 @@ def load_state(
     damaged: Callable[[Path, str], None] = skip_damaged,
     until: Cut | None = None,
 ) -> ServiceState:
-    """Load the state from the archive. With `until`, use only segments written up to this position.
+    """Load the state from the archive. If `until` is given, use only segments up to this position.
 
     Raises:
         OSError: the archive cannot be read.

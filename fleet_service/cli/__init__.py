@@ -1,5 +1,5 @@
-"""`fleet-service`: run, query, watch, page, router, hand-over, compact, retention, forget, export,
-roads, analyze, rebuild, certs, evaluate, completion.
+"""`fleet-service`: the command line program. Its commands are run, query, watch, page, router,
+hand-over, compact, retention, forget, export, roads, analyze, rebuild, certs, evaluate, completion.
 
 Bad input is reported as one line on stderr, "error: field: problem; fix", with exit code 2. Modules
 are imported only when a command needs them, so that help is fast.

@@ -149,8 +149,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _report_covered_box(arguments: argparse.Namespace, bbox: tuple[float, ...]) -> None:
-    """Print the box that contains all observations, after a query found none in its box: latitude
-    and longitude may be swapped.
+    """After a query found no observation in its box, print the box that contains all observations.
+    The user may have swapped latitude and longitude.
     """
     from fleet_service.analytics import engines
     from fleet_service.archive.export.extract import Extract
@@ -174,7 +174,9 @@ def _within_seconds(text: str | None) -> float | None:
 
 
 def _checked_question(arguments: argparse.Namespace) -> Question:
-    """Return the question after all checks of the options that need no computation."""
+    """Return the question, after all checks of the options that are possible before any
+    computation.
+    """
     question = question_of(arguments.question)
     if arguments.out is not None:
         commandline.ending_of("out", commandline.out_folder("out", arguments.out), ENDINGS)

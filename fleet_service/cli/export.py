@@ -145,7 +145,9 @@ def _register_iceberg(arguments: argparse.Namespace) -> ArchiveReport:
 
 
 def _route_costs(arguments: argparse.Namespace) -> int:
-    """Write the costs of low friction for a route planner, from the live map and a road network."""
+    """Write a file that makes a route planner avoid roads with low friction, from the live map and
+    a road network.
+    """
     from fleet_service.analytics.roads.network import read_network
     from fleet_service.client import map_client, routing
 

@@ -93,8 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _say_what_is_covered(arguments: argparse.Namespace) -> None:
-    """Print the box of the whole map, after a queried box was empty: latitude and longitude may be
-    swapped.
+    """After a query found no cell in its box, print the box of the whole map. The user may have
+    swapped latitude and longitude.
     """
     from fleet_service.client import map_client
 

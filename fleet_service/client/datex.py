@@ -82,7 +82,7 @@ def make_publication(
 
     Args:
         supplier: supplier of the publication.
-        standing: every stretch with an active alert.
+        standing: all road stretches with an active alert.
         now: current time [ns UTC].
         before: the previous publication; None to start a new one.
         is_heard: function that returns True if a service answers for a place (latitude, longitude).
@@ -262,7 +262,8 @@ def _has_ended(record: ET.Element) -> bool:
 
 def _same_place(alert: StretchAlert, old: dict[str, ET.Element], written: set[str]) -> str | None:
     """Return the id of an earlier situation that shares a cell with the stretch; None if there is
-    none. A reader that was restarted gives the same stretch another name.
+    none. A client that was restarted gives the same stretch another name, so the name cannot be
+    compared.
     """
     cells = {
         f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points

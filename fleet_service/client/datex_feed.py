@@ -115,8 +115,8 @@ class DatexFeed:
             self._has_news = True
 
     def query_alerts(self, session: zenoh.Session) -> None:
-        """Query all active alerts, and end the others. Alerts at places for which no service
-        answers are not ended.
+        """Query all active alerts, and end those that are not in the answer. Alerts at places for
+        which no service answers are not ended.
         """
         found = standing_alerts(session)
         self._heard = {}

@@ -128,7 +128,7 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
 def query_replies(
     session: zenoh.Session, key: str, parameters: Mapping[str, str]
 ) -> Iterator[tuple[str, bytes]]:
-    """Yield key and payload of every reply to a query on a key expression of the map.
+    """Query a key expression of the map, and yield key and payload of every reply.
 
     Raises:
         InputError: a service refused the query.
@@ -173,11 +173,11 @@ def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
     """Return True if any service answers for the queried part of the map. This distinguishes an
     empty map from a missing service.
 
-    There are three signs. First, a service answers for the tile at the start of the route or at a
-    corner of the box (or at an arbitrary place). Second, if no place is queried, a service replies
-    to a query of the whole map. Third, a service's liveliness token is visible, which not every
-    reader may see. A router matches only services that answer for all of a key expression, so one
-    sign alone is not enough.
+    There are three signs of a service. First, a service answers for the tile at the start of the
+    route or at a corner of the box (or at an arbitrary place). Second, if no place is queried, a
+    service replies to a query of the whole map. Third, a service's liveliness token is visible,
+    which not every reader may see. A router matches only services that answer for all of a key
+    expression, so one sign alone is not enough.
     """
     point = asked.route[0] if asked.route else asked.bbox[:2] if asked.bbox else None
     if is_place_served(session, *(reversed(point) if point else (0.0, 0.0))):

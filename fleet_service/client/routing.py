@@ -1,10 +1,11 @@
 """Low friction along road links as costs for route planners: cost factors for Valhalla, a custom
 model for GraphHopper. Pure.
 
-The factor is computed from the lower bound of friction. Only measured and estimated ("borrowed")
-cells count. In other cells the lower bound is low because no vehicle has tested the grip, which
-does not mean that the road is slippery. A factor is a cost, not a time. Valhalla also multiplies
-the reported travel time by it, so the time of a chosen route must be queried again without factors.
+The factor is computed from the lower bound of friction. Only cells that were measured, or estimated
+from neighbours ("borrowed"), count. In other cells the lower bound is low because no vehicle has
+tested the grip, which does not mean that the road is slippery. A factor is a cost, not a time.
+Valhalla also multiplies the reported travel time by it, so the time of a chosen route must be
+queried again without factors.
 """
 
 from __future__ import annotations
@@ -56,8 +57,8 @@ class CostLine(NamedTuple):
 
 
 def cost_factors(mu_lower: FloatArray) -> FloatArray:
-    """Return the cost factor for each lower bound of friction (n,): 1 from GOOD_GRIP on, at most
-    MOST.
+    """Return the cost factor for each lower bound of friction (n,). The factor is 1 if the lower
+    bound is GOOD_GRIP or more, and never above MOST.
     """
     ratio = GOOD_GRIP / np.maximum(mu_lower, 1e-3)
     exact = np.clip(ratio**POWER, 1.0, MOST)

@@ -36,11 +36,11 @@ class StretchAlert:
         since, time: begin of the alert, and time of this state [ns since 1970, UTC].
         length_m: length along the road [m], at least that of a cell.
         direction: direction of the road, e.g. north-south.
-        headings: driving directions of the vehicles that found it.
+        headings: driving directions of the vehicles that found it slippery.
         latitude, longitude: centre [deg].
         bbox: west, south, east, north [deg].
         mu, mu_lower, mu_upper, p_slippery: values of the cell with the lowest mu.
-        vehicles: largest number of vehicles of any cell.
+        vehicles: number of vehicles that measured the cell with the most vehicles.
         reason: reason from the last cell that changed the stretch.
         points: latitude and longitude [deg] of the cells from one end to the other; branches are
             left out.
@@ -201,8 +201,8 @@ class Stretches:
 
 
 def link_cells(cell: IntArray) -> IntArray:
-    """Return the stretch number of each cell, (n,): cells at most LINK_CELLS apart belong
-    together. Stretches are numbered in the order of their first cells.
+    """Return the number of the stretch to which each cell belongs, (n,). Cells at most LINK_CELLS
+    apart belong to the same stretch. Stretches are numbered in the order of their first cells.
     """
     distinct, first, of_cell = np.unique(cell, return_index=True, return_inverse=True)
     one, other = _find_neighbours(distinct)
@@ -305,7 +305,7 @@ def _measure_shape(
     cell: IntArray,
 ) -> tuple[float, str, tuple[float, float], tuple[float, float, float, float]]:
     """Return length [m], direction, centre [deg] and box [deg] of a set of cells. The direction is
-    that of the largest spread.
+    that in which the cells spread the most.
     """
     west, south, east, north = grid.bounds(cell)
     scale = METRES_PER_DEGREE * math.cos(math.radians(float(south.mean())))

@@ -120,12 +120,14 @@ class Webhook:
 
     @property
     def lost_count(self) -> int:
-        """Number of alerts that can no longer be delivered."""
+        """Return the number of alerts that can no longer be delivered."""
         return sum(self.counts[name] for name in LOSSES)
 
     @property
     def waiting_count(self) -> int:
-        """Number of alerts in the queue; after `close`, the number that remained undelivered."""
+        """Return the number of alerts in the queue; after `close`, the number that remained
+        undelivered.
+        """
         return self._undelivered if self._is_closed else len(self._queue)
 
     def health_problems(self) -> list[str]:

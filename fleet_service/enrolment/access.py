@@ -10,10 +10,11 @@ here. Pure.
 | service | everything under gripmap/ but PRIVATE    | the same                            |
 | router  | messages that others may publish, between routers | the same                   |
 
-PRIVATE stands for the keys ahead/NAME and vss/NAME: the road ahead of a vehicle, and the friction
-at the vehicle. Zenoh decides by the common name of the certificate. It reads the list only at its
-start. The sender is not informed about denials. Publishing on a wildcard counts as publishing on
-every matching key, so a rule must allow all of them.
+NAME is the name in the certificate. PRIVATE stands for the keys ahead/NAME and vss/NAME: the road
+ahead of a vehicle, and the friction at the vehicle. Zenoh decides by the common name of the
+certificate. It reads the list only at its start. The sender is not informed about denials.
+Publishing on a wildcard counts as publishing on every matching key, so a rule must allow all of
+them.
 """
 
 from __future__ import annotations
@@ -91,8 +92,8 @@ def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Sec
 
 
 def rate_caps(fleet: Enrolment, name: str) -> list[Section]:
-    """Return limits on the message rate of a session at the router `name`, so that a flooding
-    vehicle does not slow down others.
+    """Return the rules that limit the message rate of each session at the router `name`, so that a
+    flooding vehicle does not slow down others.
 
     Zenoh counts messages per session and rule, and cannot distinguish a vehicle from a router. A
     session of another router carries the messages of many vehicles and must not be limited. Routers
@@ -226,8 +227,8 @@ def _allow_rule(
 
 
 def _no_larger() -> Section:
-    """Return a rule that stops batches at the first router if they are larger than the service
-    accepts.
+    """Return a rule that stops batches of measurements that are larger than the service accepts, at
+    the first router.
     """
     return {
         "id": "batches",
@@ -239,8 +240,8 @@ def _no_larger() -> Section:
 
 
 def _no_larger_private() -> Section:
-    """Return a rule that stops private messages of a vehicle at the first router if they are larger
-    than any agent writes.
+    """Return a rule that stops private messages of a vehicle that are larger than any agent writes,
+    at the first router.
     """
     return {
         "id": "private",
@@ -265,7 +266,9 @@ def _no_payload() -> Section:
 
 
 def _topic_priority(topic: keys.Topic) -> Section:
-    """Return a rule that replaces the sender's priority with that of the topic."""
+    """Return a rule that gives each message the priority of its topic, in place of the priority
+    that its sender chose.
+    """
     return {
         "id": f"priority-{topic.name}",
         "flows": ["ingress"],

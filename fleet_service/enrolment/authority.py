@@ -30,13 +30,15 @@ Key = ec.EllipticCurvePrivateKey
 
 
 class KeyPair(NamedTuple):
-    """Certificate and its private key."""
+    """Certificate together with its private key."""
 
     certificate: x509.Certificate
     key: Key
 
     def write(self, stem: Path) -> None:
-        """Write STEM.pem and STEM.key. If only one of them is written, `read_pair` detects this."""
+        """Write STEM.pem and STEM.key. If the machine fails after the first file, `read_pair`
+        detects this.
+        """
         secret = self.key.private_bytes(
             serialization.Encoding.PEM,
             serialization.PrivateFormat.PKCS8,

@@ -77,7 +77,8 @@ class Registry:
 
         Args:
             fleet: content of the enrolment file.
-            step: step of a change to another authority; None for none.
+            step: step of the change to another authority (next, switch or drop) that is carried
+                out; None for none.
 
         Raises:
             InputError: a file is damaged, a name was revoked, or a step is out of order.
@@ -123,7 +124,9 @@ class Registry:
         return signer
 
     def _switch(self) -> None:
-        """Make the next authority the signing one; an interrupted call can be repeated."""
+        """Make the next authority the one that signs certificates. An interrupted call can be
+        repeated.
+        """
         following = ca.read_pair(self._authority / "next")
         leaving = ca.read_certificate(self._authority / "ca.pem")
         if following is None or leaving is None:

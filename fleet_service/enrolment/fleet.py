@@ -33,7 +33,7 @@ Host = Annotated[str, AfterValidator(_checked_host)]
 
 
 class Router(Settings):
-    """One Zenoh router."""
+    """Zenoh router with the addresses and ports at which it can be reached."""
 
     hosts: list[Host] = Field(
         default=["127.0.0.1", "localhost"],
@@ -86,8 +86,8 @@ def _format_endpoint(protocol: str, host: str, port: int) -> str:
 
 
 class Enrolment(Settings):
-    """Names by role. Each name has one role only, because the certificate contains only the
-    name.
+    """Content of the enrolment file: names by role. Each name has one role only, because the
+    certificate contains only the name.
     """
 
     routers: dict[VehicleName, Router] = Field(

@@ -1,5 +1,5 @@
-"""Lossless conversion of a fusion to Arrow tables and back, so that a restart needs no complete
-replay.
+"""Lossless conversion of a fusion (the beliefs about all cells) to Arrow tables and back, so that a
+restart needs no complete replay.
 
 The caller stores the tables and decides which archived rows are newer. This module does no I/O.
 """

@@ -1,5 +1,5 @@
-"""Checkpoints. A checkpoint is the state of a service after all rows up to a certain segment; a
-restart replays only later segments.
+"""Checkpoints. A checkpoint is the state of a service after all rows up to a certain segment (file
+of new rows); a restart replays only later segments.
 
     checkpoints/EPOCH-NUMBER/NAME.arrow          tables; the folder is named after the newest
                                                  segment that is included
@@ -44,7 +44,7 @@ class Taken(NamedTuple):
 
     Attributes:
         tables: tables by name.
-        cut: last segment that the tables include.
+        cut: position of the last segment that the tables include.
         weather: names of the weather files that the tables include.
     """
 

@@ -63,8 +63,12 @@ MARGIN_DEG: Final = 0.002
 
 
 class Begin(NamedTuple):
-    """Start of a replay: the first day of measurement, and the positions in the sequence of
-    segments after which and up to which rows are read.
+    """Start of a replay.
+
+    Attributes:
+        day: first day of measurement that is read; None for all days.
+        after: only segments after this position are read; None to read from the first.
+        until: only segments up to this position are read; None to read to the last.
     """
 
     day: int | None = None
@@ -116,13 +120,18 @@ def pseudonym_numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntAr
 
 
 class Since(NamedTuple):
-    """Selection of rows for a replay: from a segment position and a day on, received until `until`
-    [ns], near `box` [deg].
+    """Selection of rows for a replay.
 
     Once the vehicles' weights are known, cells do not depend on each other. Therefore cells well
-    inside a box get the same belief as in a complete replay. Compacted files may contain batches
-    from before the start position; batches in `known` are left out. If there are more rows than
-    `most`, an error is raised.
+    inside a box get the same belief as in a complete replay.
+
+    Attributes:
+        begin: day and segment at which the replay starts.
+        known: record of batches that are left out, because compacted files may contain batches from
+            before the start.
+        until: only rows received until this time are selected [ns].
+        box: only rows near this box are selected [deg].
+        most: maximum number of rows; if there are more, an error is raised.
     """
 
     begin: Begin = Begin()
@@ -132,8 +141,8 @@ class Since(NamedTuple):
     most: int | None = None
 
     def near(self) -> Box | None:
-        """Return the box enlarged by twice the margin, or None. The files of all zones that touch
-        it must be read.
+        """Return the box enlarged by twice the margin; None without a box. The files of all zones
+        (map squares of zoom 7) that touch it must be read.
         """
         if self.box is None:
             return None
@@ -232,7 +241,7 @@ def replay(
     heard: Heard = ignore_observations,
 ) -> Iterator[Updated]:
     """Replay the archive into `fusion` in order of time, with the vote weights that were used at
-    the first fusion; yield once per epoch.
+    the first fusion; yield once per epoch of the fusion.
 
     One day is read at a time, a large day in parts, so that memory does not grow with the archive.
 
@@ -241,7 +250,7 @@ def replay(
         fusion: a new fusion, or one that contains everything before `since`.
         since: selection of rows.
         damaged: called with each damaged file.
-        heard: context in which each group of observations is fused.
+        heard: function that returns the context in which a group of observations is fused.
     """
     last = None if since.until is None else since.until // layout.DAY_NS + 1
     where = since.where()
@@ -280,7 +289,7 @@ def _recorded_result(rows: segments.Rows) -> RecordedResult:
 def _join_parts(
     parts: list[tuple[Observations, RecordedResult]],
 ) -> tuple[Observations, RecordedResult]:
-    """Return several parts joined into one, in order."""
+    """Return the parts of a table joined into one, in order."""
     of = Observations(
         **{
             f.name: np.concatenate([getattr(o, f.name) for o, _ in parts])
@@ -321,8 +330,8 @@ def _fuse_epochs(
 
 
 def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.Table]:
-    """Yield the rows of a listing in chunks of about CHUNK_ROWS, in order of time. Chunks are cut
-    between epochs.
+    """Yield the rows of the listed files in chunks of about CHUNK_ROWS, in order of time. Chunks
+    are cut between epochs.
 
     A file is read once, or once per part of a day with more than PART_ROWS. Vehicles are given as
     numbers. If the number of rows is not limited, a part is read while the previous one is used.
@@ -341,8 +350,8 @@ def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.T
 
 
 def _prefetch_parts(parts: Iterator[_Held]) -> Iterator[_Held]:
-    """Yield the same parts. A thread prepares each part while the previous one is used, because
-    reading takes a third of the start time.
+    """Yield the given parts unchanged. A thread prepares each part while the previous one is used,
+    because reading takes a third of the start time.
     """
     with ThreadPoolExecutor(1, "reads ahead") as thread:
         coming = thread.submit(next, parts, None)
@@ -352,7 +361,7 @@ def _prefetch_parts(parts: Iterator[_Held]) -> Iterator[_Held]:
 
 
 def _split_parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
-    """Yield the rows of a listing in parts of about PART_ROWS."""
+    """Yield the rows of the listed files in parts of about PART_ROWS."""
     name = layout.TIME[listing.kind]
     fresh = [table for table in listing.inbox() if table.num_rows]
     inbox = pa.concat_tables(fresh).sort_by(name) if fresh else None
@@ -394,11 +403,11 @@ def _split_parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
 
 
 class _Held:
-    """Waiting rows by chunk, compressed to a third of their memory.
+    """Rows that wait until their chunk is complete. They are compressed to a third of their memory.
 
     Args:
-        name: name of the column of times.
-        borders: times between the chunks [ns].
+        name: name of the column that contains the time.
+        borders: times at which one chunk ends and the next begins [ns].
     """
 
     def __init__(self, name: str, borders: list[int]) -> None:
@@ -450,8 +459,8 @@ def _time_borders(low: int, high: int, rows: int, most: int) -> list[int]:
 
 
 def _with_numbers(table: pa.Table) -> pa.Table:
-    """Return the table with numbers in place of pseudonyms, which takes less than half the
-    memory.
+    """Return the table with numbers in place of the vehicles' pseudonyms. It takes less than half
+    the memory.
     """
     at = table.column_names.index("vehicle")
     return table.set_column(at, "vehicle", pa.array(pseudonym_numbers(table["vehicle"])))

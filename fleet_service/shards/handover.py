@@ -30,8 +30,8 @@ FIX: Final = "start it with --standby, the same settings and a name of its own"
 
 
 class HandoverResult(NamedTuple):
-    """Result of a hand-over: name of the service that stopped, and time [s] for which the region
-    had no service.
+    """Result of a hand-over: the name of the service that stopped, and the time [s] during which no
+    service served the region.
     """
 
     service: str

@@ -32,13 +32,14 @@ def claim_regions(
     stop: threading.Event,
     former: Collection[str] = (),
 ) -> Iterator[frozenset[ServiceToken]]:
-    """Claim regions exclusively until the block ends; yield the tokens of this service.
+    """Claim regions exclusively until the block ends; yield the liveliness tokens by which this
+    service announces them.
 
     Args:
         session: Zenoh session of the service.
         name: name of the service.
         regions: key expressions of the regions.
-        stop: event that ends the wait for another service's token.
+        stop: event that ends the wait for another service's token to disappear.
         former: names of earlier holders of this service's lease; their remaining tokens are
             ignored, because they will disappear soon.
 
@@ -85,8 +86,8 @@ def watch_successors(
 def rival_tokens(
     mine: frozenset[ServiceToken], there: set[ServiceToken], former: Collection[str] = ()
 ) -> list[ServiceToken]:
-    """Return the tokens of other services for overlapping regions, sorted. Tokens of the `former`
-    services are excluded.
+    """Return, sorted, the tokens by which other services announce regions that overlap `regions`.
+    Tokens of the `former` services are excluded.
     """
     others = (one for one in there - mine if one.service not in former)
     return sorted(one for one in others if any(overlap(one.region, own.region) for own in mine))
@@ -135,9 +136,9 @@ def _declare_tokens(
 def standby_signs(
     config: ServiceConfig, stop: threading.Event, alive: Callable[[], None] = lambda: None
 ) -> Iterator[tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]] | None]:
-    """Yield the functions of a standby for the lease: whether it reaches a router, whether a
-    service's token is active, and `alive`. Yield None if the service is no standby, or was stopped
-    before it reached a router.
+    """Yield three functions that a standby needs while it waits for the lease. The first tells if a
+    router is reachable, the second if the service of a given name is present; the third is `alive`.
+    Yield None if the service is no standby, or was stopped before it reached a router.
     """
     session = (
         zenoh_session.open_session(config.zenoh, stop, config.name) if config.standby else None

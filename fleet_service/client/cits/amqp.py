@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 
 class Parcel(NamedTuple):
-    """Message with the name that its sender gave it."""
+    """Message to send, with the name by which its sender recognises it when it is accepted."""
 
     name: str
     body: bytes
@@ -117,12 +117,8 @@ class _AmqpEvents(MessagingHandler):
 
 
 class AmqpLink:
-    """Connection to an interchange.
-
-    Attributes:
-        is_connected: True while the interchange answers.
-        is_waking: True from the time when a message is queued until the thread reads the queue.
-        rejected: number of messages that the interchange refused.
+    """Connection to an interchange, the AMQP server that distributes hazard messages between
+    operators.
 
     Args:
         url: amqp://HOST:PORT or amqps://HOST:PORT.
@@ -131,6 +127,11 @@ class AmqpLink:
         selector: filter on the messages to receive, e.g. "messageType = 'DENM'".
         on_accepted: called with the name of each message that need not be sent again.
         on_message: called with body and properties of each received message.
+
+    Attributes:
+        is_connected: True while the interchange answers.
+        is_waking: True from the time when a message is queued until the thread reads the queue.
+        rejected: number of messages that the interchange refused.
     """
 
     def __init__(

@@ -61,7 +61,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class Denm:
-    """One DENM.
+    """Hazard message (DENM).
 
     Attributes:
         station, sequence: identity of the event: originating station, and number of the event at
@@ -74,7 +74,7 @@ class Denm:
         position_std: standard deviation of the position on each axis [m].
         validity_s: time after `detected` for which receivers assume that the event lasts [s].
         quality: information quality, 0 (unknown) to 7.
-        cause, sub_cause: codes; 6 is adhesion.
+        cause, sub_cause: numeric codes of the cause of the hazard; cause 6 is low adhesion.
         history: further points of the event [deg].
         traces: paths that lead to the event, each from the event backwards [deg].
         heading: heading of the traffic concerned [deg from north, clockwise]; None for both
@@ -155,7 +155,7 @@ def utc_of(its_ms: int) -> int:
 
 @cache
 def compiled_denm() -> Any:  # noqa: ANN401 the library has no types
-    """Return a general encoder and decoder for `denm.asn`."""
+    """Return a general encoder and decoder of DENM, compiled from the specification `denm.asn`."""
     try:
         import asn1tools
     except ImportError as error:
@@ -218,8 +218,9 @@ def _write_location(out: BitWriter, denm: Denm) -> None:
 
 
 def _encode_deltas(origin: Point, points: Iterable[Point]) -> list[int]:
-    """Return the encoded offsets of points from `origin`, one number of bits per point: north,
-    east, and an unavailable height. Points out of reach are left out.
+    """Return the encoded offsets of points from `origin`. Each point has the offsets to the north
+    and to the east, with one number of bits for both, and a height that is marked as unavailable.
+    Points that are too far away for these bits are left out.
     """
     found = list[int]()
     height = 12_800 - LEAST["height"]

@@ -51,11 +51,11 @@ class OpenEvent:
 
 
 class EventBook:
-    """All events of a station.
+    """All events of a station that sends DENM.
 
     Args:
         station: identifier of the originating station.
-        content: saved value of the property `content`; None for a new book.
+        content: saved value of the property `content`; None for a station without events.
 
     Raises:
         InputError: the content belongs to another station or is not valid.

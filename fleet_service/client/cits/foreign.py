@@ -1,7 +1,7 @@
-"""DENM of other stations, converted to reports of one vehicle name. The fusion weighs and trusts
-this name like a vehicle. Pure.
+"""Conversion of DENM (hazard messages) from other stations to reports of one vehicle name. The
+fusion weighs and trusts this name like a vehicle. Pure.
 
-All DENM of one interchange have the same name. An alert needs two independent sources, so they
+All DENM of one interchange get the same name. An alert needs two independent sources, so they
 cannot raise an alert alone.
 """
 

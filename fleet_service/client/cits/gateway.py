@@ -28,8 +28,8 @@ log = logging.getLogger(__name__)
 
 
 class Sending(NamedTuple):
-    """Settings for sending DENM: address at the interchange, station identifier, publisher, and
-    state file.
+    """Settings for sending DENM: address at the interchange, identifier of the station, publisher,
+    and file in which the state is saved.
     """
 
     target: str
@@ -39,8 +39,8 @@ class Sending(NamedTuple):
 
 
 class Receiving(NamedTuple):
-    """Settings for receiving DENM: address at the interchange, selector, and vehicle name for the
-    reports.
+    """Settings for receiving DENM: address at the interchange, filter on the messages, and vehicle
+    name for the reports made from them.
     """
 
     source: str

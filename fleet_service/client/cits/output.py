@@ -71,12 +71,12 @@ class DenmOutput:
 
     @property
     def unaccepted_count(self) -> int:
-        """Number of messages that the interchange has not accepted yet."""
+        """Return the number of messages that the interchange has not accepted yet."""
         return len(self._pending)
 
     @property
     def open_event_count(self) -> int:
-        """Number of events that have not ended."""
+        """Return the number of events that have not ended."""
         return len(self._book.open_events)
 
     def mark_accepted(self, name: str) -> None:

@@ -16,7 +16,7 @@ PROTOCOL: Final = "DENM:1.3.1"
 
 @dataclass(frozen=True)
 class Originator:
-    """Publisher at an interchange.
+    """Publisher of messages at an interchange.
 
     Attributes:
         country: two letters, ISO 3166.
