@@ -131,7 +131,9 @@ class ListeningTown:
         return seen.columns | {"vehicle": seen.vehicle}
 
     def _truth(self, now: float) -> None:
-        """Record which cars are on the new ice, and which of them slide there."""
+        """Record which cars are on the new ice, and which of them slide there, from the true values
+        of the simulator.
+        """
         true = self.fleet.truth
         patch = self.ice
         cells = grid.cell_of(*self.fleet.scenario.to_latlon(true.x[-1], true.y[-1]))
@@ -165,7 +167,7 @@ class ListeningTown:
             self.heard.store_alert(decode_alert_message(key, wire.encode_alert(alert), now), now)
 
     def _hear(self, second: int) -> None:
-        """Pass the active alerts to the cars, and at intervals the tiles of the map."""
+        """Pass the active alerts to the listening cars, and at intervals the tiles of the map."""
         now = self._now()
         for alert in self.alerts.standing_alerts:
             self.heard.store_alert(alert, now)

@@ -39,7 +39,7 @@ LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 
 
 def demo_works(found: Sequence[Figure]) -> bool:
-    """Return True if the demo was successful.
+    """Return True if all figures that the demo must reach are good enough.
 
     A late alert, wide intervals, few passes or a busy machine do not count as a failure.
     """
@@ -63,23 +63,27 @@ class MapComparison:
 
     @property
     def is_covered(self) -> BoolArray:
-        """Mask of rows, (n,): True if the true friction lies in the interval."""
+        """Return a mask of rows, (n,): True if the true friction lies in the interval."""
         lower, upper = (self.cells[end].to_numpy() for end in ("mu_lower", "mu_upper"))
         return np.asarray((lower <= self.truth) & (self.truth <= upper))
 
     @property
     def has_several_vehicles(self) -> BoolArray:
-        """Mask of rows, (n,): True if two or more vehicles visited the cell."""
+        """Return a mask of rows, (n,): True if two or more vehicles visited the cell."""
         return np.asarray(self.cells["vehicles"].to_numpy() >= 2)
 
     @property
     def is_measured(self) -> BoolArray:
-        """Mask of rows, (n,): True if the cell's belief is based on more than lower bounds."""
+        """Return a mask of rows, (n,): True if the cell's belief is based on more than lower
+        bounds.
+        """
         return np.asarray(self.cells["basis"].to_numpy(zero_copy_only=False) == "measured")
 
     @property
     def values(self) -> FloatArray:
-        """Median friction of the map, (n,); NaN where no value was measured."""
+        """Return the median friction according to the map, (n,); NaN where no value was
+        measured.
+        """
         mu = self.cells["mu"].to_numpy()
         return np.where(self.is_measured, mu, np.nan)
 
@@ -127,8 +131,8 @@ def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison
 def delay_passes(
     visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
 ) -> float:
-    """Return the number of excited passes over a new patch of ice until its first alert: the median
-    over all patches.
+    """Return the number of excited passes (with enough grip used to measure the friction) over a
+    new patch of ice until its first alert. It is the median over all patches.
 
     A patch without an alert counts as infinite. Cells at most LINK_CELLS apart belong to one patch.
 
@@ -151,8 +155,8 @@ def delay_passes(
 def known_patches(
     visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
 ) -> list[tuple[IntArray, int]]:
-    """Return, for each patch of ice, its cells and the time of its first alert [ns]; NEVER if it
-    had no alert.
+    """Return, for each patch of ice, its cells and the time of its first alert [ns]; the time is
+    NEVER if there was no alert.
     """
     cells = np.unique(visits["cell"].to_numpy()[patch])
     label = link_cells(cells)
@@ -166,8 +170,8 @@ def known_patches(
 
 
 def count_passes(rows: pa.Table) -> int:
-    """Return the number of passes. Successive visits of one vehicle to neighbouring cells are one
-    pass.
+    """Return the number of passes in a list of visits. Successive visits of one vehicle to
+    neighbouring cells are one pass.
     """
     order = rows.sort_by([("vehicle", "ascending"), ("enter_time", "ascending")])
     vehicle = order["vehicle"].to_numpy(zero_copy_only=False)
@@ -186,7 +190,7 @@ def demo_figures(
     archive: Path,
     wall_s: float,
 ) -> list[Figure]:
-    """Return the demo's figures with their targets."""
+    """Return all figures of the demo, each with its target."""
     several = comparison.has_several_vehicles
     value = comparison.has_several_vehicles & comparison.is_measured
     error = comparison.cells["mu"].to_numpy() - comparison.truth
@@ -314,8 +318,8 @@ def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
 
 
 def per_stretch(alerts: list[tuple[int, Alert]], visits: pa.Table) -> float:
-    """Return the number of stretch alerts per icy stretch and driving direction; NaN without
-    ice.
+    """Return the number of alerts of road stretches, divided by the number of icy stretches
+    (counted per driving direction); NaN without ice.
     """
     road = Stretches()
     ids = set[str]()

@@ -49,7 +49,9 @@ _PER_TILE: Final = EXTENT
 
 @dataclass
 class StreetPlan:
-    """Shapes of the town in metres: streets with names, polygons by layer, and names of places."""
+    """Shapes of the simulated town in metres: streets with names, polygons by map layer, and names
+    of places.
+    """
 
     streets: list[tuple[str, FloatArray, str]] = field(default_factory=list)
     areas: list[tuple[str, FloatArray]] = field(default_factory=list)
@@ -57,7 +59,7 @@ class StreetPlan:
 
 
 def town_of(scenario: Scenario) -> StreetPlan:
-    """Return the shapes of the town for a scenario."""
+    """Return the shapes of the town that belong to a scenario of the simulator."""
     found = StreetPlan()
     for number, road in enumerate(scenario.roads):
         name = STREETS[number % len(STREETS)]
@@ -123,7 +125,9 @@ def _place_houses(centres: FloatArray) -> Iterable[FloatArray]:
 
 
 def _lanes_around(centres: FloatArray) -> list[tuple[str, FloatArray, str]]:
-    """Return roads that lead out of the town; no simulated car uses them."""
+    """Return roads that lead from the simulated streets out of the town. They are only drawn; no
+    simulated car uses them.
+    """
     out = []
     for name, angle in (("E20", 0.55), ("E20", math.pi + 0.35), ("Skogsvägen", 2.2)):
         away = np.array([math.cos(angle), math.sin(angle)])

@@ -68,8 +68,8 @@ class QueryEngine:
             self.connection.raw_sql(f"SET enable_progress_bar = {str(self.progress).lower()}")
 
     def files(self, table: str) -> list[Path]:
-        """Return the files of a table that may contain rows of the selected part. A map snapshot is
-        included up to the day after its own.
+        """Return the files of a table that may contain rows of the selected part. A snapshot of the
+        map is included if its day, or the day after it, is selected.
         """
         before = 1 if table == "map" else 0
         first = self.part.since // layout.DAY_NS - before
@@ -156,8 +156,9 @@ class QueryEngine:
 
 
 def has_value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
-    """Return a condition that is true for rows with a value of mu and not only a lower bound: the
-    vehicle used at least the share EXCITED_SHARE of mu (see the contract).
+    """Return a condition that is true for rows with a value of mu, and false for rows with only a
+    lower bound. A row has a value if the vehicle used at least the share EXCITED_SHARE of mu (see
+    the contract).
 
     NaN is larger than any number in both engines, so it is checked explicitly.
     """

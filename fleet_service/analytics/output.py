@@ -164,8 +164,8 @@ def add_places(table: pa.Table) -> pa.Table:
 
 
 def add_geometry(table: pa.Table, question: Question) -> pa.Table:
-    """Return the answer with the polygons of its cells; for rows of several cells, with
-    multi-polygons.
+    """Return the answer with the polygon of each row's cell; rows with several cells get a
+    multi-polygon.
     """
     if "cell" not in table.schema.names:
         raise InputError(

@@ -47,7 +47,7 @@ GRIP_SCALE: Final = Scale(
 
 @dataclass(frozen=True)
 class DrawnCells:
-    """Content to draw: rows, each with one or more squares of the map.
+    """Rows to draw; each row is drawn as one or more squares of the map.
 
     Attributes:
         boxes: west, south, east, north [deg] of each square.
@@ -56,7 +56,8 @@ class DrawnCells:
         panels: for each panel, its name and one value per row; None means 'not measured'.
         names, rows: names of the texts shown for a row, and the texts.
         frames, frame: names of the frames, and the frame number of each row.
-        lasting: for each row, True if its value is still growing.
+        lasting: for each row, True if its value will still grow, such as the duration of a spell
+            that has not ended.
     """
 
     boxes: Sequence[Sequence[float]]

@@ -40,8 +40,8 @@ def map_at(root: Path, part: Extract, lateness_s: float = LATENESS_S) -> pa.Tabl
 
 
 def snapshot_table(table: pa.Table, at: int) -> pa.Table:
-    """Return cells with their beliefs at the time `at` [ns] in the GeoParquet form of a map
-    snapshot.
+    """Return the table of cells with their beliefs in the GeoParquet form of a map snapshot; `at`
+    [ns] is the time of the beliefs.
     """
     time = pa.array(np.full(table.num_rows, at // tables.US_STEP)).cast(tables.US)
     table = table.append_column("snapshot_time", time).sort_by(

@@ -62,7 +62,7 @@ def cell_shapes(cell: IntArray, sector: IntArray | None = None) -> FloatArray:
 def paint(
     axes: Axes, shapes: FloatArray, values: FloatArray, limits: tuple[float, float] = GRIP_RANGE
 ) -> PolyCollection:
-    """Draw shapes in the colours of friction; shapes without a value are hatched and have no
+    """Draw shapes in colours that show the friction. Shapes without a value are hatched and have no
     colour.
     """
     known = np.isfinite(values)

@@ -55,8 +55,8 @@ class RebuildResult(NamedTuple):
 
 
 def require_empty(out: Path) -> None:
-    """Raise unless a folder is empty or new. Otherwise statistics of another archive in it would be
-    added to the new ones.
+    """Raise an error unless a folder is empty or does not exist yet. Otherwise statistics of
+    another archive in it would be mixed with the new ones.
 
     Raises:
         InputError: the folder has content, or cannot be created.
@@ -95,7 +95,7 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
 
 
 def zones_of(root: Path) -> list[int]:
-    """Return the zones for which an archive has compacted observations."""
+    """Return the zones (map squares of zoom 7) for which an archive has compacted observations."""
     return sorted(
         {layout.partition_of(path).zone for path in layout.compacted_files(root, Kind.OBSERVATION)}
     )

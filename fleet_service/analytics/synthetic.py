@@ -35,7 +35,7 @@ _STD: Final = 0.05
 @dataclass(frozen=True)
 class SyntheticFleet:
     """Size of the synthetic archive: number of rows, days, vehicles, roads, and cells per road
-    (`length`). One of `icy` roads freezes at night.
+    (`length`). One road in every `icy` roads freezes at night.
     """
 
     rows: int
@@ -196,8 +196,8 @@ def truth_of(
 def _make_likelihoods(
     rng: np.random.Generator, mu: FloatArray, used: FloatArray, excited: BoolArray
 ) -> ByteArray:
-    """Return likelihoods (n, 32) in steps. A value has a flank on both sides; a bound has a flank
-    only below the grip used.
+    """Return the likelihoods of the reports, (n, 32), in steps. The likelihood of a value falls on
+    both sides of the value. That of a lower bound falls only below the grip used.
     """
     distance = (mugrid.CENTRES - np.where(excited, mu, used)[:, None]).astype(np.float32)
     flank = rng.uniform(0.02, 0.08, (2, len(mu), 1)).astype(np.float32)

@@ -58,9 +58,9 @@ class ErrorModel(NamedTuple):
         tails: degrees of freedom of a visit's noise (Student's t); infinite for normal noise.
         stated: ratio of the standard deviation that a vehicle states to its true one.
         share: smallest and largest share of the grip that an excited visit uses.
-        low: how far a value reads too low, per share of the grip that was left unused.
+        low: how much too low a value is, per share of the grip that was left unused.
         tyres: relative error common to all tyres of the fleet.
-        half: additional relative error of every second vehicle.
+        half: relative error that every second vehicle has in addition.
         alike: share of the passes at a place that do its most frequent manoeuvre.
     """
 
@@ -103,8 +103,16 @@ class Errors:
 
 
 class Passes(NamedTuple):
-    """Properties of visits (n,): vehicle, friction, error shared in the place, share of the grip
-    used, noise, manoeuvre, and a mask of excited visits.
+    """Properties of visits (n,).
+
+    Attributes:
+        vehicle: number of the vehicle.
+        mu: friction of the road.
+        common: relative error that all vehicles share in the place.
+        share: share of the grip that was used.
+        e: standard normal noise of the reading.
+        manoeuvre: number of the manoeuvre.
+        excited: True if enough grip was used to measure the friction.
     """
 
     vehicle: IntArray
@@ -118,8 +126,8 @@ class Passes(NamedTuple):
 
 @dataclass(frozen=True)
 class SimulatedReports:
-    """Reports of visits: reading z and its standard deviation σ (n,), NaN for unexcited visits;
-    grip used (n,); manoeuvre (n,); log-likelihood (n, 32).
+    """Reports of visits: reading z and its standard deviation σ (n,), both NaN if too little grip
+    was used to measure the friction; grip used (n,); manoeuvre (n,); log-likelihood (n, 32).
     """
 
     reading: FloatArray
@@ -130,8 +138,8 @@ class SimulatedReports:
 
 
 def used_shares(rng: Generator, excited: BoolArray, model: ErrorModel = CLEAN) -> FloatArray:
-    """Return the share s of the grip used in each visit, (n,): within the model's range if excited,
-    else as in ordinary driving.
+    """Return the share s of the grip used in each visit, (n,). In an excited visit (one that
+    measures the friction) it is within the model's range, else as in ordinary driving.
     """
     ordinary = rng.uniform(0.05, min(0.5, model.share[1]), excited.shape)
     return np.where(excited, rng.uniform(*model.share, excited.shape), ordinary)

@@ -5,9 +5,10 @@ The attackers of `claim_random`, `shifted_pose` and `flood_one_cell` are enrolle
 honest, and are therefore trusted, until the attack begins. `add_newcomers` uses new names.
 `replay_messages` sends messages through the service's admission: old messages again, other
 vehicles' messages under the attacker's key, and old visits under the attacker's name. A cell is
-counted if its alert differs at any minute from that of the same drive without the attack. Raised
-alerts count in dry or wet cells (μ > CLEARLY_DRY), suppressed alerts in icy cells (μ <
-CLEARLY_ICY). Only cells with ENOUGH honest excited vehicles are considered.
+counted if its alert differs at any minute from that of the same drive without the attack. An alert
+that an attack raises counts in dry or wet cells (μ > CLEARLY_DRY), one that an attack suppresses
+counts in icy cells (μ < CLEARLY_ICY). Only cells are considered in which at least ENOUGH honest
+vehicles used enough grip to measure the friction.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ ENOUGH = 5
 
 @dataclass(frozen=True)
 class AttackedDrive:
-    """Drive of the honest fleet, before an attack is added."""
+    """Drive of the honest fleet to which an attack is added later."""
 
     town: Town
     visits: Visits
@@ -131,7 +132,9 @@ def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
 
 
 def victim_cells(drive: AttackedDrive) -> IntArray:
-    """Return the driest and the iciest of the counted cells."""
+    """Return the two cells that are attacked: the one with the most and the one with the least
+    friction among the cells that are considered.
+    """
     mu = np.where(drive.counted, drive.town.mu[BEGIN], np.nan)
     return np.array([np.nanargmax(mu), np.nanargmin(mu)])
 

@@ -14,7 +14,9 @@ Side = Literal["less", "more", "within"]
 
 
 class MapBar(NamedTuple):
-    """Target for a figure; if `bar` is None, the figure is listed but not judged."""
+    """Target (limit) for a figure of the evaluation; if `bar` is None, the figure is listed but not
+    judged.
+    """
 
     bar: float | tuple[float, float] | None
     better: Side

@@ -1,5 +1,5 @@
-"""Ice that forms and melts on one road of a town: measures how many excited passes the map needs to
-show the change. Pure.
+"""Ice that forms and melts on one road of a town. The module measures how many passes with enough
+grip used the map needs to show the change. Pure.
 """
 
 from __future__ import annotations
@@ -39,11 +39,10 @@ def changing_town(rng: Generator, before: float, after: float) -> Town:
 
 def detection_delays(rng: Generator, before: float, after: float) -> IntArray:
     """Return the number of excited passes over each cell of the road until the map shows the
-    change, (LENGTH,).
+    change, (LENGTH,). An excited pass uses enough grip to measure the friction.
 
     The map shows ice when P(μ < .4) > .9, and the end of ice when P(μ < .4) < .1, which ends an
-    alert. A pass is one excited visit that was reported for the cell, whether the position was
-    correct or not.
+    alert. A pass is counted in the cell for which it was reported, even if the position was wrong.
     """
     place = changing_town(rng, before, after)
     visits = town.drive_fleet(rng, place, Errors.draw(rng, VEHICLES), MINUTES)

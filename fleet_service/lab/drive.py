@@ -103,7 +103,7 @@ def novel_deliveries(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -
 
 @dataclass
 class AlertWatch:
-    """A fusion with its alerts, read at some minutes.
+    """Fusion and its alerts, which are read and stored at some minutes of a drive.
 
     Attributes:
         beliefs: beliefs about the cells by minute, (cells, 32).

@@ -63,7 +63,7 @@ WAYS: Final = tuple(
 
 
 def drive_command(vehicles: int, seconds: float, world: World) -> Drive:
-    """Return a drive that runs `python -m deploy.end_to_end`."""
+    """Return a function that simulates a drive with the command `python -m deploy.end_to_end`."""
     import sys
 
     def run_drive(folder: Path) -> None:
@@ -191,7 +191,7 @@ def read_observations(path: Path) -> dict[str, Any]:
 
 
 def driven_in(folder: Path) -> DrivenVisits:
-    """Return the reports of a drive together with the true values."""
+    """Return the reports of the drive in a folder, together with the true values."""
     truth = pq.read_table(folder / TRUTH)
     _, vehicle = np.unique(truth["vehicle"].to_numpy(zero_copy_only=False), return_inverse=True)
     enter = truth["enter_time"].cast(pa.int64()).to_numpy()
@@ -214,8 +214,9 @@ def observations_in(columns: dict[str, Any]) -> Observations:
 
 
 def slots_with_truth(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatArray]:
-    """Return the slots that a vehicle truly visited, and the true friction of each. It is the mean
-    over the last half minute of the drive, or over all visits if there were none then.
+    """Return the slots (cell and sector) that a vehicle truly visited, and the true friction of
+    each. It is the mean over the last half minute of the drive, or over all visits if there were
+    none in that time.
     """
     cell = visits["cell"].to_numpy()
     sector = visits["sector"].to_numpy()
@@ -233,8 +234,8 @@ def slots_with_truth(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatA
 
 
 def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Return a mask of slots, (slots,): True if all visits to the slot truly had the same
-    friction.
+    """Return a mask of slots (cell and sector), (slots,): True if all visits to the slot truly had
+    the same friction.
     """
     slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))
     mu = visits["mu"].to_numpy()
@@ -247,8 +248,8 @@ def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np
 
 
 def excited_vehicles(fusion: Fusion, visits: pa.Table) -> IntArray:
-    """Return the number of distinct vehicles that used at least EXCITED_SHARE of the grip in each
-    slot, (slots,).
+    """Return, for each slot (cell and sector), the number of distinct vehicles that used at least
+    the share EXCITED_SHARE of the grip there, (slots,).
     """
     rows = visits["utilisation"].to_numpy() >= EXCITED_SHARE
     slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))

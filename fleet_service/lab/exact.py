@@ -1,6 +1,6 @@
 """Properties that must hold except for rounding: the map does not depend on the order of arrival,
-and a replay from the archive gives the same map. The module also measures how far unexcited visits
-lower the upper end of an interval.
+and a replay from the archive gives the same map. The module also measures how far visits with
+little grip used lower the upper end of an interval.
 """
 
 from __future__ import annotations
@@ -86,8 +86,9 @@ def replay_difference(rng: Generator) -> float:
 
 
 def upper_shift(rng: Generator) -> float:
-    """Return how far unexcited visits lower the upper end of the interval below that of the prior.
-    The result is the maximum over all surfaces and the numbers of vehicles in UNEXCITED.
+    """Return how far unexcited visits, which use too little grip to measure the friction, lower the
+    upper end of the interval below that of the prior. The result is the maximum over all surfaces
+    and the numbers of vehicles in UNEXCITED.
     """
     prior = float(mugrid.quantiles(mugrid.PRIOR, 0.95))
     worst = -np.inf

@@ -1,5 +1,5 @@
-"""Fading of knowledge about a dry road: the lower end of the map's interval at some times after the
-last pass. Pure.
+"""Fading of knowledge about a dry road: measures the lower end of the map's interval at some times
+after the last pass. Pure.
 """
 
 from __future__ import annotations
@@ -68,8 +68,9 @@ def measure(seeds: range) -> dict[str, float]:
 
 
 def lower_ends(rng: Generator, known: WeatherSince | None) -> FloatArray:
-    """Return the lower end of the interval at each time in AFTER_MIN, after an hour of excited
-    passes over a dry road.
+    """Return the lower end of the interval at each time in AFTER_MIN after the last pass. Before
+    that, vehicles drove over the dry road for an hour with enough grip used to measure the
+    friction.
     """
     seconds = np.sort(rng.random(PASSES)) * HOUR_S
     who = rng.integers(0, CARS, PASSES)

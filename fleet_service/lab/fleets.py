@@ -66,8 +66,13 @@ AT: Final = (5, 10, 20, 30, 40)
 
 @dataclass
 class Found:
-    """Results of one fleet over all seeds: scores of the map (`ours`) and of the rules (`theirs`),
-    and masks of false and missed alerts.
+    """Results of one fleet over all seeds.
+
+    Attributes:
+        ours: scores of the map.
+        theirs: scores of each of the simple rules.
+        false_ice, missed_ice: masks of false and of missed alerts.
+        false_settled, missed_settled: the same, after the service has got to know the vehicles.
     """
 
     ours: list[Scores] = field(default_factory=list)

@@ -19,7 +19,7 @@ BATCH_ROWS = 12  # the cells of one road
 
 
 class SentMessage(NamedTuple):
-    """A message, and the index of its last visit."""
+    """Message of a simulated vehicle, and the index of the last visit in it."""
 
     message: Message
     last: int

@@ -2,9 +2,9 @@
 
 Each fleet first drives half of the roads, so that the service gets to know its vehicles. It is
 judged on the other half, which no vehicle visited before. So the map there rests only on the
-excited vehicles of each cell. Towns, drives and errors are drawn with the judging seeds. One fleet
-follows no error model: its errors are those of the real estimator on simulated drives
-(`resampled`).
+vehicles that used enough grip in each cell to measure the friction. Towns, drives and errors are
+drawn with the judging seeds. One fleet follows no error model: its errors are those of the real
+estimator on simulated drives (`resampled`).
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ MODELS: Final[dict[str, ErrorModel]] = {
 def score_town(
     model: ErrorModel, seed: int, ways: DrivenVisits | None = None
 ) -> tuple[Scores, list[Scores]]:
-    """Return the scores of the map, and of the simple rules, in one town. If `ways` is given,
-    reports are drawn from these drives.
+    """Return the scores of the map, and of the simple rules, in one town. If `ways` is given, the
+    vehicles' reports are drawn from these simulated drives.
     """
     rng = np.random.default_rng([seed, 11])
     place = town.draw_town(rng, MINUTES, 0.0, model)
@@ -83,8 +83,9 @@ def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
 
 
 def measure_real(ways: DrivenVisits, seeds: range) -> dict[str, float]:
-    """Return the figures of a fleet whose errors are those of the real estimator. Return nothing if
-    no visit of the drives, or every visit, was excited.
+    """Return the figures of a fleet whose errors are those of the real estimator; `ways` are its
+    simulated drives. Return an empty dictionary if no visit of the drives, or every visit, used
+    enough grip to measure the friction.
     """
     if not ways.excited.any() or ways.excited.all():
         return {}

@@ -40,8 +40,11 @@ MIDDLE: Final = 0.91  # of the bar on coverage: the worst is the farthest from i
 
 
 class AskedWay(NamedTuple):
-    """Scores at one moment of a drive for the cells that several vehicles had visited, and a mask
-    of the measured cells.
+    """Scores at one moment of a drive.
+
+    Attributes:
+        scores: scores of the cells that several vehicles had visited.
+        measured: True for each of these cells that was measured.
     """
 
     scores: Scores

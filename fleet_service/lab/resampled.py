@@ -37,8 +37,8 @@ FARTHEST: Final = 0.35
 
 
 class TrueVisits(NamedTuple):
-    """True values of visits, (m,): vehicle, start [ns], mean friction, and largest share of it that
-    was used.
+    """True values of visits, (m,): vehicle, start [ns], mean friction, and largest share of the
+    friction that was used.
     """
 
     vehicle: IntArray
@@ -48,8 +48,13 @@ class TrueVisits(NamedTuple):
 
 
 class DrivenVisits(NamedTuple):
-    """Visits of simulated drives, (k,): vehicle, true friction, mask of excited visits, and
-    reports.
+    """Visits of simulated drives, each attribute (k,).
+
+    Attributes:
+        vehicle: number of the vehicle.
+        mu: true friction.
+        excited: True if enough grip was used to measure the friction.
+        reports: reports of the real estimator.
     """
 
     vehicle: IntArray
@@ -99,8 +104,9 @@ def join_ways(ways: Sequence[DrivenVisits]) -> DrivenVisits:
 
 
 def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles: int) -> Visits:
-    """Return the town's visits with reports drawn from the drives `ways`. Each of the `vehicles`
-    takes the reports of one vehicle of the drives; each of a different one if there are enough.
+    """Return the town's visits with reports drawn from the drives `ways`. Each of the `vehicles` of
+    the town takes the reports of one vehicle of the drives; no two take those of the same vehicle
+    if there are enough.
     """
     there = np.unique(ways.vehicle)
     who = rng.choice(there, vehicles, replace=vehicles > len(there))
@@ -120,8 +126,9 @@ def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles
 
 
 def _nearest_friction(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntArray) -> IntArray:
-    """Return one of `rows` for each friction in `mu`: a random one of the NEAREST rows in friction.
-    `rows` must be sorted by friction; the result is -1 if there are no rows.
+    """Return one element of `rows` for each friction in `mu`, drawn at random from the NEAREST rows
+    with the most similar friction. `rows` must be sorted by friction; the result is -1 if there are
+    no rows.
     """
     if not len(rows):
         return np.full(len(mu), -1)
@@ -130,7 +137,9 @@ def _nearest_friction(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntA
 
 
 def _scale_reports(reports: SimulatedReports, row: IntArray, by: FloatArray) -> SimulatedReports:
-    """Return the selected rows of reports, scaled to roads with `by` times the friction."""
+    """Return the selected rows of reports, scaled to roads with a friction that is `by` times as
+    large.
+    """
     width = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
     place = np.clip(
         (mugrid.CENTRES / by[:, None] - mugrid.CENTRES[0]) / width, 0.0, mugrid.BINS - 1.0

@@ -54,8 +54,8 @@ _NEWEST, _ALL, _ONE, _INTERSECTION, _FEDERATED = range(_KALMAN)
 def vehicle_posteriors(
     vehicle: IntArray, reading: FloatArray, std: FloatArray, vehicles: int
 ) -> FloatArray:
-    """Return the posterior (m, P) that the vehicle of each visit sends, (n, 2). It is the state of
-    the vehicle's filter, which returns to the prior along the road.
+    """Return the posterior (m, P), mean and variance, that the vehicle sends at each visit, (n, 2).
+    It is the state of the vehicle's filter, which returns to the prior along the road.
     """
     mean = np.full(vehicles, PRIOR_MEAN)
     variance = np.full(vehicles, PRIOR_VAR)
@@ -143,8 +143,8 @@ def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
 def score_rules(
     v: Visits, town: Town, at: tuple[int, ...], vehicles: int, where: BoolArray | bool = True
 ) -> list[Scores]:
-    """Return the scores of each of RULES at the minutes `at`, for the cells in `where` that an
-    excited vehicle has reported.
+    """Return the scores of each of RULES at the minutes `at`, for the cells in `where` that a
+    vehicle with enough grip used to measure the friction has reported.
     """
     sent = vehicle_posteriors(v.vehicle, v.reports.reading, v.reports.std, vehicles)
     asked = 60.0 * np.array(at, float)

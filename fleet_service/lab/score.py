@@ -32,9 +32,10 @@ class Scores:
     """Scores of k answers of the map, each column (k,). An answer is the belief about one cell at
     one time.
 
-    `vehicles` is the number of distinct excited vehicles that had visited the cell. `slippery` is
-    the answer's P(slippery), and `crps` its continuous ranked probability score; both are NaN if an
-    answer is an interval and not a distribution.
+    `vehicles` is the number of distinct excited vehicles that had visited the cell, that is,
+    vehicles that used enough grip to measure the friction. `slippery` is the answer's P(slippery),
+    and `crps` its continuous ranked probability score; both are NaN if an answer is an interval and
+    not a distribution.
     """
 
     vehicles: IntArray
@@ -88,7 +89,7 @@ def of_intervals(
     rank: FloatArray,
     slippery: FloatArray,
 ) -> Scores:
-    """Return the scores of 90 % intervals, all (k,).
+    """Return the scores of 90 % intervals of friction; each column has k values.
 
     The interval score is the width plus 2/α times the distance by which the interval misses the
     true value.
@@ -151,8 +152,8 @@ def score_snapshots(
     vehicles: int,
     where: BoolArray | bool = True,
 ) -> Scores:
-    """Return the scores at the minutes `at`, for the cells in `where` that an excited vehicle has
-    reported.
+    """Return the scores of the map at the minutes `at`. They include the cells in `where` that were
+    reported by a vehicle with enough grip used to measure the friction.
     """
     out = []
     for minute in at:
@@ -163,7 +164,9 @@ def score_snapshots(
 
 
 def rmse(s: Scores) -> float:
-    """Return the root mean square error of cells with at least ENOUGH excited vehicles."""
+    """Return the root mean square error over the cells in which at least ENOUGH vehicles used
+    enough grip to measure the friction.
+    """
     error = s.error[s.vehicles >= ENOUGH]
     return float(np.sqrt(np.mean(error**2))) if len(error) else float("nan")
 
@@ -181,8 +184,8 @@ def safe_share(s: Scores) -> float:
 
 
 def of_class(s: Scores, n: int) -> Scores:
-    """Return the answers with at least `n` excited vehicles, but fewer than the next number in
-    COUNTS.
+    """Return the scores of answers about cells with at least `n` excited vehicles, but fewer than
+    the next number in COUNTS.
     """
     edges = (*COUNTS[1:], np.iinfo(np.int64).max)
     return s.taken((s.vehicles >= n) & (s.vehicles < edges[COUNTS.index(n)]))
@@ -235,15 +238,15 @@ def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
 
 
 def false_grip(s: Scores) -> float:
-    """Return the share of true values below the interval: the road is more slippery than the map
-    states.
+    """Return the share of true values below the interval. There the road is more slippery than the
+    map states.
     """
     return _mean_or_nan(s.rank < ALPHA / 2.0)
 
 
 def false_ice(s: Scores) -> float:
-    """Return the share of true values above the interval: the road has more grip than the map
-    allows for.
+    """Return the share of true values above the interval. There the road has more grip than the map
+    states.
     """
     return _mean_or_nan(s.rank > 1.0 - ALPHA / 2.0)
 

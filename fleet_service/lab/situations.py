@@ -41,8 +41,8 @@ VALUED: Final = 0.3  # of such passes look like values: a tenth to a third with 
 
 
 def bound_excess(used: float, path: str) -> float:
-    """Return how far the lower end of the interval exceeds the grip used, or the prior's lower end
-    if that is larger.
+    """Return how far the lower end of the map's interval exceeds the grip that was used, or the
+    prior's lower end if that is larger.
 
     BOUNDED vehicles have used the grip `used` and have reported it along one `path` (encoding and
     kind of report).
@@ -126,8 +126,8 @@ def backlog_fused(rng: Generator) -> float:
 
 
 def safe_excess(rng: Generator) -> float:
-    """Return the safe deceleration according to the map minus the true one [m/s²], 30 minutes after
-    black ice has formed.
+    """Return the safe deceleration according to the map minus the truly safe one [m/s²], 30 minutes
+    after black ice has formed.
 
     The road was dry for an hour before. On the ice the drivers use a fifth of the grip. The weather
     report states FREEZING_C and no precipitation.

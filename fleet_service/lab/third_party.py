@@ -69,7 +69,7 @@ COLD_GAP_S: Final = 5.0
 
 
 class ForeignDrive(NamedTuple):
-    """Visits of a drive, and the grid number of each cell."""
+    """Visits of a drive of another maker's fleet, and the grid number of each cell."""
 
     visits: Visits
     cells: IntArray
@@ -138,7 +138,7 @@ def select_visits(v: Visits, rows: IntArray) -> Visits:
 
 def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, IntArray]:
     """Return three items at the end of an honest drive: the scores of the map, a mask of cells with
-    an alert, and the number of excited visits of each cell.
+    an alert, and the number of visits of each cell that used enough grip to measure the friction.
     """
     drive, mu = drive_honest(rng, gain_std)
     fusion = Fusion(LATENESS_S)
@@ -155,8 +155,8 @@ def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, In
 
 
 def split_by(seconds: FloatArray, step: float) -> list[IntArray]:
-    """Return the row numbers of visits in portions of `step` seconds; the visits must be sorted by
-    time.
+    """Return the row numbers of visits, divided into portions of `step` seconds each; the visits
+    must be sorted by time.
     """
     borders = np.flatnonzero(np.diff(seconds // step)) + 1
     return np.split(np.arange(len(seconds)), borders)
@@ -222,8 +222,8 @@ def drive_change(rng: Generator, excitement: float) -> ForeignDrive:
 
 
 def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]:
-    """Return two counts of excited passes over each changing cell: until the alert, and until its
-    end.
+    """Return two counts of excited passes (with enough grip used to measure the friction) over each
+    changing cell: until the alert, and until its end.
 
     The first count begins at the change to WHITE, the second at the change back to DRY. Both are
     (CHANGE_CELLS,), with NEVER if the event did not occur.

@@ -61,11 +61,11 @@ def cell_numbers(cells: int = CELLS) -> IntArray:
 
 @dataclass(frozen=True)
 class Town:
-    """A town.
+    """Simulated town with its roads and their friction over time.
 
     Attributes:
         mu: friction at the beginning of each minute, (minutes + 1, cells).
-        excitement: probability that a pass is excited, (cells,).
+        excitement: probability that a pass uses enough grip to measure the friction, (cells,).
         changed: minute in which the surface of a cell changes, (cells,), infinite for never.
         common: error that the vehicles share, by manoeuvre, (cells, 4).
         usual: most frequent manoeuvre, (cells,).
@@ -121,7 +121,7 @@ def draw_town(rng: Generator, minutes: int, changing: float, model: ErrorModel =
 @dataclass(frozen=True)
 class Visits:
     """Visits in order of time, (n,): seconds since the start, vehicle, reported place, true μ, mask
-    of excited visits, and reports.
+    of excited visits (which used enough grip to measure μ), and reports.
     """
 
     seconds: FloatArray

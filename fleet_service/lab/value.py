@@ -58,7 +58,9 @@ class TownTraffic(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """Answers of the map and of the two rules, with the true friction, (readings, CELLS)."""
+    """Answers of the map and of the two simple rules at each reading of the map, with the true
+    friction, (readings, CELLS).
+    """
 
     truth: FloatArray
     width: FloatArray
@@ -160,8 +162,9 @@ def read_map(place: Town, traffic: TownTraffic) -> Readings:
 
 
 def count_unnoticed(place: Town, warned: BoolArray) -> FloatArray:
-    """Return, for each cell that became slippery, the minutes until the first warning, at most
-    UNNOTICED_MOST. `warned` is the mask of warned cells at each reading.
+    """Return, for each cell that became slippery, the minutes until the first warning;
+    UNNOTICED_MOST if there was none until then. `warned` is the mask of warned cells at each
+    reading.
     """
     moments = np.arange(-(-BEGIN // STEP) * STEP, MINUTES + 1, STEP)
     out = []

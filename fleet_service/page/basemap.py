@@ -43,7 +43,7 @@ class TileSource(Protocol):
     zooms: tuple[int, int]
 
     def picture(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return a tile as bytes, with rows counted from the north; None if there is no such
+        """Return the bytes of a tile, with rows counted from the north; None if there is no such
         tile.
         """
         ...
@@ -84,8 +84,8 @@ class TileFile:
         self.zooms = (int(least), int(most))
 
     def picture(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return an unpacked tile, with rows counted from the north; None if there is no such
-        tile.
+        """Return the bytes of a tile after decompression, with rows counted from the north; None if
+        there is no such tile.
         """
         if not 0 <= zoom <= DEEPEST or not 0 <= max(x, y) < 1 << zoom:
             return None
@@ -114,7 +114,7 @@ class _Pmtiles:
         self.metadata = self._file.metadata
 
     def picture(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return a tile as bytes, with rows counted from the north; None if there is no such
+        """Return the bytes of a tile, with rows counted from the north; None if there is no such
         tile.
         """
         if not 0 <= zoom <= DEEPEST or not 0 <= max(x, y) < 1 << zoom:
@@ -123,11 +123,11 @@ class _Pmtiles:
 
 
 class BaseMap(NamedTuple):
-    """Base map.
+    """Base map: address or file of its tiles, and their authors.
 
     Attributes:
         address: address of the tiles with {z}, {x} and {y}.
-        zooms: smallest and largest zoom level.
+        zooms: smallest and largest zoom level that has tiles.
         file: file of the tiles; None for tiles from elsewhere.
         attribution: authors of the map.
     """
@@ -139,7 +139,7 @@ class BaseMap(NamedTuple):
 
     @property
     def is_vector(self) -> bool:
-        """True if the tiles are vector tiles."""
+        """Return True if the tiles are vector tiles, False if they are images."""
         return self.file is not None and self.file.kind == KINDS[VECTOR]
 
 

@@ -80,8 +80,8 @@ class ServiceHealth:
 
 
 def parse_metrics(text: str) -> dict[str, dict[str, float]]:
-    """Return the values in an OpenMetrics text, by name and label; the label of a single value is
-    "".
+    """Return the values in an OpenMetrics text: for each name, the values by label. The label of a
+    value that has none is "".
     """
     found: dict[str, dict[str, float]] = {}
     for line in text.splitlines():

@@ -25,8 +25,13 @@ _EMPTY: Final = np.zeros(0, records.RECORD)
 
 @dataclass
 class MirroredTile:
-    """One tile: its records, number of changes, time of receipt [s since 1970], and cached encoded
-    blocks by level.
+    """One tile of the local copy of the map.
+
+    Attributes:
+        cells: records of the cells.
+        version: number of changes so far.
+        heard: time at which the tile was received [s since 1970].
+        made: encoded blocks by zoom level, kept for the next request.
     """
 
     cells: Records = field(default_factory=lambda: _EMPTY)
@@ -77,8 +82,8 @@ class MapMirror:
     def take_standing(
         self, standing: Iterable[Alert], served: Callable[[int], bool], now: float
     ) -> None:
-        """Replace the active alerts. `served` tells whether a service answers for a cell; alerts of
-        other cells are kept.
+        """Replace the active alerts with the given ones. `served` tells if a service answers for a
+        cell; alerts of cells without a service are kept.
         """
         with self._lock:
             self.heard = now
@@ -86,7 +91,7 @@ class MapMirror:
             self._stretches.replace_alerts(standing, lambda alert: served(alert.cell))
 
     def remember(self, now: float) -> None:
-        """Store the present map as a recent moment for the time slider."""
+        """Store the present map, so that the time slider of the page can show it later."""
         with self._lock:
             self.recent.keep(
                 now, {tile: held.cells for tile, held in self._tiles.items() if len(held.cells)}
@@ -165,8 +170,8 @@ class MapMirror:
                 self._tiles[tile].heard = now
 
     def encoded(self, tile: int, level: int) -> bytes:
-        """Return a complete tile as an encoded block at a zoom level; empty bytes if the tile is
-        unknown.
+        """Return the cells of a tile, encoded as one block at a zoom level; empty bytes if the tile
+        is unknown.
         """
         with self._lock:
             held = self._tiles.get(tile)
@@ -188,7 +193,7 @@ class MapMirror:
 
 
 def block_at(level: int, tile: int, cells: Records, version: int, moment: float) -> bytes:
-    """Return a complete tile as an encoded block at a zoom level."""
+    """Return the cells of a tile, encoded as one block at a zoom level."""
     seen = cells if level == records.CELL_LEVEL else records.aggregate_worst(cells, level)
     return TileBlock(tile, level, version, 0, moment, seen).encoded()
 

@@ -1,7 +1,8 @@
-"""The map's past: available moments, the map at a moment, and the history of a cell.
+"""The map's past: the moments of which a map is stored, the map at a moment, and the history of a
+cell.
 
 The last minutes come from memory, earlier moments from a service's snapshots. Snapshots contain
-public cells only, so these data are as public as the map itself.
+only cells that readers may see, so these data are as public as the map itself.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ _OF_HISTORY: Final = ("mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehi
 
 
 class Moments:
-    """Moments of the past: recent ones in memory, and the snapshots of an archive.
+    """Maps of past moments: recent ones in memory, and the snapshots of an archive.
 
     Args:
         root: folder of the archive; None without an archive.
@@ -58,11 +59,11 @@ class Moments:
 
     @property
     def has_archive(self) -> bool:
-        """True if an archive is given."""
+        """Return True if an archive is given."""
         return self._root is not None
 
     def times(self) -> list[int]:
-        """Return all available moments [s since 1970], oldest first."""
+        """Return the times of all moments of which a map is stored [s since 1970], oldest first."""
         return sorted({*self._files(), *self._recent.times()})[-MOST:]
 
     def tiles(self, moment: int) -> list[int]:
@@ -70,14 +71,16 @@ class Moments:
         return list(self._at(moment))
 
     def encoded(self, moment: int, tile: int, level: int) -> bytes:
-        """Return a complete tile at a moment as an encoded block; empty bytes if the tile had no
-        cells.
+        """Return the cells of a tile at a moment, encoded as one block; empty bytes if the tile had
+        no cells.
         """
         cells = self._at(moment).get(tile)
         return b"" if cells is None else map_mirror.block_at(level, tile, cells, 1, float(moment))
 
     def history(self, cell: int, sector: int) -> list[dict[str, Any]]:
-        """Return the belief about a cell at each moment at which it was public, oldest first."""
+        """Return the belief about a cell at each stored moment at which readers could see the cell,
+        oldest first.
+        """
         found = []
         files = self._files()
         for moment in self.times()[-HISTORY:]:

@@ -55,7 +55,7 @@ class FeatureRoutes:
         }
 
     async def landing(self, request: Request) -> Response:
-        """Return the landing page for programs."""
+        """Return the landing page of the interface, which lists its addresses for programs."""
         return JSONResponse(
             features.landing_document(_base_address(request)), headers={"Vary": "Accept"}
         )
@@ -65,7 +65,7 @@ class FeatureRoutes:
         return JSONResponse(features.conformance_document())
 
     async def collections(self, request: Request) -> Response:
-        """Return the list with the one collection."""
+        """Return the list of collections, which contains only `grip`."""
         return JSONResponse(features.collections_document(_base_address(request), self._extent()))
 
     async def collection(self, request: Request) -> Response:
@@ -73,13 +73,13 @@ class FeatureRoutes:
         return JSONResponse(features.collection_document(_base_address(request), self._extent()))
 
     async def schema(self, request: Request) -> Response:
-        """Return the columns of the collection as a JSON schema."""
+        """Return the properties of a feature as a JSON Schema."""
         return JSONResponse(
             features.feature_schema(_base_address(request)), media_type=features.SCHEMA_JSON
         )
 
     async def api(self, request: Request) -> Response:
-        """Return the interface definition."""
+        """Return the definition of the interface in OpenAPI."""
         return JSONResponse(
             features.api_definition(_base_address(request)), media_type=features.OPENAPI
         )

@@ -89,13 +89,13 @@ class Reader:
 
     @property
     def is_connected(self) -> bool:
-        """True if a router is connected."""
+        """Return True if a router is connected."""
         session = self._session
         return session is not None and bool(list(session.info.routers_zid()))
 
     @property
     def is_served(self) -> bool:
-        """True if any service answers."""
+        """Return True if any service answers."""
         return self._served and self.is_connected
 
     def is_heard(self, latitude: float, longitude: float) -> bool:
@@ -120,8 +120,8 @@ class Reader:
         ]
 
     def _note_fallen(self, services: presence.PresenceTracker) -> None:
-        """Record regions that have lost their service and have no known cell. Regions with known
-        cells are checked through their cells.
+        """Record regions without known cells that have lost their service. Regions with known cells
+        are checked by queries about these cells.
         """
         here = {token.region for token in services.active}
         known = [keys.chunks(region, grid.REGION_ZOOM) for region in self._queriers]
@@ -135,8 +135,8 @@ class Reader:
         self._fallen = {region: self._fallen.get(region, time.time()) for region in fallen}
 
     def names(self, kind: str) -> list[str]:
-        """Return the names that have a liveliness token of this kind; empty if the access list
-        hides them.
+        """Return the names that have a liveliness token of the given kind; empty if the access list
+        hides the tokens.
         """
         return sorted(self._names[kind])
 
@@ -171,8 +171,8 @@ class Reader:
             (names.add if sample.kind == zenoh.SampleKind.PUT else names.discard)(str(parsed.name))
 
     def _ask_all(self, session: zenoh.Session) -> None:
-        """Query all tiles and alerts that existed before this session. The subscriptions were made
-        earlier, so no change in between is missed.
+        """Query all tiles and alerts that existed before this session. The reader subscribed to
+        changes earlier, so no change in between is missed.
         """
         try:
             for tile, table in self.ask(map_client.EVERYWHERE, {}):

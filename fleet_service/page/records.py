@@ -52,10 +52,10 @@ LEAST_LEVEL: Final = grid.TILE_ZOOM
 
 
 class TileBlock(NamedTuple):
-    """Complete tile, or its changes.
+    """Block for a browser: a complete tile, or only its changes.
 
     Attributes:
-        tile: z14 quadint.
+        tile: quadint (number) of the tile, zoom 14.
         level: zoom of the records, 14 to 21.
         version: number of changes of the tile, from 1.
         base: version to which the changes apply; 0 for a complete tile.
@@ -159,7 +159,9 @@ def aggregate_worst(records: Records, level: int) -> Records:
 
 
 def changed_records(before: Records, after: Records) -> Records:
-    """Return the records that change `before` into `after`; all are ordered by place."""
+    """Return the records that must be applied to `before` to get `after`; all are ordered by
+    place.
+    """
     places = np.union1d(before["place"], after["place"])
     old, new = (np.zeros(len(places), RECORD) for _ in range(2))
     for one, records in ((old, before), (new, after)):

@@ -36,7 +36,9 @@ def parse_level(request: Request) -> int:
 
 
 def parse_tiles(request: Request) -> list[int]:
-    """Return the parameter `tiles` as z14 quadints; at most MOST_TILES are allowed."""
+    """Return the parameter `tiles` as quadints (numbers) of zoom 14; at most MOST_TILES are
+    allowed.
+    """
     words = request.query_params.get("tiles", "").split(",")
     if len(words) > MOST_TILES:
         raise InputError("tiles", f"are {len(words)}", f"request at most {MOST_TILES} at once")

@@ -33,7 +33,7 @@ _STEP: Final = (
 
 
 class Line(NamedTuple):
-    """Line of a road.
+    """Line of a road, and the directions in which it is driven.
 
     Attributes:
         name: name of the road; empty if unknown.
@@ -103,10 +103,11 @@ def _add_feature(found: RoadMap, geometry: dict[str, Any], about: dict[str, Any]
 
 
 def learned_lines(cell: IntArray, sector: IntArray) -> list[Line]:
-    """Return one line per chain of neighbouring cells with the same heading.
+    """Derive the lines of roads from visited cells: one line per chain of neighbouring cells with
+    the same heading.
 
     Args:
-        cell: (n,) z21 quadints.
+        cell: (n,) quadints (numbers of cells, zoom 21).
         sector: (n,) headings, 0 east to 3 south.
     """
     found: list[Line] = []

@@ -48,7 +48,7 @@ class PageSettings:
         names: host names under which a proxy forwards requests; if empty, any name is accepted
             unless the page listens on loopback.
         archive: folder of a service's archive, for the past; None without an archive.
-        metrics: addresses of services' metrics, for the health view.
+        metrics: addresses at which services publish their metrics, for the health view.
         overlay: Parquet file of cell, sector and mu to draw over the map.
         base_map: tiles below the roads; None without a base map.
         roads: lines along which ribbons are drawn; None to derive them from the cells.

@@ -36,7 +36,9 @@ class RequestTurns:
 
     @asynccontextmanager
     async def take(self, client: str) -> AsyncIterator[None]:
-        """Wait until the client may compute another request, and count it while the block runs."""
+        """Wait until another request of the client may be computed, and count this request while
+        the block runs.
+        """
         self._counts[client] += 1
         try:
             async with self._free.setdefault(client, asyncio.Semaphore(RUNNING)):

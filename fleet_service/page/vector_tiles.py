@@ -181,8 +181,8 @@ class PmtilesFile:
         self.metadata: dict[str, Any] = about_map if isinstance(about_map, dict) else {}
 
     def tile(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return a tile, unpacked, with rows counted from the north; None if there is no such tile,
-        or if the file is damaged there.
+        """Return a tile after decompression, with rows counted from the north; None if there is no
+        such tile, or if its part of the file is damaged.
         """
         try:
             return self._find_tile(zoom, x, y)
@@ -217,8 +217,8 @@ class PmtilesFile:
 
 
 def _find_entry(directory: bytes, wanted: int) -> tuple[int, int, int] | None:
-    """Return offset, size and run length of the last directory entry whose number is at most
-    `wanted`. A run length of 0 means a leaf directory.
+    """Return offset, size and run length of the last directory entry whose tile number is at most
+    `wanted`. A run length of 0 means that the entry refers to a further directory.
     """
     numbers = _decode_varints(directory)
     count = next(numbers)

@@ -49,7 +49,7 @@ class _OpenPage(NamedTuple):
 
 
 class Watchers:
-    """All watching browsers; for use in one event loop.
+    """All browsers that watch the map; for use in one event loop.
 
     Args:
         world: the mirrored map.

@@ -40,7 +40,7 @@ BLOCKS: Final = "application/vnd.gripmap.blocks"
 
 
 class Sources(NamedTuple):
-    """Data sources from which the routes answer."""
+    """Data sources from which the routes of the page take their answers."""
 
     world: MapMirror
     reader: Reader
@@ -187,8 +187,8 @@ class Routes:
         return JSONResponse(found)
 
     async def blocks(self, request: Request) -> Response:
-        """Return encoded blocks of the requested `tiles` at a zoom `level`, now or at the time
-        `at`. With `borrowed`, cells estimated from neighbours are included.
+        """Return the requested `tiles` as encoded blocks of records at a zoom `level`, now or at
+        the time `at`. With `borrowed`, cells estimated from neighbours are included.
         """
         wanted = request_params.parse_tiles(request)
         level = request_params.parse_level(request)
@@ -245,17 +245,17 @@ class Routes:
         return None
 
     async def history(self, request: Request) -> Response:
-        """Return the belief about a cell at each stored moment."""
+        """Return the belief about a cell at each past moment of which the map is stored."""
         return JSONResponse(
             await run_in_threadpool(self._of.moments.history, *request_params.parse_place(request))
         )
 
     async def times(self, _: Request) -> Response:
-        """Return the stored moments [s since 1970]."""
+        """Return the past moments of which the map is stored [s since 1970]."""
         return JSONResponse(await run_in_threadpool(self._of.moments.times))
 
     async def route(self, request: Request) -> Response:
-        """Return the friction along the route `points`."""
+        """Return the friction along the route that the parameter `points` describes."""
         points, text = request_params.parse_route(request)
         return JSONResponse(await run_in_threadpool(self._profile, points, text))
 
@@ -302,7 +302,9 @@ class Routes:
         )
 
     async def overlay(self, _: Request) -> Response:
-        """Return the additional map, or null."""
+        """Return the cells of the additional map that is drawn over the live one, such as the true
+        friction of a simulation; null if there is none.
+        """
         return JSONResponse(await run_in_threadpool(overlay.read_overlay, self._of.overlay))
 
 

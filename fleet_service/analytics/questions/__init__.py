@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Question(NamedTuple):
-    """One question.
+    """Question that can be asked about an archive.
 
     Attributes:
         name: name of the question on the command line.

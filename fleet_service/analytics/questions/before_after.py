@@ -25,8 +25,8 @@ from schemas.thresholds import NS, Z_95
 
 
 def expression(t: Table, at_s: int) -> Table:
-    """Return a table with one row: number of cells, vehicles and values, means of both periods, and
-    the sums from which the difference and its standard deviation follow.
+    """Return a table with one row: number of cells, vehicles and values, the means of both periods,
+    and the sums from which the difference and its standard deviation are computed.
     """
     t = t.filter(has_value(t))
     t = t.select("cell", "sector", "vehicle", after=t.time >= at_s, y=t.mu.cast("float64"))

@@ -20,8 +20,9 @@ _HOUR_S: Final = 3600
 
 
 def expression(t: Table, maps: Table) -> Table:
-    """Return a table with one row per basis (measured, borrowed or bound) and hours between
-    snapshot and value.
+    """Return a table of the shares `held` and `compatible`. It has one row for each basis
+    (measured, borrowed from neighbours, or bound) and each number of hours between snapshot and
+    value.
     """
     t = t.filter(has_value(t)).select(
         "cell",

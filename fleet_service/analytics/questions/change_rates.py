@@ -142,8 +142,8 @@ def _band_name(one: str | int) -> str:
 
 
 def _fit_class(counted: pa.Table) -> dict[str, float | int | None]:
-    """Return the rate of change for one class, with an interval from days drawn with
-    replacement.
+    """Return the rate of change for one class of values (a temperature band or a part of the day),
+    with an interval computed from days drawn with replacement.
     """
     columns = {
         name: counted[name].to_numpy().astype(float)

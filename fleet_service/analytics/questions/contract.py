@@ -133,11 +133,12 @@ def longest_breach(
     level: float,
     span: tuple[int, int],
 ) -> tuple[int, int, int, int]:
-    """Return four numbers [s] for one link: the longest breach according to the means, the longest
-    certain breach, the longest possible breach, and the begin of the first (0 for none).
+    """Return four numbers [s] for one link: the duration of the longest breach according to the
+    means, of the longest certain breach and of the longest possible breach, and the begin of the
+    first of these three (0 if there is none).
 
     Args:
-        slot: (n,) numbers of slots, ascending.
+        slot: (n,) numbers of time slots, ascending.
         lower, mu, upper: (n,) interval and mean of each slot.
         level: required friction.
         span: begin and end [s] of all measurements. Nothing is known outside it, so slots are cut
@@ -158,8 +159,8 @@ def longest_breach(
 
 
 def _find_runs(is_below: BoolArray, far: BoolArray | None = None) -> tuple[IntArray, IntArray]:
-    """Return the first position of each run of true values, and the position after its last. If
-    `far` is given, a run also ends before a slot that is far from the previous one.
+    """Return two arrays: the first position of each run of true values, and the position after its
+    last value. If `far` is given, a run also ends before a slot that is far from the previous one.
     """
     number = np.cumsum(~is_below if far is None else ~is_below | far)
     at = np.flatnonzero(is_below)
@@ -168,7 +169,13 @@ def _find_runs(is_below: BoolArray, far: BoolArray | None = None) -> tuple[IntAr
 
 
 class _Measured(NamedTuple):
-    """Row numbers of each piece of one link, and the vehicles that measured them."""
+    """Measurements of one link.
+
+    Attributes:
+        pieces: row numbers of each piece of the link.
+        vehicles: vehicles that measured the link.
+        values: number of values in each row.
+    """
 
     pieces: dict[int, list[int]]
     vehicles: set[str]

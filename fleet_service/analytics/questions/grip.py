@@ -1,4 +1,4 @@
-"""`grip`: percentiles of mu per cell and day, and coverage: the shares of cells with values, with
+"""`grip`: percentiles of mu per cell and day. Also coverage: the shares of cells with values, with
 only lower bounds, and without visits.
 """
 
@@ -17,8 +17,8 @@ PERCENTILES: Final = {"mu_p10": 0.1, "mu_p50": 0.5, "mu_p90": 0.9}
 
 
 def expression(t: Table) -> Table:
-    """Return a table with one row per day, cell and sector. Without a value there are no
-    percentiles; then only mu ≥ `utilised_max` is known.
+    """Return a table with one row per day, cell and sector. A row without a value of mu has no
+    percentiles. Then it is only known that mu is at least `utilised_max`, the largest grip used.
     """
     reported = ibis.ifelse(has_value(t), t.mu.cast("float64"), ibis.null("float64"))
     t = t.select(

@@ -17,8 +17,8 @@ def expression(t: Table) -> Table:
     """Return a table with one row per vehicle. `bias` is null if the vehicle never measured in the
     same cell and hour as another.
 
-    `bias` is the mean of (own mean - mean of the others) over cells and hours, `bias_std` its
-    standard error, and `z` the absolute value of their ratio.
+    `bias` is the mean of (own mean - mean of the others) over cells and hours. `bias_std` is its
+    standard error, and `z` is |bias| / bias_std.
     """
     reported = has_value(t)
     mine = t.group_by("vehicle").aggregate(

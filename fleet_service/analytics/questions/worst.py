@@ -101,8 +101,8 @@ def wilson_lower(hits: FloatArray, of: FloatArray) -> FloatArray:
 
 
 def _label_components(cell: IntArray, sector: IntArray) -> IntArray:
-    """Return the number of each cell's connected component, (n,). Cells are connected if they touch
-    and have the same sector.
+    """Return the number of the group to which each cell belongs, (n,). Cells belong to the same
+    group if a chain of touching cells of the same sector connects them.
     """
     key = cell * grid.SECTORS + sector
     order = np.argsort(key)
@@ -119,8 +119,8 @@ def _label_components(cell: IntArray, sector: IntArray) -> IntArray:
 
 
 def _stretch_cells(cell: IntArray, label: IntArray, count: int) -> pa.Array[Any]:
-    """Return the list of cells of each stretch, so that a bent road is drawn as such and not as a
-    box.
+    """Return the list of cells of each stretch. It makes it possible to draw a bent road as it is,
+    and not as a box.
     """
     order = np.lexsort((cell, label))
     ends = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=count))])

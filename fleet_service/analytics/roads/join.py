@@ -50,7 +50,14 @@ SCHEMA: Final = pa.schema(_TYPES)
 
 
 class _Marks(NamedTuple):
-    """Points ("marks") every STEP_M along all links; each column is (n,)."""
+    """Points ("marks") every STEP_M along all links; each attribute is a column (n,).
+
+    Attributes:
+        link: number of the link.
+        run: distance from the start of the link [m].
+        latitude, longitude: position [deg].
+        yaw: driving direction [rad].
+    """
 
     link: IntArray
     run: FloatArray
@@ -60,7 +67,7 @@ class _Marks(NamedTuple):
 
 
 class _Joined(NamedTuple):
-    """Cells and sectors that are assigned to links; each column is (n,)."""
+    """Cells and sectors that are assigned to links, in columns (n,)."""
 
     cell: IntArray
     sector: IntArray
