@@ -39,7 +39,7 @@ The lists are in the modules of the estimators. Paths in the column "where" are 
 
 
 def elements_page() -> str:
-    """Return the page as Markdown."""
+    """Return the reference page of the papers' equations, tables and figures as Markdown."""
     parts = [INTRODUCTION]
     for paper, (estimator, elements) in PAPERS.items():
         counts = ", ".join(

@@ -199,7 +199,7 @@ def _escape_cell(text: str) -> str:
 
 
 def write_pages(folder: Path) -> None:
-    """Write all pages into a folder."""
+    """Write all reference pages into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     pages = {f"cli-{program}": command_page(program) for program in COMMAND_LINES}
     pages["configuration"] = settings_page()

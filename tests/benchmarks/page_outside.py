@@ -258,8 +258,8 @@ def ogrinfo_opens(address: str) -> bool:
 
 
 def join_right() -> float:
-    """Return the figure `roads.join_right` of this commit, from an earlier `make roads-bench` or
-    measured now.
+    """Return the share of positions joined to the right road link (`roads.join_right`), from an
+    earlier `make roads-bench` of this commit or measured now.
     """
     path = roads.FOLDER / "figures.json"
     rows = json.loads(path.read_text()) if path.exists() else [{}]

@@ -63,7 +63,7 @@ class _Map:
         self.drive()
 
     def read(self) -> None:
-        """Read all cells."""
+        """Read all published cells, as a reader of the map does."""
         self._tiles.seen(self._slots, _NOW)
 
     def drive(self) -> None:

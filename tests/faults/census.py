@@ -68,7 +68,7 @@ class Told(NamedTuple):
 
 
 def read_journals(journals: Iterable[Path]) -> Told:
-    """Read the journals of all generators."""
+    """Read the journals of all load generators, and return their content."""
     out = Told({}, {})
     for journal in journals:
         for line in journal.read_text().splitlines():

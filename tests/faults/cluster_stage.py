@@ -151,7 +151,7 @@ class Asking:
         self._thread.start()
 
     def end(self) -> None:
-        """Stop the queries."""
+        """Stop the client's queries."""
         self._stop.set()
         self._thread.join(PATIENCE_S)
 
@@ -283,7 +283,7 @@ class Machines:
         self._random = random_
 
     def start_standbys(self, standbys: int) -> None:
-        """Start this many standbys."""
+        """Start services until `standbys` of them wait as standbys."""
         while len(self.waiting) < standbys:
             host = self._idle.pop(0)
             host.part.start()

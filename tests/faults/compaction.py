@@ -56,7 +56,7 @@ class Writing:
             self.acknowledged += len(self._log.flush())
 
     def close(self) -> None:
-        """Stop the writer."""
+        """Stop the thread that writes."""
         self._stop.set()
         self._thread.join()
 
@@ -83,7 +83,7 @@ class Reading:
             self.reads += 2
 
     def close(self) -> None:
-        """Stop the reader."""
+        """Stop the thread that reads."""
         self._stop.set()
         self._thread.join()
 
@@ -130,7 +130,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def main() -> None:
-    """Compact in an endless loop."""
+    """Compact the archive again and again in small rounds, until the process is killed."""
     print("compacting", flush=True)
     while True:
         compact(Path(sys.argv[1]), ROUND_ROWS)

@@ -50,7 +50,7 @@ CELLS: Final = grid.cell_of(np.array([57.7, 57.7]), np.array([11.97, 15.97]))
 
 
 class Batch(NamedTuple):
-    """One batch of the history."""
+    """Batch of a history, given by its kind and its sequence number."""
 
     kind: Kind
     seq: int
@@ -82,7 +82,7 @@ def rows_of(batches: list[Batch]) -> Rows:
 
 
 class History(Lives[Batch]):
-    """History of the log."""
+    """History of an archive's log on a disk with power loss."""
 
     lives = 3
     operations = 80

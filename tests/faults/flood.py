@@ -95,7 +95,7 @@ class Honest:
         )
 
     def drive(self) -> None:
-        """Send the next batch."""
+        """Send the vehicle's next batch."""
         seq = len(self.sent) + 1
         one = make_visit(self.name, seq, time.time_ns())
         self._last[seq] = time.monotonic()

@@ -36,7 +36,7 @@ PERIODS: Final[dict[str, object]] = {"compact_s": 5.0, "checkpoint_s": 4.0, "seg
 
 
 def run(site: Site) -> list[Figure]:
-    """Run twenty hand-overs."""
+    """Hand the region over twenty times, and return the figures."""
     pauses = []
     lease_s = ServiceConfig().lease_s
     with ExitStack() as stack:

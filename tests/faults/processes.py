@@ -197,7 +197,9 @@ class Stage:
 
 @contextmanager
 def open_stage(folder: Path, **service: object) -> Iterator[Stage]:
-    """Yield a stage whose service is ready. Every process is ended after the block."""
+    """Yield a running router and service (`Stage`) when the service is ready. Every process is
+    ended after the block.
+    """
     there = Stage(folder, **service)
     try:
         there.service.line_with("ready: ")

@@ -1,1 +1,1 @@
-"""Tests of edge_agent.adaptation."""
+"""Tests of the fuzzy adaptation (`edge_agent.adaptation`)."""

@@ -1,4 +1,6 @@
-"""Tests of banks created by name: the source of their memberships."""
+"""Tests of the function that creates an estimator bank by name, and of the memberships that it
+uses.
+"""
 
 from __future__ import annotations
 

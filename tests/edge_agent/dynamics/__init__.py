@@ -1,1 +1,1 @@
-"""Tests of edge_agent.dynamics."""
+"""Tests of the vehicle and tyre equations (`edge_agent.dynamics`)."""

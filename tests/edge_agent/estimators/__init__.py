@@ -1,1 +1,1 @@
-"""Tests of edge_agent.estimators."""
+"""Tests of the friction estimators (`edge_agent.estimators`)."""

@@ -1,1 +1,1 @@
-"""Tests of edge_agent.filters."""
+"""Tests of the square-root filters (`edge_agent.filters`)."""

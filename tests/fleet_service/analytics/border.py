@@ -54,8 +54,8 @@ def rebuilt_map(out: Path) -> pa.Table:
 
 
 def difference(ours: pa.Table, theirs: pa.Table) -> float:
-    """Return the largest difference of a number in two maps, or infinity if their cells or their
-    nulls differ.
+    """Return the largest difference between numbers of two maps, or infinity if their cells or
+    their nulls differ.
     """
     if not all(
         ours[name].equals(theirs[name])

@@ -105,7 +105,7 @@ def make_state(turn: int, vehicle: int) -> Batch:
 
 
 def messages(turn: int) -> Iterator[Message]:
-    """Return all messages of a round."""
+    """Yield all messages that the vehicles send in a round."""
     for vehicle in range(VEHICLES):
         for one, key in (
             (make_observations(turn, vehicle), keys.observation_key),

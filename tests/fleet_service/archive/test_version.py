@@ -53,8 +53,8 @@ def old(tmp_path: Path) -> Path:
 
 
 def same(found: dict[str, Any], made: dict[str, Any]) -> None:
-    """Assert that a map equals the stored one, up to single precision and another machine's
-    logarithm.
+    """Assert that a map equals the stored one, except for rounding errors of single precision and
+    of another machine's logarithm.
 
     The stored beliefs are those that the present fusion computes from the archive. A change of the
     fusion must write them again and give the reason.

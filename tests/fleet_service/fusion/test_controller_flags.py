@@ -41,7 +41,7 @@ def make_acquainted(claims_on_dry: bool) -> Fusion:
 
 
 def ice_with(fusion: Fusion, *, flag: bool) -> bool:
-    """Return True if one value of ice and one gentle visit, with or without a flag,
+    """Return True if one value of ice and one visit with little grip use, with or without a flag,
     raise an alert.
     """
     who = np.array([3, FLAGGED])

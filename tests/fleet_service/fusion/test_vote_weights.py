@@ -97,8 +97,8 @@ def test_shape_is_the_slope_and_a_doubt() -> None:
 
 
 def test_doubt_of_an_alarm_ends_once_the_shape_is_known() -> None:
-    """A service that knows no vehicle assumes a larger error of a gentle value before it raises an
-    alert than a service that knows its fleet.
+    """Before it raises an alert, a service assumes a larger error of a value from driving with
+    little grip use if it does not yet know its fleet.
     """
     unknown = shared.UNKNOWN_SHAPE
     assert unknown.alarm == pytest.approx(0.5, abs=0.01)

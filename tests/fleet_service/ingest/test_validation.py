@@ -77,7 +77,7 @@ FAR = int(grid.cell_of(LATITUDE, 12.02))
 
 
 def one(column: str, values: list[float]) -> dict[str, Any]:
-    """Return a change of one column."""
+    """Return a change that replaces one column of a batch."""
     return {column: values}
 
 

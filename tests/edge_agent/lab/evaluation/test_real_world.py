@@ -1,4 +1,6 @@
-"""Tests of the figures of the rough world, on seeds that are not used for tuning."""
+"""Tests of the figures of simulated drives with realistic sensor errors on hills, on seeds that are
+not used for tuning.
+"""
 
 from __future__ import annotations
 
