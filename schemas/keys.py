@@ -101,7 +101,9 @@ def alert_key(tile: int) -> str:
 
 
 def ahead_key(vehicle: str) -> str:
-    """Return the key under which a vehicle publishes the road ahead: warnings and horizon."""
+    """Return the key under which a vehicle publishes messages about the road ahead of it: warnings,
+    and the friction along its route.
+    """
     return f"{ROOT}/ahead/{vehicle}"
 
 

@@ -53,8 +53,8 @@ def quantiles(probability: NDArray[np.floating[Any]], q: float) -> FloatArray:
 
 
 def encode_log_likelihood(log_likelihood: NDArray[np.floating[Any]]) -> ByteArray:
-    """Return log-likelihoods ℓ (…, 32) as bytes: steps below the maximum; -inf becomes 255 steps.
-    The caller must refuse NaN.
+    """Return log-likelihoods ℓ (…, 32) as bytes. Each byte is the number of steps of 1/16 nat below
+    the maximum, at most 255; -inf becomes 255 steps. The caller must refuse NaN.
     """
     below = np.max(log_likelihood, axis=-1, keepdims=True) - log_likelihood
     steps: ByteArray = np.clip(np.rint(below * STEPS_PER_NAT), 0, FLOOR_STEPS).astype(np.uint8)

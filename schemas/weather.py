@@ -1,8 +1,8 @@
 """Road weather reports: validation rules, and encoding as bytes. An unknown temperature or
 precipitation is NaN.
 
-A report applies to a z10 region from a time on. Each value is optional, but at least one must be
-given.
+A report applies to a region (grid square of zoom 10) from a time on. Each value is optional, but at
+least one must be given.
 """
 
 from __future__ import annotations

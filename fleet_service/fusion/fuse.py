@@ -299,8 +299,9 @@ class Fusion:
     def find_sources(
         self, slots: IntArray, side: int, since: IntArray | int
     ) -> tuple[IntArray, IntArray]:
-        """Return index and report time [ns] of each vehicle that corroborates `side` in the slots,
-        two arrays (k, SOURCES). The time is 0 if the vehicle does not count (see `sources`).
+        """Return the vehicles that corroborate `side` (GRIP or ICE) in the slots, as two arrays (k,
+        SOURCES): index of the vehicle, and time of its report [ns]. The time is 0 if the vehicle
+        does not count (see `sources`).
         """
         row = self.live.reporters[slots]
         reporters = self.store.state.live.reporters

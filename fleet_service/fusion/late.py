@@ -62,8 +62,9 @@ def delay_observations(o: Observations, late_by: IntArray, weather: Weather) -> 
 def aged_evidence(
     evidence: ByteArray, key: IntArray, begin: IntArray, end: IntArray, weather: Weather
 ) -> ByteArray:
-    """Return the log-likelihoods (n, 32), in steps of 1/16 nat, of the roads `key` (n,) at time
-    `end` [ns], given observations at time `begin` [ns].
+    """Return the likelihood of the road's friction at time `end` [ns], given an observation at the
+    earlier time `begin` [ns], for each of n observations: log-likelihoods (n, 32) in steps of 1/16
+    nat. `key` (n,) is the cell and sector of each observation.
     """
     out = np.empty_like(evidence)
     likelihood = np.empty(mugrid.BINS, np.float32)

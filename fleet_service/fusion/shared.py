@@ -203,8 +203,8 @@ def kernel_of(cells: RecordArray, row: int) -> int:
 def read_road(
     kernels: Float32Array, cells: RecordArray, row: int, p: FloatArray, road: FloatArray
 ) -> None:
-    """Compute the belief about the road, `road` (32), from a belief `p` (32) about the fleet's
-    common reading. The result sums to one.
+    """Compute the belief about the road, `road` (32), from the stored belief `p` (32), which is
+    about the friction that all vehicles of the fleet read there. The result sums to one.
     """
     kernel = kernels[kernel_of(cells, row)]
     for i in range(mugrid.BINS):

@@ -1,5 +1,6 @@
-"""Record of accepted batches, which detects duplicates: per stream (vehicle, boot, kind, region) a
-watermark and the set of accepted sequence numbers above it. Pure.
+"""Record of accepted batches, which detects duplicates: per stream (vehicle, start, kind, region) a
+watermark, up to which no sequence number is open any more, and the set of accepted sequence numbers
+above it. Pure.
 
 The record's size is bounded by accepted data. Every number above a watermark is a batch in the
 archive, a stream has at most MAX_GAPS such numbers, and a stream is dropped when its newest record

@@ -88,8 +88,8 @@ class Refusal(NamedTuple):
 def check_heads(
     kind: Kind, owners: Sequence[keys.Parsed], heads: Heads, time: IntArray, clock: Clock
 ) -> tuple[IntArray, tuple[Refusal, ...]]:
-    """Check the heads of batches: owner and region must agree with the key, sequence numbers must
-    be valid, and times must be acceptable.
+    """Check the heads (fields other than records) of batches: owner and region must agree with the
+    key, sequence numbers must be valid, and times must be acceptable.
 
     Args:
         kind: kind of the batches.

@@ -243,8 +243,8 @@ def _written_day(path: Path) -> int:
 def read_file(path: Path) -> list[tuple[int, Report]]:
     """Return region and report of every row of a Parquet file.
 
-    The file has the columns `region` (z10 quadint, or quadkey of 10 digits), `time` (timestamp, or
-    ns), and any of the weather columns. Null or NaN means unknown.
+    The file has the columns `region` (quadint, a number, of zoom 10; or quadkey of 10 digits),
+    `time` (timestamp, or ns), and any of the weather columns. Null or NaN means unknown.
 
     Raises:
         InputError: names the row, the column and the fix.

@@ -44,8 +44,8 @@ def bound_excess(used: float, path: str) -> float:
     """Return how far the lower end of the map's interval exceeds the grip that was used, or the
     prior's lower end if that is larger.
 
-    BOUNDED vehicles have used the grip `used` and have reported it along one `path` (encoding and
-    kind of report).
+    BOUNDED vehicles have used the grip `used`. `path` is the form in which they report it: protobuf
+    or JSON, as posterior or as likelihood.
     """
     n = BOUNDED
     nan = float("nan")
@@ -103,7 +103,9 @@ def _decode_batch(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
 
 
 def lower_excess() -> float:
-    """Return the largest `bound_excess` over all values in USED and all paths."""
+    """Return the largest `bound_excess` over all values in USED, and over all forms of the report:
+    protobuf or JSON, as posterior or as likelihood.
+    """
     paths = ("protobuf posterior", "json posterior", "protobuf likelihood", "json likelihood")
     return max(bound_excess(used, path) for used in USED for path in paths)
 

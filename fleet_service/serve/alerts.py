@@ -151,8 +151,9 @@ class Alerts:
         return np.asarray(near[enough & (accused | along.around)])
 
     def _own_sources(self, slots: IntArray, side: int) -> IntArray:
-        """Return the report times [ns] of the vehicles that support one side (ice or grip) in slots
-        (k,), (k, SOURCES), within the hour before the slot's last report; see `Fusion.sources`.
+        """Return the report times [ns] of the vehicles that support one `side` (ice or grip) in
+        each slot (cell and sector), (k, SOURCES). Only reports within the hour before the slot's
+        last report count; see `Fusion.sources`.
         """
         return self._fusion.sources(slots, side, self._fusion.live.time[slots] - SOURCE_NS)
 

@@ -33,7 +33,8 @@ def open_durably(
         path: path of the file; an existing file is replaced.
         mode: permissions of the file, which the draft has from the beginning; None for default
             permissions.
-        named: True to make the name durable too; otherwise the caller syncs the folder.
+        named: True to sync the folder too, so that the file name is durable; False if the caller
+            syncs the folder.
 
     Raises:
         OSError: the disk is full or read-only; no draft is left.

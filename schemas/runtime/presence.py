@@ -67,7 +67,7 @@ class PresenceTracker:
         return active_tokens(session) | self.active
 
     def record(self, token: ServiceToken, *, stands: bool) -> None:
-        """Record that a token became active (`stands`) or was lost."""
+        """Record that a token became active (`stands` is True) or was lost (False)."""
         with self._guard:
             (self._here.add if stands else self._here.discard)(token)
             (self._withdrawn.discard if stands else self._withdrawn.add)(token)

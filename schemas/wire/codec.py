@@ -109,7 +109,7 @@ class Batch:
 
     @property
     def rows(self) -> int:
-        """Number of records."""
+        """Return the number of records."""
         return len(self.columns["latitude"])
 
 
@@ -152,7 +152,8 @@ def encode(batch: Batch) -> bytes:
 
 
 def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> Any:  # noqa: ANN401 protobuf messages are untyped
-    """Parse a message from its bytes: protobuf if `encoding` is the `expected` one, or JSON.
+    """Parse a message of type `message` from its bytes. They are protobuf if `encoding` is
+    `expected` or names no message type, and JSON if it is the JSON encoding.
 
     Raises:
         WireError: the payload is too large, has another encoding, or is not the expected message.

@@ -8,10 +8,10 @@
     requests/…                                                  see `erasure_requests`
     drafts/                                                     unfinished files, ignored by readers
 
-The date is that of the measurement (UTC). NAME is the name of the newest segment from which the
-file contains rows. If several services own the archive in turn (by a lease), the epoch of the
-compacting service follows SHARD. Two services may compact at once, because one of them was frozen;
-the epoch ensures that they never write the same name.
+The date is that of the measurement (UTC). NAME is the name of the newest segment (SHARD-EPOCH-SEQ,
+see `segments`) from which the file contains rows. If several services own the archive in turn (by a
+lease), the epoch of the compacting service follows SHARD. Two services may compact at once, because
+one of them was frozen; the epoch ensures that they never write the same name.
 """
 
 from __future__ import annotations
@@ -153,7 +153,9 @@ def day_folders(
 
 
 def segment_name(prefix: str, number: int) -> str:
-    """Return the file name of a segment; `prefix` has the form SHARD-EPOCH."""
+    """Return the file name of a segment; `prefix` has the form SHARD-EPOCH: name of the service,
+    and number of its start.
+    """
     return f"{prefix}-{number:08d}.parquet"
 
 

@@ -3,8 +3,8 @@
     inbox/SHARD-EPOCH-SEQ.parquet          observations
     inbox/states/SHARD-EPOCH-SEQ.parquet   states
 
-EPOCH increases with every start of the service and SEQ with every segment, so that a name is never
-used twice.
+SHARD is the name of the service. EPOCH increases with every start of the service and SEQ with every
+segment, so that a name is never used twice.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from schemas.errors import InputError
 
 
 class Version(NamedTuple):
-    """Major and minor version."""
+    """Version of the file format: major and minor number."""
 
     major: int
     minor: int

@@ -177,8 +177,8 @@ def forget_vehicle(root: Path, vehicle: str, month: str) -> ErasureResult:
 @contextmanager
 def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]:
     """Remove a vehicle's data from the files, as `forget_vehicle` does, while a service may write
-    new rows. Only rows that exist at the beginning are removed. No compaction can run before the
-    block ends.
+    new rows. Only rows that exist at the beginning are removed. This is a context manager, which
+    yields the result; no compaction can run until its block ends.
 
     Raises:
         the same errors as `forget_vehicle`, except for a running service.

@@ -85,8 +85,8 @@ class CellRecord:
 
 
 class EntryRecord:
-    """One observation in one cell, younger than the checkpoint. The fields that a commit reads are
-    in the first of its two cache lines.
+    """Entry of the lateness window: one observation in one cell, younger than the checkpoint. The
+    fields that a commit reads are in the first of its two cache lines.
 
     Attributes:
         previous, following: neighbouring entries of the slot's window, in order of time.
@@ -163,17 +163,17 @@ class WindowRecord:
 
 
 class PairRecord:
-    """Last reports of a vehicle in a cell before the checkpoint. A record is half a cache line
-    long, so that no record crosses the border of a line.
+    """Summary of the older reports of one vehicle in one cell (a pair): those that the checkpoint
+    has passed. A record is half a cache line long, so that no record crosses the border of a line.
 
     Attributes:
-        slot, vehicle: the pair; a free place has slot NONE.
-        last: newest of the pair's entries in the window, or NONE.
-        waiting: number of the pair's entries in the window.
+        slot, vehicle: the pair; a free place of the table has slot NONE.
+        last: newest of the pair's observations that are still in the lateness window, or NONE.
+        waiting: number of the pair's observations in the window.
         std: standard deviation of the last value, in units of 1/FINE.
-        time: times of the last bound and the last value [s]; 0 for none.
-        mean, spent: mean and used-up votes at the last bound and the last value, in units of
-            1/FINE.
+        time: time [s] of the last lower bound and of the last value; 0 for none.
+        mean, spent: mean friction, and votes already used up, at the last lower bound and at the
+            last value; in units of 1/FINE.
     """
 
     slot: np.int32
@@ -236,7 +236,7 @@ class PeersRecord:
 
 
 class VehicleRecord:
-    """A vehicle; the key is its permanent number."""
+    """Vehicle that has reported. Its key in the hash table is its permanent number."""
 
     key: int
 

@@ -57,10 +57,10 @@ class Store:
 
     Attributes:
         state: arrays for compiled code.
-        peers: (…) comparisons of each vehicle with others.
-        names: (…) permanent numbers of the vehicles, by index; the first `vehicles` are in use.
-        size, vehicles: number of slots and of vehicles in use.
-        hour: hour [s] for which old pairs were last dropped.
+        peers: record of each vehicle with its comparisons with other vehicles.
+        names: record of each vehicle with its permanent number; the first `vehicles` are in use.
+        size, vehicles: number of slots (cells and sectors) and of vehicles in use.
+        hour: hour [s] in which old records of vehicles in cells were last deleted.
     """
 
     def __init__(self) -> None:
@@ -108,8 +108,8 @@ class Store:
         return len(self.state.free_entries) - int(self.state.used[FREE_ENTRIES])
 
     def due_windows(self, before: int) -> tuple[IntArray, IntArray]:
-        """Return the lateness windows with entries older than `before` [ns]: first those without a
-        value, then those with a value, sorted by cell.
+        """Return the lateness windows that contain observations older than `before` [ns]: first the
+        windows without a value of friction, then those with a value, sorted by cell.
 
         Values that leave the window are compared with other values to compute trust. The order of
         these comparisons must not depend on the order of arrival, so windows with values are
@@ -280,8 +280,9 @@ class Store:
 
 @compiled
 def find_due_windows(windows: RecordArray, before: int) -> tuple[IntArray, IntArray]:
-    """Return two arrays of lateness windows with entries older than `before` [ns]: those without a
-    value, and those with a value.
+    """Return the lateness windows that contain observations older than `before` [ns], as two
+    arrays: windows in which all observations are lower bounds, and windows with at least one value
+    of friction.
     """
     plain = np.empty(len(windows), np.int64)
     valued = np.empty(len(windows), np.int64)
