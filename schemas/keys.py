@@ -2,7 +2,7 @@
 and parsed only here.
 
 A region's quadkey is split into chunks of 4, 3 and 3 digits, a tile's into 4, 3, 3 and 4, so that
-wildcards select areas of different size: `gripmap/v1/map/1200/320/*/*` is a z7 zone.
+wildcards select areas of different size: `gripmap/v1/map/1200/320/*/*` is a zone (zoom 7).
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ TOPICS: Final = {
 
 
 def chunks(quadint: int, zoom: int) -> str:
-    """Return the quadkey digits of a region (z10) or tile (z14), separated by slashes."""
+    """Return the quadkey digits of a region (zoom 10) or a tile (zoom 14), separated by slashes."""
     digits = grid.quadkey(quadint, zoom)
     parts = []
     for size in _CHUNKS:

@@ -38,8 +38,8 @@ class Acks:
             durable[stream].append(seq)
 
     def record_late(self, batches: Iterable[BatchId]) -> None:
-        """Record that batches arrived too late to change the map in order. This is sent together
-        with their acknowledgement as durable.
+        """Record that batches arrived too late for the map to use them in order of time. The sender
+        learns this with the acknowledgement that the batches are durable.
         """
         for stream, seq in batches:
             self._late[stream].add(seq)

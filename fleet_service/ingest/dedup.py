@@ -135,7 +135,7 @@ class SequenceTrackers:
 
     def accepted(self, kind: Kind, names: IntArray) -> BoolArray:
         """Return a mask (n,): True for batches that were accepted before. `names` is (n, 4):
-        vehicle, boot, region and sequence number.
+        numbers of the vehicle, of the vehicle's start and of the region, and sequence number.
         """
         get = self._streams.get
         found = (get((vehicle, boot, kind, region)) for vehicle, boot, region, _ in names.tolist())

@@ -2,7 +2,7 @@
 
 Three checks are made in this order, cheap ones first:
     identity   does the key belong to the sender, and do batch and key agree?      per message
-    novelty    was this (vehicle, boot, kind, region, seq) accepted before?        per message
+    novelty    was this (vehicle, start, kind, region, seq) accepted before?       per message
     rows       is every value finite, in range, in its region and in time?         all rows at once
 
 One invalid row refuses its batch, with row number and reason, and the batch need not be sent again.

@@ -4,8 +4,8 @@ town. Pure.
 The simulated vehicle of `agent` has the errors that the fusion assumes, which makes the fusion look
 too good. Here each vehicle of a town takes its errors from one vehicle of the drives, with all
 errors that persist in it (offsets, a tilted sensor, tyres). Each of its visits is replaced with one
-that this vehicle made on a road with nearly the same friction, excited if the town's visit is
-excited:
+that this vehicle made on a road with nearly the same friction, with enough grip used to measure the
+friction ("excited") if the town's visit has this too:
 
     μ, μ_w   friction of the town's road, and of the road in the visit that is drawn     (n,)
     c        μ/μ_w, scale factor: value, interval and grip used are multiplied by c, because

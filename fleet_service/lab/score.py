@@ -184,8 +184,8 @@ def safe_share(s: Scores) -> float:
 
 
 def of_class(s: Scores, n: int) -> Scores:
-    """Return the scores of answers about cells with at least `n` excited vehicles, but fewer than
-    the next number in COUNTS.
+    """Return the scores of answers about cells in which at least `n` vehicles, but fewer than the
+    next number in COUNTS, used enough grip to measure the friction.
     """
     edges = (*COUNTS[1:], np.iinfo(np.int64).max)
     return s.taken((s.vehicles >= n) & (s.vehicles < edges[COUNTS.index(n)]))

@@ -258,8 +258,9 @@ def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]
 
 
 def measure_change(seeds: range) -> dict[str, float]:
-    """Return medians and 95 % quantiles of the passes for each share of excited visits, and the
-    number of cells in which an alert was not raised or not cleared.
+    """Return medians and 95 % quantiles of the passes for each share of visits with enough grip
+    used to measure the friction, and the number of cells in which an alert was not raised or not
+    cleared.
     """
     out: dict[str, float] = {}
     for percent in CHANGE_EXCITED:

@@ -26,8 +26,8 @@ class RecentMoments:
         self._kept: OrderedDict[int, dict[int, Records]] = OrderedDict()
 
     def keep(self, now: float, tiles: Mapping[int, Records]) -> None:
-        """Store the tiles of a moment, unless the last moment is too recent or nothing has changed
-        since.
+        """Store the tiles of a moment if the last stored moment is old enough and a tile has
+        changed since then.
         """
         moment = int(now)
         last = next(reversed(self._kept), None)

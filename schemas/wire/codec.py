@@ -182,7 +182,8 @@ class StreamAck(NamedTuple):
     """Acknowledged batches of one stream, given by sequence numbers (`seq`).
 
     Attributes:
-        boot, kind, region: identity of the stream.
+        boot, kind, region: identity of the stream: start of the vehicle, kind of the batches,
+            region.
         durable: ranges of batches that are stored safely, both ends included.
         rejected: sequence number, row and reason of each refused record.
         late: ranges of durable batches that arrived too late to change the map in order.

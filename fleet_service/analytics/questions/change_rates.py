@@ -53,7 +53,8 @@ BANDS: Final = (
 
 def expression(t: Table) -> Table:
     """Return counts of value pairs by class, day and bin of elapsed time: number of `pairs`, number
-    of `unlike` pairs, number of `slippery` values in them, and sum of elapsed `seconds`.
+    of `unlike` pairs (one value slippery, the other not), number of `slippery` values in them, and
+    sum of elapsed `seconds`.
 
     Args:
         t: observations with `temperature` of the air [°C], null if unknown.
@@ -189,8 +190,8 @@ def fit(counts: FloatArray, begins: Sequence[tuple[float, float]] = BEGINS) -> t
     if all values are on one side of the slippery limit.
 
     Args:
-        counts: (bins, 4): number of pairs, number of unlike pairs, number of slippery values, and
-            sum of elapsed seconds.
+        counts: (bins, 4): number of pairs, number of unlike pairs (one slippery, one not), number
+            of slippery values, and sum of elapsed seconds.
         begins: pairs (λ, e) from which the search begins; the best result is taken.
     """
     counts = counts[counts[:, 0] > 0]

@@ -276,8 +276,8 @@ class State(NamedTuple):
 
     Attributes:
         live: the current slots.
-        base: copies of slots before their window, one row per row of `windows`; of the reporters
-            only the sources are copied.
+        base: the slots (cells and sectors) in the state before the observations in their windows,
+            one row per row of `windows`; of the reporters only the sources are copied.
         windows, entries: pools.
         free_windows, free_entries: stacks of the pools' free rows.
         pairs: hash table that contains the pair records.

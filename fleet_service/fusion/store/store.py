@@ -1,5 +1,5 @@
-"""The store of a fusion: tables and pools that grow. Compiled code receives all arrays as one
-`State`.
+"""The store of a fusion: the memory for its state, which consists of tables and pools that grow.
+Compiled code receives all arrays as one `State`.
 """
 
 from __future__ import annotations
