@@ -88,8 +88,12 @@ def record_erasure(folder: Path, month: str, newest: int, pseudonym: str | None 
 
 
 class ErasedData(NamedTuple):
-    """Erased data: time ranges that apply to all vehicles, and the end [ns] per pseudonym
-    number.
+    """Erased data.
+
+    Attributes:
+        months: time ranges in which the data of all vehicles are erased.
+        vehicles: for each erased vehicle, the number of its pseudonym, and the time [ns] up to
+            which its data are erased.
     """
 
     months: list[Span]
