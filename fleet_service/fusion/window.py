@@ -1,13 +1,14 @@
 """The lateness window: recent observations, kept per cell in order of time. The belief takes them
 in this order, whatever their order of arrival.
 
-A slot is the storage of one cell and sector, and its live row is the belief after all observations.
-While a slot has observations younger than the checkpoint it has a window: these observations, and
-the base, a copy of the row before them. An observation that is newer than all others updates the
-live row. An observation in between makes the window stale; after the batch all stale windows are
-computed again from their bases. A commit moves observations that the checkpoint has passed into the
-base. When the last has been moved, the base equals the live row and the window is freed. Both rows
-go through the same operations in the same order, so that they agree bit for bit.
+A slot is the storage of one cell and sector. Its live row contains the belief after all
+observations. A slot has a window while it has observations younger than the checkpoint. The window
+contains these observations and the base, which is a copy of the row before them. An observation
+that is newer than all others updates the live row. An older one makes the window stale. After each
+batch, the live rows of all stale windows are computed again from their bases. A commit moves
+observations that the checkpoint has passed into the base. When the last observation has been moved,
+the base equals the live row and the window is freed. Both rows go through the same operations in
+the same order, so that they agree bit for bit.
 """
 
 from __future__ import annotations

@@ -186,7 +186,8 @@ class StreamAck(NamedTuple):
             region.
         durable: ranges of batches that are stored safely, both ends included.
         rejected: sequence number, row and reason of each refused record.
-        late: ranges of durable batches that arrived too late to change the map in order.
+        late: ranges of durable batches that arrived too late for the map to use them in order of
+            time.
         time: clock of the service [ns]; 0 if not sent.
     """
 

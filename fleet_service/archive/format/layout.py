@@ -133,7 +133,8 @@ def compacted_files(
     root: Path, kind: Kind, since_day: int | None = None, until_day: int | None = None
 ) -> Iterator[Path]:
     """Yield the compacted files of a kind (observations or states), sorted by date, zone and age.
-    The first and the last day are included.
+    Only days (since 1970) from `since_day` to `until_day`, both included, are read; None means no
+    limit.
     """
     for folder in day_folders(root, TABLES[kind], since_day, until_day):
         yield from sorted(folder.glob("zone=*/*.parquet"))
@@ -142,7 +143,9 @@ def compacted_files(
 def day_folders(
     root: Path, table: str, since_day: int | None = None, until_day: int | None = None
 ) -> list[Path]:
-    """Return the folders of a table's days in order of time; both limits are included."""
+    """Return the folders of a table's days (since 1970) from `since_day` to `until_day`, both
+    included, in order of time; None means no limit.
+    """
     found = sorted(path for path in (root / table).glob("date=*") if _DAY.fullmatch(path.name))
     return [
         folder
