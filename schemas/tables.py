@@ -157,6 +157,14 @@ STATE: Final = (
     Field("sideslip", F32, "rad", "atan2(vy, vx)", 2.0**-12, (-4.0, 4.0)),
     *_MU,
     Field("health", I32, "flags", "bits of schemas.signals.Health", range=(0, _MAX_I32)),
+    Field(
+        "p_slippery",
+        F32,
+        "-",
+        f"P(mu < {SLIPPERY_MU}); NaN if unknown",
+        2.0**-10,
+        (0.0, 1.0),
+    ),
 )
 
 # Origin of a row: the identity of its batch. In the archive the vehicle is a keyed hash.
@@ -316,6 +324,7 @@ ESTIMATES: Final = (
     Field("mu", F64, "-", "peak adhesion coefficient, median"),
     Field("mu_lower", F64, "-", "5 % quantile of mu"),
     Field("mu_upper", F64, "-", "95 % quantile of mu"),
+    Field("p_slippery", F64, "-", f"P(mu < {SLIPPERY_MU})"),
     *(
         Field(
             f"{wheel}{end}",

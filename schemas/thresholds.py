@@ -5,6 +5,7 @@ EXCITED_SHARE       share of μ that must be used for a reading of μ to be more
 UTILISED_WINDOW_S   `mu_utilised` is the largest grip used within this time [s] (contract)
 SLIPPERY_MU         slippery is μ below this: packed snow has .2–.35, wet asphalt .5–.8 (Pacejka
                     2012, ch. 1)
+CALLED_SHARE        P(μ < SLIPPERY_MU) above which a road counts as reported slippery
 SURFACES            kinds of road by their range of μ: above the first number, up to the second;
                     intervals are evaluated for each kind separately
 Z_95                95 % quantile of the standard normal distribution: half the width of a 90 %
@@ -26,6 +27,7 @@ from typing import Final
 EXCITED_SHARE: Final = 0.6
 UTILISED_WINDOW_S: Final = 1.0
 SLIPPERY_MU: Final = 0.4
+CALLED_SHARE: Final = 0.9
 SURFACES: Final = {"ice": (0.0, 0.2), "snow": (0.2, 0.45), "wet": (0.45, 0.75), "dry": (0.75, 2.0)}
 Z_95: Final = NormalDist().inv_cdf(0.95)
 GRAVITY: Final = 9.81

@@ -2,10 +2,10 @@
 
     python -m tests.regexes      print every suspicious pattern of the product
 
-A backtracking matcher takes quadratic time if two unbounded repeats of the same character follow
-each other and no other mandatory character lies between them. Then the text can be divided between
-the repeats in many ways. The matcher takes exponential time if such a repeat is inside another
-repeat. The check examines literal patterns of the module `re`.
+A backtracking matcher takes quadratic time if two unbounded repeats follow each other and can match
+the same character, with nothing mandatory and different between them, because the text can be
+divided between them in many ways. It takes exponential time if such a repeat is inside another. The
+check looks at literal patterns of the module `re`.
 """
 
 from __future__ import annotations

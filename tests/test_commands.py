@@ -1,6 +1,4 @@
-"""Tests of both command lines: versions, examples, completion, Ctrl-C, negative numbers, and exit
-codes.
-"""
+"""Both command lines: versions, examples, completion, Ctrl-C, negative numbers, and exit codes."""
 
 from __future__ import annotations
 

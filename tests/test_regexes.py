@@ -1,4 +1,4 @@
-"""Test that no regular expression of the product takes more than linear time."""
+"""No regular expression of the product takes more than linear time."""
 
 from __future__ import annotations
 

@@ -24,6 +24,7 @@ from schemas.signals import S
 from schemas.thresholds import GRAVITY
 
 PRIOR = (0.11, 0.63, 1.14)  # 5 %, 50 %, 95 % of what is believed before anything is known
+PRIOR_SLIPPERY = 0.3  # P(mu < 0.4) by the same prior
 
 
 class AtLeast:
@@ -59,6 +60,7 @@ class AtLeast:
         values[..., Column.YAW_RATE] = np.nan_to_num(signals[..., S.YAW_RATE])
         values[..., Column.VX_STD : Column.SIDESLIP_STD + 1] = 1.0
         values[..., Column.MU_UTILISED] = used
+        values[..., Column.P_SLIPPERY] = PRIOR_SLIPPERY
         for column, prior in zip((Column.MU_LOWER, Column.MU, Column.MU_UPPER), PRIOR, strict=True):
             values[..., column] = np.maximum(prior, used)
         return edge_agent.Estimates(values)

@@ -32,7 +32,8 @@ class Column(IntEnum):
     ADAPTATION = 13  # largest factor on R
     INNOVATION_LOG_LIKELIHOOD = 14  # of what was measured at the sample, 0 where nothing was [nat]
     HEALTH = 15  # schemas.signals.Health
-    WHEELS = 16  # median, lower, upper of each wheel, where the estimator has them
+    P_SLIPPERY = 16  # P(mu < SLIPPERY_MU)
+    WHEELS = 17  # median, lower, upper of each wheel, where the estimator has them
 
 
 COLUMNS = tuple(column.name.lower() for column in Column if column < Column.WHEELS)
@@ -80,6 +81,7 @@ class Estimates:
     innovation_nis: FloatArray = _view_column(Column.INNOVATION_NIS)
     adaptation: FloatArray = _view_column(Column.ADAPTATION)
     innovation_log_likelihood: FloatArray = _view_column(Column.INNOVATION_LOG_LIKELIHOOD)
+    p_slippery: FloatArray = _view_column(Column.P_SLIPPERY)
 
     def __init__(
         self, values: FloatArray, evidence: FloatArray | None = None, jumps: BoolArray | None = None

@@ -458,7 +458,17 @@ def _build_states(
         "yaw": located.yaw[k, n],
         **{
             name: getattr(estimates, name)[k, n]
-            for name in ("vx", "vy", "yaw_rate", "sideslip", "mu", "mu_lower", "mu_upper", "health")
+            for name in (
+                "vx",
+                "vy",
+                "yaw_rate",
+                "sideslip",
+                "mu",
+                "mu_lower",
+                "mu_upper",
+                "health",
+                "p_slippery",
+            )
         },
     }
     return RecordBlock(

@@ -32,10 +32,10 @@ class TimeNow(NamedTuple):
 
     Attributes:
         now: the time.
-        slack: how far the time of a report may lie beyond `now`, because archived reports already
-            lie that far beyond.
-        doubt: how much further beyond `now` the time of a report may lie without the report being
-            refused for good; the report must then wait.
+        slack: how far the time of a report may lie beyond `now`, because reports in the archive are
+            that late already.
+        doubt: how much further beyond `now` it may lie so that the report is only kept waiting, and
+            not refused for good.
         least: lower bound of the true time.
         sure: True if active alerts may end only because time has passed; False while the clock may
             be wrong.

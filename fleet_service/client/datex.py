@@ -51,8 +51,7 @@ class Supplier:
     Attributes:
         country: two letters, ISO 3166.
         name: name of the supplier at its National Access Point.
-        status: `real`, or the value of the standard that marks a publication as a test or an
-            exercise.
+        status: real, or one of the kinds of exercise of the standard.
 
     Raises:
         InputError: the country is not valid, or the name is empty.

@@ -14,10 +14,10 @@ reading of a road, and a reader of the map gets a belief about the road itself:
     σ_c² = COMMON_ALWAYS² + COMMON_MANOEUVRE²/n_eff + σ_s²·(a + (1 - a)/n_eff)
     n_eff = (Σ w_k)²/Σ w_k²
 
-The shape error is one-sided: it makes values too low and never too high, because a likelihood that
-is too high falls too little towards the highest friction to count as a value. The slope of this
-error is the estimate of `trust.shape_of` plus SHAPE_DOUBT. An alarm uses the upper end of the
-slope's confidence range. This extra doubt disappears once the fleet's slope is known.
+The shape error is one-sided: only readings that are too low are treated as values, because their
+likelihood falls towards the upper end. Its slope is the estimate of `trust.shape_of` plus
+SHAPE_DOUBT. An alarm uses the upper end of the slope's confidence range. This extra doubt
+disappears once the fleet's slope is known.
 
 A sender states its whole error. A part of it is common to all senders of the same manoeuvre, so it
 cannot be seen by comparing them: σ_s² = SHARED_PART·stated² (relative, weighted mean of the cell's

@@ -361,9 +361,7 @@ def _commit_windows(
 
 @refcount_free_inlined
 def _shorten_window(state: State, slot: int, window: int, entry: int) -> None:
-    """Make `entry` the first observation of a window. If `entry` is NONE, no observation is left,
-    and the window is freed.
-    """
+    """Make `entry` the first observation of a window; free the window if `entry` is NONE."""
     windows = state.windows
     windows[window].head = entry
     if entry == NONE:

@@ -98,9 +98,8 @@ def _is_listed(name: str, only: str | None, found: Mapping[str, float]) -> bool:
 
 
 def drives_end_to_end(quick: bool) -> Drives:
-    """Return the function that simulates an end-to-end drive, for each of the conditions in
-    LENGTHS: level or hilly roads, a minute to half an hour. If `quick`, each drive lasts only a few
-    seconds.
+    """Return the end-to-end drives, for the level and the rough world; if `quick`, only a few
+    seconds each.
     """
     return {
         world: end_to_end.drive_command(*((4, 3.0) if quick else length), world)

@@ -118,13 +118,8 @@ class LeaseRecord(NamedTuple):
 
 
 class Standby(NamedTuple):
-    """Functions that a waiting (standby) service gives to the lease.
-
-    Attributes:
-        may: returns True if the service could reach vehicles and readers if it took over now.
-        stands: returns True if the liveliness token of the service with this name is active.
-        alive: called each time the lease is checked.
-        get_ahead: downloads new objects of the bucket in advance.
+    """Functions that a waiting (standby) service gives to the lease; see the comments of the
+    fields.
     """
 
     may: Callable[[], bool]  # whether it would be heard if it took over now

@@ -428,8 +428,8 @@ class BucketReplica:
         return self._root / f"{name}{BAD}"
 
     def _list_files(self, folders: Iterable[str]) -> dict[str, Stamp]:
-        """Return the names of the files that belong into the copy, with their stamps (size and
-        time), in the order of `folders`.
+        """Return names and stamps (size and time) of the files that belong into the copy, in the
+        order of the folders.
         """
         found: dict[str, Stamp] = {}
         paths = (path for one in folders for path in sorted((self._root / one).rglob("*")))

@@ -17,12 +17,12 @@ from fleet_service.serve.idle_roads import OTHERS_NEEDED, IdleRoads
 from fleet_service.serve.view import LOWER, UPPER, coarse_counts
 from schemas import grid
 from schemas.numeric import BoolArray, IntArray
-from schemas.thresholds import NS, SLIPPERY_MU
+from schemas.thresholds import CALLED_SHARE, NS, SLIPPERY_MU
 from schemas.wire import Alert
 
 # P(slippery). Of 20 tuning fleets that take a wet curve gently on winter tyres, one raises a false
 # alert with .9, nine with .8. With .7, .96 of the slippery cell-minutes below are under alert.
-RAISE_ABOVE: Final = 0.9
+RAISE_ABOVE: Final = CALLED_SHARE
 # ... and by its own reports alone no less than without any
 LIKELY: Final = float(SLIPPERY_SHARE @ PRIOR)
 CLEAR_BELOW: Final = 0.05  # grip must be as sure as ice was: clearing too early is the dearer error

@@ -92,7 +92,7 @@ class ObservationBatch(_message.Message):
     def __init__(self, vehicle: _Optional[str] = ..., boot: _Optional[int] = ..., region: _Optional[int] = ..., seq: _Optional[int] = ..., first_held: _Optional[int] = ..., estimator: _Optional[str] = ..., enter_time: _Optional[_Iterable[int]] = ..., leave_time: _Optional[_Iterable[int]] = ..., cell: _Optional[_Iterable[int]] = ..., sector: _Optional[_Iterable[int]] = ..., latitude: _Optional[_Iterable[float]] = ..., longitude: _Optional[_Iterable[float]] = ..., position_std: _Optional[_Iterable[float]] = ..., yaw: _Optional[_Iterable[float]] = ..., yaw_std: _Optional[_Iterable[float]] = ..., speed: _Optional[_Iterable[float]] = ..., mu: _Optional[_Iterable[float]] = ..., mu_lower: _Optional[_Iterable[float]] = ..., mu_upper: _Optional[_Iterable[float]] = ..., mu_utilised: _Optional[_Iterable[float]] = ..., log_likelihood: _Optional[bytes] = ..., health: _Optional[_Iterable[int]] = ..., tyre_season: _Optional[_Iterable[int]] = ..., air_temperature: _Optional[_Iterable[float]] = ..., abs_active: _Optional[_Iterable[int]] = ..., used_longitudinal: _Optional[_Iterable[float]] = ..., used_lateral: _Optional[_Iterable[float]] = ..., esc_active: _Optional[_Iterable[int]] = ..., tcs_active: _Optional[_Iterable[int]] = ..., wiper: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class StateBatch(_message.Message):
-    __slots__ = ("vehicle", "boot", "region", "seq", "first_held", "estimator", "time", "latitude", "longitude", "position_std", "yaw", "vx", "vy", "yaw_rate", "sideslip", "mu", "mu_lower", "mu_upper", "health")
+    __slots__ = ("vehicle", "boot", "region", "seq", "first_held", "estimator", "time", "latitude", "longitude", "position_std", "yaw", "vx", "vy", "yaw_rate", "sideslip", "mu", "mu_lower", "mu_upper", "health", "p_slippery")
     VEHICLE_FIELD_NUMBER: _ClassVar[int]
     BOOT_FIELD_NUMBER: _ClassVar[int]
     REGION_FIELD_NUMBER: _ClassVar[int]
@@ -112,6 +112,7 @@ class StateBatch(_message.Message):
     MU_LOWER_FIELD_NUMBER: _ClassVar[int]
     MU_UPPER_FIELD_NUMBER: _ClassVar[int]
     HEALTH_FIELD_NUMBER: _ClassVar[int]
+    P_SLIPPERY_FIELD_NUMBER: _ClassVar[int]
     vehicle: str
     boot: int
     region: int
@@ -131,7 +132,8 @@ class StateBatch(_message.Message):
     mu_lower: _containers.RepeatedScalarFieldContainer[float]
     mu_upper: _containers.RepeatedScalarFieldContainer[float]
     health: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, vehicle: _Optional[str] = ..., boot: _Optional[int] = ..., region: _Optional[int] = ..., seq: _Optional[int] = ..., first_held: _Optional[int] = ..., estimator: _Optional[str] = ..., time: _Optional[_Iterable[int]] = ..., latitude: _Optional[_Iterable[float]] = ..., longitude: _Optional[_Iterable[float]] = ..., position_std: _Optional[_Iterable[float]] = ..., yaw: _Optional[_Iterable[float]] = ..., vx: _Optional[_Iterable[float]] = ..., vy: _Optional[_Iterable[float]] = ..., yaw_rate: _Optional[_Iterable[float]] = ..., sideslip: _Optional[_Iterable[float]] = ..., mu: _Optional[_Iterable[float]] = ..., mu_lower: _Optional[_Iterable[float]] = ..., mu_upper: _Optional[_Iterable[float]] = ..., health: _Optional[_Iterable[int]] = ...) -> None: ...
+    p_slippery: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, vehicle: _Optional[str] = ..., boot: _Optional[int] = ..., region: _Optional[int] = ..., seq: _Optional[int] = ..., first_held: _Optional[int] = ..., estimator: _Optional[str] = ..., time: _Optional[_Iterable[int]] = ..., latitude: _Optional[_Iterable[float]] = ..., longitude: _Optional[_Iterable[float]] = ..., position_std: _Optional[_Iterable[float]] = ..., yaw: _Optional[_Iterable[float]] = ..., vx: _Optional[_Iterable[float]] = ..., vy: _Optional[_Iterable[float]] = ..., yaw_rate: _Optional[_Iterable[float]] = ..., sideslip: _Optional[_Iterable[float]] = ..., mu: _Optional[_Iterable[float]] = ..., mu_lower: _Optional[_Iterable[float]] = ..., mu_upper: _Optional[_Iterable[float]] = ..., health: _Optional[_Iterable[int]] = ..., p_slippery: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class SeqRange(_message.Message):
     __slots__ = ("first", "last")

@@ -20,6 +20,7 @@ from schemas.config import AgentConfig
 from schemas.numeric import FloatArray
 from schemas.runtime.records import RecordArray
 from schemas.signals import CHANNELS, S
+from schemas.thresholds import SLIPPERY_MU
 
 if TYPE_CHECKING:
     from edge_agent.estimators import Estimates
@@ -42,6 +43,7 @@ class MadeUp:
     mu: FloatArray
     mu_lower: FloatArray
     mu_upper: FloatArray
+    p_slippery: FloatArray
     mu_utilised: FloatArray
     health: NDArray[np.int32]
     evidence: FloatArray | None
@@ -67,8 +69,11 @@ def estimates(
     vx, vy, yaw_rate, sideslip = (rng.normal(10.0, 1.0, shape) for _ in range(4))
     lower = middle - 0.05
     upper = middle + 0.05
+    slippery = (middle < SLIPPERY_MU).astype(float)
     gripped = np.full(shape, used)
-    return MadeUp(vx, vy, yaw_rate, sideslip, middle, lower, upper, gripped, health, evidence)
+    return MadeUp(
+        vx, vy, yaw_rate, sideslip, middle, lower, upper, slippery, gripped, health, evidence
+    )
 
 
 def ground(

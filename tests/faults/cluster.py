@@ -87,7 +87,7 @@ OWES: Final = (
 
 
 def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
-    """Run `failovers` failovers of all kinds in turn, and return the figures."""
+    """Run this many failovers of all kinds in turn."""
     random_ = random.Random(site.seed)
     happened: list[Failover] = []
     pauses = []

@@ -172,8 +172,8 @@ def run_log_history(number: int) -> list[str]:
 
 
 def _run_log(number: int) -> tuple[list[str], int]:
-    """Return the violations (broken promises) of one history of the log, and the number of batches
-    acknowledged before a power loss.
+    """Return the violations of one history of the log, and the number of batches acknowledged
+    before a power loss.
     """
     folder = Path(tempfile.mkdtemp(prefix="crash-", dir=_find_memory_folder()))
     one = History(number, folder)

@@ -91,7 +91,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def _make_message(r: random.Random, mutants: Mutants) -> tuple[str, bytes, str]:
-    """Return key, payload and encoding of the next malformed message."""
+    """Return key, payload and encoding of the next message."""
     message = mutants.make_message()
     what = r.random()
     if what < 0.02:

@@ -223,7 +223,7 @@ class VirtualBucket:
         return cast("bytes | None", self._request(lambda: self.objects.get(name)))
 
     def put(self, name: str, content: bytes) -> None:
-        """Write an object; the request may be slow, lost, or take effect later."""
+        """Write an object."""
         self._request(lambda: self.objects.__setitem__(name, content))
 
     def create(self, name: str, content: bytes) -> bool:

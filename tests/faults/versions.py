@@ -30,9 +30,7 @@ from tests.fleet_service.archive.test_version import rewrite_file, with_columns
 
 
 def run(site: Site) -> list[Figure]:
-    """Read both archives with today's service, before and after a compaction, with and without a
-    checkpoint.
-    """
+    """Run both cases, before and after a compaction, with and without a checkpoint."""
     old = site.folder / "old"
     new = site.folder / "new"
     shutil.copytree(DATA / "v1.0" / "archive", old)

@@ -22,6 +22,7 @@ LATER = (
     "esc_active",
     "tcs_active",
     "wiper",
+    "p_slippery",
 )  # columns that came after the kept bytes
 
 
@@ -55,7 +56,7 @@ def batch_of_version_1(kind: Kind) -> Batch:
 
 
 def make_acknowledgement() -> tuple[str, list[StreamAck]]:
-    """Return the vehicle's name and the acknowledgement of two of its streams."""
+    """Return an acknowledgement of two streams."""
     return "volvo-240", [
         StreamAck(2**62 + 5, Kind.OBSERVATION, 396_303, durable=((1, 12), (14, 14))),
         StreamAck(

@@ -17,7 +17,7 @@ from edge_agent.filters.cholesky import variance
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
-from schemas.thresholds import Z_95
+from schemas.thresholds import SLIPPERY_MU, Z_95
 
 # what is known of the friction of a road nobody has measured: moments of the uniform prior
 PRIOR_MU = 0.5 * (LOWER + UPPER)
@@ -73,11 +73,14 @@ def write_quality(
 
 @compiled
 def write_friction(output: FloatArray, first: int, mu: float, std: float) -> None:
-    """Write the median, 5 % and 95 % quantiles of friction into columns `first` to `first` + 2.
+    """Write the median, 5 % and 95 % quantiles of friction into columns `first` to `first` + 2, and
+    with the friction of the vehicle (`first` is Column.MU) P(mu < SLIPPERY_MU).
 
     `mu` and `std` are mean and standard deviation; each quantile is clipped to the range of the
     grid.
     """
+    if first == Column.MU:
+        output[Column.P_SLIPPERY] = 0.5 * math.erfc((mu - SLIPPERY_MU) / (std * math.sqrt(2.0)))
     wide = Z_95 * std
     output[first] = min(max(mu, LOWER), UPPER)
     output[first + 1], output[first + 2] = (
@@ -89,8 +92,10 @@ def write_friction(output: FloatArray, first: int, mu: float, std: float) -> Non
 @compiled
 def write_prior(output: FloatArray, first: int) -> None:
     """Write the median, 5 % and 95 % quantiles of the uniform prior, for an unknown road, into
-    columns `first` to `first` + 2.
+    columns `first` to `first` + 2, and with the friction of the vehicle P(mu < SLIPPERY_MU).
     """
+    if first == Column.MU:
+        output[Column.P_SLIPPERY] = (SLIPPERY_MU - LOWER) / (UPPER - LOWER)
     output[first] = 0.5 * (LOWER + UPPER)
     output[first + 1], output[first + 2] = 0.95 * LOWER + 0.05 * UPPER, 0.05 * LOWER + 0.95 * UPPER
 

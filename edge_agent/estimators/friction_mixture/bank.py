@@ -126,6 +126,7 @@ def write_estimates(memory: MixtureMemory, design: MixtureDesign, output: FloatA
     _report_friction(
         memory.friction, reported_upper(memory.grip, memory.friction), output, Column.MU
     )
+    output[Column.P_SLIPPERY] = memory.friction.p_slippery
     for wheel in range(4):
         side = memory.friction_left if wheel % 2 == 0 else memory.friction_right
         upper = side.upper if memory.split else reported_upper(memory.grip, side)

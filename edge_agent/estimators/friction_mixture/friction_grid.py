@@ -105,6 +105,24 @@ def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> floa
 
 
 @compiled
+def probability_below(mu: FloatArray, prior: FloatArray, w: FloatArray, limit: float) -> float:
+    """Return P(mu < limit) under the density of `quantile`, for a limit between two nodes."""
+    count = mu.shape[0]
+    below = total = 0.0
+    for j in range(count + 1):
+        mass = _segment_mass(mu, prior, w, j)
+        total += mass
+        if 0 < j < count and mu[j - 1] <= limit < mu[j]:
+            share = (limit - mu[j - 1]) / (mu[j] - mu[j - 1])
+            first = w[j - 1] / prior[j - 1]
+            at_limit = first + share * (w[j] / prior[j] - first)
+            below += 0.5 * (limit - mu[j - 1]) * (first + at_limit)
+        elif j < count and mu[j] <= limit:
+            below += mass
+    return below / total
+
+
+@compiled
 def _segment_mass(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
     """Return the unnormalised probability mass between nodes j - 1 and j. Node -1 and node K are
     the ends of the friction range.

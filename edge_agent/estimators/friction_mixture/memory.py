@@ -126,6 +126,7 @@ class Quantiles:
     median: float
     lower: float  # 5 %
     upper: float  # 95 %
+    p_slippery: float  # P(mu < SLIPPERY_MU)
 
 
 class MixtureMemory:

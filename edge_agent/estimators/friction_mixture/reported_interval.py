@@ -5,8 +5,10 @@ measurements, the node probabilities are wider than the actual errors. Without m
 equal the prior, which has the right width. The level of the upper end moves from one case to the
 other with the information gained, which is the divergence of the node probabilities from the prior
 (Kullback and Leibler 1951). It moves further for a car that matches its vehicle file
-(`trust.nominal_agreement`). The upper end falls below the slippery limit only if at least 99 % of
-the probability lies below the reported value.
+(`trust.nominal_agreement`).
+
+P(mu < SLIPPERY_MU) is computed from the same node probabilities. Therefore it tends to be too close
+to that of the prior.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ import math
 
 from edge_agent.estimators.friction_mixture.constants import PATCH_NODES
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.friction_grid import quantile
+from edge_agent.estimators.friction_mixture.friction_grid import probability_below, quantile
 from edge_agent.estimators.friction_mixture.memory import Quantiles
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -34,8 +36,6 @@ DRAWN_IN = 0.085
 # stays: safe deceleration rests on it.
 NEARER = 0.15
 DRAWN_NEARER = 0.15
-# Ice ends without a sign: of what .95 called slippery for sure in towns .08 lay beyond it
-SURE_END = 0.99
 
 
 @compiled
@@ -47,7 +47,7 @@ def find_interval(
     likeness: float,
     friction: Quantiles,
 ) -> None:
-    """Compute median and interval of friction from the probabilities (NODES,) of the
+    """Compute median, interval and P(mu < SLIPPERY_MU) of friction from the probabilities (NODES,) of the
     single-friction nodes.
 
     `patch` (PATCH_NODES,) are the probabilities of a possible ice patch. `blended` (NODES,) is
@@ -55,6 +55,7 @@ def find_interval(
     """
     friction.median = quantile(design.mu, design.prior, weight, 0.5)
     friction.upper = upper_end(design, weight, likeness)
+    friction.p_slippery = probability_below(design.mu, design.prior, weight, SLIPPERY_MU)
     rest = 1.0
     for j in range(PATCH_NODES):
         rest -= patch[j]
@@ -77,11 +78,7 @@ def upper_end(design: MixtureDesign, weight: FloatArray, likeness: float) -> flo
     learned_end = LEARNED_END - NEARER * likeness
     level = learned_end + (UPPER_END - learned_end) * math.exp(-max(learned, 0.0) / LEARNED)
     widest = quantile(design.mu, design.prior, weight, UPPER_END)
-    upper = max(
+    return max(
         quantile(design.mu, design.prior, weight, level),
         widest - DRAWN_IN - DRAWN_NEARER * likeness,
     )
-    if upper >= SLIPPERY_MU:
-        return upper
-    surely = quantile(design.mu, design.prior, weight, SURE_END)
-    return max(upper, min(surely, SLIPPERY_MU))

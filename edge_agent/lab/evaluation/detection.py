@@ -14,10 +14,12 @@ Legend
                 friction <= .2
     excited     visit: some wheel uses more than EXCITED_SHARE of its grip during it
     pass        a stretch of PASS_S or longer of one car on ice, or on snow; a pass is found if
-                mu_upper < .4 at some time during it
+                P(mu < .4) > CALLED_SHARE at some time during it
     settled     not within SETTLED_S of snow and ice
-    false event a settled stretch with mu_upper < .4 on wet or dry road; gaps up to EVENT_GAP_S do
-                not end it
+    false event a settled stretch with P(mu < .4) > CALLED_SHARE on wet or dry road; gaps up to
+                EVENT_GAP_S do not end it. Friction is the mean of the wheels, so that a front axle
+                that has just reached ice counts as false; `.off_ice` counts only samples without
+                a wheel on snow or ice
     false grip  mu_lower more than FALSE_GRIP above the true friction
     stood       ice or snow appeared under the standing car; these cases are evaluated separately
                 and in no other figure
@@ -43,7 +45,7 @@ from edge_agent.lab.evaluation.slide_oracle import visit_evidence
 from edge_agent.lab.evaluation.slip_flag import FLAGGED_MU
 from schemas.numeric import FloatArray
 from schemas.signals import Health
-from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU, SURFACES
+from schemas.thresholds import CALLED_SHARE, EXCITED_SHARE, SLIPPERY_MU, SURFACES
 
 SLIDING: Final = 2.6
 SLIDE_S: Final = 0.1
@@ -180,7 +182,7 @@ def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
         )
         tally.add(f"score.{name}", score[among & apart])
     ice = (mu <= ICE_MU) & apart
-    called = drive.upper < SLIPPERY_MU
+    called = drive.slippery > CALLED_SHARE
     grips = mu > SNOW_MU
     tally.add("false_grip", (drive.lower > mu + FALSE_GRIP)[ice])
     tally.add("false_grip.sure", (drive.lower > SLIPPERY_MU)[ice])
@@ -189,6 +191,8 @@ def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
     tally.add("false_ice", called[grips])
     settled = grips & ~recent_maximum(~grips, SETTLED_S).astype(bool)
     tally.add("false_ice.settled", called[settled])
+    off_ice = drive.mu_wheel.min(axis=-1) > SNOW_MU
+    tally.add("false_ice.off_ice", called[off_ice])
     tally.add("km", np.array([float(drive.speed[settled].sum(dtype=np.float64)) / RATE_HZ / 1e3]))
     contradicted = (drive.health & int(Health.CONTRADICTION)) > 0
     tally.add("contradiction_share.ice.excited", contradicted[ice & excited])
@@ -207,7 +211,7 @@ def passes_of(drive: DetectionDrive, n: int, kind: str) -> Stretches:
 def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches) -> None:
     for kind in ("ice", "snow"):
         for first, end in passes_of(drive, n, kind):
-            called = drive.upper[first:end, n] < SLIPPERY_MU
+            called = drive.slippery[first:end, n] > CALLED_SHARE
             flag = drive.flagged[first:end, n] < FLAGGED_MU
             if drive.stood[first:end, n].any():
                 tally.add_case(f"passes.{kind}.stood", holds=bool(called.any()))
@@ -255,7 +259,7 @@ def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
         if float(drive.mu_wheel[first:end, n].mean()) >= TOLD_MU or drive.stood[first:end, n].any():
             continue
         late = end + round(TOLD_AFTER_S * RATE_HZ)
-        told = bool((drive.upper[first:late, n] < SLIPPERY_MU).any())
+        told = bool((drive.slippery[first:late, n] > CALLED_SHARE).any())
         four = bridge_gaps(np.asarray(beyond[first:end].all(axis=1)), BRIDGED_S)
         whole = any(b - a >= round(TOLD_SLIDE_S * RATE_HZ) for a, b in runs_of(four))
         tally.add_case("slide.told.all_wheels" if whole else "slide.told.some_wheels", holds=told)
@@ -292,7 +296,7 @@ def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) ->
     grips = drive.mu[:, n] > SNOW_MU
     settled = grips & ~recent_maximum(~grips[:, None], SETTLED_S)[:, 0].astype(bool)
     ways = {
-        "false_events": drive.upper[:, n] < SLIPPERY_MU,
+        "false_events": drive.slippery[:, n] > CALLED_SHARE,
         "flag.false_events": drive.flagged[:, n] < FLAGGED_MU,
     }
     ways |= {f"roc.{nats:g}.false_events": drive.favoured[:, n] > nats for nats in ROC_NATS}
@@ -300,6 +304,10 @@ def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) ->
     for name, called in ways.items():
         events = runs_of(bridge_gaps(called & settled, EVENT_GAP_S))
         tally.add(name, np.array([float(len(events))]))
+    low = drive.mu_wheel[:, n].min(axis=-1) <= SNOW_MU
+    off_ice = ~recent_maximum(low[:, None], SETTLED_S)[:, 0].astype(bool)
+    events = runs_of(bridge_gaps(ways["false_events"] & off_ice, EVENT_GAP_S))
+    tally.add("false_events.off_ice", np.array([float(len(events))]))
 
 
 def _judge_visits(

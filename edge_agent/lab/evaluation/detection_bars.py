@@ -116,10 +116,18 @@ DETECTION: Final = (
     DetectionBar("coverage90.dry.short", "short", mean_of("coverage90.dry"), SHARE, (0.87, 0.87)),
     DetectionBar("false_ice.short", "short", mean_of("false_ice"), SHARE, (0.0015, 0.0015), "less"),
     DetectionBar("false_ice.long", "long", mean_of("false_ice"), SHARE),
+    DetectionBar("false_ice.off_ice.short", "short", mean_of("false_ice.off_ice"), SHARE),
+    DetectionBar("false_ice.off_ice.long", "long", mean_of("false_ice.off_ice"), SHARE),
     DetectionBar(
         "false_events.short", "short", rate_of("false_events", "km"), PER_1000_KM, (70, 70), "less"
     ),
     DetectionBar("false_events.long", "long", rate_of("false_events", "km"), PER_1000_KM),
+    DetectionBar(
+        "false_events.off_ice.short", "short", rate_of("false_events.off_ice", "km"), PER_1000_KM
+    ),
+    DetectionBar(
+        "false_events.off_ice.long", "long", rate_of("false_events.off_ice", "km"), PER_1000_KM
+    ),
     DetectionBar("false_grip.short", "short", mean_of("false_grip"), SHARE, (0.05, 0.05), "less"),
     DetectionBar("false_grip.long", "long", mean_of("false_grip"), SHARE, (0.05, 0.05), "less"),
     DetectionBar("false_grip.sure.short", "short", mean_of("false_grip.sure"), SHARE),

@@ -56,7 +56,7 @@ class DetectionDrive:
         speed, ax, ay: true motion [m/s, m/s^2].
         mu: true mean friction of the four wheels.
         mu_wheel, theta, used: friction, normalised slip and used share of the grip, per wheel.
-        lower, median, upper, health: estimates.
+        lower, median, upper, slippery, health: estimates; `slippery` is P(mu < SLIPPERY_MU).
         favoured: ln of the largest belief below SLIPPERY_MU over the largest above; NaN where the
             estimator has no belief.
         flagged: friction that the slip flag reports, infinite without a flag.
@@ -75,6 +75,7 @@ class DetectionDrive:
     lower: Samples
     median: Samples
     upper: Samples
+    slippery: Samples
     health: NDArray[np.int32]
     favoured: Samples
     flagged: Samples
@@ -202,6 +203,7 @@ def _samples_of(
         "lower": estimates.mu_lower,
         "median": estimates.mu,
         "upper": estimates.mu_upper,
+        "slippery": estimates.p_slippery,
         "health": estimates.health,
         "favoured": favoured,
         "controlled": true.abs | true.tcs | true.esc,

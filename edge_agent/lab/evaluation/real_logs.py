@@ -7,7 +7,7 @@ of the surface). The figures cover the time in which the car moves, from the thi
     informative    share with an interval narrower than INFORMATIVE times the prior's
     right          share of the informative time in which the interval agrees with the known
                    friction: the true one, else at least the grip in use
-    ice            share with P(slippery) > ICE although the road was not slippery
+    ice            share with P(slippery) > CALLED_SHARE although the road was not slippery
     contradicted   share with the health flag CONTRADICTION
     urgent         observations per hour that would be sent immediately, for logs with a position
     used           99th percentile of mu_utilised
@@ -35,11 +35,10 @@ from edge_agent.inputs.signal_log import SignalLog, read_log
 from edge_agent.observe.pipeline import Pipeline
 from schemas.config import AgentConfig
 from schemas.errors import InputError
-from schemas.mugrid import CENTRES
 from schemas.numeric import BoolArray, FloatArray
 from schemas.runtime.figures import Figure
 from schemas.signals import Health, S
-from schemas.thresholds import GRAVITY, SLIPPERY_MU
+from schemas.thresholds import CALLED_SHARE, GRAVITY
 from schemas.vehicle import Vehicle, load_vehicle
 
 ESTIMATOR: Final = "aco-fckf"
@@ -47,12 +46,10 @@ BEGIN_S: Final = 3.0  # of a log that are left out
 MOVING_M_S: Final = 1.5
 FAST_M_S: Final = 3.0  # from which on sideslip is judged
 INFORMATIVE: Final = 0.6
-ICE: Final = 0.9
 GRIPS: Final = 0.6  # friction from which on a road is not slippery
 CERTAIN: Final = 0.9  # share of `mu_known` that a surface had at least
 MARGIN: Final = 0.03  # noise of the grip in use
 USED_SHARE: Final = 99.5  # percentile of the grip in use that a surface surely had
-LOOK_S: Final = 0.2  # between two looks at P(slippery)
 SMOOTH_S: Final = 0.25
 TRUTH: Final = ("vx", "vy", "mu")
 HEAD: Final = (
@@ -115,38 +112,29 @@ def judge_folder(
 def judge_log(path: Path) -> LogFigures:
     """Replay one log and evaluate its estimates."""
     adopted = prepare_log(read_log(path), load_vehicle(path.with_suffix(".json")))
-    values, slippery, urgent = replay_log(adopted.log, adopted.vehicle)
+    values, urgent = replay_log(adopted.log, adopted.vehicle)
     truth = read_truth(path, adopted.log.t)
     meta = path.with_suffix(".meta.json")
     known = json.loads(meta.read_text(encoding="utf-8")).get("mu_known") if meta.exists() else None
-    return judge_estimates(path.stem, adopted, (values, slippery), truth, known, urgent)
+    return judge_estimates(path.stem, adopted, values, truth, known, urgent)
 
 
-def replay_log(log: SignalLog, vehicle: Vehicle) -> tuple[FloatArray, FloatArray, int | None]:
-    """Return estimates (T, columns), P(slippery) (T,), and the number of urgent observations.
+def replay_log(log: SignalLog, vehicle: Vehicle) -> tuple[FloatArray, int | None]:
+    """Return estimates (T, columns), and the number of urgent observations.
 
     The number is None if the log has no position.
     """
     pipeline = Pipeline(bank_of(ESTIMATOR, [vehicle]), 1, AgentConfig())
-    rows = max(1, round(LOOK_S / float(np.median(np.diff(log.t)))))
     parts = []
-    slippery = []
     urgent = 0
-    below = CENTRES < SLIPPERY_MU
-    for block in log.blocks(0, rows=rows):
+    for block in log.blocks(0):
         estimates, observations, _ = pipeline.step(block)
         urgent += int(observations.urgent.sum())
         parts.append(estimates.values[:, 0])
-        belief = pipeline.beliefs()
-        probability = math.nan
-        if belief is not None:
-            weight = np.exp(belief[0][0])
-            probability = float(weight[below].sum() / weight.sum())
-        slippery.append(np.full(len(block.t), probability))
     last = pipeline.finish()
     urgent += 0 if last is None else int(last.urgent.sum())
     located = bool(np.isfinite(log.signals[:, S.LATITUDE]).any())
-    return np.concatenate(parts), np.concatenate(slippery), urgent if located else None
+    return np.concatenate(parts), urgent if located else None
 
 
 def read_truth(path: Path, t: FloatArray) -> dict[str, FloatArray]:
@@ -176,17 +164,14 @@ def read_truth(path: Path, t: FloatArray) -> dict[str, FloatArray]:
 def judge_estimates(
     name: str,
     adopted: Adopted,
-    estimates: tuple[FloatArray, FloatArray],
+    values: FloatArray,
     truth: dict[str, FloatArray],
     known: float | None,
     urgent: int | None,
 ) -> LogFigures:
-    """Return the figures of one log from its estimates (T, columns) with P(slippery) (T,), and the
-    true values.
-    """
+    """Return the figures of one log from its estimates (T, columns) and the true values."""
     t = adopted.log.t
     signals = adopted.log.signals
-    values, slippery = estimates
     wheels = np.where(
         np.isfinite(signals[:, S.OMEGA : S.OMEGA + 4]), signals[:, S.OMEGA : S.OMEGA + 4], 0.0
     )
@@ -216,7 +201,7 @@ def judge_estimates(
         passed=adopted.diagnosis.is_passed,
         informative=share_of(told, moving),
         right=share_of(right, told),
-        ice=share_of(slippery > ICE, moving & grips),
+        ice=share_of(values[:, Column.P_SLIPPERY] > CALLED_SHARE, moving & grips),
         contradicted=share_of(contradicted, moving),
         urgent_per_hour=math.nan if urgent is None or hours == 0.0 else urgent / hours,
         used=float(np.percentile(values[moving, Column.MU_UTILISED], 99))

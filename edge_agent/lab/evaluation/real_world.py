@@ -8,11 +8,12 @@ on any road.
 Legend
     surface       class of the mean friction of the four wheels: ice up to .2, snow up to .45, wet
                   up to .75, dry above
-    missed ice    share of the excited samples on ice whose upper end is not below SLIPPERY_MU
+    missed ice    share of the excited samples on ice with P(mu < SLIPPERY_MU) of at most
+                  CALLED_SHARE
     false grip    share of the samples on ice whose lower end lies FALSE_GRIP or more above the
                   true friction
-    false ice     share of the samples on wet and dry road whose whole interval lies below
-                  SLIPPERY_MU. "settled": only samples at least SETTLED_S after snow and ice,
+    false ice     share of the samples on wet and dry road with P(mu < SLIPPERY_MU) above
+                  CALLED_SHARE. "settled": only samples at least SETTLED_S after snow and ice,
                   because a driver notices the end of the ice only by using the grip. "of_all":
                   share of all samples that are false ice on a road above SURE_GRIP
     below         share of all samples whose upper end lies below the grip in use: certainly wrong
@@ -41,9 +42,9 @@ from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import Health, S, per_wheel
 from schemas.thresholds import (
+    CALLED_SHARE,
     EXCITED_SHARE,
     GRAVITY,
-    SLIPPERY_MU,
     SURFACES,
     UTILISED_WINDOW_S,
     Z_95,
@@ -176,7 +177,7 @@ def tally_town(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatAr
     tally.add(
         "coverage90.no_torque", inside[:, np.isnan(batch.signals[:, :, S.TORQUE]).all(axis=0)]
     )
-    icy = reported.mu_upper < SLIPPERY_MU
+    icy = reported.p_slippery > CALLED_SHARE
     grips = mu > SURFACES["wet"][0]
     ice = mu <= SURFACES["ice"][1]
     tally.add("missed_ice", ~icy, ice & excited)

@@ -59,8 +59,8 @@ _ROW: Final[dict[str, pa.DataType]] = {
 
 
 def expression(t: Table, places: Table) -> Table:
-    """Return a table of the mean of each vehicle's values, for each piece of a link and each time
-    slot, with the mean of the variances that the vehicle reported.
+    """Return the mean of each vehicle's values, per piece of a link and slot, with the mean of the
+    variances that the vehicle reported.
 
     Args:
         t: observations.

@@ -6,6 +6,7 @@
 | 1.1 | `gripmap.version` and `gripmap.digest` in the footer |
 | 1.2 | observations: `value`; roll-up: `value_count`, `value_sum`; map: `mu` is null where only bounds are known |
 | 1.3 | observations: `esc_active`, `tcs_active`, `wiper` |
+| 1.4 | states: `p_slippery` |
 
 A minor version adds columns: older readers ignore them, newer readers read null. A major version
 changes the meaning of a column: older readers refuse the file. The digest is computed in the same
@@ -37,7 +38,7 @@ class Version(NamedTuple):
         return f"{self.major}.{self.minor}"
 
 
-VERSION: Final = Version(1, 3)
+VERSION: Final = Version(1, 4)
 OLDEST: Final = Version(1, 0)  # of a file that says none
 PREFIX: Final = "gripmap."
 KEY: Final = PREFIX + "version"

@@ -88,12 +88,8 @@ def record_erasure(folder: Path, month: str, newest: int, pseudonym: str | None 
 
 
 class ErasedData(NamedTuple):
-    """Erased data.
-
-    Attributes:
-        months: time ranges in which the data of all vehicles are erased.
-        vehicles: for each erased vehicle, the number of its pseudonym, and the time [ns] up to
-            which its data are erased.
+    """Erased data: time ranges that apply to all vehicles, and the end [ns] per pseudonym
+    number.
     """
 
     months: list[Span]

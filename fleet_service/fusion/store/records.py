@@ -148,10 +148,10 @@ class WindowRecord:
 
     Attributes:
         slot: the slot; NONE if the window is not in use.
-        head, tail: first and last entry (observation) of the window.
-        stale: 1 if the belief of the slot must be computed again from the window.
+        head, tail: first and last entry.
+        stale: 1 if the live row must be computed again.
         first: time of the first entry [ns].
-        values: number of entries that are values of friction (not only lower bounds).
+        values: number of entries that are values (not only lower bounds).
     """
 
     slot: np.int32

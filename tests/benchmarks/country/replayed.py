@@ -101,7 +101,7 @@ class Country:
         return (zone_x + zone - 1) * _REGIONS + k % _REGIONS, zone_y * _REGIONS + 2 + k // _REGIONS
 
     def list_expressions(self) -> list[str]:
-        """Return for each service the key expression of its zone, which covers its regions."""
+        """Return the regions of each service as key expressions of zones."""
         first = [sum(ZONES[:zone]) for zone in range(len(ZONES))]
         parts = [keys.chunks(int(self.region_id(k)), grid.REGION_ZOOM).split("/") for k in first]
         return ["/".join((*part[:2], "*")) for part in parts]

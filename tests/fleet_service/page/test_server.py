@@ -204,7 +204,7 @@ def test_as_many_watch_as_may_and_the_next_is_told_to_come_again(router: ZenohSe
 
 
 def ask_briefly(address: str) -> int:
-    """Open an event stream, close it at once, and return its HTTP status."""
+    """Return the status of an event stream that is closed at once."""
     connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
     connection.request("GET", "/events")
     answer = connection.getresponse()

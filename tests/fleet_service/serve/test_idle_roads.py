@@ -34,7 +34,7 @@ def test_each_vehicle_supports_alerts_in_few_areas() -> None:
 
 
 def alerts_of(vehicles: int) -> int:
-    """Return the number of alerts if `vehicles` vehicles report ice in all cells."""
+    """Return the number of alerts when this many vehicles report ice in all cells."""
     fusion = Fusion(120.0)
     alerts = Alerts(fusion, IdleRoads())
     raised = 0

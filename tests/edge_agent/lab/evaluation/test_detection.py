@@ -40,6 +40,7 @@ from edge_agent.lab.simulation.manoeuvres import jump
 from schemas.errors import InputError
 from schemas.mugrid import BINS, CENTRES
 from schemas.signals import CHANNELS, Health
+from schemas.thresholds import SLIPPERY_MU
 
 SAMPLES = 1200  # 2 s dry, 4 s of ice with a slide of 1 s, 6 s dry
 
@@ -70,6 +71,7 @@ def drive_saying(lower: float, upper: float) -> DetectionDrive:
         lower=lower * ones,
         median=lower * ones,
         upper=upper * ones,
+        slippery=float(upper < SLIPPERY_MU) * ones,
         health=np.zeros((SAMPLES, 1), np.int32),
         favoured=0.0 * ones,
         flagged=np.where(theta[..., 0] > 0.0, 0.1, np.inf).astype(np.float32),
@@ -91,6 +93,18 @@ def test_always_reporting_ice_misses_none_and_is_false_on_every_road() -> None:
     assert found.mean("coverage90.dry") == found.mean("false_grip") == 0.0
     assert found.total["false_events"] == 2.0
     assert found.seconds["seconds.ice.braking"] == [0.0]
+
+
+def test_a_front_axle_that_reaches_ice_first_is_false_by_the_mean_alone() -> None:
+    drive = drive_saying(0.05, 0.3)
+    drive.slippery[:] = 0.0
+    drive.slippery[150:400] = 1.0
+    drive.mu_wheel[150:200, :, :2] = 0.15
+    drive.mu[150:200] = 0.525
+    found = judge_drive(drive)
+    assert found.mean("false_ice") > 0.0
+    assert found.mean("false_ice.off_ice") == found.total["false_events.off_ice"] == 0.0
+    assert found.total["false_events"] == 1.0
 
 
 def test_always_reporting_grip_finds_nothing_and_is_false_grip_on_ice() -> None:

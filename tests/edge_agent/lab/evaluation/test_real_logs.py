@@ -45,13 +45,14 @@ def judge(
     values[:, [Column.MU_LOWER, Column.MU_UPPER]] = [0.4, 0.8]
     values[0, [Column.MU_LOWER, Column.MU_UPPER]] = [0.1, 1.1]
     values[:, [Column.VX, Column.VY, Column.HEALTH]] = [SPEED, 0.5, health]
+    values[:, Column.P_SLIPPERY] = slippery
     truth = {
         "vx": np.full(len(t), SPEED),
         "vy": np.full(len(t), 0.2),
         "mu": np.full(len(t), friction),
     }
     adopted = Adopted(SignalLog(t, signals, None, None, None), CAR, Diagnosis(), [])
-    return judge_estimates("log", adopted, (values, np.full(len(t), slippery)), truth, known, 2)
+    return judge_estimates("log", adopted, values, truth, known, 2)
 
 
 @pytest.mark.parametrize(("friction", "right"), [(0.6, 1.0), (0.3, 0.0), (0.9, 0.0)])

@@ -17,7 +17,7 @@ from edge_agent.lab.seeds import FIGURES
 from edge_agent.lab.tuning import objectives, study
 from schemas.numeric import FloatArray
 from schemas.signals import Health, S
-from schemas.thresholds import GRAVITY, SURFACES
+from schemas.thresholds import GRAVITY, SLIPPERY_MU, SURFACES
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +39,7 @@ def saying(batch: DriveSet, lower: float, upper: float) -> Estimates:
         upper,
     )
     output[..., Column.VX_STD : Column.MU] = 1.0
+    output[..., Column.P_SLIPPERY] = upper < SLIPPERY_MU
     return Estimates(output)
 
 
