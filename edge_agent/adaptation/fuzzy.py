@@ -23,7 +23,8 @@ LARGEST_FACTOR = 10.0
 
 @compiled
 def infer_step(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> float:
-    """Return the logarithm of the multiplier on R [nat] for a mismatch.
+    """Return the logarithm of the factor on the measurement noise R [nat] for a mismatch of the
+    innovation variance [1].
 
     It is the mean of `outputs` (5,), weighted by the memberships of the mismatch in triangular sets
     with peaks `inputs` (5,). Each triangle ends at its neighbours' peaks, so the weighted mean is
@@ -43,8 +44,8 @@ def infer_step(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> floa
 def adapted_factor(
     factor: float, actual: float, theoretical: float, inputs: FloatArray, outputs: FloatArray
 ) -> float:
-    """Return the next factor on R: factor*exp(infer_step(actual/theoretical - 1)), limited to the
-    bounds.
+    """Return the next factor on the measurement noise R: factor*exp(infer_step(actual/theoretical -
+    1)), limited to [LEAST_FACTOR, LARGEST_FACTOR].
     """
     return adapted_within(
         factor, actual, theoretical, inputs, outputs, 1.0, (LEAST_FACTOR, LARGEST_FACTOR)
@@ -61,8 +62,8 @@ def adapted_within(
     pace: float,
     bounds: tuple[float, float],
 ) -> float:
-    """Return the next factor on R like `adapted_factor`, but with other bounds, and with the step
-    of ln R multiplied by `pace`.
+    """Return the next factor on the measurement noise R like `adapted_factor`, but limited to
+    `bounds`, and with the step of ln R multiplied by `pace`.
     """
     if not theoretical > 0.0:
         return factor

@@ -35,8 +35,8 @@ LEAST_OVERLAP: Final = 0.02
 
 @dataclass(frozen=True)
 class LowerVertices:
-    """Sets of mismatch and step with free feet, given as shares of the distance between
-    neighbouring peaks.
+    """Fuzzy sets of the mismatch and of the step of ln R. Their feet are free, and given as shares
+    of the distance between neighbouring peaks.
 
     Attributes:
         feet: alternately how far set k extends towards peak k + 1, and set k + 1 towards peak k
@@ -82,14 +82,16 @@ class LowerVertices:
         return _triangle_sets(self.peaks, self.feet), _triangle_sets(self.out_peaks, self.out_feet)
 
     def step(self, mismatch: float) -> float:
-        """Return ln of the factor on R [nat] for a mismatch [1]."""
+        """Return ln of the factor on R [nat] for a mismatch of the innovation variance [1]."""
         inputs, outputs = self.triangle_sets()
         weight = _membership_weights(inputs, mismatch)
         total = float(weight.sum())
         return float(weight @ outputs.mean(axis=1)) / total if total > 0.0 else 0.0
 
     def knot_table(self, knots: int) -> tuple[FloatArray, FloatArray]:
-        """Return a table for linear interpolation: mismatches and steps, (knots,) each."""
+        """Return a table for linear interpolation of the step: mismatches [1] and steps of ln R
+        [nat], (knots,) each.
+        """
         inputs, _ = self.triangle_sets()
         corners = np.unique(np.clip(inputs.ravel(), self.peaks[0], self.peaks[-1]))
         even = np.linspace(self.peaks[0], self.peaks[-1], knots - len(corners) + 2)
@@ -103,8 +105,8 @@ class LowerVertices:
 
     @classmethod
     def from_vector(cls, vector: FloatArray) -> LowerVertices:
-        """Return the sets with the free parameters `vector` (16,). Two neighbouring sets that would
-        leave a gap are both widened.
+        """Return the sets with the free parameters `vector` (16,). Where two neighbouring sets
+        would leave a gap between them, both sets are widened.
         """
         shares = np.asarray(vector, float).copy()
         pairs = shares[:FEET].reshape(-1, 2)

@@ -18,8 +18,8 @@ consequents of rules.
     shares      ln of the share of a block's evidence on friction that is used, in the order: a
                 wheel slides (no, yes), demand (low, middle, high), forces (as before, new) [nat]
                 (12,)
-    strained    term added to `shares` where the beliefs about the car are strained, in the order: a
-                wheel slides (no, yes) [nat] (2,)
+    strained    term added to `shares` where the beliefs about the car are strained (far from their
+                prior), in the order: a wheel slides (no, yes) [nat] (2,)
 
 Each triangle ends at its neighbours' peaks. Therefore the memberships of a mismatch sum to one, and
 the sets cover the whole range.

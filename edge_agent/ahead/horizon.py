@@ -71,7 +71,9 @@ def horizon_length(speed: float) -> float:
 
 
 def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
-    """Return the horizon along a path at the time `now` [ns UTC]."""
+    """Return the horizon (the map's knowledge about each metre) along a path at the time `now` [ns
+    UTC].
+    """
     places, inverse = np.unique(path.places, return_inverse=True)
     found = known.look_up(places, now)
     inverse = inverse.reshape(path.places.shape)
@@ -124,8 +126,8 @@ def justifies_warning(found: PlaceBelief) -> BoolArray:
 
 
 def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
-    """Return the safe speed [m/s] at each metre (M,): it allows the bends, and stopping within
-    SIGHT_M, at the lower end of the friction interval.
+    """Return the safe speed [m/s] at each metre (M,). At this speed a car can take the bends and
+    stop within SIGHT_M, with friction at the lower end of its interval.
 
     Before a slower place the speed decreases with a comfortable deceleration, or with the grip that
     cornering leaves. Where nothing is measured (NaN in `mu_lower`) the result is NaN, except before

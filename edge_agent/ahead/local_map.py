@@ -35,7 +35,9 @@ SLIPPERY_BINS: Final[FloatArray] = np.clip(
 
 
 class ReceivedCells(NamedTuple):
-    """Received cells (n,); `belief` (n, 32) are probabilities on the friction grid."""
+    """Cells (n,) received from the fleet service; `belief` (n, 32) are probabilities on the
+    friction grid.
+    """
 
     key: IntArray
     belief: FloatArray
@@ -65,8 +67,8 @@ class PlaceBelief(NamedTuple):
 def belief_of(
     lower: FloatArray, mu: FloatArray, upper: FloatArray, slippery: FloatArray
 ) -> FloatArray:
-    """Return probabilities on the friction grid (n, 32) from the values of n cells; `mu` may be
-    NaN.
+    """Return probabilities on the friction grid (n, 32) for n cells, computed from the values in a
+    tile; `mu` may be NaN.
 
     `lower`, `mu` and `upper` are the 5 %, 50 % and 95 % quantiles, `slippery` is P(slippery). The
     distribution function is linear between these values.
@@ -159,7 +161,7 @@ class LocalMap:
         return news + [key for key, alert in stand.items() if self.store_alert(alert, now)]
 
     def drop_old(self, now: int) -> None:
-        """Remove cells and alerts that are too old."""
+        """Remove cells and alerts from the cache that are too old."""
         for tile in [
             tile
             for tile, cells in self._tiles.items()

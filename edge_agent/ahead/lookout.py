@@ -51,7 +51,7 @@ class _Watcher:
 
 @dataclass
 class LookoutCounts:
-    """Counters of the lookout."""
+    """Counters of the lookout: looks ahead, warnings, failures and processor time."""
 
     looks: int = 0
     warnings: int = 0
@@ -82,7 +82,7 @@ class LookoutCounts:
 
 
 class Lookout:
-    """Lookout for several vehicles, identified by name.
+    """Thread that looks ahead for several vehicles, which are identified by name.
 
     Args:
         names: the vehicles; row k of the poses is vehicle k.
@@ -119,7 +119,7 @@ class Lookout:
         self._thread.start()
 
     def attach(self, name: str, session: zenoh.Session) -> None:
-        """Use a vehicle's session, which has been opened."""
+        """Receive the map for a vehicle over its opened Zenoh session."""
         k = self._number.get(name)
         if k is not None:
             watcher = self._watchers[k]

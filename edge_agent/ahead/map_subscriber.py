@@ -35,7 +35,7 @@ _TOPIC: Final = keys.TOPICS["ahead"]
 
 
 class MapSubscriber:
-    """Map subscriber of one vehicle.
+    """Receiver of the map ahead for one vehicle: subscribes to alerts, and queries cells.
 
     Args:
         vehicle: name of the vehicle.
@@ -127,7 +127,7 @@ class MapSubscriber:
             self._map.drop_old(pose.time)
 
     def publish_view(self, payload: Callable[[], bytes]) -> None:
-        """Publish the view ahead on the vehicle's own key, if there is a subscriber."""
+        """Publish the view ahead on the vehicle's own Zenoh key, if there is a subscriber."""
         if self._publisher.matching_status.matching:  # type: ignore[attr-defined] # stub: bool
             self._publisher.put(payload())
             self.counts["told"] += 1

@@ -55,8 +55,8 @@ class RequestLog:
     def missing_boxes(self, path: Path, pose: Pose, within: float) -> list[Box]:
         """Return the boxes to request now along a path, and record them as requested.
 
-        The result is empty while the first `within` [m] of the path are covered. Otherwise the
-        boxes cover all missing parts of the path.
+        The result is empty while recently requested boxes cover the first `within` [m] of the path.
+        Otherwise the boxes cover all missing parts of the path.
         """
         latitude, longitude = to_degrees(path.x[::STEP], path.y[::STEP], pose)
         open_ = np.ones(len(latitude), np.bool_)

@@ -80,8 +80,8 @@ class _Neighbours:
         self.side = side
 
     def next_places(self, here: tuple[float, float], heading: float, cells: float) -> list[int]:
-        """Return the keys of places that may come next, the most likely first, at most one per
-        road.
+        """Return the keys of places that may follow the present place on a road, the most likely
+        first, at most one per road.
         """
         reach = cells * self.side
         found = []

@@ -86,7 +86,7 @@ class AgentPart(Protocol):
     """Interface of an additional part that uses the vehicles' Zenoh sessions."""
 
     def attach_session(self, name: str, session: zenoh.Session) -> None:
-        """Use the session of a vehicle, which has been opened."""
+        """Use the opened Zenoh session of a vehicle."""
 
     def start_part(self) -> None:
         """Start the part, before the first block."""
@@ -101,7 +101,9 @@ class AgentPart(Protocol):
 
 
 class Agent:
-    """An agent that processes the signals of its vehicles, once."""
+    """Agent for several vehicles: estimates friction from their signals, and publishes records. It
+    can run only once.
+    """
 
     def __init__(
         self, options: AgentOptions, source: AgentSource, parts: Sequence[AgentPart] = ()

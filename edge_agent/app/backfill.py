@@ -33,7 +33,7 @@ class Task(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Result of a task: samples estimated, or the reason of a failure."""
+    """Result of a task: the number of estimated samples, or the reason of a failure."""
 
     task: Task
     samples: int

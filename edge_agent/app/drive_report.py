@@ -96,8 +96,8 @@ def write_report(drive: RecordedDrive, path: Path) -> None:
 def curve_of(
     table: pa.Table, panel: Panel
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return time, value, lower and upper end of a quantity, (n,) each. The ends are NaN for a
-    quantity without interval.
+    """Return time, value, lower and upper end of the interval of a quantity, (n,) each. The ends
+    are NaN for a quantity without interval.
     """
     t, value = (table[name].to_numpy().astype(np.float64) for name in ("t", panel.column))
     if len(panel.band) == 2:
@@ -113,13 +113,15 @@ def curve_of(
 
 
 def thin_parts(count: int) -> list[slice]:
-    """Return slices that divide a curve of `count` samples into at most MOST_POINTS points."""
+    """Return slices of a curve of `count` samples. Each slice becomes one point of the plot, and
+    there are at most MOST_POINTS slices.
+    """
     step = max(1, math.ceil(count / MOST_POINTS))
     return [slice(k, min(k + step, count)) for k in range(0, count, step)]
 
 
 def page_of(drive: RecordedDrive) -> str:
-    """Return the report as an HTML page."""
+    """Return the report of a recorded drive as an HTML page."""
     plots = [_plot_of(drive, panel) for panel in PANELS]
     data: dict[str, Any] = {
         "title": drive.title,
@@ -224,7 +226,7 @@ def _least_known(values: FloatArray) -> float:
 
 
 def figure_of(drive: RecordedDrive) -> Any:  # noqa: ANN401 a figure of matplotlib, which is optional
-    """Return the report as a figure of matplotlib.
+    """Return the report of a recorded drive as a figure of matplotlib.
 
     Raises:
         InputError: matplotlib is not installed.

@@ -111,7 +111,7 @@ class KuksaProvider:
                 return
 
     def _write_one(self, publish: Any, path: str, value: Any, time_ns: int) -> bool:  # noqa: ANN401
-        """Write a value; return False if the broker is unavailable."""
+        """Write one value to the databroker; return False if the broker is unavailable."""
         messages = self._connection.messages
         point = messages.Datapoint(value=value)
         point.timestamp.seconds, point.timestamp.nanos = divmod(time_ns, NS)
@@ -135,7 +135,7 @@ class KuksaProvider:
         return True
 
     def _log_problem(self, problem: str) -> None:
-        """Log a problem when it begins, and its end."""
+        """Log a problem with the databroker when it begins and when it ends."""
         if problem and not self._problem:
             log.warning("writing to the databroker fails (%s); trying again", problem)
         elif self._problem and not problem:

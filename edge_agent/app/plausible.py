@@ -41,7 +41,7 @@ def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
 
 @dataclass
 class Plausibility:
-    """Counters over the blocks of one replay, from which the check is computed."""
+    """Counters over the blocks of one replay. The plausibility check is computed from them."""
 
     radius: float
     first: float = np.inf
@@ -87,7 +87,7 @@ class Plausibility:
         return float(np.median(away)) if len(away) else 0.0
 
     def problems(self) -> list[str]:
-        """Return one message per implausible finding."""
+        """Return one message per property that makes the estimates implausible."""
         n = max(self.samples, 1)
         found = {
             "speed differs much from that of the wheels": self.median_speed_error > FURTHEST_SPEED,

@@ -81,7 +81,9 @@ class SignalWatch:
         self._seen.update({name: now for name, here in present.items() if here})
 
     def is_missing(self, name: str) -> bool:
-        """Return True if the required signal has been missing for at least MISSING_S."""
+        """Return True if the source has not delivered the signal called `name` ("position",
+        "wheels" or "turning") for longer than MISSING_S.
+        """
         return bool(self._seen) and self._clock() - self._seen[name] > MISSING_S
 
 
@@ -130,7 +132,8 @@ def reasons_not_publishing(
 
 
 class ReasonReporter:
-    """Printer of the reasons: first within FIRST_S + EVERY_S, then whenever they change.
+    """Printer of the reasons why an agent publishes nothing. It checks first after FIRST_S, then
+    every EVERY_S, and prints reasons that differ from the last ones.
 
     Args:
         find: returns the present reasons.

@@ -40,8 +40,8 @@ log = logging.getLogger(__name__)
 
 
 class Known(BaseModel):
-    """Stored knowledge about a car: True if its signals passed the doctor, and the estimates of
-    each part of its trips.
+    """Stored knowledge about a car: `passed` (True if its signals passed the signal doctor), and in
+    `drives` the sensor errors estimated from each part of its trips.
     """
 
     model_config = ConfigDict(extra="forbid")

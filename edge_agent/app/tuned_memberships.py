@@ -23,7 +23,7 @@ Count = Annotated[int, Field(ge=1)]
 
 
 class Record(BaseModel):
-    """Base of the parts of a file; unknown field names are rejected."""
+    """Base class of the records in a file of tuned memberships; unknown field names are rejected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -74,7 +74,7 @@ class Budget(Record):
 
 
 class Provenance(Record):
-    """Parameters needed to reproduce the numbers."""
+    """Origin of the scores in a file: all parameters needed to compute these scores again."""
 
     command: str
     seed: Annotated[int, Field(ge=0)]

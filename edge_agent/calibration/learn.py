@@ -26,7 +26,7 @@ A quantity that a drive does not excite enough is left out for that drive. The s
 has two parts. The first is the median deviation between drives divided by the square root of their
 number; it is at least FLOOR, because few drives may agree by chance. The second is BIAS, the error
 common to all drives (crossfall of 2.5 %, a nonlinear steering ratio, load). Both were set on 40
-simulated cars with large errors, with other seeds than those of the published figures. The result
+simulated cars with large errors, with other seeds than those of the published results. The result
 is the posterior with the prior USUAL: a quantity with little excitation is therefore moved towards
 its usual value.
 """
@@ -189,7 +189,8 @@ def _posterior_of(
 
 
 def one_drive(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> DriveEstimates:
-    """Return the estimates of one drive by quantity, from times t (T,) [s] and signals (T, 18).
+    """Return the sensor and vehicle errors estimated from one drive, by quantity, for times t (T,)
+    [s] and signals (T, 18).
 
     Quantities without enough excitation are left out.
     """

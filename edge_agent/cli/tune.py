@@ -300,8 +300,8 @@ def print_line(line: str) -> None:
 def progress_printer(
     way: str, iterations: int, clock: Callable[[], float], write: Callable[[str], None]
 ) -> Progress:
-    """Return a function that prints one line per iteration: best, mean, elapsed and expected
-    remaining time.
+    """Return a function that prints one line per iteration of a search: best and mean value of the
+    objective, elapsed time and expected remaining time.
 
     `clock` returns the time [s].
     """

@@ -57,7 +57,7 @@ def stiffness(body: Body, load: float, mu: float, rear: bool) -> tuple[float, fl
     """Return the slip stiffness (longitudinal [N], lateral [N/rad]) of a tyre under `load` [N] on
     friction `mu`.
 
-    It depends only on the load (proportionally), unless the parameter row selects PROPORTIONAL,
+    The stiffness is proportional to the load, unless the parameter row selects PROPORTIONAL,
     QUADRATIC or REAR_SLOPE.
     """
     by_load = 1.0 + body.quadratic - body.quadratic * load * (4.0 / (body.mass * GRAVITY))

@@ -41,7 +41,9 @@ class WheelState(NamedTuple):
 def drive_wheel(
     state: WheelState, settled: float, inertia: float, radius: float, step: float
 ) -> WheelState:
-    """Return the state after `step` [s] by Euler's rule, as printed (32). `settled` is tau_u [N m]."""
+    """Return the state of a driven wheel after `step` [s] by Euler's rule, as printed in equation
+    (32) of paper 002. `settled` is tau_u, the stationary motor torque [N m].
+    """
     torque, omega, force, slope = state
     pull = SLIDING_GAIN * math.tanh(slope / SOFT_N_S) + SLIDING_RATE * slope
     return WheelState(
@@ -54,8 +56,8 @@ def drive_wheel(
 
 @compiled
 def slip_share(radius: float, omega: float, along: float) -> float:
-    """Return the weight of the tyre model's force, 1/2 + 2^(-1/|s|) (33), with the slip s of (15).
-    It is about one half at all ordinary slips.
+    """Return the weight of the tyre model's force, 1/2 + 2^(-1/|s|), by equation (33) of paper 002,
+    with the slip s of equation (15). The weight is about one half at all ordinary slips.
     """
     turning = radius * omega
     most = max(abs(turning), abs(along), 1e-3)
@@ -67,6 +69,8 @@ def slip_share(radius: float, omega: float, along: float) -> float:
 def blend_forces(
     share: FloatArray, model: FloatArray, observed: FloatArray, out: FloatArray
 ) -> None:
-    """Compute the compensated force (33): out (4,) = share*model + (1 - share)*observed."""
+    """Compute the compensated force by equation (33) of paper 002: out (4,) = share*model + (1 -
+    share)*observed.
+    """
     for wheel in range(4):
         out[wheel] = share[wheel] * model[wheel] + (1.0 - share[wheel]) * observed[wheel]

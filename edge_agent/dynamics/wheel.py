@@ -2,8 +2,7 @@
 
 Legend: T torque at the wheel, driving positive [N m], J inertia [kg m^2], omega wheel speed
 [rad/s], R radius [m], F_x longitudinal tyre force [N]: J*omega' = T - R*F_x. Torque gives the force
-with little noise. Wheel speed is used as a measurement, never as an exact input (errata, what held
-up).
+with little noise. Wheel speed is used as a measurement, never as an exact input (errata).
 """
 
 from __future__ import annotations

@@ -73,8 +73,8 @@ B_NOISE = np.array([1e-4, 0.04, 0.04])  # variances of r, a_x, a_y, with some mo
 
 
 class DriveWheelState(IntEnum):
-    """Index of a state of WCKF-A and WCKF-B; for four wheel values of A, the index of the front
-    left wheel.
+    """Index of a state of WCKF-A and WCKF-B. For a quantity that WCKF-A has per wheel, it is the
+    index of the front left wheel's value.
     """
 
     VX = 0

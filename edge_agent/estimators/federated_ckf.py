@@ -121,7 +121,8 @@ def _step_filter(memory: JointMemory, nothing: EmptyRecord, dt: float) -> bool: 
 
 @compiled
 def share_by_information(first: float, second: float) -> float:
-    """Return the information share of sub-filter 1 [1] from the traces of the two covariances.
+    """Return the information share of sub-filter 1 [1] from the traces of the covariances of both
+    sub-filters.
 
     The sub-filter with the smaller trace gets the larger share: (54) with the ratio inverted.
     """

@@ -59,7 +59,7 @@ LARGEST_FACTOR = 20.0
 
 
 class Setting(NamedTuple):
-    """Variances of the filter, its initial state, and options of the model."""
+    """Variances and initial state of the filter of paper 004, and options of its model."""
 
     process: tuple[float, ...] = (1e-6, 1e-6, 1e-3, 1e-3, 1e-6, 1e-5)  # Q per STEP_S (errata)
     start: tuple[float, ...] = (
@@ -206,7 +206,9 @@ def _step_filter(memory: FuzzyMemory, context: FuzzyContext, dt: float) -> bool:
 
 @compiled
 def _adapt_noise(memory: FuzzyMemory, context: FuzzyContext, pace: float, keep: float) -> None:
-    """Compute R of this sample (context.adapted), and the factors on R for the next sample."""
+    """Compute the measurement noise R of this sample (context.adapted), and the factors on R for
+    the next sample.
+    """
     for r in range(ROWS):
         context.adapted[r] = memory.factor[r] * context.noise[r]
         innovation = memory.track.now[r] - memory.mean[PlanarState.AX + r]

@@ -320,7 +320,7 @@ def straighten_times(t: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _still_courses(series: dict[str, Series]) -> None:
-    """Set the course of a position receiver to NaN at walking speed."""
+    """Set the course over ground of a position receiver to NaN at walking speed."""
     if "yaw" in series and GROUND in series and len(series["yaw"].t) == len(series[GROUND].t):
         yaw = series["yaw"]
         speed = series[GROUND].values

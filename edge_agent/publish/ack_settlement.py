@@ -23,7 +23,9 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Counts:
-    """Numbers of records by kind and by result."""
+    """Numbers of records by kind and by result (published, acknowledged, rejected, dropped), and of
+    late or resent batches.
+    """
 
     offered: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
     published: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))

@@ -67,7 +67,7 @@ class Batcher:
 
     @property
     def records(self) -> int:
-        """Return the number of waiting records."""
+        """Return the number of records that wait for a batch."""
         return sum(group.rows for group in self._groups.values())
 
     def add(self, records: RecordBlock, now: float) -> None:

@@ -72,7 +72,7 @@ class StoredBatch:
 
 @dataclass
 class OutboxCounts:
-    """Numbers of records by result."""
+    """Numbers of records that were stored, settled, evicted, damaged or never answered."""
 
     stored: int = 0
     settled: int = 0
@@ -262,8 +262,8 @@ class Outbox:
         return max((now - one for one in since if one is not None), default=0.0)
 
     def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
-        """Number the drafts and commit them in one transaction; if the commit fails, nothing
-        changes.
+        """Assign sequence numbers to the drafts, and commit the drafts in one transaction; if the
+        commit fails, nothing changes.
 
         Return the stored batches.
 

@@ -14,7 +14,7 @@ from schemas.wire import Kind
 
 
 class PublisherStatus:
-    """Status figures of a publisher, which may be read on any thread."""
+    """Status of a publisher (connections, delays and counts), which may be read on any thread."""
 
     def __init__(
         self,

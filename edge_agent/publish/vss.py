@@ -85,7 +85,7 @@ class RoadFrictionOutput:
         self._due = 0
 
     def attach(self, name: str, session: zenoh.Session) -> None:
-        """Use a vehicle's session, which has been opened."""
+        """Publish the friction of a vehicle over its opened Zenoh session."""
         self.publishers[name] = session.declare_publisher(
             keys.vss_key(name), encoding=ENCODING, **quality_of(_TOPIC)
         )

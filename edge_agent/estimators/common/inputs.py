@@ -90,7 +90,7 @@ def _reset_track(track: InputTrack) -> None:
 
 @compiled
 def _store_inputs(track: InputTrack) -> None:
-    """Store the inputs as those of the previous sample."""
+    """Store the inputs of this sample; the next sample uses them as the previous inputs."""
     for k in range(INPUTS):
         track.inputs_before[k] = track.inputs[k]
     for wheel in range(4):

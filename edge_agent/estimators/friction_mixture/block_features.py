@@ -79,7 +79,9 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
 
 @compiled
 def mean_or(block: BlockSums, channel: int, otherwise: float) -> float:
-    """Return the mean of the valid samples of a channel in the block, or `otherwise`."""
+    """Return the mean of the valid samples of a channel in the block, or `otherwise` if the channel
+    has no valid sample.
+    """
     return block.sums[channel] / block.counts[channel] if block.counts[channel] > 0 else otherwise
 
 
@@ -195,7 +197,8 @@ def axle_force(memory: MixtureMemory, features: BlockFeatures, axle: int) -> flo
 
 @compiled
 def _compute_side_forces(memory: MixtureMemory, features: BlockFeatures) -> None:
-    """Compute the lateral force over load with its derivatives, and the load shares, of both axles.
+    """Compute the lateral force over load of both axles, its derivatives by the leak of gravity and
+    by a_y, and each wheel's share of the axle load.
 
     The lateral force is NaN if a_y is missing.
     """
@@ -247,8 +250,8 @@ def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
 
 @compiled
 def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> None:
-    """Combine slip noise and force noise. Each enters the total-least-squares residual with half of
-    the variance.
+    """Fill `features.noise_std` and the slip noise: combine the noise of slip and force. Each of
+    the two enters the total-least-squares residual with half of its variance.
     """
     row = memory.row
     constants = design.constants
@@ -338,8 +341,8 @@ def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
 
 @compiled
 def _compute_information(constants: Constants, features: BlockFeatures) -> None:
-    """Compute informs_x and informs_y: how much [0 to 1] a wheel or axle informs the stiffness
-    states.
+    """Compute informs_x and informs_y of both axles: the share (0 to 1) with which deviations of
+    the stiffness states count in the axle's slips.
 
     At small forces the stiffness suggested by slip is only noise.
     """

@@ -1,9 +1,9 @@
 """All numbers of the friction mixture, with unit and reason: one table, and one record for the
 kernels.
 
-Figures marked (vehicle) follow from typical uncertainty of a vehicle and its sensors: mass 3 %,
+Values marked (vehicle) follow from typical uncertainty of a vehicle and its sensors: mass 3 %,
 inertia 5 %, stiffness 10 to 12 %, torque 3 %, and white noise and offsets of ordinary inertial
-sensors. Figures marked (errata) were found by measurement.
+sensors. Values marked (errata) were measured.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 """Model of short ice patches: on bridges, in shade, where water ran over the road.
 
-After a few metres without grip demand the road may be icy again, so the lower end of the interval
-falls. The median is unaffected. In the mixture the road changes only once in hundreds of metres, so
-that learned friction lasts. With the mixture alone, the lower end would fall to ice only long after
-the car has passed a patch.
+After a few metres without grip demand, the estimator lowers the lower end of the friction interval,
+because the road may be icy again. The median is unaffected. In the mixture the road changes only
+once in hundreds of metres, so that learned friction lasts. With the mixture alone, the lower end
+would fall to ice only long after the car has passed a patch.
 
 Therefore this module stores, for each ice node, the probability that the car is now on a patch.
 Within the length of a patch this probability grows to the prior of the node minus the mixture's
-weight. Evidence against ice reduces it. Only the reported lower end uses it.
+weight. Evidence against ice reduces it. Only the reported lower end uses this probability.
 """
 
 from __future__ import annotations

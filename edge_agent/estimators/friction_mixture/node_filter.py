@@ -50,7 +50,7 @@ DOUBTED = 0.05  # of distrust_noise, at the brink of it
 
 
 class NodeUpdate(NamedTuple):
-    """Result of one node's update."""
+    """Result of the measurement update of one node."""
 
     log_likelihood: float  # with the inflated R and the price of sliding [nat]
     moved: float  # change of `belief_cost` [nat]
@@ -176,9 +176,9 @@ def _by_wheel_speeds(
 ) -> None:
     """Compute the derivatives of the rows by the wheel radii and by the lag of the wheel speeds.
 
-    Each wheel's row depends on the speed of this wheel. All radii are changed at the same time,
-    because they hardly change the rows of the axles. node.force must already be computed at the
-    mean.
+    Each wheel's row depends on the speed of this wheel. One evaluation with all four radii changed
+    gives all derivatives, because the radii hardly change the rows of the axles. node.force must
+    already be computed at the mean.
     """
     row = memory.row
     mean = memory.mean[j]

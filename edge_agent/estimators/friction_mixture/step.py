@@ -66,7 +66,9 @@ def step(
 
 @compiled
 def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Finish the block with a step of the mixture, and begin the next block at the same time."""
+    """Process the block that ends: run one step of the mixture with its sums. The next block begins
+    at the time of the last sample.
+    """
     features = scratch.features
     features.duration = memory.last.time - memory.block.time
     features.speed = abs(memory.overall_mean[NodeState.VX])

@@ -98,7 +98,9 @@ def interpolate_table(table: FloatArray, place: float) -> float:
 
 @compiled
 def ratio_at(curve: TyreCurve, theta: float) -> float:
-    """Return f/theta at theta >= 0; beyond the table the force is constant."""
+    """Return f/theta (tyre force over mu*F_z, divided by normalised slip) at theta >= 0; beyond the
+    table the force is constant.
+    """
     last = curve.ratio.shape[0] - 2
     if theta >= last:
         return float(curve.ratio[last] * last / theta)

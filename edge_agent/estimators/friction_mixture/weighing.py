@@ -39,7 +39,9 @@ LEAST_DEMAND = 1e-3  # [1] below it no evidence is left
 
 @compiled
 def apply_measurement(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Update all nodes, recompute their weights, and adapt R."""
+    """Apply the block's measurements: update all nodes, recompute their weights, and adapt the
+    measurement noise R.
+    """
     update_all(memory, design, scratch)
     temper_evidence(memory, design, scratch)
     weight = memory.weight[: active_nodes(memory)]
@@ -220,7 +222,9 @@ def axle_slip(row: FloatArray, features: BlockFeatures, vx: float, vy: float, ax
 
 @compiled
 def adapt_noise(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Update the windowed innovation variances, and the factors on R for the next block."""
+    """Update the windowed innovation variances, and the factors on the measurement noise R for the
+    next block.
+    """
     keep = math.exp(-scratch.features.duration / design.constants.window)
     for group in range(2):
         if scratch.theoretical_sum[group] > 0.0:

@@ -104,7 +104,9 @@ class SubFilter(NamedTuple):
 
 
 def set_motion(filters: RecordArray, setting: MotionSetting) -> None:
-    """Write the setting into the filter records; call this once, before the first sample."""
+    """Write the setting of the motion filter into the filter records; call this once, before the
+    first sample.
+    """
     motion = filters["motion"]
     # of the rounded squares: the square roots are those of before, bit for bit, where nothing is
     # set

@@ -26,7 +26,7 @@ LEAST_SHARE: Final = 0.01  # of the information of a sub-filter
 
 
 class FederatedSetting(NamedTuple):
-    """Variances and initial friction of the filter, and its tyre option."""
+    """Variances, initial friction and tyre option of the friction filter of paper 000."""
 
     process: float = 1.0  # Q of each friction per sample
     start: float = 1.0  # P_0
@@ -41,7 +41,9 @@ AS_PRINTED: Final = FederatedSetting()
 
 
 def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:
-    """Run the filter over a drive; return the friction of the four wheels at each sample."""
+    """Run the friction filter over a drive; return the friction of the four wheels at each sample,
+    (T, 4).
+    """
     forces = WheelForces.for_drive(given, proportional=setting.proportional, single=False)
     given_x = given.wheel_forces()
     signals = given.signals

@@ -1,4 +1,4 @@
-"""Tyre forces at one sample for many values of friction at the same time, in double or single
+"""Tyre forces at one sample, computed in one call for many values of friction, in double or single
 precision.
 
 Legend: s_x, s_y longitudinal and lateral slip; k_x, k_y slip stiffness over load [1]; f Dugoff's

@@ -35,7 +35,7 @@ STATES: Final = 4
 
 
 class UnscentedSetting(NamedTuple):
-    """Variances and options of the filter."""
+    """Variances and options of the friction filter of paper 003."""
 
     alpha: float = 0.001
     beta: float = 2.0
@@ -144,7 +144,8 @@ def _root_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _square_root_step(
     model: _Model, k: int, mean: FloatArray, covariance: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
-    """Run one step in square-root form; `covariance` is returned unchanged.
+    """Run one step in square-root form. This form does not use `covariance`, and returns the
+    argument as it is.
 
     Return (mean, covariance, root, False); False states that no Cholesky factor was missing.
     """
@@ -177,7 +178,7 @@ def _cholesky_or_last(covariance: FloatArray, last: FloatArray) -> tuple[FloatAr
 def _covariance_step(
     model: _Model, k: int, mean: FloatArray, covariance: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
-    """Run one step of the textbook filter.
+    """Run one step of the filter in covariance form, as in textbooks.
 
     Return (mean, covariance, root, True if a Cholesky factor was missing).
     """

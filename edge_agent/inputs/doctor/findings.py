@@ -71,7 +71,7 @@ CHANNELS_OF: Final = {"ax": "ax", "ay": "ay", "r": "yaw_rate", "delta": "delta",
 def diagnose(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None
 ) -> Diagnosis:
-    """Examine a log and return the diagnosis.
+    """Examine a signal log for faults, and return the diagnosis.
 
     Args:
         t: times (T,) [s].
@@ -403,8 +403,8 @@ def _compare_axles(drive: EvenDrive) -> list[Finding]:
 
 
 def _find_offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
-    """Return findings about constant errors that exceed the largest usual one by SURE standard
-    deviations.
+    """Return findings about constant sensor errors that exceed the largest usual error by SURE
+    standard deviations.
     """
     moving = drive.moving > 0
     lateral = found["lateral"]

@@ -290,8 +290,8 @@ def _fit_with_priors(
 
 
 def _gains_of_parts(x: FloatArray, y: FloatArray, excited: BoolArray) -> tuple[float, ...]:
-    """Return the gain in each of PARTS consecutive parts of the excited time. Parts that are too
-    short are left out.
+    """Return the gain of an identity in each of PARTS consecutive parts of the excited time. Parts
+    that are too short are left out.
     """
     rows = np.flatnonzero(excited)
     found = []
@@ -311,7 +311,7 @@ def _median_ratio(x: FloatArray, y: FloatArray) -> float:
 
 def fit_robustly(table: FloatArray, y: FloatArray) -> FloatArray:
     """Return the least-squares solution of table · x = y, fitted twice. The second fit leaves out
-    points that are more than three robust standard deviations off.
+    points whose residual in the first fit exceeds three robust standard deviations.
     """
     solution = np.linalg.lstsq(table, y, rcond=None)[0]
     off = np.abs(y - table @ solution)

@@ -31,7 +31,7 @@ COMPASS: Final[dict[str, Callable[[FloatArray], FloatArray]]] = {
 
 
 def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
-    """Return the findings about the yaw angle."""
+    """Return the faults found in the yaw angle."""
     findings = []
     if np.isfinite(signals[:, S.LATITUDE]).sum() < 10:
         return []

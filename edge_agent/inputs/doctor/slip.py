@@ -173,7 +173,7 @@ def spread_of_parts(beside: FloatArray) -> float:
 
 
 def is_steady(fit: Fit) -> bool:
-    """Return True if most parts of the drive have the gain of the whole drive."""
+    """Return True if the gain in most parts of the drive equals the gain over the whole drive."""
     return share_of_parts(fit, fit.gain) >= STEADY_SHARE
 
 

@@ -174,7 +174,7 @@ class Feed(ABC):
             self.stopping.wait(RETRY_S)
 
     def say(self, reason: str) -> None:
-        """Log a reason, but each different reason only once."""
+        """Log the reason of a problem with the source; each different reason is logged only once."""
         if reason not in self._reasons and len(self._reasons) < 50:
             self._reasons.add(reason)
             log.warning("%s: %s", self.name, reason)

@@ -55,8 +55,9 @@ class FilterTrace:
 
 
 def entry_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
-    """Return the figures over all towns: ratios of errors and delays with over without the map, and
-    the largest change of a published value.
+    """Return the figures over all towns: the error at the entry of a cell and the delay caused by a
+    wrong map, each as the ratio with the map to without it, and the largest change of a published
+    value.
     """
     errors: list[FloatArray] = []
     delays: dict[str, list[tuple[float, float]]] = {"dry": [], "ice": []}
@@ -145,8 +146,8 @@ def arrival_times(
     """Return pairs of times [s] with and without the map, one pair per stretch where the map is
     wrong.
 
-    A time is that from entry until |μ - truth| <= ARRIVED; if this is never reached, the time spent
-    on the stretch.
+    A time is counted from the entry of the stretch until the estimate differs by at most ARRIVED
+    from the true friction; if it never does, the time spent on the stretch counts.
     """
     differ = _maps_differ(trace.place, wrong, right, now)
     with_prior = with_map(trace, wrong, now)

@@ -64,8 +64,8 @@ def open_router() -> Iterator[ZenohSettings]:
 
 
 def latency_figures(seed: int, alerts: int, vehicles: int = VEHICLES) -> list[Figure]:
-    """Return figures: quantiles of the time from publication to warning, and the share of processor
-    time that looking ahead takes.
+    """Return the quantiles of the time from the publication of an alert to the warning, and the
+    share of processor time that looking ahead takes, as figures.
     """
     waited, share, lost = measure_alerts(np.random.default_rng(seed), alerts, vehicles)
     return [

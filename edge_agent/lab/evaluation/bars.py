@@ -34,8 +34,8 @@ class EstimatorBar(NamedTuple):
 
 
 def mean_of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[Results], float]:
-    """Return a function that reads a measure from the results: its mean over all seeds, with
-    ordinary sensors.
+    """Return a function that reads a measure from the results of the campaign: its mean over all
+    seeds, with ordinary sensors.
     """
 
     def read_mean(results: Results) -> float:
@@ -59,20 +59,20 @@ def in_the_world(name: str) -> Callable[[Results], float]:
 
 
 def worth_of(name: str) -> Callable[[Results], float]:
-    """Return a function that reads a ratio of interval scores: with over without fuzzy sets, or
-    tuned by the ant colony over untuned or tuned by random search.
+    """Return a function that reads the ratio of two interval scores of friction, called `name`: for
+    example the score with fuzzy sets divided by the score without fuzzy sets.
     """
     return lambda results: worth.ratio(results.worth, name)
 
 
 def mean(values: FloatArray | None) -> float:
-    """Return the mean of the values; NaN if there are no values."""
+    """Return the mean of the values of a measure; NaN if there are no values."""
     return math.nan if values is None or not len(values) else float(np.mean(values))
 
 
 def false_per_hour(results: Results) -> float:
-    """Return the number of false changes per hour of the default estimator, in scenarios with
-    constant friction.
+    """Return how often per hour the friction estimate of the default estimator changes falsely, in
+    scenarios with constant friction.
     """
     counted = [m for (_, name), m in results.real.items() if name == DEFAULT and "hours" in m]
     hours = sum(float(m["hours"].sum()) for m in counted)
@@ -80,7 +80,9 @@ def false_per_hour(results: Results) -> float:
 
 
 def both_stops(results: Results) -> float:
-    """Return the mean coverage of two braking manoeuvres with ABS, on dry road and on snow."""
+    """Return the mean coverage of the friction interval over two braking manoeuvres with ABS, on
+    dry road and on snow.
+    """
     return 0.5 * (
         mean_of("default.abs.dry", "coverage90")(results)
         + mean_of("default.abs.snow", "coverage90")(results)
@@ -88,15 +90,15 @@ def both_stops(results: Results) -> float:
 
 
 def on_foreign_tyres(results: Results) -> float:
-    """Return the mean coverage of the default estimator over all scenarios with tyres that the
-    filter does not model.
+    """Return the mean coverage of the default estimator's friction interval over all scenarios with
+    tyres that the filter does not model.
     """
     return mean(np.concatenate(list(results.foreign.values()))) if results.foreign else math.nan
 
 
 def width_ratio(results: Results) -> float:
-    """Return the interval width of the default estimator over the prior's width, when driving
-    straight at constant speed.
+    """Return the width of the default estimator's friction interval divided by the prior's width,
+    when driving straight at constant speed.
     """
     return mean_of("default.straight", "width")(results) / PRIOR_WIDTH
 
@@ -210,8 +212,8 @@ def unit_of(measure: str) -> str:
 
 
 def figures(results: Results, *, quick: bool) -> list[Figure]:
-    """Return all figures: first those with targets (with `quick`, only the measured ones), then
-    `KIND.SCENARIO.ESTIMATOR.MEASURE` with its standard deviation.
+    """Return all figures of the evaluation: first those with targets (with `quick`, only the
+    measured ones), then `KIND.SCENARIO.ESTIMATOR.MEASURE` with its standard deviation.
     """
     barred = [Figure(bar.name, bar.read(results), bar.unit, bar.bar, bar.better) for bar in BARS]
     listed = [figure for figure in barred if not (quick and math.isnan(figure.value))]

@@ -1,5 +1,5 @@
-"""Evaluation of the calibration with simulated inaccurate cars (ROUGH_FLEET): its errors against
-the truth, and its benefit.
+"""Evaluation of the calibration with simulated inaccurate cars (ROUGH_FLEET): the errors of the
+learned quantities, and the benefit.
 
 Errors are divided by the standard deviations that the calibration states. The benefit is a narrower
 interval of friction.
@@ -125,8 +125,8 @@ def _drive_fleet(fleet: SimulatedFleet, seconds: int) -> tuple[FloatArray, Float
 
 
 def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
-    """Return figures: the ratio of interval widths with over without calibration, and the coverage
-    in both cases.
+    """Return the width of the friction interval with calibration, its ratio to the width without
+    calibration, and the coverage in both cases, as figures.
     """
     groups = [
         learn_and_narrow(min(CARS_AT_ONCE, cars - k), seed + k, judged_s)
@@ -144,8 +144,8 @@ def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
 
 
 def figures(cars: int, seed: int) -> list[Figure]:
-    """Return the RMS over cars of (learned − true) / standard deviation, by quantity. The four
-    radii count as one quantity.
+    """Return the RMS over cars of (learned − true value) / stated standard deviation, by quantity.
+    The four radii count as one quantity.
     """
     away: dict[str, list[float]] = {}
     for first in range(0, cars, CARS_AT_ONCE):

@@ -72,8 +72,8 @@ Stretches: TypeAlias = list[tuple[int, int]]
 
 @dataclass
 class DetectionTally:
-    """Sums for one town or several: sums and counts of values by name (for means), and lists of
-    times [s] by name.
+    """Sums of the detection evaluation for one or several towns: sums and counts of values by name
+    (for means), and lists of times [s] by name.
     """
 
     total: dict[str, float] = field(default_factory=dict)
@@ -153,8 +153,8 @@ def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
 
 
 def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTally:
-    """Return the tally of one town. With `oracle`, excited visits to ice are also evaluated by an
-    oracle.
+    """Evaluate the drives of one town, and return their tally. With `oracle`, an oracle also
+    evaluates the excited visits to ice.
     """
     tally = DetectionTally()
     _judge_samples(tally, drive)
@@ -251,8 +251,8 @@ def _add_seconds(tally: DetectionTally, key: str, activity: str, wait: float) ->
 
 
 def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
-    """Evaluate slides on slippery road: does the estimator report slippery road until at most
-    TOLD_AFTER_S after the slide?
+    """Count the slides of car n on slippery road that the estimator reports as slippery, at the
+    latest TOLD_AFTER_S after the slide.
     """
     beyond = drive.theta[:, n] > SLIDING
     for first, end in slides_of(drive.theta[:, n], TOLD_SLIDE_S):
@@ -268,8 +268,8 @@ def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
 def _judge_contradictions(
     tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches
 ) -> None:
-    """Count the onsets of CONTRADICTION during slides on slippery road and elsewhere, and the
-    seconds of each without it.
+    """Count the onsets of the health flag CONTRADICTION during slides on slippery road and
+    elsewhere, and in both cases the time [s] without this flag.
     """
     sliding = np.zeros(len(drive.mu), np.bool_)
     extended = np.zeros(len(drive.mu), np.bool_)

@@ -151,8 +151,8 @@ def apply_fault(batch: DriveSet, case: Case) -> DriveSet:
 
 
 def case_measures(batch: DriveSet, reported: Estimates, case: Case) -> dict[str, FloatArray]:
-    """Return the measures of a case, per drive: `finite` and `told` (1 or 0), coverage and width
-    from BEGINS on, and RMSE.
+    """Return the measures of a fault case, per drive: `finite` and `told` (1 or 0), and from BEGINS
+    on coverage and width of the friction interval, and RMSE of v_x and v_y.
     """
     after = batch.t[:, 0] >= BEGINS
     whole = np.isfinite(reported.values).all(axis=-1)

@@ -67,7 +67,9 @@ HEAD: Final = (
 
 @dataclass(frozen=True)
 class LogFigures:
-    """Figures of one log; NaN where the log does not determine a figure."""
+    """Figures about the estimates of one log, as listed in the module's docstring; NaN where the
+    log does not determine a figure.
+    """
 
     name: str
     seconds: float
@@ -169,7 +171,7 @@ def judge_estimates(
     known: float | None,
     urgent: int | None,
 ) -> LogFigures:
-    """Return the figures of one log from its estimates (T, columns) and the true values."""
+    """Return the evaluation figures of one log from its estimates (T, columns) and the true values."""
     t = adopted.log.t
     signals = adopted.log.signals
     wheels = np.where(
@@ -248,8 +250,8 @@ def root_mean_square(error: FloatArray, among: BoolArray) -> float:
 
 
 def summarise(found: Sequence[LogFigures]) -> list[Figure]:
-    """Return the figures over all logs: means weighted by time, and the worst log where even one
-    bad log matters.
+    """Return the evaluation figures over all logs: means weighted by time, and the worst log where
+    even one bad log matters.
     """
     seconds = np.array([log.seconds for log in found])
 
@@ -277,7 +279,7 @@ def summarise(found: Sequence[LogFigures]) -> list[Figure]:
 
 
 def table_row(log: LogFigures) -> str:
-    """Return the figures of one log as a row of a Markdown table."""
+    """Return the evaluation figures of one log as a row of a Markdown table."""
     cells = [
         f"{value:.3g}" if math.isfinite(value) else "–"
         for value in (asdict(log)[name] for name in HEAD)
@@ -289,7 +291,7 @@ def table_row(log: LogFigures) -> str:
 
 
 def table(found: Sequence[LogFigures]) -> str:
-    """Return all logs as a Markdown table."""
+    """Return the evaluation figures of all logs as a Markdown table."""
     head = ["log", "seconds", "doctor passed", *(name.replace("_", " ") for name in HEAD)]
     rows = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}", *(table_row(log) for log in found)]
     return "\n".join(rows)

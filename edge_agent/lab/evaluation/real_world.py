@@ -138,7 +138,7 @@ def in_use(batch: DriveSet) -> FloatArray:
 
 
 def recent_maximum(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDOW_S) -> FloatArray:
-    """Return, for each sample, the largest value within the last `seconds`, (T, N)."""
+    """Return, for each sample, the largest value of `used` within the last `seconds`, (T, N)."""
     samples = round(seconds * RATE_HZ)
     padded = np.concatenate([np.zeros((samples - 1, used.shape[1])), used])
     return np.asarray(
@@ -147,8 +147,8 @@ def recent_maximum(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDO
 
 
 def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
-    """Return the interval score: width plus MISS times the distance of the truth from the interval.
-    It rewards narrow intervals that contain the truth.
+    """Return the interval score: width of the interval plus MISS times its distance from the true
+    value. The score rewards narrow intervals that contain the true value.
     """
     return np.asarray(
         upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0))
@@ -235,8 +235,8 @@ def fastest(estimator: str, batches: Sequence[DriveSet]) -> float:
 
 @dataclass
 class RealWorldResults:
-    """Figures by estimator and name, with "baseline" (the wheels' speed, the prior's interval) as
-    one of the estimators; and a drive to plot.
+    """Evaluation figures by estimator and name, with "baseline" (the wheels' speed, the prior's
+    interval) as one of the estimators; and a drive to plot.
     """
 
     found: dict[str, dict[str, float]]

@@ -67,8 +67,8 @@ def _rank_of_truth(
 
 
 def on_the_grid(truth: FloatArray, log_likelihood: FloatArray) -> FloatArray:
-    """Return the probability (N,) that posteriors with log-likelihoods (N, 32) and a uniform prior
-    assign to friction below the truth (N,).
+    """Return the probability (N,) of friction below the true value `truth` (N,), according to
+    posteriors with log-likelihoods (N, 32) and a uniform prior.
     """
     weight = np.exp(log_likelihood)
     below = np.cumsum(weight / weight.sum(axis=1, keepdims=True), axis=1)
@@ -80,8 +80,8 @@ def on_the_grid(truth: FloatArray, log_likelihood: FloatArray) -> FloatArray:
 def between_quantiles(
     truth: FloatArray, lower: FloatArray, mu: FloatArray, upper: FloatArray
 ) -> FloatArray:
-    """Return the probability (N,) below the truth for Gaussians with these 5, 50 and 95 %
-    quantiles.
+    """Return the probability (N,) of friction below the true value `truth`, for Gaussians with
+    these 5, 50 and 95 % quantiles.
 
     One of the outer quantiles may be clipped. An interval as wide as the prior's counts as uniform.
     """
@@ -93,5 +93,7 @@ def between_quantiles(
 
 
 def shares(ranks: FloatArray) -> FloatArray:
-    """Return the share of ranks at or below each of LEVELS, (L,)."""
+    """Return, for each of LEVELS, the share of drives and times at which the rank of the true
+    friction is at or below the level, (L,).
+    """
     return np.asarray((ranks.ravel()[:, None] <= np.array(LEVELS)).mean(axis=0))

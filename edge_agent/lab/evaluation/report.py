@@ -277,7 +277,9 @@ def faults(values: dict[str, float]) -> str:
 
 
 def verdict(shares: Sequence[float]) -> str:
-    """Return "yes" if all shares are 1, else "NO" with the smallest share; a dash without shares."""
+    """Return "yes" if all shares (of drives that passed a check) are 1, else "NO" with the smallest
+    share; a dash without shares.
+    """
     return "–" if not shares else "yes" if min(shares) == 1.0 else f"NO ({min(shares):.2g})"
 
 

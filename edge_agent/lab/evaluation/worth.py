@@ -71,7 +71,7 @@ def campaign(
     quick: bool,
     log_line: Callable[[str], None] = lambda _line: None,
 ) -> Scores:
-    """Return the interval scores by filter variant and surface, one number per seed."""
+    """Return the interval scores of friction by filter variant and surface, one number per seed."""
     cars, seconds, count = (2, 5.0, 1) if quick else (CARS, TOWN_S, SEEDS)
     chosen = [seeds[0]] if quick else list(seeds[:count])
     found = ways()
@@ -170,8 +170,8 @@ def ratio(scores: Scores, name: str) -> float:
 
 
 def figures(scores: Scores) -> list[Figure]:
-    """Return figures: the standard deviation of each ratio, the paired differences and the ratios
-    per surface, then every score.
+    """Return the figures of the comparison: standard deviations of the ratios, paired differences
+    of the scores, ratios per surface, and every interval score.
     """
     listed = []
     for name, (over, under) in RATIOS.items():
@@ -200,7 +200,7 @@ def figures(scores: Scores) -> list[Figure]:
 
 
 def barred_figures(scores: Scores) -> list[Figure]:
-    """Return the ratios with their targets first, then all other figures."""
+    """Return the figures of the comparison: first the ratios, which have targets, then all others."""
     barred = [Figure(name, ratio(scores, name), "1", bar, "less") for name, bar in BARS.items()]
     plain = [
         Figure(name, ratio(scores, name), "1")
@@ -211,7 +211,9 @@ def barred_figures(scores: Scores) -> list[Figure]:
 
 
 def comparison_table(values: dict[str, float]) -> str:
-    """Return the ratios as a Markdown table, from the values of the figures by name."""
+    """Return the ratios of the interval scores as a Markdown table, from the values of the figures
+    by name.
+    """
     lines = [
         "| figure | compares | ratio | paired difference ± standard error | share of seeds better |",
         "|---|---|---|---|---|",

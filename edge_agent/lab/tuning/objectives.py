@@ -12,7 +12,8 @@ Inflating R does not improve them, in contrast to paper 004's equation 33 (varia
 errors against the truth. IS is the score of Gneiting and Raftery (JASA 2007). The innovations need
 no true friction. However, they look only one update ahead and do not show persistent errors: R
 shrinks to white noise, and friction intervals become too narrow. Therefore the objective
-`predictive` adds a cost for the deviation of NIS from its expectation. README has figures.
+`predictive` adds a cost for the deviation of NIS from its expectation. README.md, section
+"Choices", explains the default objective.
 
 The simulated cars are inaccurate: misaligned sensors, slopes, clock delays, and in towns half of
 the cars have no torque. The drives of a search and the held-out drives share no seed, no vehicle

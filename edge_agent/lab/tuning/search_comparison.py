@@ -142,7 +142,7 @@ def _mean(name: str, values: Sequence[float]) -> list[Figure]:
 
 
 def comparison_markdown(figures: Sequence[Figure]) -> str:
-    """Return the report as Markdown, from the figures only."""
+    """Return the report of the comparison as Markdown, from the figures only."""
     return (
         "# Search methods with equal budgets on the filter of paper 004\n\n"
         "Mean log-likelihood of the innovations [nat/s] ± standard error over seeds; more is "

@@ -213,7 +213,9 @@ def search(
     seed: int,
     progress: Progress | None = None,
 ) -> Result:
-    """Search for the best vertices with one of WAYS. Every search starts at the untuned vertices."""
+    """Search for the best vertices by a method of WAYS. Every search starts at the untuned
+    vertices.
+    """
     return WAYS[way](
         Problem(
             objective_on(drives),

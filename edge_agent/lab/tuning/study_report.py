@@ -57,14 +57,16 @@ class Study:
     found: dict[str, list[Result]] = field(default_factory=dict)
 
     def memberships(self, way: str) -> list[Memberships]:
-        """Return the memberships found by each search of a kind, or the given memberships."""
+        """Return the memberships found by each search of the kind `way`. For a kind of GIVEN, which
+        is not searched, return its only memberships.
+        """
         if way in GIVEN:
             return [GIVEN[way]]
         return [memberships_of(result.best) for result in self.found[way]]
 
     def best(self, way: str) -> Memberships:
-        """Return the memberships of the search with the best objective on the drives of the search,
-        or the given memberships.
+        """Return the memberships of that search of the kind `way` which has the best objective on
+        the drives of the search. For a kind of GIVEN, return its only memberships.
         """
         if way in GIVEN:
             return GIVEN[way]
@@ -100,8 +102,8 @@ def run(
 
 
 def figures(done: Study) -> list[Figure]:
-    """Return figures per kind of search: the scores under each condition on held-out drives, the
-    objective on both sets of drives, and the progress of the searches.
+    """Return the figures of the study per kind of search: the scores under each condition on
+    held-out drives, the objective on both sets of drives, and the progress of the searches.
     """
     listed = []
     overalls: dict[str, list[float]] = {}
@@ -174,8 +176,9 @@ def markdown(listed: Sequence[Figure]) -> str:
 
 
 def scores(done: Study, way: str) -> dict[str, Score]:
-    """Return the scores of a kind of search for the file of tuned memberships: over all conditions,
-    on both sets of drives.
+    """Return the scores that the file of tuned memberships states: those of the best memberships of
+    a kind of search, averaged over all conditions of R, for the search drives and the held-out
+    drives.
     """
     found = {}
     for drives, recorded in (("train", done.train), ("held_out", done.held_out)):
@@ -191,8 +194,8 @@ def scores(done: Study, way: str) -> dict[str, Score]:
 
 
 def draw(listed: Sequence[Figure], per_iteration: int, path: Path) -> None:
-    """Plot the best value so far over the number of evaluations: mean and one standard deviation
-    over the searches.
+    """Plot the best objective found so far over the number of evaluations: mean and one standard
+    deviation over the searches.
     """
     import matplotlib as mpl
 

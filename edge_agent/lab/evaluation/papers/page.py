@@ -37,8 +37,8 @@ def number(value: float) -> str:
 
 
 def cells(row: PaperRow) -> list[str]:
-    """Return the cells of a row as text: printed, matched, own plant, realistic sensors, default
-    estimator.
+    """Return the cells of a row as text: printed number, matched conditions, own vehicle model,
+    realistic sensors, default estimator.
     """
     shown = row.shown or number(row.printed)
     return [shown, *(number(value) for value in (row.matched, row.own, row.realistic, row.default))]
