@@ -156,7 +156,7 @@ def stop_words(text: str) -> list[str]:
 
 
 def measure_package(package: str) -> dict[str, float]:
-    """Return the figures of a package; less is better for each.
+    """Return the language figures of a package; less is better for each.
 
     Keys: `openings` (docstrings that begin with What, Who, Whether, Of or How), `stop_words` (in
     docstrings), `free_relatives` (per 1,000 docstring words), `user_texts` (stop words and free
@@ -242,8 +242,8 @@ def markdown_words() -> int:
 
 
 def measure_pages() -> dict[str, dict[str, float]]:
-    """Return the figures of each page with a fault, and under the key "*" the number of words of
-    all pages.
+    """Return the numbers of long sentences and stop words, by page with at least one of them; under
+    the key "*" the number of words of all pages.
     """
     found: dict[str, dict[str, float]] = {"*": {"words": float(markdown_words())}}
     for page in list_pages():
@@ -259,8 +259,8 @@ def measure_pages() -> dict[str, dict[str, float]]:
 
 
 def read_ceilings() -> dict[str, dict[str, dict[str, float]]]:
-    """Return the ceilings, indexed by `packages` or `pages`, then by package or page, then by
-    figure.
+    """Return the ceilings (upper limits) of the language figures, indexed by `packages` or `pages`,
+    then by package or page, then by figure.
     """
     found: dict[str, dict[str, dict[str, float]]] = json.loads(CEILINGS.read_text(encoding="utf-8"))
     return found

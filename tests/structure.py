@@ -372,7 +372,7 @@ def _per_1000_lines(count: int, root: Path) -> float:
 
 
 class Figure(NamedTuple):
-    """Row of the table of figures.
+    """Figure about the code's structure, with its limits; one row of the printed table.
 
     Attributes:
         name: name of the figure.

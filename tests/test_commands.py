@@ -338,14 +338,18 @@ def test_missing_package_is_one_line_with_its_extra(capsys: pytest.CaptureFixtur
     ],
 )
 def test_demo_and_plain_commands_load_without_optional_packages(modules: str) -> None:
-    """The extras `demo` and `page` do not install SciPy or matplotlib."""
+    """The demo and the plain commands must load without SciPy, matplotlib and Ibis, which the
+    extras `demo` and `page` do not install.
+    """
     hidden = "import sys; sys.modules.update(dict.fromkeys(('scipy', 'matplotlib', 'ibis')))"
     command = [sys.executable, "-c", f"{hidden}; import {modules}"]
     subprocess.run(command, check=True, capture_output=True)
 
 
 def test_demo_extra_brings_what_its_processes_need(tmp_path: Path) -> None:
-    """The demo's service serves metrics; a process that cannot start gives its reason."""
+    """The extra `demo` must install the packages for the demo's metrics and page. If a process
+    cannot start, the error must contain the reason that the process printed.
+    """
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     names = {re.split(r"[<>=]", one)[0] for one in extras["optional-dependencies"]["demo"]}
     assert {"prometheus-client", "starlette", "uvicorn"} <= names

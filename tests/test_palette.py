@@ -19,7 +19,9 @@ LEAST = 10.0  # CIEDE2000; 2.3 is just noticed side by side
 
 
 def test_the_difference_is_the_published_one() -> None:
-    """Check pairs 1, 13 and 21 of table 1 of Sharma, Wu and Dalal (2005)."""
+    """The computed differences must equal those published for pairs 1, 13 and 21 in table 1 of
+    Sharma, Wu and Dalal (2005).
+    """
     pairs = [
         ((50.0, 2.6772, -79.7751), (50.0, 0.0, -82.7485), 2.0425),
         ((50.0, 2.5, 0.0), (56.0, -27.0, -3.0), 31.9030),
@@ -67,8 +69,8 @@ def test_the_lines_of_the_estimators_are_told_apart(sight: str) -> None:
 
 
 def test_the_old_scale_fails() -> None:
-    """In the former palette (red to green), dry and snow had the same olive colour for
-    deuteranopes.
+    """The former palette (red to green) must fail the check of distances: for deuteranopes its dry
+    and snow had the same olive colour.
     """
     snow = to_lab("#b8831b", "deuteranopia")
     dry = to_lab("#1bb83e", "deuteranopia")

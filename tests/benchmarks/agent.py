@@ -44,8 +44,8 @@ LOG_S = 60.0
 
 
 def agent() -> list[Figure]:
-    """Measure the edge agent's processes: start, a vehicle's share of a core, vehicles per core,
-    and replay with two jobs.
+    """Measure the edge agent's processes: start time, processor share of one vehicle, vehicles per
+    core, and replay with two jobs.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -96,7 +96,8 @@ def measure_usage(folder: Path, endpoint: str, *words: str) -> tuple[float, floa
     """Return processor time [s] and resident memory [MB] of a command of the edge agent.
 
     Raises:
-        ArithmeticError: the command left reports unacknowledged, so its figures would be too good.
+        ArithmeticError: the command left reports unacknowledged, so the measured cost would be too
+            low.
     """
     config = folder / "agent.json"
     config.write_text(

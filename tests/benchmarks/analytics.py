@@ -92,7 +92,7 @@ def write_stations(folder: Path) -> Path:
 
 
 def measure_archive(root: Path, rows: int) -> list[Figure]:
-    """Measure rows per second of compaction, and bytes per observation."""
+    """Measure rows per second of compaction, and bytes per observation in the compacted archive."""
     print_progress(f"writing {rows:,} observations")
     synthetic.write_archive(root, SyntheticFleet(rows, DAYS))
     inbox = size_of(segments.list_segments(root, Kind.OBSERVATION))
@@ -115,7 +115,7 @@ def measure_archive(root: Path, rows: int) -> list[Figure]:
 
 
 def _ask_question(name: str, root: Path, options: Options) -> pa.Table:
-    """Answer a question with a new query engine."""
+    """Answer a question about the archive with a new query engine."""
     return QUESTIONS[name].ask(QueryEngine("duckdb", root, PART), options)
 
 
@@ -250,7 +250,7 @@ def open_folder() -> Iterator[Path]:
 
 
 def main() -> int:
-    """Measure everything. Return 1 if a figure misses its target, otherwise 0."""
+    """Measure archive and analytics. Return 1 if a figure misses its target, otherwise 0."""
     parser = argparse.ArgumentParser(
         prog="make analytics-bench", description=(__doc__ or "").splitlines()[0]
     )

@@ -18,7 +18,7 @@ FOLDER: Final = ROOT / ".batch"
 
 
 def measure_all(folder: Path) -> list[Figure]:
-    """Return all figures. Temporary files go into `folder`."""
+    """Measure the batch work, and return all figures. Temporary files go into `folder`."""
     logs = spread.simulate_drives(folder / "drives")
     return [
         Figure(
@@ -38,7 +38,7 @@ def measure_all(folder: Path) -> list[Figure]:
 
 
 def main() -> int:
-    """Measure everything. Return 1 if a figure misses its target, otherwise 0."""
+    """Measure the batch work. Return 1 if a figure misses its target, otherwise 0."""
     FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         rows = measure_all(Path(folder))

@@ -342,7 +342,7 @@ def colour_distance() -> float:
 
 
 def measure_all() -> list[Figure]:
-    """Return all figures in the order of the printed table."""
+    """Measure the page, and return all figures in the order of the printed table."""
     with open_stage(SEED) as on:
         found = _time_part("drawn", lambda: measure_drawing(on))
         found["push_p95_ms"] = _time_part("pushed", lambda: pushed_ms(on))
@@ -378,9 +378,7 @@ def _time_part(what: str, measure: Callable[[], T]) -> T:
 
 
 def main() -> int:
-    """Measure everything and write the figures. Return 1 if a figure misses its target, otherwise
-    0.
-    """
+    """Measure the page and write the figures. Return 1 if a figure misses its target, otherwise 0."""
     began = time.time_ns()
     rows = measure_all()
     OUT.mkdir(exist_ok=True)

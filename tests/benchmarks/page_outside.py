@@ -234,7 +234,9 @@ def measured_cells(table: pa.Table) -> set[int]:
 
 
 def can_open(reader: str, address: str) -> bool:
-    """Return True if a program reads all features, and lower bounds without a value of μ."""
+    """Return True if a program reads all features of the page, and reads a lower bound as a feature
+    without a value of μ.
+    """
     script = READERS[reader].format(address=address) + _COUNT
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False
@@ -274,7 +276,7 @@ def join_right() -> float:
 
 
 def measure_outside() -> list[Figure]:
-    """Return all figures of the interfaces for other systems."""
+    """Measure the page's interfaces for other systems, and return all figures."""
     invalid, unended = made_up(is_valid())
     try:
         found = measure_publication()

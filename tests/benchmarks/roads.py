@@ -82,7 +82,9 @@ def judge_join(network: RoadNetwork, traffic: Traffic, seed: int) -> dict[str, f
 
 
 def main() -> int:
-    """Simulate, join and measure. Return 1 if a figure misses its target, otherwise 0."""
+    """Simulate traffic, join its positions to road links, and measure the share of right links.
+    Return 1 if a figure misses its target, otherwise 0.
+    """
     sumo = Sumo(FOLDER)
     network = read_network(sumo.extract)
     found = [judge_join(network, simulate_traffic(sumo, seed), seed) for seed in SEEDS]

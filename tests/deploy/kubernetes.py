@@ -321,7 +321,7 @@ class Cluster:
 
 
 def has_answered(pod: Pod, container: Manifest, probe: Manifest) -> bool:
-    """Return True if a probe succeeds."""
+    """Return True if a probe of a container succeeds."""
     if "tcpSocket" in probe:
         with socket.socket() as one:
             one.settimeout(1.0)
@@ -361,7 +361,9 @@ def open_cluster(overlay: str, root: Path) -> Iterator[Cluster]:
 
 
 def main() -> int:
-    """Validate and start every overlay. Return 1 if a figure misses its target, otherwise 0."""
+    """Validate the manifests of every overlay, and start its pods. Return 1 if a figure misses its
+    target, otherwise 0.
+    """
     wrong = list[str]()
     failed = list[str]()
     objects = 0

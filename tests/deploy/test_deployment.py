@@ -161,7 +161,9 @@ def test_systemd_accepts_a_standby_with_one_more_word(site: Site, tmp_path: Path
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd on this machine")
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
 def test_each_unit_is_shut_in(unit: Path, tmp_path: Path) -> None:
-    """systemd itself scores the exposure of a unit from 0 (isolated) to 10 (unprotected)."""
+    """The exposure of each unit, scored by systemd from 0 (isolated) to 10 (unprotected), must be
+    at most MOST_EXPOSED.
+    """
     instance = INSTANCES[unit.stem][0]
     file = tmp_path / unit.name.replace("@.", f"@{instance}.")
     file.write_text(unit.read_text())
@@ -263,8 +265,8 @@ def test_every_configuration_is_for_a_name_on_the_list() -> None:
 @pytest.mark.timeout(400)
 @pytest.mark.campaign
 def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> None:
-    """Certificates are issued, and two routers, service, agent and reader are started. Then each
-    process is stopped as systemd does.
+    """Two routers, a service, an agent and a reader, started from the units with new certificates,
+    must work together. Each process must end in time when it is stopped as systemd does.
     """
     etc = site.root / "etc"
     enrol = [

@@ -42,8 +42,8 @@ def test_the_examples_of_the_reference_run_in_their_order(
 
 
 def test_every_page_stands_in_the_contents_of_the_site() -> None:
-    """Sphinx warns of a page that is not in the table of contents, and `make docs` treats warnings
-    as errors.
+    """Every page must be in the table of contents of the site. Otherwise Sphinx warns of the page,
+    and `make docs` treats the warning as an error.
     """
     tables = re.findall(r"```\{toctree\}\n(.*?)```", (DOCS / "index.md").read_text(), re.DOTALL)
     entries = [

@@ -80,7 +80,9 @@ def test_the_map_is_asked_and_a_tile_decoded(tmp_path: Path, capsys: Output) -> 
 
 
 def test_a_car_is_warned_of_what_three_others_found(tmp_path: Path, capsys: Output) -> None:
-    """Router, service, reports, alert and an approaching car are all real."""
+    """A car that approaches ice reported by three other cars must be warned. Router, service,
+    reports and alert are real.
+    """
     before = LONGITUDE - 60.0 / 111e3 / math.cos(math.radians(LATITUDE))
     with serve_ice(tmp_path) as endpoint:
         warned = be_warned.main(endpoint, LATITUDE, before)

@@ -90,7 +90,8 @@ def test_every_reference_leads_to_what_is_there(overlay: str) -> None:
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
 def test_network_policies_reach_routers_but_never_services(overlay: str) -> None:
-    """The policies are evaluated as a cluster does: a pod may do everything that any policy
+    """Each pod must reach the routers, but no other pod may reach a service except for its metrics.
+    The test evaluates the policies as a cluster does: a pod may do everything that any policy
     selecting it allows.
     """
     objects = build_overlay(overlay)

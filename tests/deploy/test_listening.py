@@ -18,8 +18,8 @@ from edge_agent.lab.simulation.listeners import WarnedDrivers
 def test_a_town_that_hears_its_own_map_makes_the_same_map_bit_for_bit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The drivers in this test do not react to warnings, because a driver who reacts produces other
-    measurements.
+    """A town whose cars receive the map must make the same map as one whose cars receive none. The
+    drivers do not react to warnings, because a driver who reacts produces other measurements.
     """
     monkeypatch.setattr(listening, "ASKED_S", 4.0)
     hearing, deaf = (

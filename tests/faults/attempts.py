@@ -504,7 +504,7 @@ def administration_of_the_routers(ground: Ground) -> bool:
 
 @register_attempt
 def revoked_vehicle(ground: Ground) -> bool:
-    """Connect with a certificate of a name that was removed from the list."""
+    """Connect with the certificate of a name that was removed from the access list."""
     network = ground.network
     lost = {
         f"connect_{part}": str(ground.folder / f"lost.{end}")

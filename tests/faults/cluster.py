@@ -87,7 +87,9 @@ OWES: Final = (
 
 
 def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
-    """Run this many failovers of all kinds in turn."""
+    """Run `failovers` failovers of all kinds in turn, and return the figures about losses, takeover
+    times and pauses.
+    """
     random_ = random.Random(site.seed)
     happened: list[Failover] = []
     pauses = []

@@ -40,8 +40,8 @@ WARM_S: Final = 60  # until pools and windows are what they are
 
 
 def _make_growth_figure(grown: float, seconds: int, *, quick: bool) -> Figure:
-    """Return memory growth per hour. A quick run returns the growth itself [MB], because three
-    minutes are too short for a rate.
+    """Return the figure of the service's memory growth per hour. A quick run returns the growth
+    itself [MB], because three minutes are too short for a rate.
     """
     if quick:
         return replace(make_figure("faults.insider.mb_per_hour", grown), unit="MB in all")

@@ -17,7 +17,9 @@ from tests.faults.lease_histories import ServiceHistory, judge_history
 
 
 class Judged(NamedTuple):
-    """Sums of the results over histories."""
+    """Sums over all simulated lease histories: violations, failovers, acknowledgements and
+    refusals.
+    """
 
     acknowledged_by_two: int
     violations: int

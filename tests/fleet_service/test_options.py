@@ -249,7 +249,9 @@ def place(folder: Path) -> dict[str, str]:
 
 
 def content(path: Path, folder: Path) -> str:
-    """Return the reproducible part of a file's content."""
+    """Return a text for a file's content that is equal in every run: its hash, for certificates
+    their days of validity, and "" for private keys and READMEs.
+    """
     if path.suffix == ".key" or path.name.startswith("README"):
         return ""
     if path.suffix == ".pem":

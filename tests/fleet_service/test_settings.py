@@ -100,7 +100,9 @@ def count_queued(made: Service) -> int:
 
 
 def turns(made: Service) -> tuple[int, int]:
-    """Return the numbers of segments and of rounds of tiles in ten simulated turns of .3 s each."""
+    """Return two numbers from ten simulated worker turns of .3 s each: segments written, and rounds
+    in which tiles are published.
+    """
     clock = [time.monotonic()]
     calls = {"begin_flush": 0, "take_dirty": 0}
 

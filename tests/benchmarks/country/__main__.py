@@ -28,7 +28,7 @@ SEED: Final = 30_000
 
 
 def main() -> int:
-    """Simulate the city and the country, and measure. Return 1 if a figure misses its target,
+    """Simulate the city and the country, and measure both. Return 1 if a figure misses its target,
     otherwise 0.
     """
     parser = argparse.ArgumentParser(

@@ -31,7 +31,7 @@ TURN: Final = 512
 
 
 class Coefficients(NamedTuple):
-    """Memory cost of a service [bytes]."""
+    """Memory cost of a service per vehicle, per cell, and per pair of cell and vehicle [bytes]."""
 
     vehicle_bytes: float
     cell_bytes: float
@@ -41,7 +41,9 @@ class Coefficients(NamedTuple):
 
 
 def measure_coefficients() -> Coefficients:
-    """Measure the memory cost, and return the coefficients."""
+    """Measure the memory cost of a service per vehicle, cell and pair, and return these
+    coefficients.
+    """
     few, vehicles, cells = (_measure_growth(kind) for kind in ("few", "vehicles", "cells"))
     return Coefficients(
         (vehicles[0] - few[0]) / (MANY - FEW), (cells[0] - few[0]) / (cells[1] - few[1]), few[2]

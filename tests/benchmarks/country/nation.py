@@ -115,7 +115,9 @@ def start_service(folder: Path, endpoint: str, name: str, region: str) -> Servic
 def simulate_nation(
     city: Path, folder: Path, seed: int, coefficients: Coefficients
 ) -> list[Figure]:
-    """Run the country and measure. The samples stay in `folder`/course.npz."""
+    """Run the country's services and vehicles, and measure delay, memory and processor time. The
+    samples of the run stay in `folder`/course.npz.
+    """
     country = Country(city, seed)
     seconds = WARM_S + MEASURED_S
     with ExitStack() as stack:
@@ -181,7 +183,9 @@ def simulate_nation(
 
 
 def _watch_parts(parts: Sequence[Part], services: Sequence[Service], sender: Part) -> list[Look]:
-    """Return samples taken every EVERY_S seconds until the sender, which ends last, has ended."""
+    """Sample all processes every EVERY_S seconds while the sender runs, and return the samples. The
+    sender is the process that ends last.
+    """
     looks: list[Look] = []
     began = time.monotonic() - SAYS_S
     least = [float("inf")] * (len(parts) - 1)
@@ -215,8 +219,8 @@ def _watch_parts(parts: Sequence[Part], services: Sequence[Service], sender: Par
 
 
 def _update_least(before: list[float], parts: Sequence[Part]) -> list[float]:
-    """Return for each process except the last the smaller of its earlier memory and its memory now
-    [MB].
+    """Return for each process except the last (the sender) the smaller of two values [MB]: its
+    earlier memory and its memory now.
     """
     return [min(then, memory_mb(part)) for then, part in zip(before, parts[:-1], strict=True)]
 
@@ -244,8 +248,8 @@ def _save_course(folder: Path, looks: Sequence[Look]) -> None:
 
 
 def _make_wait_figures(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure]:
-    """Return figures of the waiting times of the batches of the measured ten minutes, and those of
-    the slowest regions.
+    """Return figures of the waiting times of all batches sent in the measured ten minutes, and of
+    the batches of the slowest regions.
     """
     measured = (put >= WARM_S) & (put < WARM_S + MEASURED_S)
     waits = np.where(np.isnan(wait), np.inf, wait)

@@ -61,8 +61,8 @@ class Waits:
 
 
 def main() -> int:
-    """Send for the given time, wait for the last acknowledgements, write the waits, and return the
-    exit code.
+    """Send reports for the given time, wait for the last acknowledgements, write the waiting times
+    of the batches, and return the exit code.
     """
     parser = argparse.ArgumentParser(prog="sender")
     parser.add_argument("endpoint")

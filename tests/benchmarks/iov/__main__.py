@@ -156,7 +156,9 @@ PARTS: Final = {
 
 
 def main() -> int:
-    """Measure all figures. Return 0 if every figure meets its target, otherwise 1."""
+    """Measure the interfaces for other vehicles and programs. Return 0 if every figure meets its
+    target, otherwise 1.
+    """
     parser = argparse.ArgumentParser(prog="tests.benchmarks.iov", description=__doc__)
     parser.add_argument("--only", nargs="+", choices=PARTS, help="these parts alone")
     parser.add_argument(

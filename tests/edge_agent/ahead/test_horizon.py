@@ -67,7 +67,7 @@ def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
     ahead: float, turned: float, spacing: float
 ) -> None:
     """The route has a right angle to the left after 120 m. A car that cuts or overshoots this
-    corner is still on the route.
+    corner must still count as on the route.
     """
     way = np.arange(0.0, 120.0 + spacing / 2, spacing)
     x = np.concatenate([way, np.full(len(way) - 1, 120.0)])
@@ -85,8 +85,8 @@ def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
 
 @pytest.mark.parametrize("turned", [0.0, 90.0, 180.0])
 def test_a_route_that_begins_here_is_not_left_by_how_the_car_stands(turned: float) -> None:
-    """A navigation system leaves out the part already driven, so the route may begin at the next
-    corner. The car's heading then differs from the route's.
+    """A car whose heading differs from that of the route's beginning must count as on the route. A
+    navigation system leaves out the part already driven, so the route may begin at the next corner.
     """
     path = GivenRoute(*line()).ahead(HOME._replace(yaw=HOME.yaw + math.radians(turned)), 300.0)
     assert path is not None
@@ -230,8 +230,8 @@ def test_the_map_shows_the_road_around_a_bend_and_both_ways_at_a_fork() -> None:
 
 
 def test_a_car_without_a_route_knows_the_road_some_way_ahead_all_the_time() -> None:
-    """The car receives only the map boxes that it requested, so it must request a box before it
-    arrives there.
+    """The car must always know the road some way ahead. It receives only the map boxes that it
+    requested, so it must request a box before it arrives there.
     """
     road = keys_on(1500.0)
     cache = LocalMap()

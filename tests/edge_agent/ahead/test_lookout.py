@@ -241,8 +241,8 @@ def test_what_was_observed_yesterday_says_how_old_it_is(router: Router) -> None:
 
 
 def test_a_map_of_yesterday_neither_warns_nor_replaces_that_of_today(router: Router) -> None:
-    """A map of ice from yesterday causes no warning, and a map from yesterday does not replace
-    today's.
+    """A map with ice from yesterday must cause no warning. A map from yesterday must not replace
+    today's map.
     """
     yesterday = {int(key): 0.85 for key in keys_on()} | {int(key): 0.15 for key in ICE}
     with driving(router) as car:
@@ -349,8 +349,8 @@ def test_bytes_that_are_no_tile_are_refused(payload: bytes) -> None:
 
 
 class Liar(MadeUpService):
-    """Simulated service that answers map queries with invalid tiles in turn, and then with an empty
-    tile.
+    """Simulated service that answers map queries with different invalid tiles, one after the other,
+    and then with an empty tile.
     """
 
     said = 0

@@ -55,8 +55,8 @@ def test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes(
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_so_many_drives_are_under_way_at_once(drives: Path, tmp_path: Path, jobs: int) -> None:
-    """The vehicle files are named pipes, so each started drive waits until its pipe is written or
-    closed. The test counts the waiting drives.
+    """Exactly `jobs` drives must be in progress at once. The vehicle files are named pipes, so each
+    started drive waits until its pipe is closed, and the test counts the waiting drives.
     """
     tasks = [
         task._replace(vehicle=tmp_path / task.vehicle.name)

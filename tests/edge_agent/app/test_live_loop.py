@@ -125,8 +125,8 @@ def run(
 def test_a_simulated_source_hands_its_context_to_the_observations(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """There are three cars: the first brakes with ABS now and then, the ABS flag of the second is
-    always on, and the third has no flag.
+    """Observations must contain the ABS flag of a car that brakes with ABS now and then. The flag
+    must be unknown for a car whose flag is always on, and for a car without a flag.
     """
     fleet, parts = fleet_blocks(300)
     for place, block in enumerate(parts):

@@ -23,7 +23,7 @@ REFUSED = Counts(rejected={Kind.OBSERVATION: 3})
 
 @dataclass
 class State:
-    """Simulated state of a publisher."""
+    """Status of a publisher that the test sets."""
 
     links: int = 1
     cut_off: bool = False
@@ -70,7 +70,7 @@ CAUSES: dict[str, tuple[Block, State, list[str], str]] = {
 def told_within(
     source: Block, find: Callable[[SignalWatch], list[str]], seconds: float
 ) -> list[str]:
-    """Return the lines that are printed in `seconds` of simulated time."""
+    """Return the lines that the printer of reasons prints in `seconds` of simulated time."""
     clock = Clock()
     lines = list[str]()
     watch = SignalWatch(clock)

@@ -1,5 +1,5 @@
-"""Tests of every constant of the default estimator: a changed value changes a figure of a drive in
-the direction and by the size that the constant's stated reason implies.
+"""Tests of every constant of the default estimator: if a constant changes, a figure of a drive (for
+example the mean interval width) must change as the constant's stated reason implies.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ SHORT: dict[str, float | None] = {
 
 
 class Move(NamedTuple):
-    """Expected change of a figure of a drive when a constant is multiplied by `times`."""
+    """Expected change of a figure of a drive (mean interval width, for example) when a constant is
+    multiplied by `times`.
+    """
 
     figure: str
     drive: str
@@ -246,7 +248,9 @@ def made_up(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
 
 @cache
 def figures(place: str, name: str | None, times: float) -> dict[str, float]:
-    """Return the figures of a drive with the constant `name` multiplied by a factor."""
+    """Return the figures of one drive (means of outputs and of internal states), with the constant
+    `name` multiplied by `times`.
+    """
     t, signals, vehicle = make_drive(place)
     constants = Constants()
     if name is not None:
@@ -264,7 +268,9 @@ def figures(place: str, name: str | None, times: float) -> dict[str, float]:
 
 
 def summarize_reports(estimates: Estimates) -> dict[str, float]:
-    """Return figures of an estimator's output for one drive."""
+    """Return the means of the estimator's outputs over one drive, by name: interval of friction,
+    standard deviations, innovation statistics.
+    """
     mean = {
         "width": estimates.mu_upper - estimates.mu_lower,
         "lower": estimates.mu_lower,
@@ -279,7 +285,9 @@ def summarize_reports(estimates: Estimates) -> dict[str, float]:
 
 
 def inside(filters: np.ndarray) -> dict[str, float]:
-    """Return figures of the filter's internal states during one drive."""
+    """Return figures of the filter's internal states over one drive, by name: node probabilities,
+    penalties, means and standard deviations of the states, strain.
+    """
     weight = filters["weight"]
     split = filters["split"]
     chain = weight[:, :NODES]
@@ -316,7 +324,7 @@ def inside(filters: np.ndarray) -> dict[str, float]:
 
 
 def mean_of_known(values: FloatArray, where: FloatArray) -> float:
-    """Return the mean of the values at which `where` is finite, or 0 without any."""
+    """Return the mean of `values` at which `where` is finite, or 0 if there are none."""
     there = np.isfinite(where)
     return float(values[there].mean()) if there.any() else 0.0
 

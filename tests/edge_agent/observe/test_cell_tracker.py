@@ -44,7 +44,9 @@ def test_the_visited_cell_is_that_of_the_position_but_for_the_margin() -> None:
 
 
 def test_jitter_at_a_border_does_not_start_a_visit_with_every_fix() -> None:
-    """A car stands on the border of two cells, and its receiver scatters by 0.3 m."""
+    """A standing car on the border of two cells, whose receiver scatters by 0.3 m, must begin
+    hardly any visits.
+    """
     rng = np.random.default_rng(3)
     west, south, _, north = (float(v) for v in grid.bounds(grid.cell_of(57.70, 11.97)))
     block = ground(np.zeros((600, 1)), np.zeros((600, 1)), np.zeros((600, 1)))

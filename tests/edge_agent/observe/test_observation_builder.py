@@ -135,7 +135,9 @@ def test_a_visit_that_the_bank_could_not_follow_is_flat() -> None:
     ids=["upper bound slippery", "only the median", "median with excitation", "dry"],
 )
 def test_only_slippery_visits_are_urgent(mu: float, used: float, urgent: bool) -> None:
-    """The reported interval is mu ± 0.05, and slippery means below 0.4."""
+    """A visit must be urgent only if the upper end of its interval lies below 0.4, or if its median
+    does and enough grip was used. The reported interval is mu ± 0.05.
+    """
     _, observations, states = Watch.of(3).step(
         wanderers(150, 3), estimates(150, 3, mu=mu, used=used)
     )
@@ -144,8 +146,8 @@ def test_only_slippery_visits_are_urgent(mu: float, used: float, urgent: bool) -
 
 
 def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
-    """Braking ends just before the border, but it remains in the estimator's window for
-    a second.
+    """Braking that ends just before the border must not count as grip used in the next cell,
+    although it remains in the estimator's window for a second.
     """
     samples = 60
     east = np.arange(samples)[:, None] * 0.5
@@ -285,8 +287,8 @@ def test_without_position_there_is_no_state() -> None:
 
 
 def test_observation_contains_controller_flags_and_context_of_its_visit() -> None:
-    """A car drives east through cells at 10 m/s. A controller intervenes in the first visit; the
-    second visit has hardly any reading.
+    """The observation of a visit must contain the ABS flag and the context read during this visit,
+    and "unknown" where there was hardly any reading. A car drives east through cells at 10 m/s.
     """
     samples = 40
     east = np.arange(samples)[:, None] * 1.0

@@ -101,7 +101,7 @@ def test_an_acknowledgement_of_what_is_not_held_changes_nothing(path: Path) -> N
 
 
 def test_stored_batches_survive_a_kill_and_are_due_under_their_name(path: Path) -> None:
-    """A child process stores batches, reports this, and is then killed."""
+    """Batches that a killed process had stored must be due again under their old identifiers."""
     script = f"""
 import os, pathlib, signal
 from edge_agent.publish.batching import Draft
@@ -279,7 +279,9 @@ def test_what_was_given_up_does_not_come_back_after_a_restart(path: Path) -> Non
 
 
 def test_a_settled_batch_that_a_crash_brings_back_is_offered_again(path: Path) -> None:
-    """Nothing is lost, because the service knows the batch and acknowledges it again."""
+    """A settled batch whose deletion a crash undid must be sent again. The service knows the batch
+    and acknowledges it again.
+    """
     script = f"""
 import os, pathlib, signal
 from edge_agent.publish.batching import Draft
@@ -353,7 +355,9 @@ def test_an_unanswered_batch_is_given_up_before_it_blocks_its_stream(
 
 @pytest.mark.campaign
 def test_waiting_batches_take_little_memory_and_leave_none_behind(path: Path) -> None:
-    """The reports of one vehicle in a day are 170 000 batches."""
+    """Waiting batches must need little memory, and settled ones none. One vehicle's reports of a
+    day are 170 000 batches.
+    """
     count = 20_000
     outbox = Outbox(path, boot=BOOT)
     outbox.store(

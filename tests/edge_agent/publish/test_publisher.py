@@ -244,7 +244,9 @@ def test_a_service_that_tells_its_time_shows_that_the_clock_is_off(
 def test_a_full_disk_is_waited_for(
     router: Router, service: Service, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """SQLite is prevented from growing its file, and later allowed."""
+    """The publisher must lose no record while the disk is full. The test prevents SQLite from
+    growing its file, and later allows it.
+    """
     config = settings(router, tmp_path)
     outbox = Outbox(config.spool)
     database = outbox._database

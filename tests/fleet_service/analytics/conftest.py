@@ -37,7 +37,9 @@ HOUR_NS = 3600 * 10**9
 
 
 def find_visited(fusion: Fusion) -> IntArray:
-    """Return the slots of the cells that a vehicle visited."""
+    """Return the rows (slots) in the fusion's memory of those cells and sectors that a vehicle
+    visited.
+    """
     return np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)
 
 

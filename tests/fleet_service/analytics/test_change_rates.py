@@ -60,8 +60,8 @@ NAMES = ("pairs", "unlike", "slippery", "seconds")
 
 @pytest.mark.campaign
 def test_the_interval_holds_as_often_as_it_says_when_days_differ() -> None:
-    """Days have very different rates with mean RATE, so pairs of the same day are not
-    independent.
+    """The interval must contain the true rate RATE in most trials, although the rates of single
+    days differ widely, so that pairs of the same day are not independent.
     """
     held = 0
     trials = 20

@@ -230,7 +230,9 @@ def test_a_certificate_that_is_not_there_is_said_by_name(tmp_path: Path) -> None
 
 
 def test_a_declared_publisher_of_a_vehicle_is_told_that_somebody_listens(running: Network) -> None:
-    """Without this access rule the vehicle would send nothing and get no error."""
+    """The access list must let a vehicle's declared publisher learn that a service subscribes.
+    Otherwise the vehicle would send nothing and get no error.
+    """
     received: list[bytes] = []
     with (
         running.open_session(SERVICE) as service,

@@ -61,8 +61,9 @@ def test_shape_of_nobody_is_the_prior() -> None:
 
 @pytest.mark.parametrize("gain_std", [0.05, 0.1])
 def test_gain_error_common_to_value_and_use_is_no_shape(gain_std: float) -> None:
-    """Between vehicles such errors look like a slope cov(value, use)/var(use) ≥ .3. Within one
-    vehicle they cancel.
+    """A gain error that changes a vehicle's values and its used grip alike must not be learned as a
+    slope. Between vehicles it looks like a slope cov(value, use)/var(use) ≥ .3; within one vehicle
+    it cancels.
     """
     assert learned_slope(make_acquainted(0.0, gain_std, gain_in_use=True)) < 0.12
 
@@ -97,8 +98,8 @@ def test_shape_is_the_slope_and_a_doubt() -> None:
 
 
 def test_doubt_of_an_alarm_ends_once_the_shape_is_known() -> None:
-    """Before it raises an alert, a service assumes a larger error of a value from driving with
-    little grip use if it does not yet know its fleet.
+    """Before an alert, the service assumes a larger error for values measured with little grip use.
+    This extra error must become small once the service knows its fleet.
     """
     unknown = shared.UNKNOWN_SHAPE
     assert unknown.alarm == pytest.approx(0.5, abs=0.01)

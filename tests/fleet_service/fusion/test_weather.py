@@ -50,7 +50,9 @@ def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGIO
 
 
 def compute_road_time(weather: w.Weather, begin: float, end: float) -> tuple[float, float]:
-    """Return the road time [h] of drift and of sudden change between two times [h after START]."""
+    """Return two road times [h] (times weighted by the weather) between two times [h after START]:
+    that of the friction's drift, and that of its sudden change.
+    """
     drift, change, _ = w.road_time(weather, KEY, START + int(begin * HOUR), START + int(end * HOUR))
     return drift / 3600.0, change / 3600.0
 

@@ -109,7 +109,10 @@ def test_batches_with_unhashed_starts_are_recognised_again(
 
 
 def test_a_car_with_one_foot_in_last_month_raises_no_alert_alone(engine: Engine) -> None:
-    """The pseudonym of a batch belongs to the month of its first record, which may be long ago."""
+    """One car must not raise an alert with batches that reach back into the last month. The
+    pseudonym of a batch belongs to the month of its first record, so these batches would count as
+    those of a second vehicle.
+    """
     now = time.time_ns()
     for seq in range(1, 40):
         old = now - 29 * 86_400 * SECOND

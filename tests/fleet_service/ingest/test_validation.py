@@ -219,8 +219,8 @@ def test_no_text_stops_the_intake(desk: Desk, payload: bytes) -> None:
 
 
 def test_unusable_records_are_rejected_if_the_head_can_be_read(desk: Desk) -> None:
-    """Without a rejection the vehicle would send the batch for ever, and its stream would stop
-    after 65 536 later batches.
+    """A batch with a readable head and unusable records must be rejected. Otherwise the vehicle
+    would send it for ever, and its stream would stop after 65 536 later batches.
     """
     pb = wire.parse(wire.encode(batch("sim-001", 7, NOW, [0.8, 0.8])), "", ObservationBatch, "")
     del pb.mu[1:]

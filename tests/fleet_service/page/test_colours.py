@@ -54,8 +54,8 @@ def test_any_two_classes_and_the_ground_are_told_apart(
 
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_lightness_is_the_order_of_danger(sight: str) -> None:
-    """The most dangerous class is the darkest on a light background and the lightest on a dark
-    background. The order also holds when printed in grey.
+    """The most dangerous class must be the darkest on a light background and the lightest on a dark
+    background. The order must also hold when printed in grey.
     """
     for ladder, sign in ((in_danger(FOUR, TWO), 1.0), (in_danger(DARK_FOUR, DARK_TWO), -1.0)):
         light = [sign * float(to_lab(colour, sight)[0]) for colour in ladder]
@@ -94,8 +94,8 @@ def test_what_is_slippery_at_its_upper_end_keeps_its_colour() -> None:
 @pytest.mark.parametrize("sight", SIGHTS)
 @pytest.mark.parametrize("theme", [":root", '[data-theme="dark"]'])
 def test_text_and_map_classes_have_the_contrast_of_wcag_aa(sight: str, theme: str) -> None:
-    """Text needs a contrast of 4.5 : 1 (WCAG 1.4.3). Fill or edge of a map class needs 3 : 1
-    against the background (1.4.11).
+    """Text must have a contrast of 4.5 : 1 (WCAG 1.4.3). Fill or edge of a map class must have 3 :
+    1 against the background (1.4.11).
     """
     static = ROOT / "fleet_service" / "page" / "static"
     style = (static / "style.css").read_text()

@@ -104,7 +104,9 @@ def test_nothing_is_kept_twice_while_nothing_changes() -> None:
 
 
 def test_cells_side_by_side_are_one_learned_line() -> None:
-    """The position error spreads one lane over two or three rows of cells."""
+    """Two or three rows of cells, over which the position error spreads one lane, must become one
+    road line.
+    """
     scattered = cells(
         *((k, (0, 2, 0, 1)[k % 4]) for k in range(24)), *((k, 2) for k in range(3, 9))
     )

@@ -43,8 +43,8 @@ def test_every_word_stands_in_the_table_and_every_entry_is_used() -> None:
 
 
 def test_modules_joined_do_what_they_do_apart_each_with_names_of_its_own() -> None:
-    """When modules are joined, an import becomes the exported value, and a private name used in two
-    modules becomes two variables.
+    """In the joined modules an import must become the exported value, and a private name used in
+    two modules must become two variables.
     """
     modules = {
         "main": 'import { add as sum, ONE } from "./a.js";\nimport { two } from "./b.js";\nsay(sum(two(), ONE));\n',

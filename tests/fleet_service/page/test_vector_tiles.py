@@ -86,8 +86,8 @@ def test_what_is_no_vector_pmtiles_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_tile_is_the_bytes_of_the_specification() -> None:
-    """This is the example of section 4.3.5 of the specification: a point at (25, 17), a line and a
-    polygon.
+    """The encoded point, line and polygon must have the bytes of the examples in section 4.3.5 of
+    the specification.
     """
     point = encode_tile({"p": [TileShape(POINT, [[(25, 17)]], {})]})
     assert bytes([9, 50, 34]) in point

@@ -141,7 +141,9 @@ def read_state(engine: Engine) -> dict[str, NDArray[Any]]:
 def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
     tmp_path: Path, oldest_s: float
 ) -> None:
-    """The restart follows a compaction that joined old and new rows in one file."""
+    """A restart must not fuse a batch that is too old to be sent again, although a compaction
+    joined old and new rows in one file.
+    """
     config = ServiceConfig(oldest_s=oldest_s)
     now = time.time_ns()
     old = now - int(30.5 * DAY_S * SECOND)
@@ -163,7 +165,9 @@ def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
 
 
 def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) -> None:
-    """The checkpoint is written after late and unordered reports."""
+    """The state restored from a checkpoint, or from the log alone, must equal that of the running
+    service. Reports before the checkpoint are late and unordered.
+    """
     rng = np.random.default_rng(3)
     now = time.time_ns()
     sent = []
@@ -262,8 +266,8 @@ def _set() -> threading.Event:
 
 
 def test_rows_after_the_checkpoint_are_replayed_whatever_the_clock(tmp_path: Path) -> None:
-    """The clock is an hour ahead when the checkpoint is written. Then the clock is corrected, and
-    ice is reported.
+    """A restart must replay all rows written after the checkpoint, although the clock was an hour
+    ahead when the checkpoint was written and was corrected then.
     """
     ahead = time.time_ns() + 3600 * SECOND
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:

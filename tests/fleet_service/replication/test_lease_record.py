@@ -114,7 +114,9 @@ def test_holder_repairs_a_damaged_lease_and_keeps_it() -> None:
 
 
 def test_failed_renewal_uses_its_turn_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The failed write may take effect late, so the next renewal must use another turn."""
+    """A renewal after a failed one must use another turn, because the failed write may take effect
+    late.
+    """
     bucket = MemoryBucket()
     holder = lease_on(bucket, "one", 0.5)
     assert holder._create_next(None, lambda: 0, threading.Event())

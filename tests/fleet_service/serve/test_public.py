@@ -116,7 +116,9 @@ def test_a_route_tells_the_deceleration_that_is_safe_at_95_percent(start: Start)
 
 
 def test_no_single_passage_shows_where_persons_are_kept_private(start: Start) -> None:
-    """Times and counts are coarse, so that one pass changes neither of them."""
+    """One more pass must not change the published times and counts of a public cell, because they
+    are coarse.
+    """
     engine = start(3)
     hear(engine, *(f"sim-{k:03}" for k in range(6)))
     (before,) = rows(engine, later())
@@ -151,8 +153,8 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
 
 
 def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Start) -> None:
-    """Only vehicles of the last hours make a cell public, in answers, routes, snapshots
-    and tiles.
+    """Only vehicles of the last hours may make a cell public, in answers, routes, snapshots and
+    tiles.
     """
     engine = start(3)
     day = (time.time_ns() // (2 * PART_NS) - 2) * 2 * PART_NS + 8 * 3600 * SECOND

@@ -110,8 +110,8 @@ def nothing(
 def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(
     session: zenoh.Session, much: AnswerSize
 ) -> None:
-    """The heavy answer ends only after the light one has arrived. Many tiles of one cell each are
-    heavy too.
+    """A light query must be answered while a heavy answer is still under way. Many tiles of one
+    cell each must count as heavy too.
     """
     key = keys.map_key(TILE)
     counts = Counter[str]()
@@ -197,7 +197,9 @@ def test_a_smaller_question_is_answered_amid_a_larger_one_that_came_before(half:
 
 
 def test_light_questions_beyond_their_share_are_still_answered(half: Half) -> None:
-    """A client with many small queries waits behind the heavy queries, but no query is refused."""
+    """A client with many small queries must wait behind the heavy queries, but none of its queries
+    may be refused.
+    """
     for _ in range(2 * int(LIGHT_PER_S / LIGHT)):
         assert half.ask(4) == ["last"]
     assert half.counts["queries"] > half.counts["heavy_queries"] > 0

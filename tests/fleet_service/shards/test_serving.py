@@ -253,7 +253,9 @@ def test_who_comes_while_it_is_asked_may_not_have_been_asked(
 def test_who_is_found_after_it_was_asked_is_asked_again(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The queryables of the service exist, but its presence token has not arrived yet."""
+    """A client must ask a service again if its queryables exist but its presence token has not
+    arrived yet.
+    """
     monkeypatch.setattr("fleet_service.app.service.serving_regions", lambda *_: nullcontext())
     with running(router, tmp_path / "one", name="first", regions=NAMES[1:2]) as service:
         drive_one(session, service)

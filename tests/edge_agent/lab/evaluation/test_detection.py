@@ -1,5 +1,5 @@
-"""Tests of the detection figures: definitions on synthetic drives, and one small town through the
-whole pipeline.
+"""Tests of the figures of the detection evaluation: their definitions on synthetic drives, and one
+small town through the whole pipeline.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the campaign: all names and targets exist, measures are correct on small cases, and the
-report is made only from figures.
+"""Tests of the evaluation campaign: all figures and targets exist, measures are correct on small
+cases, and the report is made only from figures.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ ASKED = {
 
 
 def fake(mu: float, lower: float, upper: float, like: DriveSet) -> Estimates:
-    """Return estimates with constant friction and the true motion."""
+    """Return estimates of a drive with the true motion and a constant friction."""
     output = np.zeros((*like.t.shape, ONE_FRICTION))
     truth = like.truth
     output[..., Column.VX], output[..., Column.VY], output[..., Column.YAW_RATE] = (

@@ -1,5 +1,5 @@
-"""Tests of sensor faults: estimates continue, health flags report the fault, and the default's
-interval stays calibrated.
+"""Tests of simulated sensor faults: the estimates stay finite, health flags report the fault, and
+the default estimator's friction interval keeps its coverage.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ def driven() -> tuple[DriveSet, FloatArray]:
 
 
 def saying(batch: DriveSet, lower: float, upper: float) -> Estimates:
-    """Return estimates with the true motion and constant friction."""
+    """Return estimates of a drive with the true motion and a constant friction."""
     output = np.zeros((*batch.t.shape, ONE_FRICTION))
     for column, name in ((Column.VX, "vx"), (Column.VY, "vy"), (Column.YAW_RATE, "yaw_rate")):
         output[..., column] = batch.truth[f"true_{name}"]
@@ -148,8 +148,8 @@ def test_cars_stand_on_the_slope_they_were_put_on() -> None:
 
 
 def test_the_oracle_knows_what_is_told_and_misses_what_is_unknown() -> None:
-    """Most of the oracle's error of speed comes from the wheel radius in the vehicle file. Its
-    error of friction is a few hundredths.
+    """Most of the oracle's speed error must come from the wheel radius in the vehicle file. Its
+    friction error must be a few hundredths.
     """
     seeds = range(FIGURES, FIGURES + 4)
     speeds = oracle.speed(seeds)

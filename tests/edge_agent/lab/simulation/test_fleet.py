@@ -162,7 +162,9 @@ def test_a_block_needs_at_least_one_sample() -> None:
 
 
 def test_warned_driver_slows_down_only_for_the_stretch() -> None:
-    """The same driver drives from the same start with and without a warning."""
+    """A warned driver must slow down for the slippery stretch, and only there. The same driver
+    drives from the same start with and without a warning.
+    """
     speeds = []
     for warned in (False, True):
         fleet = SimulatedFleet("demo", 1, 3, 50.0)

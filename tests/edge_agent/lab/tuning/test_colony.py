@@ -62,7 +62,9 @@ def run(search: object, objective: Objective, seed: int, **options: object) -> R
 def test_colony_beats_random_search_in_at_least_21_of_24_trials(
     family: Callable[[int], Objective],
 ) -> None:
-    """If both searches were equally good, 21 wins of 24 would have a probability of 1 in 7 000."""
+    """The colony must win at least 21 of 24 trials. If both searches were equally good, this would
+    have a probability of 1 in 7 000.
+    """
     wins = 0
     for trial in range(TRIALS):
         ours = run(colony, family(trial), 1000 + trial)

@@ -93,8 +93,8 @@ def test_interval_score_pays_for_width_and_twenty_times_for_a_miss() -> None:
 
 
 def test_interval_score_is_least_at_the_true_quantiles() -> None:
-    """The interval score is proper: on draws from a known distribution, neither a wider nor a
-    narrower interval is better.
+    """The interval score must be least at the true quantiles: on draws from a known distribution, a
+    wider and a narrower interval must both score worse.
     """
     draws = np.random.default_rng(1).normal(size=200_000)
     scores = {
@@ -105,7 +105,7 @@ def test_interval_score_is_least_at_the_true_quantiles() -> None:
 
 
 def test_inflated_noise_does_not_win_the_innovation_likelihood(drives: TuningSet) -> None:
-    """Innovations are less likely with 4.5 R than with R, although fewer of them exceed their
+    """Innovations must be less likely with 4.5 R than with R, although fewer of them exceed their
     bound.
     """
     usual, inflated = (
@@ -246,8 +246,8 @@ def test_another_drive_of_the_set_gives_another_worth(drives: TuningSet) -> None
 
 
 def test_drives_of_one_s_own_are_searched_on(tmp_path: Path) -> None:
-    """Without true friction the score is the prediction of the next measurement, on the last third
-    of the recordings.
+    """Recorded drives without true friction must be usable for tuning. Their score is the
+    prediction of the next measurement, on the last third of the recordings.
     """
     logs = []
     found = []

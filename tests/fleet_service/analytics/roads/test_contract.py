@@ -189,8 +189,8 @@ def test_options_that_say_nothing_are_refused(
 
 
 def test_a_breach_lies_within_the_measurements() -> None:
-    """The reports cover half an hour and begin in the middle of a slot. No breach may begin earlier
-    or last longer than the reports.
+    """The reports cover half an hour and begin in the middle of a time slot. No breach may begin
+    earlier or last longer than the reports.
     """
     begin = 100 * SLOT_S + 1300
     span = (begin, begin + 1897)
