@@ -174,9 +174,7 @@ IMPATIENT = (
 def test_replay_with_a_hanging_session_keeps_its_estimates(
     drive: Path, tmp_path: Path, well: bool
 ) -> None:
-    """A replay must write its estimates and end, although a frozen router accepts the connection
-    but never answers.
-    """
+    """A replay must end and keep its estimates although a frozen router never answers."""
     router = Part(
         "router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], tmp_path
     )
@@ -516,9 +514,7 @@ def test_help_imports_nothing_heavy() -> None:
 
 
 def test_estimates_of_a_split_or_odd_log_stay_finite(drive: Path, tmp_path: Path) -> None:
-    """Estimates must be finite for a log without torque and rear steering, and with only half of
-    one wheel's speeds.
-    """
+    """Estimates must be finite without torque, rear steering and half of a wheel's speeds."""
     log = pq.read_table(drive / "log.parquet")
     gone = [n for n in log.column_names if n.startswith(("torque", "delta_r", "true"))]
     holes = pa.array(
