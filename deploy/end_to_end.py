@@ -38,8 +38,8 @@ REPORT_S = 30.0
 
 
 def drive_fleet(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
-    """Simulate the drive. Return the columns of all observations, with `vehicle`; write the true
-    values to the file `truth`.
+    """Simulate the drive. Return the columns of all observations, with the column `vehicle`; write
+    the true values to the file `truth`.
     """
     vehicles = len(fleet.vehicles)
     config = AgentConfig()

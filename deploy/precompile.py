@@ -2,8 +2,8 @@
 
 `make setup` ends with this command, which compiles the functions of service, agent and simulated
 vehicle, so that their first start does not have to wait. With `papers`, the filters of the papers
-are compiled, which the tests need. A function that cannot be compiled here is compiled at its first
-use.
+are compiled too, because the tests need them. A function that cannot be compiled here is compiled
+at its first use.
 """
 
 from __future__ import annotations

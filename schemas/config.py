@@ -135,7 +135,9 @@ class ArchiveSettings(Settings):
 
     @property
     def options(self) -> dict[str, str]:
-        """Return the options in `store` with their secrets in plain text."""
+        """Return the options for access to the bucket (setting `store`) by name, with secrets in
+        plain text.
+        """
         return {name: value.get_secret_value() for name, value in self.store.items()}
 
 

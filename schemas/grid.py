@@ -11,7 +11,7 @@ even bits), so that its base-4 digits are the quadkey. The cell's ancestor at zo
     zone     zoom 7    area of one folder of the archive
     sector   0 east, 1 north, 2 west, 3 south   quarter of the compass that the vehicle heads for
 
-Sectors keep the carriageways of a road apart.
+The two carriageways of a road lie in different sectors.
 
 Latitudes are limited to ±85.0511° (Web Mercator). Longitudes wrap at ±180°. Source: the slippy-map
 tile scheme (OpenStreetMap wiki, "Slippy map tilenames") and Bing's quadkeys.
@@ -155,8 +155,8 @@ def outline(cell: ArrayLike, sector: ArrayLike | None = None) -> tuple[FloatArra
 def touches(
     box: tuple[float, float, float, float], area: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
 ) -> NDArray[np.bool_]:
-    """Return a mask of areas: True if the area and the box overlap in more than a border. Each is
-    given as west, south, east, north [deg].
+    """Return a mask of areas: True if the area and the box overlap in more than a border. Box and
+    areas are given as west, south, east, north [deg].
     """
     west, south, east, north = (np.asarray(side) for side in area)
     return np.asarray((east > box[0]) & (north > box[1]) & (west < box[2]) & (south < box[3]))
@@ -194,7 +194,7 @@ def sector_of(yaw: ArrayLike) -> NDArray[np.int8]:
 
 def sectors_touched(yaw: ArrayLike) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
     """Return two arrays: the heading sector of each yaw [rad], and a second sector if the yaw lies
-    within 15° of its edge, else -1.
+    within 15° of the edge to that sector, else -1.
     """
     angle = np.asarray(yaw, dtype=np.float64)
     first = sector_of(angle)

@@ -75,7 +75,7 @@ def _regions_without(
 
 
 class Rank:
-    """Sort order of cells and sectors along a route; those that are not on the route come last."""
+    """Sort order of cells and sectors along a route; cells that are not on the route come last."""
 
     def __init__(self, route: Sequence[tuple[float, float]]) -> None:
         self._place = {key: place for place, key in enumerate(keys_along(route).tolist())}

@@ -39,7 +39,7 @@ LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 
 
 def demo_works(found: Sequence[Figure]) -> bool:
-    """Return True if all figures that the demo must reach are good enough.
+    """Return True if all figures whose targets the demo must meet do so.
 
     A late alert, wide intervals, few passes or a busy machine do not count as a failure.
     """
@@ -63,7 +63,7 @@ class MapComparison:
 
     @property
     def is_covered(self) -> BoolArray:
-        """Return a mask of rows, (n,): True if the true friction lies in the interval."""
+        """Return a mask of rows, (n,): True if the true friction lies in the map's interval."""
         lower, upper = (self.cells[end].to_numpy() for end in ("mu_lower", "mu_upper"))
         return np.asarray((lower <= self.truth) & (self.truth <= upper))
 
@@ -254,7 +254,9 @@ class LostGrip:
         ]
 
     def line(self) -> str:
-        """Return the result as one line of text."""
+        """Return the shares of passes that lost grip, for warned and unwarned drivers, as one line
+        of text.
+        """
         counts = [
             f"{int(self.lost[rows].sum())} of {int(rows.sum())}"
             for rows in (self.warned, ~self.warned)
@@ -318,7 +320,7 @@ def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
 
 
 def per_stretch(alerts: list[tuple[int, Alert]], visits: pa.Table) -> float:
-    """Return the number of alerts of road stretches, divided by the number of icy stretches
+    """Return the number of road stretches under alert, divided by the number of icy stretches
     (counted per driving direction); NaN without ice.
     """
     road = Stretches()

@@ -32,7 +32,9 @@ REPORT_S = 5.0
 def drive_fleet(
     folder: Path, endpoint: str, args: argparse.Namespace
 ) -> tuple[Listener, dict[str, float]]:
-    """Let the fleet drive; return the listener with the received data, and the fleet's counts."""
+    """Let the fleet drive; return the listener with the received data, and the counts that the
+    fleet's process printed.
+    """
     session = open_session(ZenohSettings(connect=[endpoint]))
     if session is None:
         raise processes.DemoError(f"no session to {endpoint}")

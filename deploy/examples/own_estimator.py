@@ -28,7 +28,7 @@ PRIOR_SLIPPERY = 0.3  # P(mu < 0.4) by the same prior
 
 
 class AtLeast:
-    """Estimator for N vehicles; its only state is the largest grip used by each.
+    """Estimator for N vehicles; its only state is the largest grip that each vehicle has used.
 
     Args:
         vehicles: nominal parameters of the N vehicles.

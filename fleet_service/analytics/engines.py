@@ -37,7 +37,8 @@ NAMES: Final = {"observations": layout.TABLES[Kind.OBSERVATION], "map": snapshot
 
 @dataclass
 class QueryEngine:
-    """Connection to an engine, with the files of the selected part of an archive.
+    """Connection to a query engine (DuckDB or Spark), with the files of the selected part of an
+    archive.
 
     Args:
         name: one of ENGINES.

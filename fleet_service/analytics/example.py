@@ -1,4 +1,4 @@
-"""Example to start from: five figures about an archive.
+"""Example script to copy: it answers five questions about an archive and plots each answer.
 
 python -m fleet_service.analytics.example --archive DIR --out FOLDER
 python -m fleet_service.analytics.example --out FOLDER            # with a synthetic archive
@@ -35,7 +35,7 @@ def whole_archive(root: Path) -> Extract:
 
 
 def draw_figures(root: Path, folder: Path) -> dict[str, pa.Table]:
-    """Answer five questions, draw a figure of each answer into `folder`, and return the answers by
+    """Answer five questions, draw a plot of each answer into `folder`, and return the answers by
     name.
     """
     folder.mkdir(parents=True, exist_ok=True)

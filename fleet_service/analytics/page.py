@@ -20,7 +20,7 @@ Value = float | None
 
 @dataclass(frozen=True)
 class Scale:
-    """Meaning of the colours.
+    """Colour scale of the map: which values the colours stand for.
 
     Attributes:
         label: label of the scale, with its unit.

@@ -2,7 +2,7 @@
 vehicles.
 
 Its rows resemble those of the real estimator: two of three visits give only a lower bound of mu,
-the third gives a value.
+the third gives a value of mu.
 """
 
 from __future__ import annotations
@@ -196,8 +196,9 @@ def truth_of(
 def _make_likelihoods(
     rng: np.random.Generator, mu: FloatArray, used: FloatArray, excited: BoolArray
 ) -> ByteArray:
-    """Return the likelihoods of the reports, (n, 32), in steps. The likelihood of a value falls on
-    both sides of the value. That of a lower bound falls only below the grip used.
+    """Return the log-likelihoods of the reports, (n, 32), in steps of 1/16 nat. The likelihood of a
+    value of mu falls on both sides of the value. The likelihood of a lower bound falls only below
+    the grip used.
     """
     distance = (mugrid.CENTRES - np.where(excited, mu, used)[:, None]).astype(np.float32)
     flank = rng.uniform(0.02, 0.08, (2, len(mu), 1)).astype(np.float32)

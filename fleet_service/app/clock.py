@@ -123,7 +123,7 @@ class SteadyClock:
 
     def lag(self) -> int:
         """Return how far the wall clock is behind the service's time [ns], negative if it is ahead.
-        This is the size of a jump that is not followed.
+        This is the size of a wall-clock jump that the service does not follow.
         """
         now = self.now()
         return max(now, self._seen if self._seen > now else now) - self._wall()

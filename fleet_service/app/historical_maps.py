@@ -1,8 +1,9 @@
-"""Maps of past moments, rebuilt in a separate process. Its memory is limited in advance and freed
-when it ends.
+"""Maps of past moments, rebuilt in a separate process. The memory of this process is limited in
+advance and freed when the process ends.
 
-This process (`past_process`) reads queries as lines of JSON. It writes the replies; each is
-preceded by a head of tile number and length. Tile -1 marks an error and -2 the end of an answer.
+This process (`past_process`) reads queries as lines of JSON. It writes the replies; each reply is
+preceded by a head, which states the tile number and the length of the reply. Tile -1 marks an error
+and -2 the end of an answer.
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ class PastQuery(NamedTuple):
 
 
 class HistoricalMaps:
-    """Answers to queries about past maps. Starting the process takes a second, so it is kept for
-    another IDLE_S.
+    """Answers to queries about past maps. Starting the process takes a second, so an idle process
+    is kept for IDLE_S.
 
     Args:
         root: folder of the archive.

@@ -247,7 +247,9 @@ class Service:
                 queryable.undeclare()
 
     def _hand_over(self, query: zenoh.Query, session: zenoh.Session) -> None:
-        """Answer a hand-over request: stop regularly, in favour of the named standby."""
+        """Answer a hand-over request: shut the service down regularly, so that the named standby
+        takes over.
+        """
         self.engine.holding.to = (
             handover.answer_request(query, session, self._config.regions) or self.engine.holding.to
         )

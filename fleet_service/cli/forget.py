@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Erase the selected data."""
+    """Erase the rows of the selected vehicle, or destroy the key of the selected month."""
     return on_archive(arguments, _forget_data)
 
 

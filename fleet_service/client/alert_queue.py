@@ -79,6 +79,6 @@ class AlertQueue:
             )
 
     def close(self) -> None:
-        """Release the file."""
+        """Close the queue's file, so that other processes can use it."""
         with self._guard:
             self._file.close()

@@ -97,7 +97,9 @@ class Stretches:
         self._last: Alert | None = None
 
     def apply_alert(self, alert: Alert) -> None:
-        """Record that the alert of a cell was raised or cleared; repeating a call has no effect."""
+        """Record that the alert of a cell was raised or cleared; a repeated call
+        changes nothing.
+        """
         place = (alert.cell, alert.sector)
         if alert.raised:
             self._standing[place] = alert

@@ -25,7 +25,7 @@ PRIVATE: Final = 0o700  # of the authority's folder
 
 @dataclass(frozen=True)
 class Terms:
-    """Validity periods [days].
+    """Validity periods of certificates and authorities [days].
 
     Attributes:
         days: validity of a certificate.

@@ -19,7 +19,7 @@ _FAR: Final = (
 
 
 def normal_cdf(x: FloatArray) -> FloatArray:
-    """Return the distribution function Φ(x)."""
+    """Return the distribution function Φ(x) of the standard normal distribution."""
     return _normal_cdf(np.ravel(x)).reshape(x.shape)
 
 

@@ -4,8 +4,8 @@ rows are compiled.
 Each vehicle keeps a table of the others that it met: how often (`met`) and how well they agreed
 (`agreed`). Every other vehicle counts once, weighted by its own trust; the number of meetings does
 not matter. So a colluding group counts only by the number of its members, not by the number of
-cells in which it drives alone. Once the majority distrusts it, its reports about others have no
-weight.
+cells in which it drives alone. Once the majority distrusts the group, the group's reports about
+others have no weight.
 
 The module does not learn a vehicle's error from its differences to others. Such differences show
 only relative errors. In addition, an error that affects both the value and the grip used looks like

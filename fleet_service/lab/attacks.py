@@ -132,8 +132,8 @@ def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
 
 
 def victim_cells(drive: AttackedDrive) -> IntArray:
-    """Return the two cells that are attacked: the one with the most and the one with the least
-    friction among the cells that are considered.
+    """Return the two cells that are attacked: among the cells in which enough honest vehicles
+    measured the friction, the one with the most and the one with the least friction.
     """
     mu = np.where(drive.counted, drive.town.mu[BEGIN], np.nan)
     return np.array([np.nanargmax(mu), np.nanargmin(mu)])
@@ -199,8 +199,9 @@ VISITS: Final[dict[str, Callable[[Generator, AttackedDrive], Visits]]] = {
 
 
 def replay_messages(rng: Generator, drive: AttackedDrive) -> int:
-    """Return the number of cells whose alert changes if messages of the first minutes are sent
-    again: unchanged, under other keys, and under another name.
+    """Return the number of cells whose alert changes if the attackers send recorded messages of the
+    first minutes again, in three forms: as they were, under an attacker's key, and with an
+    attacker's name.
     """
     sent = make_messages(drive.visits)
     at = drive.visits.seconds[[m.last for m in sent]]

@@ -98,8 +98,8 @@ def _is_listed(name: str, only: str | None, found: Mapping[str, float]) -> bool:
 
 
 def drives_end_to_end(quick: bool) -> Drives:
-    """Return the end-to-end drives, for the level and the rough world; if `quick`, only a few
-    seconds each.
+    """Return one function per world (LEVEL and rough, with realistic sensor errors) that simulates
+    an end-to-end drive; if `quick`, the drives last only a few seconds.
     """
     return {
         world: end_to_end.drive_command(*((4, 3.0) if quick else length), world)

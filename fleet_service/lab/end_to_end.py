@@ -88,8 +88,8 @@ def drive_command(vehicles: int, seconds: float, world: World) -> Drive:
 
 
 def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float]:
-    """Return figures of one drive: coverage of cells that SEVERAL vehicles visited, error of those
-    that are measured, alerts, and counts.
+    """Return figures of one drive: interval coverage of the cells that SEVERAL vehicles visited,
+    error of μ in the measured ones of these cells, alerts, and counts of observations.
     """
     folder = folder / world.prefix.removeprefix("fusion.")
     drive(folder)

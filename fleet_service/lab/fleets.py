@@ -158,7 +158,9 @@ def _fleet_figures(fleet: Fleet, found: Found) -> dict[str, float]:
 
 
 def _reliability_curve(ours: Scores) -> dict[str, float]:
-    """Return the points of the reliability diagram."""
+    """Return the points of the map's reliability diagram: for each quantile level, the share of
+    true frictions below that quantile of the belief.
+    """
     return {
         f"fusion.clean.reliability.{level:.2f}": float(share)
         for level, share in zip(LEVELS, reliability(ours), strict=True)

@@ -164,15 +164,15 @@ def score_snapshots(
 
 
 def rmse(s: Scores) -> float:
-    """Return the root mean square error over the cells in which at least ENOUGH vehicles used
-    enough grip to measure the friction.
+    """Return the root mean square error of the map's friction over the cells in which at least
+    ENOUGH vehicles used enough grip to measure the friction.
     """
     error = s.error[s.vehicles >= ENOUGH]
     return float(np.sqrt(np.mean(error**2))) if len(error) else float("nan")
 
 
 def coverage(s: Scores) -> float:
-    """Return the share of true values inside the interval."""
+    """Return the share of answers whose 90 % interval contains the true friction."""
     return float(s.covered.mean()) if len(s.covered) else float("nan")
 
 
@@ -192,7 +192,9 @@ def of_class(s: Scores, n: int) -> Scores:
 
 
 def by_surface(s: Scores) -> dict[str, float]:
-    """Return the share of true values inside the interval, separately for each of SURFACES."""
+    """Return the share of true frictions inside the 90 % interval, separately for each
+    of SURFACES.
+    """
     return {
         name: coverage(s.taken((s.truth > above) & (s.truth <= to)))
         for name, (above, to) in SURFACES.items()

@@ -258,9 +258,9 @@ def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]
 
 
 def measure_change(seeds: range) -> dict[str, float]:
-    """Return medians and 95 % quantiles of the passes for each share of visits with enough grip
-    used to measure the friction, and the number of cells in which an alert was not raised or not
-    cleared.
+    """Return medians and 95 % quantiles of the number of passes until an alert is raised and until
+    it is cleared, and the number of cells in which the alert was not raised or not cleared. The
+    figures are given for each share of visits with enough grip used to measure the friction.
     """
     out: dict[str, float] = {}
     for percent in CHANGE_EXCITED:
@@ -314,7 +314,9 @@ def measure_cold(seed: int) -> dict[str, float]:
 
 
 def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
-    """Return all figures of this module; `log_line` is called with lines about the progress."""
+    """Return all figures of the other maker's fleets; `log_line` is called with lines about the
+    progress.
+    """
     out: dict[str, float] = {}
     for name, gain_std in GAINS.items():
         out |= measure_honest(name, gain_std, seeds)

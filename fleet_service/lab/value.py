@@ -218,7 +218,9 @@ def measure_rate(cars: int, seeds: range, demand: float = 1.0) -> dict[str, floa
 
 
 def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
-    """Return all figures of this module; `log_line` is called with lines about the progress."""
+    """Return all figures about the value of the map to its users; `log_line` is called with lines
+    about the progress.
+    """
     out: dict[str, float] = {}
     for cars in CARS:
         out |= {

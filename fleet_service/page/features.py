@@ -68,7 +68,7 @@ class FeatureQuestion(NamedTuple):
 
 
 def feature_id(cell: int, sector: int) -> str:
-    """Return the id of a feature."""
+    """Return the id of a feature (one heading in one cell) as text."""
     return f"{cell}-{sector}"
 
 

@@ -61,7 +61,7 @@ class FeatureRoutes:
         )
 
     async def conformance(self, _: Request) -> Response:
-        """Return the conformance classes."""
+        """Return the list of conformance classes of the interface."""
         return JSONResponse(features.conformance_document())
 
     async def collections(self, request: Request) -> Response:
@@ -69,7 +69,7 @@ class FeatureRoutes:
         return JSONResponse(features.collections_document(_base_address(request), self._extent()))
 
     async def collection(self, request: Request) -> Response:
-        """Return the description of the collection."""
+        """Return the description of the collection `grip`, the cells of the map."""
         return JSONResponse(features.collection_document(_base_address(request), self._extent()))
 
     async def schema(self, request: Request) -> Response:

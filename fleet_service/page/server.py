@@ -70,7 +70,7 @@ class PageSettings:
 
 
 def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None]) -> None:
-    """Serve until `stop` is set; call `say` with `page: ADDRESS` when the server listens.
+    """Serve the page until `stop` is set; call `say` with `page: ADDRESS` when the server listens.
 
     Raises:
         InputError: the port is in use.

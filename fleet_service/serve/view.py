@@ -115,8 +115,8 @@ def is_measured(
 ) -> BoolArray:
     """Return a mask of beliefs (k,): True if the belief contains more than a lower bound.
 
-    This always includes a belief that the road is slippery, whatever its source: values from other
-    headings lower it too, and known ice must never be shown as unknown.
+    A belief that the road is slippery always counts as measured, even if it comes from values of
+    other headings, because known ice must never be shown as unknown.
 
     Args:
         lower, upper: ends of the interval of μ, (k,).

@@ -86,8 +86,8 @@ def watch_successors(
 def rival_tokens(
     mine: frozenset[ServiceToken], there: set[ServiceToken], former: Collection[str] = ()
 ) -> list[ServiceToken]:
-    """Return, sorted, the tokens by which other services announce regions that overlap `regions`.
-    Tokens of the `former` services are excluded.
+    """Return, sorted, the tokens by which other services announce regions that overlap the regions
+    of `mine`. Tokens of the `former` services are excluded.
     """
     others = (one for one in there - mine if one.service not in former)
     return sorted(one for one in others if any(overlap(one.region, own.region) for own in mine))

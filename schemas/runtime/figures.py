@@ -58,7 +58,7 @@ def header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:
 
 
 def _find_versions() -> dict[str, str]:
-    """Return the versions of those PACKAGES that are installed, by name."""
+    """Return the version of each installed package of PACKAGES, by package name."""
     found = {}
     for name in PACKAGES:
         with suppress(metadata.PackageNotFoundError):

@@ -1,9 +1,9 @@
 """Zenoh session for GripMap: a client of routers, without scouting, gossip and shared memory.
 
 Reasons: scouting finds foreign routers and costs half a second at start. Shared memory drops
-samples silently when a receiver stalls. The lease states how long a silent peer is kept. An
-endpoint that does not answer is abandoned after `open_timeout`. So, where UDP is blocked, TLS
-(listed after QUIC) is tried soon.
+samples silently when a receiver stalls. The lease of a Zenoh link states how long the link to a
+silent peer stays open. An endpoint that does not answer is abandoned after `open_timeout`. So,
+where UDP is blocked, TLS (listed after QUIC) is tried soon.
 """
 
 from __future__ import annotations

@@ -56,8 +56,8 @@ class GripWarning:
 
 
 class Runs(NamedTuple):
-    """Horizon as n runs. A run is a segment of the route within one cell and sector. Fields as in
-    the protobuf message `Ahead`.
+    """Horizon (the road ahead) as n runs. A run is a segment of the route within one cell and
+    sector. Fields as in the protobuf message `Ahead`.
     """
 
     start_m: FloatArray

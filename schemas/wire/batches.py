@@ -1,8 +1,9 @@
 """Decoder of one batch of records, and the parts that all decoders share: heads (fields of a batch
 other than its records), checks, and columns that a sender may leave out.
 
-Missing columns are filled: floats with NaN, cell and sector from the pose, the leaving time with
-the entering time. The fleet service has its own decoder, which decodes many batches at once.
+Missing columns are filled: floats with NaN, cell and sector from the pose (position and yaw), the
+leaving time with the entering time. The fleet service has its own decoder, which decodes many
+batches at once.
 """
 
 from __future__ import annotations
@@ -221,9 +222,9 @@ def _check_columns(message: Any, kind: Kind) -> None:  # noqa: ANN401
 
 
 def complete(found: Decoded, sent: PresentColumns) -> Decoded:
-    """Fill the columns that follow from the pose. Move two kinds of messages from the valid batches
-    to the errors: messages without a position, and messages with a number that does not fit its
-    column.
+    """Fill the columns that follow from the pose (position and yaw). Move two kinds of messages
+    from the valid batches to the errors: messages without a position, and messages with a number
+    that does not fit its column.
     """
     kind = sent.kind
     columns = found.columns

@@ -41,7 +41,9 @@ MAX_BYTES: Final = 64 * 1024  # fifty records take 8 kB as protobuf, 40 kB as JS
 
 
 class Kind(StrEnum):
-    """Kind of a batch: observations or states; the value is the part of the key that names it."""
+    """Kind of a batch: observations or states. The enum value is the chunk of the Zenoh key that
+    names the kind.
+    """
 
     OBSERVATION = "obs"
     STATE = "state"

@@ -59,8 +59,9 @@ def expression(t: Table, at_s: int) -> Table:
 
 
 def find_difference(row: dict[str, Any]) -> dict[str, float]:
-    """Return `difference` with its 90 % interval `lower` to `upper`, and `cells`, from the row of
-    `expression`. Return an empty dictionary if fewer than two vehicles measured in both periods.
+    """Return the change of the mean friction (`difference`) with its 90 % interval (`lower`,
+    `upper`), and the number of cells (`cells`), computed from the row of `expression`. Return an
+    empty dictionary if fewer than two vehicles measured in both periods.
     """
     if not row["cells"] or row["vehicles"] < 2:
         return {}

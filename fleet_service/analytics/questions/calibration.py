@@ -55,5 +55,5 @@ def expression(t: Table, maps: Table) -> Table:
 
 
 def ask(engine: QueryEngine, _: Options) -> pa.Table:
-    """Return the rows of `expression` for the selected part."""
+    """Return the rows of `expression` for the selected part of the archive."""
     return engine.answer(expression(engine.observations(), engine.maps()))

@@ -4,11 +4,11 @@ kept, and the longest breach.
 A link is divided into pieces of PIECE_M, and the worst piece counts, so that ice on a tenth of the
 link is not averaged away. Values are collected in time slots of SLOT_S. They are averaged per
 vehicle first, so that a car that passes ten times counts once. A slot is certainly below the
-required level if the 90 % interval of its mean lies below the level. It is certainly kept if the
-interval lies above. A breach begins with a slot below the level and ends with the next slot that is
-not below. `least_s` is the time that is certainly below. `most_s` is the longest possible breach:
-from a slot that was certainly kept to the next such slot. Unmeasured time is unknown, and never
-counts as kept.
+required level if the 90 % interval of its mean lies below the level. The level is certainly kept if
+this interval lies above the level. A breach begins with a slot below the level and ends with the
+next slot that is not below the level. `least_s` is the duration of the longest certain breach.
+`most_s` is the longest possible breach: from a slot that was certainly kept to the next such slot.
+Unmeasured time is unknown, and never counts as kept.
 """
 
 from __future__ import annotations

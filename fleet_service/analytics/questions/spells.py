@@ -1,5 +1,5 @@
 """`spells`: begin and duration of slippery spells, and the time until a second vehicle reported
-each.
+each spell.
 
 A spell is a sequence of values below SLIPPERY_MU in one cell and sector, in order of time. It ends
 with the first value that is not slippery. Only spells that at least `least_vehicles` vehicles
@@ -68,5 +68,5 @@ def expression(t: Table, least_vehicles: int) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return the rows of `expression` for the selected part."""
+    """Return the rows of `expression` for the selected part of the archive."""
     return engine.answer(expression(engine.observations(), options.least_vehicles))

@@ -62,5 +62,5 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, _: Options) -> pa.Table:
-    """Return the rows of `expression` for the selected part."""
+    """Return the rows of `expression` for the selected part of the archive."""
     return engine.answer(expression(engine.observations()))

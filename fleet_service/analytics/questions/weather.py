@@ -74,7 +74,7 @@ def _join_stations(t: Table, stations: Table, readings: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return the rows of `expression` for the selected part.
+    """Return the rows of `expression` for the selected part of the archive.
 
     Raises:
         InputError: the table of stations is missing, or lacks a column.
@@ -92,7 +92,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def read_stations(path: Path) -> tuple[pa.Table, pa.Table]:
-    """Return two tables: the stations, and the mean readings per station and hour.
+    """Return two tables: the stations, and the mean temperature readings per station and hour.
 
     Raises:
         InputError: the file cannot be read, or lacks a column.

@@ -93,7 +93,7 @@ def join_stretches(cells: pa.Table) -> pa.Table:
 
 
 def wilson_lower(hits: FloatArray, of: FloatArray) -> FloatArray:
-    """Return the lower 95 % confidence bound of a share (Wilson 1927), (n,)."""
+    """Return the lower 95 % confidence bound (Wilson 1927) of the share `hits` / `of`, (n,)."""
     n = np.maximum(of, 1.0)
     p = hits / n
     spread = Z_95 * np.sqrt(p * (1 - p) / n + Z_95**2 / (4 * n * n))

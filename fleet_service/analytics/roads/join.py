@@ -78,8 +78,8 @@ class _Joined(NamedTuple):
 
 
 def join_roads(network: RoadNetwork) -> pa.Table:
-    """Return a table with one row per cell and sector on a link. The reference "Columns of the ten
-    questions" explains the columns.
+    """Return a table with one row per cell and sector on a link. The documentation page "Columns of
+    the questions" explains the columns.
     """
     lengths, marks = _link_marks(network.links)
     scale = np.cos(np.radians(marks.latitude))

@@ -88,8 +88,8 @@ def record_erasure(folder: Path, month: str, newest: int, pseudonym: str | None 
 
 
 class ErasedData(NamedTuple):
-    """Erased data: time ranges that apply to all vehicles, and the end [ns] per pseudonym
-    number.
+    """Erased data: time ranges whose rows are refused for all vehicles, and, per pseudonym number,
+    the time [ns] before which the rows of that vehicle are refused.
     """
 
     months: list[Span]

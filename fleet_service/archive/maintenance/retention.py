@@ -114,8 +114,8 @@ def destroy_key(root: Path, month: str, newest: int) -> None:
     """Destroy the key of a month like `forget_period`. The caller must have locked the archive and
     must not have data of the month in memory.
 
-    Measurements of the month up to `newest` [ns], the newest in the archive, are not accepted
-    again.
+    Measurements of the month up to `newest` [ns], the time of the newest measurement in the
+    archive, are not accepted again.
 
     Raises:
         InputError: there is no such key.

@@ -29,7 +29,7 @@ TERMINATED_NS: Final = VALID_NS  # for which the number of an ended event is not
 
 @dataclass(frozen=True)
 class OpenEvent:
-    """Event that has been sent.
+    """Event that has been sent to the interchange.
 
     Attributes:
         name: id of the stretch.

@@ -1,8 +1,8 @@
 """Conversion of DENM (hazard messages) from other stations to reports of one vehicle name. The
 fusion weighs and trusts this name like a vehicle. Pure.
 
-All DENM of one interchange get the same name. An alert needs two independent sources, so they
-cannot raise an alert alone.
+All DENM of one interchange get the same name. An alert needs two independent sources, so DENM alone
+cannot raise an alert.
 """
 
 from __future__ import annotations
