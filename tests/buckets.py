@@ -38,7 +38,7 @@ class BucketServer:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Return the part of a service's configuration for this bucket."""
+        """Return the part of a service's configuration that names this bucket."""
         return {"copy": self.url, "store": self.store}
 
     def start(self) -> None:
@@ -82,7 +82,7 @@ class BucketServer:
         return {path.relative_to(base).as_posix(): path.read_bytes() for path in found}
 
     def path_of(self, name: str) -> Path:
-        """Return the path of the file that stores an object."""
+        """Return the path of the file in which the server stores an object."""
         return self._folder / BUCKET / PREFIX / name
 
     def _is_up(self) -> bool:
@@ -95,7 +95,7 @@ class BucketServer:
 
 @contextmanager
 def bucket_server(folder: Path) -> Iterator[BucketServer]:
-    """Yield a running server for the duration of the `with` block."""
+    """Yield a running S3 server for the duration of the `with` block."""
     made = BucketServer(folder)
     made.start()
     try:

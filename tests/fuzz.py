@@ -115,7 +115,7 @@ class _OneFence:
         return ["fence/0000000001-000001.json.gz"]
 
     def get(self, _: str) -> bytes:
-        """Return the content of the only object."""
+        """Return the content of the only object in this bucket."""
         return self._content
 
 

@@ -92,7 +92,9 @@ class Image:
             raise SystemExit(f"error: {name}: is no step that is known here")
 
     def run_command(self, *words: str) -> None:
-        """Run a command of the image. Raise CalledProcessError if its exit code is not 0."""
+        """Run a command with the folders of the image. Raise CalledProcessError if its exit code is
+        not 0.
+        """
         subprocess.run(words, cwd=self.folder, env=self.environment, check=True)
 
     def _start_from(self, base: str) -> None:

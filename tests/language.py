@@ -267,7 +267,7 @@ def read_ceilings() -> dict[str, dict[str, dict[str, float]]]:
 
 
 def lower_ceilings() -> None:
-    """Lower each ceiling to today's figure if that is smaller, and add missing ceilings."""
+    """Lower each ceiling to the present figure if that is smaller, and add missing ceilings."""
     today = {
         "packages": {package: measure_package(package) for package in PACKAGES},
         "pages": measure_pages(),

@@ -56,7 +56,7 @@ class Found(NamedTuple):
 
 
 def is_superlinear(pattern: str) -> bool:
-    """Return True if matching a pattern may take more than linear time."""
+    """Return True if matching a regular expression may take more than linear time."""
     return any(_is_ambiguous(sequence) for sequence in _find_sequences(parser.parse(pattern)))
 
 
@@ -146,7 +146,7 @@ def _describe_part(item: Any) -> Part:  # noqa: ANN401
 
 
 def _match_characters(items: Any) -> Characters:  # noqa: ANN401
-    """Return the ASCII characters that any of the items can match."""
+    """Return the ASCII characters that any of the given items of a pattern can match."""
     out: Characters = frozenset()
     for name, value in items:
         if name is sre.LITERAL:

@@ -87,7 +87,7 @@ def list_licences() -> str:
 
 
 def main() -> int:
-    """Run all steps, print the remaining manual steps, and return the exit code."""
+    """Run all steps of a release, print the remaining manual steps, and return the exit code."""
     version = next(iter(sys.argv[1:]), "")
     if not VERSION.fullmatch(version):
         print("error: version: must be like 0.2.0; make release VERSION=0.2.0", file=sys.stderr)

@@ -408,7 +408,7 @@ def readme_block() -> str:
 
 
 def format_number(value: float | None) -> str:
-    """Return a value as text with four significant digits."""
+    """Return a figure's value as text with four significant digits."""
     if value is None:
         return ""
     return f"{value:,.0f}".replace(",", " ") if abs(value) >= 1e4 else f"{value:.4g}"

@@ -56,7 +56,7 @@ def open_registry(folder: Path) -> Registry:
 
 
 def settings(endpoint: str, folder: Path, **changed: object) -> ZenohSettings:
-    """Return the settings of a session; `changed` are entries of its TLS section."""
+    """Return the Zenoh settings of a session; `changed` are entries of its TLS section."""
     tls = {
         "root_ca_certificate": str(folder / "trust.pem"),
         "connect_certificate": str(folder / "{name}.pem"),

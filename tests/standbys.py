@@ -34,7 +34,7 @@ class Link:
         threading.Thread(target=self._accept_connections, daemon=True).start()
 
     def cut(self) -> None:
-        """Stop forwarding."""
+        """Stop forwarding traffic."""
         self._open.clear()
 
     @property

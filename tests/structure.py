@@ -389,7 +389,7 @@ class Figure(NamedTuple):
     per_1000: bool = False
 
     def measure(self, root: Path) -> float:
-        """Return the value of the figure for a checkout."""
+        """Return the figure's value for a checkout of the repository."""
         count = len(self.places(root))
         return _per_1000_lines(count, root) if self.per_1000 else float(count)
 

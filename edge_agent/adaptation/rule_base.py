@@ -56,7 +56,7 @@ class RuleBase(NamedTuple):
 
 
 def rule_base(memberships: Memberships) -> RuleBase:
-    """Return the rules with the vertices of `memberships`."""
+    """Return the fuzzy rules with the vertices of `memberships`."""
     m = memberships
     ln_noise, pace = m.consequents
     return RuleBase(
@@ -81,7 +81,7 @@ def plain_rules(half: float, power: float, steady: float) -> RuleBase:
 
 @compiled
 def is_high(value: float, ramp: FloatArray) -> float:
-    """Return the membership of `value` in the set that rises from ramp[0] to ramp[1]."""
+    """Return the membership of `value` in a fuzzy set that rises from 0 at ramp[0] to 1 at ramp[1]."""
     return float(min(max((value - ramp[0]) / (ramp[1] - ramp[0]), 0.0), 1.0))
 
 

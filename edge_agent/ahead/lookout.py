@@ -60,11 +60,11 @@ class LookoutCounts:
     subscribers: dict[str, MapSubscriber] = field(default_factory=dict)
 
     def total_of(self, what: str) -> int:
-        """Return the sum of one counter over all map subscribers."""
+        """Return the sum of the counter called `what` over the map subscribers of all vehicles."""
         return sum(one.counts[what] for one in self.subscribers.values())
 
     def values(self) -> dict[str, float]:
-        """Return the counters for the last line of output of a drive."""
+        """Return the counters, by name, that the agent prints in its last line of output."""
         refused = sum(
             n
             for one in self.subscribers.values()
@@ -162,7 +162,7 @@ class Lookout:
         return self._watchers[self._number[name]].outlook
 
     def close(self, within_s: float = 1.0) -> None:
-        """Stop the thread; the sessions stay open."""
+        """Stop the thread that looks ahead; the vehicles' sessions stay open."""
         self._stop.set()
         self._wake.set()
         if self._thread.ident is not None:
@@ -267,7 +267,9 @@ def paths_ahead(
 
 
 def runs_of_places(horizon: Horizon) -> Runs:
-    """Return a horizon as runs of consecutive metres in the same place."""
+    """Return the runs of consecutive metres of a horizon that lie in the same place (cell and
+    sector).
+    """
     key = horizon.key
     starts = np.append(
         0, np.flatnonzero((key[1:] != key[:-1]) | (horizon.basis[1:] != horizon.basis[:-1])) + 1

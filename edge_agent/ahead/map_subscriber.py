@@ -133,7 +133,7 @@ class MapSubscriber:
             self.counts["told"] += 1
 
     def close(self) -> None:
-        """Stop the subscriptions; the session stays open."""
+        """Stop the subscriptions to alerts; the vehicle's session stays open."""
         for subscriber in self._subscribers.values():
             subscriber.undeclare()
         self._subscribers.clear()

@@ -69,7 +69,7 @@ class Path(NamedTuple):
     y: FloatArray
 
     def first_metres(self, length: float) -> Path:
-        """Return the first `length` metres of the path."""
+        """Return the part of the path that covers its first `length` metres."""
         n = max(int(length), 1)
         return Path(
             self.kind,

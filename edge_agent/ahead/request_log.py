@@ -34,7 +34,7 @@ LEAVE_S: Final = 20.0
 
 
 class Box(NamedTuple):
-    """Rectangle of the map, with its sides in degrees."""
+    """Rectangle of the map, given by the latitude or longitude of its sides [deg]."""
 
     west: float
     south: float

@@ -89,7 +89,7 @@ class AgentPart(Protocol):
         """Use the opened Zenoh session of a vehicle."""
 
     def start_part(self) -> None:
-        """Start the part, before the first block."""
+        """Start the part, before the agent processes the first block."""
 
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:
         """Update the part from the pipeline after a block; `admitted` is True if the block's
@@ -97,7 +97,7 @@ class AgentPart(Protocol):
         """
 
     def close_part(self) -> Mapping[str, float]:
-        """Stop the part, and return counts for the last line of output."""
+        """Stop the part, and return its counts for the agent's last line of output."""
 
 
 class Agent:

@@ -54,7 +54,9 @@ class Plausibility:
     away: list[FloatArray] = field(default_factory=list)
 
     def add(self, t: FloatArray, signals: FloatArray, estimates: Estimates) -> None:
-        """Add a block: t (T, 1), signals (T, 1, 18) and their estimates."""
+        """Add a block of the replay: t (T, 1), signals (T, 1, 18) and the estimates of these
+        samples.
+        """
         wheels = signals[:, 0, S.OMEGA : S.OMEGA + 4]
         some = np.isfinite(wheels).any(axis=1)
         speed = np.full(len(wheels), np.nan)

@@ -27,12 +27,12 @@ class PublisherState(Protocol):
 
     @property
     def links(self) -> int:
-        """Return the number of open sessions."""
+        """Return the number of open Zenoh sessions."""
         ...
 
     @property
     def cut_off(self) -> bool:
-        """Return True if an open session has no router."""
+        """Return True if an open Zenoh session has no connection to a router."""
         ...
 
     @property
@@ -42,7 +42,7 @@ class PublisherState(Protocol):
 
     @property
     def counts(self) -> Counts:
-        """Return the numbers of records by kind and result."""
+        """Return the numbers of records by kind and by result (acknowledged, rejected, …)."""
         ...
 
 

@@ -121,7 +121,7 @@ class Trip:
         self._start_examination(final=True)
 
     def close(self) -> None:
-        """Wait at most LEAVE_S for the examination to end."""
+        """Wait at most LEAVE_S for the running examination of the signals to end."""
         if self._looking is not None:
             try:
                 self._looking.result(LEAVE_S)
@@ -212,7 +212,7 @@ def _read_state(path: Path, identity: str) -> Known:
 
 
 def _write_state(path: Path, known: Known) -> None:
-    """Write the stored knowledge to its file, atomically."""
+    """Write the stored knowledge about a car to its file, atomically."""
     part = path.with_suffix(".part")
     try:
         with part.open("w", encoding="utf-8") as file:

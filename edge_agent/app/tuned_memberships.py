@@ -59,7 +59,7 @@ class Score(Record):
 
 
 class SplitScores(Record):
-    """Scores on the drives used in the search, and on held-out drives."""
+    """Scores of the memberships on the drives used in the search, and on held-out drives."""
 
     train: Score
     held_out: Score
@@ -104,7 +104,7 @@ class Document(Record):
 
 @dataclass(frozen=True)
 class Tuned:
-    """A parsed file: its valid memberships, and its complete document."""
+    """A parsed file of tuned memberships: the valid memberships, and the complete document."""
 
     memberships: Memberships
     document: Document

@@ -35,7 +35,9 @@ Drive: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 class Prediction(NamedTuple):
-    """Predictive score of a vehicle with a certain calibration on one drive."""
+    """Score of a vehicle with a certain calibration: it shows how well the vehicle predicts the
+    measurements of one drive.
+    """
 
     log_likelihood: float  # of the innovations [nat/s]
     contradicted: float  # share of the time

@@ -93,7 +93,7 @@ LINE: Final = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command line; return the exit code."""
+    """Run a command line of `edge-agent`; return the exit code."""
     arguments = commandline.join_negative_numbers(sys.argv[1:] if argv is None else argv)
     chosen = next((argument for argument in arguments if not argument.startswith("-")), None)
     progress_messages.enable_messages(quiet=commandline.wants_quiet(arguments))

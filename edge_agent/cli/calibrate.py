@@ -70,7 +70,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:
-    """Replay a drive with a vehicle; return how well the estimator predicts its measurements."""
+    """Replay a drive with a vehicle; return the score of the estimator's predictions of the
+    measurements.
+    """
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.calibration.held_out import Prediction
     from edge_agent.estimators.estimates import Column

@@ -44,7 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Import the recordings; return 0 if the command succeeded."""
+    """Import the recordings into a signal log, write a draft profile, or list the profiles; return
+    0.
+    """
     from edge_agent.app.estimates_file import prepare_path
     from edge_agent.inputs.bring_in import database_of, read_source, write_log
     from edge_agent.inputs.doctor.adopt import align_import

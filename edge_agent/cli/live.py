@@ -67,11 +67,11 @@ class VssPart:
         self._output = output
 
     def attach_session(self, name: str, session: zenoh.Session) -> None:
-        """Publish the signals on a vehicle's session."""
+        """Publish the friction signals on a vehicle's session."""
         self._output.attach(name, session)
 
     def start_part(self) -> None:
-        """Do nothing: the output starts with the first report."""
+        """Do nothing: the output starts with the first report of friction."""
 
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:
         """Report the friction after a block, if its records may be published."""

@@ -225,7 +225,7 @@ def _search_worth(score: Score, objective: str) -> float:
 
 
 def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
-    """Run the study with --study, and write its results into a folder; return 0."""
+    """Run the study of paper 004's filter, and write its results into a folder; return 0."""
     from edge_agent.lab.tuning import study_report
 
     if importlib.util.find_spec("matplotlib") is None:

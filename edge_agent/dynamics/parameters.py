@@ -15,7 +15,7 @@ from schemas.vehicle import Vehicle
 
 
 class Parameter(IntEnum):
-    """Index of a vehicle parameter in its array (row)."""
+    """Index of a vehicle parameter in a parameter row (array of all parameters of one vehicle)."""
 
     MASS = 0  # [kg]
     YAW_INERTIA = 1  # [kg m^2]
@@ -103,7 +103,7 @@ class Body(NamedTuple):
 
 @inlined
 def body_of(row: FloatArray) -> Body:
-    """Return the body parameters in a parameter row (15,)."""
+    """Return the parameters that body and tyres use, from a parameter row (15,)."""
     p = Parameter
     return Body(
         row[p.MASS],

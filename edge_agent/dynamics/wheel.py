@@ -14,7 +14,9 @@ from schemas.runtime.jit import compiled
 def force_from_torque(
     torque: float, wheel_acceleration: float, inertia: float, radius: float
 ) -> float:
-    """Return the longitudinal tyre force F_x = (T - J*omega')/R [N]."""
+    """Return the longitudinal tyre force F_x = (T - J*omega')/R [N] that follows from the wheel
+    torque T.
+    """
     return (torque - inertia * wheel_acceleration) / radius
 
 

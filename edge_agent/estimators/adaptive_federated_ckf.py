@@ -52,7 +52,7 @@ ORDINARY = 1.0  # c of (32): gamma up to here is no sign of trouble; the paper's
 
 
 class AdaptiveMemory(FederatedMemory):
-    """Memory of the filter of one vehicle."""
+    """Memory of paper 001's filter for one vehicle."""
 
     actual: Annotated[FloatArray, 2, ROWS]  # windowed squared innovations
     expected: Annotated[FloatArray, 2, ROWS]  # windowed innovation variances

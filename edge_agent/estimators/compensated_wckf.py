@@ -87,7 +87,7 @@ class DriveWheelState(IntEnum):
 
 
 class CompensatedMemory(PaperMemory):
-    """Memory of the two filters, WCKF-A and WCKF-B, of one vehicle."""
+    """Memory of paper 002's filters, WCKF-A and WCKF-B, for one vehicle."""
 
     mean: Annotated[FloatArray, A_STATES]
     root: Annotated[FloatArray, A_STATES, A_STATES]

@@ -80,7 +80,7 @@ AY_SHARE = 0.05  # of a_y that the tyre model may miss
 
 
 class JointMemory(FederatedMemory):
-    """Memory of the joint filter of one vehicle."""
+    """Memory of paper 000's joint filter for one vehicle."""
 
     mean: Annotated[FloatArray, WHEELS]  # friction
     root: Annotated[FloatArray, WHEELS, WHEELS]

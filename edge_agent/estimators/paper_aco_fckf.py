@@ -101,7 +101,7 @@ printed tables.
 
 
 class FuzzyMemory(PaperMemory):
-    """Memory of the filter of one vehicle."""
+    """Memory of paper 004's filter for one vehicle."""
 
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]
@@ -155,7 +155,7 @@ def make_bank(
 
 @compiled
 def _begin_filter(memory: FuzzyMemory, context: FuzzyContext) -> None:
-    """Begin the filter straight ahead at the speed of the wheels."""
+    """Begin the filter with a straight motion at the speed of the wheels."""
     mean = memory.mean
     root = memory.root
     use = memory.track.inputs

@@ -110,7 +110,7 @@ class WheelFrictionState(IntEnum):
 
 
 class UnscentedMemory(PaperMemory):
-    """Memory of the filter of one vehicle."""
+    """Memory of the filter `sr-ukf` for one vehicle."""
 
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]

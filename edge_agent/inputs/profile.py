@@ -28,7 +28,7 @@ Text = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class Part(BaseModel):
-    """Base of the parts of a profile; unknown field names are rejected."""
+    """Base class of the records in a profile; unknown field names are rejected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -88,7 +88,7 @@ class Channel(Part):
 
     @property
     def signals(self) -> list[str]:
-        """Return the full names of the signals whose values are added."""
+        """Return the full names of the signals whose values are added to give the channel's value."""
         names = [self.signal] if isinstance(self.signal, str) else self.signal
         return [self.full_name(name) for name in names]
 

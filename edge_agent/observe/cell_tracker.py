@@ -85,7 +85,7 @@ class Located(NamedTuple):
 
 
 def new_tracks(vehicles: int) -> RecordArray:
-    """Return tracks (N,) of vehicles that have not received a position."""
+    """Return the initial tracks (N,) of vehicles that have not received a position."""
     tracks = records(CellTrack, vehicles)
     for name in tracks.dtype.names or ():
         tracks[name] = NOWHERE if name in ("cell", "sector") else np.nan

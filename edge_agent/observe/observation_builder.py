@@ -113,14 +113,16 @@ class Sample:
 
 @dataclass(frozen=True)
 class OpenVisits:
-    """Open visits as records (N,), and the number of the last state slot (N,)."""
+    """Open visits of all vehicles as records (N,), and the time slot of each vehicle's last state
+    (N,).
+    """
 
     visits: RecordArray
     slot: IntArray
 
     @staticmethod
     def before_any(vehicles: int) -> OpenVisits:
-        """Return the state before the first visit."""
+        """Return the open visits of vehicles that have not begun a visit."""
         visits = records(Visit, vehicles)
         visits["cell"] = NOWHERE
         return OpenVisits(visits, np.full(vehicles, np.iinfo(np.int64).min))
@@ -443,7 +445,7 @@ def _likelihood_bytes(ended: RecordArray, evidence: FloatArray | None) -> NDArra
 def _build_states(
     after: OpenVisits, time: IntArray, located: Located, estimates: Estimates, config: AgentConfig
 ) -> RecordBlock:
-    """Return the states: the first sample of each time slot in which the position is known.
+    """Return the states to publish: the first sample with a known position in each time slot.
     `after.slot` is advanced.
     """
     slot = np.floor_divide(time, round(NS / config.state_rate_hz))

@@ -25,7 +25,8 @@ class TripEnds:
 
     Args:
         vehicles: number of vehicles.
-        metres, seconds: distance and time at each end of a trip; both must have passed.
+        metres, seconds: distance and time from either end of a trip; a record is published only
+            beyond both.
     """
 
     def __init__(self, vehicles: int, metres: float, seconds: float) -> None:
@@ -71,7 +72,9 @@ class TripEnds:
         return _select_rows(both, begun & passed)
 
     def _drop_old_track(self) -> None:
-        """Drop the stored track before the oldest waiting record."""
+        """Drop the part of the vehicles' stored tracks that is older than the oldest waiting
+        record.
+        """
         waiting = [
             r.columns[_TIME[kind]].min() for kind, r in self._waiting.items() if len(r.vehicle)
         ]

@@ -95,7 +95,7 @@ class Batcher:
             group.urgent |= bool(records.urgent[chosen].any())
 
     def take_due(self, now: float, *, everything: bool = False) -> list[Draft]:
-        """Remove the batches that are due (or all, with `everything`), and return them."""
+        """Remove the batches that are due (or all batches, with `everything`), and return them."""
         drafts: list[Draft] = []
         for place, group in list(self._groups.items()):
             whole = everything or group.urgent or now - group.since >= self._flush_s

@@ -251,7 +251,7 @@ class Outbox:
 
     @property
     def bytes(self) -> int:
-        """Return the size of all stored payloads [bytes]."""
+        """Return the total size of the stored payloads [bytes]."""
         return self._bytes
 
     def unanswered_s(self, now: float) -> float:

@@ -78,7 +78,7 @@ class Publisher:
         self._sender = threading.Thread(target=self._send_loop, name="sender", daemon=True)
 
     def start(self) -> None:
-        """Start the threads that open the sessions and send."""
+        """Start two threads: one opens the Zenoh sessions, the other sends."""
         self._links.start()
         self._sender.start()
 
@@ -94,7 +94,7 @@ class Publisher:
         )
 
     def count_unsettled(self, kind: Kind | None = None) -> int:
-        """Return the number of unsettled records; see `PublisherStatus`."""
+        """Return the number of records that no service has settled yet; see `PublisherStatus`."""
         return self.status.count_unsettled(kind)
 
     def offer(self, *blocks: RecordBlock) -> None:

@@ -53,7 +53,7 @@ class SignalProvider(Protocol):
     """Interface of a receiver for the signals of a vehicle."""
 
     def write(self, signals: Mapping[str, float], time_ns: int) -> None:
-        """Accept signals [%] and their time [ns UTC] without waiting."""
+        """Accept signals [%] and their time [ns UTC] for sending, without waiting."""
 
     def close(self) -> None:
         """Deliver the waiting signals, and stop."""
@@ -114,6 +114,6 @@ class RoadFrictionOutput:
                 publisher.put(line.encode())
 
     def close(self) -> None:
-        """Close the provider, if there is one."""
+        """Close the provider of the signals, if there is one."""
         if self._provider is not None:
             self._provider.close()

@@ -62,7 +62,7 @@ def print_progress(line: str) -> None:
 
 
 def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
-    """Return the median duration [s] of a function."""
+    """Return the median duration [s] of several calls of a function."""
     spent = []
     for _ in range(rounds):
         began = time.perf_counter()

@@ -62,5 +62,5 @@ def parquet_bytes() -> list[Figure]:
 
 
 def size_of(paths: Iterable[Path]) -> int:
-    """Return the size of files in bytes."""
+    """Return the total size of files in bytes."""
     return sum(path.stat().st_size for path in paths)

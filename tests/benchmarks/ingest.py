@@ -93,12 +93,12 @@ def _decoding_s(sent: list[Message], decode: Callable[[list[Message]], object]) 
 
 
 def turn_of(sent: list[Message]) -> int:
-    """Return the number of messages that the service takes at once."""
+    """Return the number of messages that the service ingests in one turn."""
     return min(STEP_BYTES // len(sent[0].payload), STEP_MESSAGES)
 
 
 def _decode_messages(sent: list[Message]) -> list[NDArray[Any]]:
-    """Return the columns of messages, decoded by protobuf's generated module."""
+    """Return the columns of the observations in messages, decoded by protobuf's generated module."""
     read = [MESSAGE.FromString(message.payload) for message in sent]
     out: list[NDArray[Any]] = []
     for name, dtype in wire.column_types(Kind.OBSERVATION).items():

@@ -57,7 +57,7 @@ def compile_library(source: str, *options: str) -> ctypes.CDLL:
 
 
 def setting_row(memberships: Memberships) -> FloatArray:
-    """Return the fields of the kernels' C structure Setting as an array."""
+    """Return an array with the fields of the structure Setting of the C kernels."""
     setting = Setting()
     return np.array(
         [
@@ -104,7 +104,7 @@ def pointer_to(array: FloatArray) -> ctypes.c_void_p:
 
 
 class Limit:
-    """N filters in C, one structure each, on all OpenMP threads."""
+    """Bank of N filters in C, one structure each, on all OpenMP threads."""
 
     def __init__(
         self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
@@ -142,8 +142,8 @@ class Limit:
 
 
 class VectorLimit:
-    """N filters in C, interleaved in SIMD vectors, on one thread. N must be a multiple of the
-    vector length.
+    """Bank of N filters in C, interleaved in SIMD vectors, on one thread. N must be a multiple of
+    the vector length.
     """
 
     def __init__(
@@ -159,7 +159,9 @@ class VectorLimit:
         )
 
     def side_by_side(self, values: FloatArray) -> FloatArray:
-        """Convert (..., N, numbers) to (..., N/lanes, numbers, lanes), aligned to a vector."""
+        """Rearrange values (..., N, numbers) of N vehicles to (..., N/lanes, numbers, lanes),
+        aligned to a SIMD vector.
+        """
         *rest, vehicles, numbers = values.shape
         turned = values.reshape(*rest, vehicles // self._lanes, self._lanes, numbers).swapaxes(
             -1, -2

@@ -70,7 +70,7 @@ def list_records(document: bytes) -> list[ET.Element]:
 
 
 def is_over(record: ET.Element) -> bool:
-    """Return True if a record states its end."""
+    """Return True if a situation record states its end."""
     return record.find(".//com:overallEndTime", _SPACES) is not None
 
 
@@ -215,7 +215,7 @@ def count_features(address: str) -> int:
 
 
 def cells_of(document: bytes) -> set[int]:
-    """Return the cells that lie in a situation of a publication."""
+    """Return the map cells that lie in a situation of a DATEX II publication."""
     found = set[int]()
     for record in list_records(document):
         words = record.findtext(".//loc:posList", "", _SPACES).split()
@@ -250,7 +250,7 @@ def can_open(reader: str, address: str) -> bool:
 
 
 def ogrinfo_opens(address: str) -> bool:
-    """Return True if GDAL's program ogrinfo lists all features."""
+    """Return True if GDAL's program ogrinfo lists all features of the page's OGC API."""
     words = ["ogrinfo", "-ro", "-al", "-q", f"OAPIF:{address}", "grip"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
     held = done.stdout.count("OGRFeature(grip)") == street.count_known("ice", "passed", "wet")

@@ -26,8 +26,8 @@ class Problem(NamedTuple):
     speed: float  # [m/s] at the first
 
     def start(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return mean (6,), covariance (6, 6), process noise Q (6, 6) per sample and measurement
-        noise R (3, 3).
+        """Return mean (6,) and covariance (6, 6) of the initial state, process noise Q (6, 6) per
+        sample and measurement noise R (3, 3).
         """
         setting = Setting()
         mean = np.array([self.speed, 0.0, *self.readings[0, :3], setting.mu])
@@ -66,7 +66,7 @@ def by_numpy(problem: Problem) -> FloatArray:
 
 
 def by_filterpy(problem: Problem) -> FloatArray:
-    """Run filterpy's cubature filter. Return the last mean (6, 1)."""
+    """Run filterpy's cubature filter over the readings. Return the last mean (6, 1)."""
     from filterpy.kalman import CubatureKalmanFilter
 
     inputs: dict[str, FloatArray] = {}
@@ -90,7 +90,9 @@ def by_filterpy(problem: Problem) -> FloatArray:
 
 
 def by_stonesoup(problem: Problem) -> FloatArray:
-    """Run Stone Soup's cubature predictor and updater. Return the last mean (6, 1)."""
+    """Run Stone Soup's cubature predictor and updater over the readings. Return the last mean (6,
+    1).
+    """
     from stonesoup.models.measurement.linear import LinearGaussian
     from stonesoup.models.transition.base import TransitionModel
     from stonesoup.predictor.kalman import CubatureKalmanPredictor
@@ -103,7 +105,7 @@ def by_stonesoup(problem: Problem) -> FloatArray:
     inputs: dict[str, FloatArray] = {}
 
     class Motion(TransitionModel):  # type: ignore[misc]
-        """Transition model with the function f and the process noise Q."""
+        """Transition model of Stone Soup with the function f and the process noise Q."""
 
         ndim_state = 6
 

@@ -133,7 +133,7 @@ def bare(endpoint: str, folder: str) -> None:
 
 @contextmanager
 def run_process(*words: str) -> Iterator[None]:
-    """Run a command for the duration of the block."""
+    """Run a command in a process for the duration of the `with` block."""
     running = subprocess.Popen(
         [sys.executable, *words], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
     )
@@ -145,12 +145,12 @@ def run_process(*words: str) -> Iterator[None]:
 
 
 def fetch_reply(session: zenoh.Session, selector: str) -> bytes:
-    """Return the only reply to a query; empty if there is none."""
+    """Return the only reply to a map query; empty if there is none."""
     return b"".join(reply.ok.payload.to_bytes() for reply in session.get(selector) if reply.ok)
 
 
 def poll_until(something: Callable[[], object]) -> None:
-    """Repeat a query until its answer is not empty. Raise TimeoutError after two minutes."""
+    """Repeat a map query until its answer is not empty. Raise TimeoutError after two minutes."""
     deadline = time.monotonic() + 120.0
     while not something():
         if time.monotonic() > deadline:

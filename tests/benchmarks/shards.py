@@ -107,7 +107,7 @@ def _time_round(running: Sequence[subprocess.Popen[str]]) -> float:
 
 
 def engine(root: str) -> None:
-    """Run one engine that ingests one burst per line of standard input."""
+    """Run an engine that ingests one burst of messages for each line of standard input."""
     bursts = [
         [Message(*fields) for fields in burst]
         for burst in pickle.loads((Path(root) / "sent").read_bytes())
@@ -124,7 +124,7 @@ def engine(root: str) -> None:
 
 
 def _make_burst(number: int) -> list[Message]:
-    """Return messages for two regions, alternating."""
+    """Return a burst of messages whose observations lie alternately in two regions."""
     now = time.time_ns()
     west, east = (
         make_messages(BURST, ROWS, now, VEHICLES, number * BURST, side) for side in (0, 1)
@@ -133,7 +133,7 @@ def _make_burst(number: int) -> list[Message]:
 
 
 def list_regions(burst: Sequence[Message]) -> list[str]:
-    """Return the region part of the keys of both regions of a burst."""
+    """Return both regions of a burst, as they appear in the Zenoh keys of the messages."""
     return ["/".join(message.key.split("/")[3:6]) for message in burst[:2]]
 
 

@@ -74,7 +74,7 @@ Kind = TypeVar("Kind", Limit, VectorLimit)
 
 
 def make_limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> Kind:
-    """Return C filters in the state of the drive's first sample."""
+    """Return a bank of C filters in the state of the drive's first sample."""
     rows = parameter_table([drive.vehicle] * vehicles)
     return kind(
         rows, np.repeat(drive.readings[:1], vehicles, 0), speed, shipped_memberships(TUNED[NAME])

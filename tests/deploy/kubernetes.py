@@ -72,7 +72,7 @@ def find_schema_errors(objects: list[Manifest]) -> list[str]:
 
 
 def of_kind(objects: list[Manifest], kind: str) -> list[Manifest]:
-    """Return the objects of a kind."""
+    """Return the Kubernetes objects of a kind, such as "Service"."""
     return [one for one in objects if one["kind"] == kind]
 
 
@@ -90,12 +90,12 @@ class Pod:
 
     @property
     def containers(self) -> list[Manifest]:
-        """Return the containers that keep running, without the init containers."""
+        """Return the containers of the pod that keep running, without the init containers."""
         return list(self.template["spec"]["containers"])
 
     @property
     def grace_s(self) -> float:
-        """Return the termination grace period [s]."""
+        """Return the termination grace period of the pod [s]."""
         return float(self.template["spec"]["terminationGracePeriodSeconds"])
 
     def port_of(self, container: Manifest, named: str | int) -> int:
@@ -191,7 +191,7 @@ class Cluster:
         return pod.root / str(mount["name"])
 
     def _fill_volumes(self, pod: Pod) -> None:
-        """Write the files into the mounted volumes of a pod."""
+        """Write the files of a pod's volumes into the mounted folders."""
         volumes = {one["name"]: one for one in pod.template["spec"]["volumes"]}
         for container in [*pod.template["spec"].get("initContainers", []), *pod.containers]:
             for mount in container.get("volumeMounts", []):

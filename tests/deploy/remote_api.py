@@ -99,7 +99,7 @@ def _encoding(encoding: zenoh.Encoding) -> bytes:
 
 
 def _sample(sample: zenoh.Sample) -> bytes:
-    """Return a serialized sample without attachment and timestamp."""
+    """Return a received sample, serialized for the client, without attachment and timestamp."""
     congestion = int(sample.congestion_control == zenoh.CongestionControl.BLOCK)
     priority = 1 + PRIORITIES.index(sample.priority)
     quality = priority | congestion << 3 | int(sample.express) << 4

@@ -34,7 +34,7 @@ START_NS = 1_767_225_600_000_000_000  # 2026-01-01
 
 @dataclass(frozen=True)
 class MadeUp:
-    """Arbitrary estimates that do not depend on signals."""
+    """Synthetic output of an estimator bank, which does not depend on signals."""
 
     vx: FloatArray
     vy: FloatArray
@@ -50,7 +50,7 @@ class MadeUp:
     jumps: NDArray[np.bool_] | None = None
 
     def part(self, rows: slice) -> MadeUp:
-        """Return the estimates of a slice of the samples."""
+        """Return the estimates of those samples that a slice selects."""
         cut = {f.name: v[rows] for f in fields(self) if (v := getattr(self, f.name)) is not None}
         return replace(self, **cut)
 
@@ -120,7 +120,7 @@ class Watch:
 
     @staticmethod
     def of(vehicles: int, config: AgentConfig | None = None) -> Watch:
-        """Return the state before the first sample."""
+        """Return the tracks and open visits of vehicles before the first sample."""
         return Watch(new_tracks(vehicles), OpenVisits.before_any(vehicles), config or AgentConfig())
 
     def step(self, block: Block, output: MadeUp) -> tuple[Located, RecordBlock, RecordBlock]:
@@ -134,7 +134,7 @@ class Watch:
 
 
 def part(block: Block, rows: slice) -> Block:
-    """Return a slice of the samples of a block."""
+    """Return those samples of a block that a slice selects."""
     return Block(block.t[rows], block.time[rows], block.signals[rows])
 
 

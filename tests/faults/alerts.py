@@ -127,7 +127,7 @@ def _make_ice_batches(turn: int, places: int) -> list[Batch]:
 
 
 def _has_alerts(session: zenoh.Session, least: int) -> bool:
-    """Return True if at least `least` alerts are active."""
+    """Return True if the service has at least `least` active alerts."""
     return len(_list_alerts(session)) >= least
 
 

@@ -173,7 +173,7 @@ def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
 
 
 def list_foreign_keys(name: str) -> list[str]:
-    """Return keys on which a vehicle of this name may not publish."""
+    """Return Zenoh keys on which a vehicle of this name may not publish."""
     other = HONEST if name != HONEST else ROGUE
     return [
         key(other),
@@ -363,7 +363,7 @@ def who_is_alive_is_told_to_a_vehicle(ground: Ground) -> bool:
 
 
 def as_router(ground: Ground, mode: str) -> bool:
-    """Connect as a router or peer, through which messages of others might pass."""
+    """Connect as a router or peer, so that messages of others might pass the attacker."""
     given = settings(ground.network.endpoints[ROUTERS[1]], ground.folder)
     given = given.model_copy(
         update={"config": {**given.config, "mode": mode, "listen/endpoints": []}}

@@ -51,7 +51,9 @@ class Target(NamedTuple):
 
 
 def run(site: Site) -> list[Figure]:
-    """Send twenty requests during each attack; in a quick run, six."""
+    """Send twenty requests of another reader during each attack (in a quick run, six), and return
+    the figures.
+    """
     asked = site.choose_amount(20, 6)
     served = {}
     with open_stage(site.folder, vehicle_kb_s=1e4, vehicle_burst_kb=1e5) as there:

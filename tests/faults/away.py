@@ -103,7 +103,7 @@ def _make_draft(car: int, now: float) -> tuple[Draft, int]:
 
 
 def run(site: Site) -> list[Figure]:
-    """Simulate an outage of one hour; in a quick run, of ten minutes."""
+    """Simulate an outage of one hour (in a quick run, ten minutes), and return the figures."""
     with closing(Engine(ServiceConfig(), site.folder / "archive")) as engine:
         return _run_outage(site, engine)
 

@@ -68,7 +68,7 @@ class Machine:
 
 @dataclass
 class Found:
-    """Numbers of failures, summed over the cases."""
+    """Numbers of failures by kind, summed over the cases."""
 
     sent: int = 0
     rejected: int = 0

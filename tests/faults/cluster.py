@@ -198,7 +198,7 @@ def _make_figures(failovers: int, happened: list[Failover], census: list[Census]
 
 
 def _make_figure(failovers: int, name: str, value: float, unit: str) -> Figure:
-    """Return a figure, with its target only if the whole campaign ran."""
+    """Return a figure of the campaign, with its target only if the whole campaign ran."""
     return make_figure(name, value) if failovers >= FULL else Figure(name, value, unit)
 
 
@@ -219,7 +219,7 @@ def _make_median_figures(happened: list[Failover]) -> list[Figure]:
 
 
 def main() -> int:
-    """Run the campaign. Return 0 if every figure meets its target, otherwise 1."""
+    """Run the campaign of failovers. Return 0 if every figure meets its target, otherwise 1."""
     parser = argparse.ArgumentParser(
         prog="tests.faults.cluster", description="Services that follow each other."
     )

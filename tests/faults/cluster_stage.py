@@ -151,7 +151,7 @@ class Asking:
         self._thread.start()
 
     def end(self) -> None:
-        """Stop the client's queries."""
+        """Stop the queries of this client."""
         self._stop.set()
         self._thread.join(PATIENCE_S)
 
@@ -315,7 +315,7 @@ class Machines:
         return Failover(name if hit else "kill", seconds)
 
     def _count_leases(self) -> int:
-        """Return the number of leases taken so far."""
+        """Return the number of leases of the region that services have taken so far."""
         return sum(1 for _ in self._leases.glob("*.json"))
 
     def _await_takeover(self) -> None:

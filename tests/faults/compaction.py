@@ -106,7 +106,7 @@ def is_complete(tables: Iterable[pa.Table], owed: int) -> bool:
 
 
 def run(site: Site) -> list[Figure]:
-    """Kill 50 compactions; in a quick run, five."""
+    """Kill 50 compactions (in a quick run, five), and return the figures."""
     root = site.folder / "archive"
     random_ = random.Random(site.seed)
     part = Part(

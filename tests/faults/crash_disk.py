@@ -76,7 +76,7 @@ class CrashDisk:
         return self._numbers
 
     def _keep_content(self, path: Path) -> None:
-        """Record the content of a file that is about to lose its name."""
+        """Record the durable content of a file that is about to lose its name."""
         if path.is_file():
             self._written[self._number[path.stat().st_ino]] = path.read_bytes()
 

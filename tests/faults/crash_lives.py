@@ -59,11 +59,11 @@ class Lives(ABC, Generic[BatchType]):
 
     @abstractmethod
     def _run_life(self, root: Path, last: bool) -> None:
-        """Run one life on the disk `root`."""
+        """Run one life of the archive on the disk `root`."""
 
     @abstractmethod
     def _find_problems(self, root: Path, last: bool) -> list[str]:
-        """Read the archive as the next life finds it, and return the problems."""
+        """Read the archive as the next life finds it, and return its errors."""
 
     def _pass_time(self) -> None:
-        """Change the archive between two lives, as time or an operator would."""
+        """Change the archive between two lives, as the passing of time or an operator would."""

@@ -106,7 +106,9 @@ def _refuse_writes(*names: str) -> Iterator[None]:
 
 
 def run(site: Site) -> list[Figure]:
-    """Fill the disk several times, at different stages of the background jobs."""
+    """Fill the disk several times, at different stages of the background jobs, and return the
+    figures.
+    """
     false = 0
     stuck = 0
     refused = 0
@@ -155,7 +157,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def _drive(engine: Engine, since: int, steps: int) -> int:
-    """Run `steps` seconds of load, and return the number of acknowledged batches."""
+    """Run load on the service for `steps` seconds, and return the number of acknowledged batches."""
     got = 0
     for seq in range(since + 1, since + steps + 1):
         now = time.time_ns()
@@ -204,7 +206,7 @@ def _count_rows(root: Path) -> int:
 
 
 def _room_made(engine: Engine, folder: Path) -> int:
-    """Fill the disk, run retention, and return the number of days that it deleted."""
+    """Fill the disk, run the retention job, and return the number of days that it deleted."""
     root = folder / "archive"
     begin_with_old_rows(root)
     with patch.multiple(disk_reserve, SIZE=RESERVE_MB << 20, _LEAST_FREE=2 * RESERVE_MB << 20):

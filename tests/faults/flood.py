@@ -95,7 +95,7 @@ class Honest:
         )
 
     def drive(self) -> None:
-        """Send the vehicle's next batch."""
+        """Send the next batch of this honest vehicle."""
         seq = len(self.sent) + 1
         one = make_visit(self.name, seq, time.time_ns())
         self._last[seq] = time.monotonic()
@@ -103,7 +103,7 @@ class Honest:
         self._put_batch(one)
 
     def resend(self) -> None:
-        """Send again the batches that wait for longer than RESEND_S, as an outbox does."""
+        """Send again this vehicle's batches that wait for longer than RESEND_S, as an outbox does."""
         now = time.monotonic()
         for seq in [seq for seq in self._last if seq in self.delays]:
             del self._last[seq]
@@ -115,7 +115,7 @@ class Honest:
 
 
 def run(site: Site) -> list[Figure]:
-    """Flood for half a minute; in a quick run, for three seconds."""
+    """Flood the service for half a minute (in a quick run, three seconds), and return the figures."""
     seconds = site.choose_amount(30, 3)
     fleet = make_enrolment(vehicles=[*HONEST, FLOODER])
     with open_network(site.folder / "certificates", fleet=fleet) as running:

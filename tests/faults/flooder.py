@@ -25,7 +25,7 @@ ROWS = (1, 1, 1, 50)  # the smallest messages cost most for their size, the larg
 
 
 def main() -> None:
-    """Send messages for the given time."""
+    """Send observations as fast as possible for the given time."""
     told = json.loads(sys.stdin.readline())
     name = told["name"]
     cells = told["cells"]

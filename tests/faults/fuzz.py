@@ -77,7 +77,9 @@ NEEDED: Final = {"latitude", "longitude"}
 
 
 def run(site: Site) -> list[Figure]:
-    """Process a million malformed messages; in a quick run, some thousands."""
+    """Let the engine process a million malformed messages (in a quick run, some thousands), and
+    return the figures.
+    """
     count = site.choose_amount(1_000_000, 10_000)
     began = time.time_ns()
     crashes = 0

@@ -22,7 +22,9 @@ LONGEST_S: Final = 7200.0
 
 
 def run(site: Site) -> list[Figure]:
-    """Run ten million inputs; in a quick run, some thousands."""
+    """Run the parsers on ten million inputs (in a quick run, some thousands), and return the
+    figures.
+    """
     fuzzers = {
         name: Fuzzer(parser, seeds_of(name), site.seed, make_keeper(site.folder / name))
         for name, parser in PARSERS.items()

@@ -46,7 +46,9 @@ ASKED: Final = (
 
 
 def run(site: Site) -> list[Figure]:
-    """Send two hundred thousand malformed messages; in a quick run, four thousand."""
+    """Send two hundred thousand malformed messages (in a quick run, four thousand), and return the
+    figures.
+    """
     r = random.Random(site.seed)
     sent = 0
     answers = 0
@@ -91,7 +93,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def _make_message(r: random.Random, mutants: Mutants) -> tuple[str, bytes, str]:
-    """Return key, payload and encoding of the next message."""
+    """Return Zenoh key, payload and encoding of the next malformed message."""
     message = mutants.make_message()
     what = r.random()
     if what < 0.02:

@@ -49,7 +49,9 @@ def _make_growth_figure(grown: float, seconds: int, *, quick: bool) -> Figure:
 
 
 def run(site: Site) -> list[Figure]:
-    """Simulate an hour; in a quick run, four minutes."""
+    """Simulate an hour of the insider's messages (in a quick run, four minutes), and return the
+    figures.
+    """
     seconds = site.choose_amount(3600, 240)
     counts = Counter[str]()
     random_ = np.random.default_rng(site.seed)

@@ -49,7 +49,7 @@ class Event(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """Result of the check of a history."""
+    """Result of the check of a history: acknowledgements by two holders, and violations."""
 
     acknowledged_by_two: int
     violations: int
@@ -118,12 +118,12 @@ class VirtualTime:
 
     @property
     def process(self) -> _Process:
-        """Return the process whose thread is running."""
+        """Return the simulated process whose thread is running."""
         assert self._actor is not None
         return self._actor.process
 
     def spawn(self, process: _Process, run: Callable[[], None]) -> _Actor:
-        """Start a thread of a process, and return it."""
+        """Start a thread of a simulated process, and return it."""
         actor = _Actor(process, run)
         self._push_event(self.now, actor)
         threading.Thread(target=self._run_actor, args=(actor,), daemon=True).start()
@@ -223,7 +223,7 @@ class VirtualBucket:
         return cast("bytes | None", self._request(lambda: self.objects.get(name)))
 
     def put(self, name: str, content: bytes) -> None:
-        """Write an object."""
+        """Write an object into the bucket."""
         self._request(lambda: self.objects.__setitem__(name, content))
 
     def create(self, name: str, content: bytes) -> bool:
@@ -270,7 +270,7 @@ class ServiceHistory:
         self.refused = 0
 
     def run(self) -> None:
-        """Simulate the history to its end."""
+        """Simulate the history of the services to its end."""
         for name in NAMES:
             self._start_process(name, 0.0)
         chaos = _Process("chaos", self._random, 1.0)

@@ -359,7 +359,7 @@ def measure_flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, f
 
 
 def measure(site: Site) -> list[Figure]:
-    """Run all parts of the campaign, and return the figures."""
+    """Run all parts of the link campaign, and return the figures."""
     address_s = site.choose_amount(15, 6)
     lossy_s = site.choose_amount(60, 12)
     flood_s = site.choose_amount(20, 5)

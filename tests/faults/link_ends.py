@@ -31,7 +31,7 @@ HEAD: Final = struct.Struct("<Id")  # number of the message, time at which it wa
 
 
 def open_end(given: dict[str, Any]) -> zenoh.Session:
-    """Open a session with the certificate of the given name."""
+    """Open a Zenoh session with the certificate of the given name."""
     one = settings(given["connect"][0], Path(given["certificates"]))
     config = {key: value for key, value in one.config.items() if key != "connect/retry"}
     session = open_session(

@@ -134,7 +134,7 @@ def _set_events(*events: threading.Event) -> None:
 
 
 def main(path: str) -> int:
-    """Run one load generator."""
+    """Run one load generator until it is told to end."""
     plan = Plan(**json.loads(Path(path).read_text()))
     quiet = threading.Event()
     leave = threading.Event()

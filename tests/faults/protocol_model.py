@@ -123,7 +123,7 @@ class Violation(NamedTuple):
 
 
 class Checked(NamedTuple):
-    """Result of exploring all states."""
+    """Result of exploring all states of the model."""
 
     states: int
     violation: Violation | None

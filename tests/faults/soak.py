@@ -109,7 +109,7 @@ def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
 
 
 def main() -> int:
-    """Run the campaign. Return 0 if every figure meets its target, otherwise 1."""
+    """Run the campaign of steady load. Return 0 if every figure meets its target, otherwise 1."""
     parser = argparse.ArgumentParser(
         prog="tests.faults.soak", description="A steady load; does anything grow?"
     )

@@ -30,7 +30,9 @@ from tests.fleet_service.archive.test_version import rewrite_file, with_columns
 
 
 def run(site: Site) -> list[Figure]:
-    """Run both cases, before and after a compaction, with and without a checkpoint."""
+    """Read archives of an older and a newer format, before and after a compaction, with and without
+    a checkpoint. Return the figures.
+    """
     old = site.folder / "old"
     new = site.folder / "new"
     shutil.copytree(DATA / "v1.0" / "archive", old)

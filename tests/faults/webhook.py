@@ -173,7 +173,7 @@ def run_kind(folder: Path, kind: str) -> tuple[int, int]:
 
 
 def run(site: Site) -> list[Figure]:
-    """Run all kinds of receivers at once, for some seconds."""
+    """Send alerts to all kinds of receivers at once, for some seconds, and return the figures."""
     with ThreadPoolExecutor(len(BREAKS)) as pool:
         found = dict(
             zip(BREAKS, pool.map(lambda kind: run_kind(site.folder, kind), BREAKS), strict=True)

@@ -46,7 +46,7 @@ def observations(
     cell: int | Numbers = CELL,
     second: int = -1,
 ) -> Observations:
-    """Return visits at the times START + seconds, numbered in their order."""
+    """Return observations of visits at the times START + seconds, numbered in this order."""
     n = len(seconds)
     whole = np.zeros(n, np.int64)
     time = START + (np.asarray(seconds, float) * SECOND).astype(np.int64)
@@ -148,7 +148,7 @@ def batch(
 
 
 def key(vehicle: str) -> str:
-    """Return the observation key of a vehicle in the region of the examples."""
+    """Return the Zenoh key for observations of a vehicle in the region of the examples."""
     return keys.observation_key(REGION, vehicle)
 
 

@@ -261,7 +261,7 @@ def content(path: Path, folder: Path) -> str:
 
 
 def run_command(words: list[str], folder: Path, capsys: Capture) -> Done:
-    """Run a command in a new folder, and return its result."""
+    """Run a command in a new folder with test files, and return its result."""
     names = place(folder)
     code = main([word.format(**names) for word in words])
     said = capsys.readouterr()
@@ -414,7 +414,7 @@ FAR: Final = (LATITUDE, LONGITUDE + 0.05)
 
 
 def there(name: str, mu: float) -> wire.Batch:
-    """Return a batch of another tile in the same region."""
+    """Return a batch whose visits lie in another tile of the same region."""
     cell = int(grid.cell_of(*FAR))
     return batch(
         name, 2, time.time_ns() - SECOND, [mu], latitude=[FAR[0]], longitude=[FAR[1]], cell=[cell]

@@ -161,7 +161,7 @@ def find_blocked() -> list[str]:
 
 
 def main(endpoint: str) -> None:
-    """Publish, receive, query, and print the results."""
+    """Publish reports, receive messages, query the map, and print the results."""
     with open_session(endpoint) as session:
         heard = Heard(session)
         sent = {

@@ -120,8 +120,8 @@ def pages_with_errors(house: House) -> float:
 
 
 def live_page(house: House) -> tuple[str, list[str], list[str]] | None:
-    """Return the faults of the live page with a service and cars on ice, or None if
-    there are none.
+    """Return the faults (errors and requests to other hosts) of the live page with a service and
+    cars on ice, or None if there are none.
     """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     connection = ZenohSettings(connect=endpoints)

@@ -137,7 +137,7 @@ FLEET: Final = (
 
 
 def prepare_files(folder: Path) -> None:
-    """Create the files that the mistakes need."""
+    """Create the files to which the mistaken commands refer."""
     (folder / "text.csv").write_text("a;b\n1,5;x\n")
     (folder / "bad.json").write_text(json.dumps({"mass": "heavy", "surprise": 1}))
     words = ["simulate", "slalom", "--duration", "1", "--out", str(folder / "log.parquet")]

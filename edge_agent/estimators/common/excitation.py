@@ -26,7 +26,7 @@ class Excitation:
 
 @compiled
 def begin_excitation(ring: Excitation) -> None:
-    """Reset the ring: no grip has been used so far."""
+    """Reset the ring of time slots: no grip has been used so far."""
     ring.largest_time = -math.inf
     for k in range(SLOTS):
         ring.time[k] = -math.inf
@@ -34,7 +34,7 @@ def begin_excitation(ring: Excitation) -> None:
 
 @compiled
 def note_excitation(ring: Excitation, time: float, used: float) -> None:
-    """Add the grip used at `time` [s] to the ring and update `largest`."""
+    """Store the grip used at `time` [s] in the ring of time slots, and update `largest`."""
     place = ring.newest
     if not time - ring.time[place] < SLOT_S:
         place = (place + 1) % SLOTS

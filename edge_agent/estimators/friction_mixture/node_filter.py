@@ -50,7 +50,9 @@ DOUBTED = 0.05  # of distrust_noise, at the brink of it
 
 
 class NodeUpdate(NamedTuple):
-    """Result of the measurement update of one node."""
+    """Result of the measurement update of one node, such as its log-likelihood and its number of
+    rows.
+    """
 
     log_likelihood: float  # with the inflated R and the price of sliding [nat]
     moved: float  # change of `belief_cost` [nat]

@@ -52,7 +52,7 @@ theta = 0 and its peak is 1; beyond the peak it is constant or falls.
 
 
 def check_curve(curve: Curve) -> Curve:
-    """Return the curve if it is valid; otherwise raise ValueError with the reason."""
+    """Return the tyre curve if it is valid; otherwise raise ValueError with the reason."""
     theta = np.linspace(0.0, 10.0, 10_001)
     f = np.asarray(curve(theta), dtype=np.float64)
     if f.shape != theta.shape or not np.isfinite(f).all():
@@ -67,7 +67,7 @@ def check_curve(curve: Curve) -> Curve:
 
 
 def curve_tables(curve: Curve) -> TyreCurve:
-    """Return the tables of a curve, including the spread of shapes between tyres."""
+    """Return the tables of a tyre curve, including the spread of shapes between tyres."""
     u = np.linspace(0.0, 1.0, CELLS + 1)
     theta = u / np.maximum(1.0 - u, 1e-9)
     f = curve(theta)

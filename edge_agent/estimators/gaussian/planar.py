@@ -113,7 +113,7 @@ def propagate_points(
 def _apply_heun_step(
     vehicle: Body, columns: FloatArray, first: int, last: int, drive: HeunInputs
 ) -> None:
-    """Apply one Heun step to the columns first to last - 1, in place.
+    """Apply one Heun step to the states in the columns first to last - 1, in place.
 
     The function is pure arithmetic, so that the compiler can process several points in parallel.
     """
@@ -165,7 +165,7 @@ def _apply_heun_step(
 
 @inlined
 def _with_friction(wheels: WheelInputs, mu: Four) -> WheelInputs:
-    """Return the same wheel inputs with another friction."""
+    """Return the wheel inputs with their friction replaced by `mu`."""
     return WheelInputs(wheels.cos, wheels.sin, wheels.omega, wheels.force_x, mu)
 
 

@@ -39,7 +39,7 @@ class GivenMotion:
 
     @property
     def step(self) -> float:
-        """Return the sampling interval [s]."""
+        """Return the sampling interval of the drive [s]."""
         return float(self.t[1] - self.t[0])
 
     @property

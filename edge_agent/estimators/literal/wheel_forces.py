@@ -43,7 +43,9 @@ class WheelForces:
 
     @classmethod
     def for_drive(cls, given: GivenMotion, *, proportional: bool, single: bool) -> WheelForces:
-        """Return the wheel data of a drive, in single precision if `single` is True."""
+        """Return slips, loads and steering angles of the wheels in a drive, in single precision if
+        `single` is True.
+        """
         kind: Any = np.float32 if single else np.float64
         row = given.row
         p = Parameter

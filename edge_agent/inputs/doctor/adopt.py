@@ -44,7 +44,7 @@ def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
 
 
 def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
-    """Examine a log, correct the measured faults, and examine the corrected log."""
+    """Examine a log, correct the faults whose size the drive shows, and examine the corrected log."""
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
     delays = {
         finding.channel: finding.delay_s

@@ -84,7 +84,7 @@ def find_lags(
 
 
 class _Peak(NamedTuple):
-    """Lag [s] with the largest correlation, and that correlation."""
+    """Shift [s] of one series against another with the largest correlation, and that correlation."""
 
     seconds: float
     likeness: float

@@ -91,5 +91,5 @@ class CanFeed(Feed):
                 self.hear(round(message.timestamp * NS), frame)
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the profile's signals, by name, in the received frames."""
+        """Return the signals that the profile needs, by name, from the received frames."""
         return self._decoder.series(heard)

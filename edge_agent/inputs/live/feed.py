@@ -50,7 +50,7 @@ class HostClock:
         return time.monotonic() - self.steady_s
 
     def seconds_of(self, stamp_ns: int) -> float:
-        """Return a date [ns UTC] as seconds since the start of the clock."""
+        """Return the time since the start of the clock [s] for a date [ns UTC]."""
         return (stamp_ns - self.start_ns) / NS
 
 
@@ -146,12 +146,12 @@ class Feed(ABC):
         self.newest = max(self.newest, placed)
 
     def unreadable(self, reason: str) -> None:
-        """Count an unreadable message. The first one with this reason is logged."""
+        """Count an unreadable message. The first message with this reason is logged."""
         self.broken += 1
         self.say(reason)
 
     def take(self) -> dict[str, Series]:
-        """Return the signals received since the last call."""
+        """Return the signals that the source has received since the last call of this method."""
         heard = [self._waiting.popleft() for _ in range(len(self._waiting))]
         return self.series(heard) if heard else {}
 

@@ -24,7 +24,7 @@ class GpsdFeed(Feed):
         self._address = address
 
     def listen(self) -> None:
-        """Receive reports until the connection ends."""
+        """Receive position reports until the connection to gpsd ends."""
         with socket.create_connection(self._address, CONNECT_S) as connection:
             connection.sendall(WATCH)
             connection.settimeout(TICK_S)

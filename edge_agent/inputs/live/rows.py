@@ -89,7 +89,7 @@ class LiveRows:
         )  # speed over ground of the last block's rows (T,) [m/s]
 
     def blocks(self) -> Generator[Block]:
-        """Yield blocks in real time until the caller stops, then close the sources."""
+        """Yield blocks of samples in real time until the caller stops, then close the sources."""
         size = max(1, round(BLOCK_S * self.rate_hz))
         self._next = math.ceil(self._clock.now() * self.rate_hz)
         for feed in self.feeds:
@@ -116,7 +116,7 @@ class LiveRows:
         return [trouble for feed in self.feeds if (trouble := feed.trouble)]
 
     def _may_deliver(self, time: float) -> bool:
-        """Return True if a source may still deliver readings for a time.
+        """Return True if a source may still deliver readings that belong to the given time.
 
         Silent sources do not count, and neither do position receivers, because their fixes are
         rare.
@@ -253,7 +253,7 @@ class LiveRows:
 
 
 def _readings_at(series: Series | None, times: FloatArray) -> FloatArray:
-    """Return the readings at exactly the given times; NaN at times without a reading."""
+    """Return the readings of a signal at exactly the given times; NaN at times without a reading."""
     found = np.full(len(times), np.nan)
     if series is not None and len(series.t):
         place = np.clip(np.searchsorted(series.t, times), 0, len(series.t) - 1)

@@ -41,7 +41,7 @@ class Frames:
     shortest: int = LONGEST
 
     def add(self, time: float, data: bytes | bytearray) -> None:
-        """Add one frame."""
+        """Add one CAN frame."""
         self.times.append(time)
         self.shortest = min(self.shortest, len(data))
         self.data += data[:LONGEST].ljust(LONGEST, b"\0")

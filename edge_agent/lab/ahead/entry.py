@@ -190,7 +190,7 @@ def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) 
 
 
 def with_map(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
-    """Return the median friction of the beliefs combined with a map, (T, N)."""
+    """Return the median friction (T, N) according to the filters' beliefs combined with a map."""
     prior = MapPrior(trace.place.shape[1])
     out = np.empty(trace.place.shape)
     for t, place in enumerate(trace.place):

@@ -29,7 +29,7 @@ class KnownPlaces(NamedTuple):
 
 
 def places_of(scenario: Scenario, t: float) -> KnownPlaces:
-    """Return the places of a scenario's lanes with their friction at t [s]."""
+    """Return the places (cells and sectors) of a scenario's lanes with their friction at t [s]."""
     points = scenario.network.points
     x = points[:, LanePoint.X]
     y = points[:, LanePoint.Y]

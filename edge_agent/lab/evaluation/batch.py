@@ -66,7 +66,7 @@ class DriveSet:
         return np.asarray(self.mu_wheel.mean(axis=-1))
 
     def last(self, seconds: float) -> slice:
-        """Return the slice of the samples in the last `seconds`."""
+        """Return the slice of the samples in the last `seconds` of the drives."""
         return slice(int(np.searchsorted(self.t[:, 0], self.t[-1, 0] - seconds)), None)
 
 
@@ -140,5 +140,5 @@ def repeat_drive(batch: DriveSet, count: int) -> DriveSet:
 
 
 def estimates(bank: EstimatorBank, batch: DriveSet) -> Estimates:
-    """Return the bank's estimates of the drives."""
+    """Return the estimates that the bank computes from the drives' signals."""
     return bank.advance(batch.t, batch.signals)

@@ -44,8 +44,8 @@ class PlottedDrive:
 
 @dataclass
 class Results:
-    """Measures per drive, by (scenario, estimator): `real` with ordinary sensors, `ideal` with
-    error-free sensors.
+    """Measures of the estimates per drive, by (scenario, estimator): `real` with ordinary sensors,
+    `ideal` with error-free sensors.
     """
 
     real: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)

@@ -90,7 +90,7 @@ class DetectionTally:
         self.add(name, np.array([holds]))
 
     def merge(self, other: DetectionTally) -> None:
-        """Add the sums and times of another tally."""
+        """Add the sums and times of another tally to this one."""
         for name, value in other.total.items():
             self.total[name] = self.total.get(name, 0.0) + value
             self.count[name] = self.count.get(name, 0) + other.count[name]
@@ -125,7 +125,7 @@ def runs_of(on: NDArray[np.bool_]) -> Stretches:
 
 
 def bridge_gaps(on: NDArray[np.bool_], seconds: float) -> NDArray[np.bool_]:
-    """Return `on` (T,) with gaps of at most `seconds` filled."""
+    """Return `on` (T,) with gaps (stretches of False) of at most `seconds` filled."""
     out = on.copy()
     most = round(seconds * RATE_HZ)
     for first, end in runs_of(~on):
@@ -243,8 +243,8 @@ def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
 
 
 def _add_seconds(tally: DetectionTally, key: str, activity: str, wait: float) -> None:
-    """Add a time until detection [s] to the list for all activities, and to the list of its own
-    activity.
+    """Add a time until detection [s] to the list for all slides, and to the list for slides with
+    this cause (`activity`).
     """
     tally.seconds.setdefault(key, []).append(wait)
     tally.seconds.setdefault(f"{key}.{activity}", []).append(wait)
@@ -354,7 +354,7 @@ def _note_visit(
 
 
 class TownTally(NamedTuple):
-    """Tally of one town, with its season."""
+    """Tally of the detection evaluation for one town, with the town's season."""
 
     winter: bool
     tally: DetectionTally
@@ -367,7 +367,7 @@ class DetectionResults:
     towns: dict[tuple[str, str], list[TownTally]] = field(default_factory=dict)
 
     def add(self, length: str, kind: str, town: TownTally) -> None:
-        """Add a town."""
+        """Add the tally of a town."""
         self.towns.setdefault((length, kind), []).append(town)
 
     def pool_towns(

@@ -59,7 +59,7 @@ class DetectionTown(NamedTuple):
 
     @property
     def length(self) -> str:
-        """Return the class of the duration, "short" or "long"."""
+        """Return "short" or "long", the class of the town's duration."""
         return "long" if self.seconds >= LONGER_THAN_SHORT_S else "short"
 
 
@@ -150,7 +150,7 @@ def town_named(text: str) -> DetectionTown:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Evaluate the towns given on the command line, and print a table."""
+    """Evaluate the detection in the towns given on the command line, and print a table."""
     parse = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -37,7 +37,7 @@ DRIVES: Final = {
 
 
 def in_order(t: FloatArray) -> FloatArray:
-    """Return the clock t (T, N) unchanged."""
+    """Return the clock t (T, N) unchanged, for faults that do not affect the time stamps."""
     return t
 
 

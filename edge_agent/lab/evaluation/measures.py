@@ -46,7 +46,7 @@ def is_covered(batch: DriveSet, reported: Estimates) -> BoolArray:
 
 
 def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Return the measures that are defined for every drive, by name, (N,) each."""
+    """Return the measures of estimates that are defined for every drive, by name, (N,) each."""
     end = batch.last(LAST_S)
     found: dict[str, FloatArray] = {}
     for name, error in errors(batch, reported).items():

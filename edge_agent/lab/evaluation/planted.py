@@ -49,7 +49,9 @@ Spoil: TypeAlias = Callable[[Recorded], Recorded]
 
 
 class Planted(NamedTuple):
-    """A fault, and the finding (channel and kind) that must name it."""
+    """A fault added to a drive, and the finding (channel and kind) with which the doctor must name
+    it.
+    """
 
     spoil: Spoil
     channel: str

@@ -39,7 +39,9 @@ PRINTED_002: Final = {"sine": (".1008", ".0779"), "jturn": (".0825", ".0117")}
 def printed_row(
     paper: str, scenario: str, estimator: str, measure: str, what: str, value: str
 ) -> Printed:
-    """Return a row whose comparison figure is measured with error-free sensors."""
+    """Return a paper's printed number together with our figure, which is measured with error-free
+    sensors.
+    """
     same = f"ideal.{scenario}.{estimator}.{measure}"
     real = f"real.{scenario}.ESTIMATOR.{measure}"
     return Printed(paper, what, value, same, real)

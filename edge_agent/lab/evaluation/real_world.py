@@ -68,7 +68,9 @@ STANDING_SLOPES: Final = (0.05, 0.08)
 
 @dataclass
 class Tally:
-    """Sums and counts over samples by name: `add` adds values, `means` returns their means."""
+    """Sums and counts of measures over samples, by name: `add` adds values, `means` returns their
+    means.
+    """
 
     total: dict[str, float] = field(default_factory=dict)
     count: dict[str, int] = field(default_factory=dict)
@@ -156,7 +158,7 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
 
 
 def tally_town(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) -> None:
-    """Add the results of one town to the tally of an estimator."""
+    """Add an estimator's results in one town to its tally."""
     mu = batch.mu
     inside = is_covered(batch, reported)
     width = reported.mu_upper - reported.mu_lower

@@ -95,7 +95,9 @@ def campaign(
 
 
 def ways() -> dict[str, list[MixtureDesign]]:
-    """Return the filters of each variant; a variant with several searches has several filters."""
+    """Return the filters that represent each filter variant; a variant with several searches has
+    several filters.
+    """
     untuned = Memberships()
     found = {
         "fuzzy": [design_of(shipped_memberships(ESTIMATOR), adaptive=True)],

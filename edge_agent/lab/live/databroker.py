@@ -65,11 +65,11 @@ class Databroker:
 
     @property
     def subscribers(self) -> int:
-        """Return the number of current subscribers."""
+        """Return the number of current subscribers to the broker."""
         return len(self._subscribers)
 
     def value(self, path: str) -> Any:  # noqa: ANN401
-        """Return the data point (value and time stamp) of a path."""
+        """Return the data point (value and time stamp) that the broker has for a path."""
         with self._changed:
             return self._values[path]
 

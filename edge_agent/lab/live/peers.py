@@ -58,7 +58,9 @@ def drive_at(t: float) -> dict[str, float]:
 
 
 def profile_of(kind: str) -> Profile:
-    """Return the profile for a peer. For a databroker it is the shipped profile."""
+    """Return the profile that maps the signals of a test sender ("peer"). For a databroker it is
+    the shipped profile.
+    """
     if kind == "can":
         return Profile(
             name=kind,
@@ -212,7 +214,7 @@ def report_ready() -> None:
 
 
 def wait_for_line() -> None:
-    """Wait until a line is read or the input ends."""
+    """Wait until a line is read from standard input or the input ends."""
     sys.stdin.readline()
 
 

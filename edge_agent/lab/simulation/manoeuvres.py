@@ -43,7 +43,7 @@ Control = Callable[[Moment], tuple[float, float]]
 
 
 class TimedFriction(NamedTuple):
-    """Friction that changes at a time, under all wheels simultaneously (paper 003, section 4.2.4)."""
+    """Friction that changes at a given time under all wheels at once (paper 003, section 4.2.4)."""
 
     before: float
     after: float
@@ -108,7 +108,7 @@ def steer_to(now: Moment, target_x: float, target_y: float) -> float:
 
 
 def preview(now: Moment) -> float:
-    """Return the distance [m] ahead of the car at which the driver looks."""
+    """Return the distance ahead of the car [m] of the point to which the driver steers."""
     return max(4.0, 0.6 * now.vx)
 
 

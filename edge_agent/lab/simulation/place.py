@@ -15,7 +15,7 @@ from schemas.thresholds import EARTH_RADIUS_M
 
 @dataclass(frozen=True)
 class Origin:
-    """Position of x = y = 0 [deg, WGS 84]."""
+    """Position on earth [deg, WGS 84] of the point x = y = 0."""
 
     latitude: float
     longitude: float

@@ -144,7 +144,7 @@ def level_relief(_seed: int) -> Relief:
 
 
 def rolling_relief(seed: int) -> Relief:
-    """Return waves of 3 % slope along the road, 300 and 120 m long."""
+    """Return a relief of waves along the road, 300 and 120 m long, with slopes of 3 %."""
     key = key_of(seed, RELIEF_STREAM)
     return Relief(
         tuple(
@@ -154,20 +154,22 @@ def rolling_relief(seed: int) -> Relief:
 
 
 def stepped_relief(seed: int) -> Relief:
-    """Return slopes of alternately +4 % and -4 %, 60 m long each, with kinks between them."""
+    """Return a relief of slopes of alternately +4 % and -4 %, 60 m long each, with kinks between
+    them.
+    """
     return Relief(
         (Wave(0.04, 120.0, 0.0, _random_turn(key_of(seed, RELIEF_STREAM), 0), stepped=True),)
     )
 
 
 def banked_relief(_seed: int) -> Relief:
-    """Return a crossfall of 4 % without longitudinal slope."""
+    """Return a relief with a crossfall of 4 % and no longitudinal slope."""
     return Relief(crossfall=0.04)
 
 
 def hilly_relief(seed: int) -> Relief:
-    """Return a random combination: a constant slope (2 %), waves (up to 3 %) that also tilt the
-    road sideways, steps, and crossfall.
+    """Return a random relief: a constant slope (2 %), waves (up to 3 %) that also tilt the road
+    sideways, steps, and crossfall.
     """
     key = key_of(seed, RELIEF_STREAM)
     waves = [

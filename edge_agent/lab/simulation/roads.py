@@ -77,7 +77,7 @@ class Network:
     starts: IntArray | None = None
 
     def lane(self, k: int) -> FloatArray:
-        """Return the points of lane k."""
+        """Return the points of lane k, one row of the table each."""
         return self.points[self.first[k] : self.first[k] + self.size[k]]
 
 
@@ -197,7 +197,7 @@ def _distance_along(line: FloatArray) -> FloatArray:
 
 
 def _inner_points(line: FloatArray, setback: float) -> IntArray:
-    """Return the indices of the points that are at least `setback` from both ends."""
+    """Return the indices of those points of a line that are at least `setback` [m] from both ends."""
     run = _distance_along(line)
     return np.flatnonzero((run >= setback) & (run <= run[-1] - setback))
 

@@ -54,7 +54,7 @@ class Habits:
     trace: Callable[[FloatArray], None] | None = None
 
     def __post_init__(self) -> None:
-        """Reject parameters for which (31) or (32) are meaningless."""
+        """Reject parameters for which equation (31) or (32) is meaningless."""
         for name in ("evaporation", "elite", "memory", "retrace"):
             value = getattr(self, name)
             if not 0.0 < value < 1.0:
@@ -123,7 +123,9 @@ def renew(
 
 
 def _walk_ant(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
-    """Return the path of one ant (V,): one draw from each row of (31)."""
+    """Return the path of one ant (V,): at each vertex a position drawn with the probabilities of
+    (31).
+    """
     reached = np.cumsum(probabilities, axis=1)
     drawn = rng.random((len(probabilities), 1)) * reached[:, -1:]
     path: IntArray = np.argmax(reached > drawn, axis=1)

@@ -55,7 +55,7 @@ WARM_S: Final = 15.0  # of a town before the recording begins: its cars set out 
 
 @dataclass(frozen=True)
 class TuningDrive:
-    """One simulated drive of a set."""
+    """One simulated drive of a tuning set."""
 
     manoeuvre: str
     vehicle: str
@@ -217,7 +217,7 @@ def record_town(seed: int, cars: int, duration_s: float) -> TuningSet:
 
 
 def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
-    """Return the interval score of 90 % intervals, elementwise [unit of `truth`]."""
+    """Return the interval score of each 90 % interval, in the unit of `truth`."""
     score: FloatArray = (
         upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0))
     )

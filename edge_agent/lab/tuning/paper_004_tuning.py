@@ -79,7 +79,7 @@ def likelihood(sets: Sets, drive: LevelDrive) -> float:
 
 
 def mismatch(sets: Sets, drive: LevelDrive) -> float:
-    """Return the objective of equation (33), with the absolute mismatch |e|."""
+    """Return the tuning objective of equation (33) of paper 004, with the absolute mismatch |e|."""
     batch = drive.batch
     filters = make_bank(batch.vehicles, sets, drive.setting)
     differences = []

@@ -150,12 +150,12 @@ def _noisy(
 
 
 def setting(condition: Condition) -> Setting:
-    """Return the filter's setting for a condition."""
+    """Return the setting of paper 004's filter for a condition of R."""
     return AT_THE_TRUTH._replace(noise=(condition.scale * VARIANCE,) * 3)
 
 
 def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudyScores:
-    """Return the scores of memberships on the drives under the condition called `name`."""
+    """Return the scores of memberships on the drives under the condition of R called `name`."""
     filters = make_bank(drives.vehicles, memberships, setting(CONDITIONS[name]))
     reported = filters.advance(drives.t, drives.signals[name])
     log_likelihoods = np.nan_to_num(
@@ -185,7 +185,9 @@ def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[flo
 
 
 def overall(memberships: Memberships, drives: StudySet) -> float:
-    """Return the objective of the search: the mean log-likelihood over the conditions [nat/s]."""
+    """Return the objective of the search: the mean log-likelihood of the innovations over all
+    conditions of R [nat/s].
+    """
     return float(
         np.mean([scores_of(memberships, drives, name).log_likelihood for name in CONDITIONS])
     )
@@ -199,7 +201,9 @@ def memberships_of(vector: FloatArray) -> Memberships:
 
 
 def objective_on(drives: StudySet) -> Objective:
-    """Return the objective as a function of a vector of ten vertices."""
+    """Return the objective of the search on the given drives, as a function of a vector of ten
+    vertices.
+    """
     return lambda vector: overall(memberships_of(vector), drives)
 
 

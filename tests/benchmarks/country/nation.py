@@ -65,7 +65,7 @@ def spent_s(part: Part) -> float:
 
 
 class Service(NamedTuple):
-    """Service of the country, with the address of its metrics."""
+    """Fleet service that serves a part of the country, with the address of its metrics."""
 
     part: Part
     archive: Path
@@ -93,7 +93,7 @@ class Service(NamedTuple):
 
 
 def start_service(folder: Path, endpoint: str, name: str, region: str) -> Service:
-    """Start a service, and return it when it is ready."""
+    """Start a fleet service, and return it when it is ready."""
     config = ServiceConfig(
         name=name,
         regions=[region],
@@ -321,7 +321,9 @@ def _make_growth_figures(looks: Sequence[Look], coefficients: Coefficients) -> l
 
 
 def _make_share_figures(looks: Sequence[Look], observations: int) -> list[Figure]:
-    """Return figures of the processor time of each process in the measured ten minutes."""
+    """Return figures of the processor time of services, router and sender in the measured ten
+    minutes.
+    """
     late = [look for look in looks if look.time >= WARM_S]
     first = late[0]
     last = late[-1]

@@ -47,13 +47,13 @@ class Drive(NamedTuple):
 
 @dataclass(frozen=True)
 class Streets(Scenario):
-    """Scenario with given lanes."""
+    """Scenario of the simulation whose lanes are given."""
 
     lanes: Network | None = None
 
     @property
     def network(self) -> Network:
-        """Return the given lanes as a road network."""
+        """Return the given lanes as a road network of the simulation."""
         assert self.lanes is not None
         return self.lanes
 

@@ -130,7 +130,7 @@ def _meets(shape: np.ndarray[Any, Any], middles: np.ndarray[Any, Any]) -> bool:
 
 
 def _decode(text: str) -> np.ndarray[Any, Any]:
-    """Return the points of an encoded polyline with six decimals."""
+    """Return the points [deg] of a route from an encoded polyline with six decimals."""
     numbers = list[int]()
     value = 0
     shift = 0

@@ -41,7 +41,7 @@ class StreetTown:
     streets: list[tuple[int, int]]
 
     def line(self, street: tuple[int, int]) -> routing.RoadLine:
-        """Return a street as a road line."""
+        """Return a street as a road line of the map."""
         first, last = self.crossings[list(street)]
         return routing.RoadLine(np.array([first[0], last[0]]), np.array([first[1], last[1]]))
 
@@ -116,7 +116,7 @@ def unpack_wheel(name: str, version: str, target: Path) -> None:
 
 
 class Valhalla:
-    """Valhalla's own programs from the wheel, in a folder."""
+    """Valhalla's own programs, unpacked from the wheel into a folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -160,7 +160,9 @@ class Valhalla:
         self._run("valhalla_build_tiles", "-c", str(self.config), str(pbf))
 
     def ask(self, action: str, request: dict[str, Any]) -> dict[str, Any]:
-        """Return the answer to a request. An answer without a route has an `error_code`."""
+        """Return Valhalla's answer to a routing request. An answer without a route has an
+        `error_code`.
+        """
         done = self._call("valhalla_service", str(self.config), action, json.dumps(request))
         line = next((line for line in done.stdout.splitlines() if line.startswith("{")), None)
         assert line is not None, (done.stdout + done.stderr)[-2000:]

@@ -21,7 +21,7 @@ DRIVES = 3
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder of drives, each with its vehicle file."""
+    """Return a folder of recorded drives, each with its vehicle file."""
     folder = tmp_path_factory.mktemp("drives")
     for seed in range(DRIVES):
         files = [

@@ -32,7 +32,7 @@ class State:
 
 
 class Clock:
-    """Clock that the test sets."""
+    """Simulated clock whose time the test sets."""
 
     def __init__(self) -> None:
         self.now = 100.0

@@ -23,7 +23,7 @@ from schemas.vehicle import Calibration, Vehicle
 
 @pytest.fixture(scope="module")
 def drive() -> Recorded:
-    """Return two minutes of a car whose accelerometer is tilted."""
+    """Return a simulated drive of two minutes in a car whose accelerometer is tilted."""
     return offset_columns([S.AX], 0.5)(drives(1, 31, rough=False, seconds=120)[0])
 
 

@@ -33,7 +33,7 @@ def turn() -> tuple[GivenMotion, FloatArray]:
 
 
 def one_sample(speed: float) -> GivenMotion:
-    """Return one sample of motion with slip at all wheels."""
+    """Return a given motion of one sample, with slip at all wheels."""
     signals = np.zeros((1, len(CHANNELS)))
     signals[0, [S.AX, S.AY, S.YAW_RATE]] = 1.0, 2.0, 0.2
     signals[0, S.DELTA : S.DELTA + 2] = 0.05

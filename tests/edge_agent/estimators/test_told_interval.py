@@ -65,7 +65,7 @@ def find_told_interval(
 
 
 def about(mu: float, width: float) -> FloatArray:
-    """Return node probabilities centred on the friction `mu`."""
+    """Return probabilities of the friction nodes that are centred on the friction `mu`."""
     weight = DESIGN.prior * np.exp(-0.5 * ((DESIGN.mu - mu) / width) ** 2)
     return np.asarray(weight / weight.sum())
 

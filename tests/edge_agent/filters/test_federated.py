@@ -32,7 +32,9 @@ System = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 def textbook(
     mean: FloatArray, cov: FloatArray, system: System, z: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean and covariance after one step of the Kalman filter with full covariances."""
+    """Return mean and covariance after one step of the textbook Kalman filter, which computes with
+    full covariances.
+    """
     f, q, h, noise = system
     mean = f @ mean
     cov = f @ cov @ f.T + q

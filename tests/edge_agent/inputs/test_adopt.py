@@ -23,7 +23,7 @@ RATE_HZ = 100
 
 @pytest.fixture(scope="module")
 def drive() -> Recorded:
-    """Return two and a half minutes of a car with exact sensors."""
+    """Return a simulated drive of two and a half minutes in a car with exact sensors."""
     return drives(1, 31, rough=False)[0]
 
 

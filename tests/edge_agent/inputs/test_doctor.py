@@ -31,7 +31,9 @@ Output = pytest.CaptureFixture[str]
 
 @pytest.fixture(scope="module")
 def rough() -> Recorded:
-    """Return two and a half minutes on hills of a car with realistic sensor errors."""
+    """Return a simulated drive of two and a half minutes on hills, in a car with realistic sensor
+    errors.
+    """
     return drives(1, 23, rough=True)[0]
 
 
@@ -114,7 +116,7 @@ def test_slides_and_constant_speed_accuse_no_sensor(manoeuvre: str, mu: float | 
 
 @pytest.fixture(scope="module")
 def winter() -> Recorded:
-    """Return two and a half minutes on ice and snow."""
+    """Return a simulated drive of two and a half minutes on ice and snow."""
     return winter_drives(1, 23)[0]
 
 

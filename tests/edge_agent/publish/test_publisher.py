@@ -31,7 +31,7 @@ Make = Callable[..., Publisher]
 
 
 def drive(seed: int = 0, samples: int = 200) -> tuple[RecordBlock, RecordBlock]:
-    """Return observations and states of a random drive of three vehicles."""
+    """Return the observations and states of a random drive by three vehicles."""
     _, observations, states = Watch.of(3).step(
         wanderers(samples, 3, seed), estimates(samples, 3, seed, mu=0.8)
     )
@@ -295,7 +295,7 @@ def batches_of(batcher: Batcher, now: float, everything: bool = False) -> list[t
 
 
 def one_vehicle(records: int, urgent: bool = False) -> RecordBlock:
-    """Return the first records of one vehicle, changed to lie in one cell."""
+    """Return the first records of one vehicle, changed so that they lie in one cell."""
     observations, _ = drive(samples=3000)
     chosen = np.flatnonzero(observations.vehicle == 0)[:records]
     assert len(chosen) == records

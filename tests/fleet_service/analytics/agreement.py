@@ -23,7 +23,9 @@ Order: TypeAlias = list[tuple[str, Literal["ascending", "descending"]]]
 
 
 def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
-    """Return a description of the difference between two answers, or None if they agree."""
+    """Return a description of the difference between the answers of two engines, or None if they
+    agree.
+    """
     if one.schema.names != other.schema.names or one.num_rows != other.num_rows:
         return (
             f"{one.num_rows} rows of {one.schema.names}, {other.num_rows} of {other.schema.names}"

@@ -28,7 +28,7 @@ NUMBERS: Final = ("mu", "mu_lower", "mu_upper", "p_slippery", "vehicles", "obser
 
 
 def fill(root: Path, world: SyntheticFleet) -> None:
-    """Write the archive of one day, compact it, and compute its roll-ups."""
+    """Write an archive with one day of observations, compact it, and compute its roll-ups."""
     step = 360.0 / (1 << grid.CELL_ZOOM)
     shift = BORDER - synthetic.LONGITUDE - world.length // 2 * step
     writer = segments.Writer(root, "shard-0")
@@ -44,7 +44,7 @@ def fill(root: Path, world: SyntheticFleet) -> None:
 
 
 def rebuilt_map(out: Path) -> pa.Table:
-    """Return all zones of a rebuilt map as one table, sorted like a map."""
+    """Return all zones of a rebuilt map as one table, in the row order of a map."""
     parts = [
         pq.read_table(path, partitioning=None)
         for path in sorted((out / "map").glob("*/*/*.parquet"))

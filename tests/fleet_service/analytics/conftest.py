@@ -104,7 +104,9 @@ def links(rows: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def asked(archive: Path) -> Callable[..., pa.Table]:
-    """Return a function that answers a question: `asked("grip", at=...)`."""
+    """Return a function that answers an analytics question about the archive: `asked("grip",
+    at=...)`.
+    """
 
     def ask(name: str, engine: str = "duckdb", part: Extract = PART, **options: object) -> pa.Table:
         said: list[str] = []

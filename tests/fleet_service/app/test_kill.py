@@ -81,7 +81,7 @@ def test_killed_service_keeps_acknowledged_reports_and_doubles_none(
 
 
 def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
-    """Return (boot as archived, seq, row) of every acknowledged row."""
+    """Return the identity (boot as archived, seq, row) of every acknowledged row."""
     pseudonyms = Pseudonyms(folder / "archive" / "keys")
     now = time.time_ns()
     boots = {
@@ -96,7 +96,7 @@ def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
 
 
 def list_archived(folder: Path) -> list[tuple[int, int, int]]:
-    """Return (boot, seq, row) of every row in the archive."""
+    """Return the identity (boot, seq, row) of every row in the archive."""
     table = pa.concat_tables(
         reading.read_tables(folder / "archive", Kind.OBSERVATION, ["boot", "seq", "row"])
     )

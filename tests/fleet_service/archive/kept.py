@@ -105,7 +105,7 @@ def make_state(turn: int, vehicle: int) -> Batch:
 
 
 def messages(turn: int) -> Iterator[Message]:
-    """Yield all messages that the vehicles send in a round."""
+    """Yield all messages that the vehicles send in one round."""
     for vehicle in range(VEHICLES):
         for one, key in (
             (make_observations(turn, vehicle), keys.observation_key),
@@ -150,7 +150,7 @@ def map_of(engine: Engine, at: int) -> dict[str, Any]:
 
 
 def make(root: Path) -> dict[str, Any]:
-    """Write the archive, and return its final map, alerts and rows."""
+    """Write the reference archive, and return its final map, alerts and rows."""
     with closing(Engine(ServiceConfig(), root)) as engine:
         for turn in range(ROUNDS):
             if turn == 2:

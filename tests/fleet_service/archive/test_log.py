@@ -27,7 +27,7 @@ def log(tmp_path: Path) -> Iterator[SegmentLog[str]]:
 
 
 def add(log: SegmentLog[str], name: str, seed: int, kind: Kind = Kind.OBSERVATION) -> None:
-    """Add a batch of three rows to the log."""
+    """Add a batch of three rows to the segment log."""
     log.add(kind, rows_of(kind, 3, seed), [name])
 
 

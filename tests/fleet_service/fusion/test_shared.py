@@ -39,7 +39,7 @@ def test_what_bounds_share_never_lowers_the_upper_end_of_a_rising_belief(p: np.n
 
 
 def width(used: float, manoeuvres: np.ndarray, mu: float = 0.6) -> float:
-    """Return the width of the interval after agreeing values of thirty vehicles."""
+    """Return the width of a cell's friction interval after agreeing values of thirty vehicles."""
     fusion = Fusion(120.0)
     n = len(manoeuvres)
     o = observations(np.arange(n) * 1.0, np.arange(n), value(np.full(n, mu)))

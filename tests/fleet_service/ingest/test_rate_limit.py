@@ -28,7 +28,7 @@ BURST = 50_000.0
 
 
 class Clock:
-    """Clock that the test sets."""
+    """Simulated clock whose time the test sets."""
 
     now = 0.0
 

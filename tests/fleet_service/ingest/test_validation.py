@@ -36,7 +36,7 @@ def test_ranges_hold_exactly_their_numbers(numbers: set[int]) -> None:
 
 
 class Desk:
-    """Intake of messages without a service."""
+    """Intake of messages that works without a running service."""
 
     def __init__(self, folder: Path) -> None:
         self.counts: Counter[str] = Counter()
@@ -77,7 +77,7 @@ FAR = int(grid.cell_of(LATITUDE, 12.02))
 
 
 def one(column: str, values: list[float]) -> dict[str, Any]:
-    """Return a change that replaces one column of a batch."""
+    """Return a change for `batch` that replaces the values of one column."""
     return {column: values}
 
 

@@ -33,7 +33,7 @@ READERS = {
 
 
 def opened_by(reader: str, address: str, folder: Path) -> Any:  # noqa: ANN401 geopandas is untyped
-    """Return the features as another program reads them."""
+    """Return the map's features as another program reads them."""
     out = folder / f"{reader}.parquet"
     script = f"{READERS[reader].format(address=address)}; found.to_parquet({str(out)!r})"
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
@@ -57,7 +57,7 @@ def drive_parts(page: RunningPage, drive: Drive, *parts: str) -> None:
 
 
 def count(page: RunningPage) -> int:
-    """Return the number of features, or 0 while the page knows no service."""
+    """Return the number of features that the page offers, or 0 while it knows no service."""
     status, _, body = ask(page.address, ITEMS)
     assert status in (200, 503), body
     return int(json.loads(body)["numberReturned"]) if status == 200 else 0

@@ -29,7 +29,7 @@ ICE, SNOW, WET, DRY, RATHER, RATHER_NOT, LITTLE, HOLLOW = range(8)
 
 
 def look(seen: Opened, name: str) -> None:
-    """Store a screenshot, so that a person can inspect it."""
+    """Store a screenshot of the page, so that a person can inspect it."""
     PICTURES.mkdir(exist_ok=True)
     seen.page.screenshot(path=PICTURES / f"{name}.png")
 
@@ -61,7 +61,7 @@ def kinds(seen: Opened) -> list[int]:
 
 
 def near(seen: Opened, cell: int, zoom: float = 18.0) -> None:
-    """Zoom in on a cell until the headings are shown separately."""
+    """Zoom in on a cell, so far that its headings are shown separately."""
     latitude, longitude = (float(v) for v in grid.centre(cell))
     seen.page.evaluate(
         "([x, y, z]) => { gripmap.goTo(x, y); gripmap.view.go(gripmap.view.x, gripmap.view.y, z) }",
@@ -70,7 +70,7 @@ def near(seen: Opened, cell: int, zoom: float = 18.0) -> None:
 
 
 def waits(seen: Opened, script: str) -> None:
-    """Wait until a script in the page returns true."""
+    """Wait until a script that runs in the page returns true."""
     until(
         lambda: seen.page.evaluate(script)
     )  # the page's own policy forbids Playwright to poll inside it
@@ -315,7 +315,7 @@ def test_slider_shows_a_past_cell_and_two_moments_side_by_side(
 
 
 def list_snapshots(archive: Path) -> list[int]:
-    """Return the times [s] of the map snapshots."""
+    """Return the times [s] of the map snapshots that the page offers."""
     return sorted(
         snapshots.time_of(path) // 10**9 for path in archive.glob(f"{snapshots.TABLE}/*/*.parquet")
     )

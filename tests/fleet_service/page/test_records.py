@@ -28,7 +28,7 @@ from tests.fleet_service.examples import CELL, START, TILE, at_least, observatio
 
 @pytest.fixture(scope="module")
 def table() -> pa.Table:
-    """Return a tile of a thousand cells, some with only a lower bound."""
+    """Return the table of a tile with a thousand cells, some with only a lower bound of μ."""
     rng = np.random.default_rng(3)
     n = 1000
     fusion = Fusion(120.0)

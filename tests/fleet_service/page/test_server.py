@@ -44,7 +44,7 @@ WORLD: Final = View((-180.0, -90.0, 180.0, 90.0), 21)
 
 
 def ask(address: str, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    """Return status, headers and body of the answer to a request."""
+    """Return status, headers and body of the page's answer to a request."""
     connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
@@ -61,7 +61,7 @@ def ask(address: str, path: str, **headers: str) -> tuple[int, dict[str, str], b
 
 @contextmanager
 def listening(address: str, path: str = "/events") -> Iterator[Iterator[tuple[str, Any]]]:
-    """Yield an iterator over the events of an event stream."""
+    """Yield an iterator over the events that an event stream of the page sends."""
     connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
     connection.request("GET", path)
     answer = connection.getresponse()

@@ -177,7 +177,7 @@ class Machine:
         return self.holding.copy
 
     def freeze(self) -> None:
-        """Stop the renewals of the lease."""
+        """Stop the service's renewals of its lease."""
         assert self.holding.lease is not None
         self.holding.lease._stop.set()
 

@@ -19,7 +19,7 @@ from schemas.errors import InputError
 
 
 class MemoryBucket:
-    """Bucket in memory with conditional create."""
+    """Bucket in memory, with an operation that creates an object only if there is none."""
 
     def __init__(self) -> None:
         self.objects: dict[str, bytes] = {}
@@ -42,7 +42,7 @@ def lease_on(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
 
 
 def standby_of(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
-    """Let a standby take over, and return its lease."""
+    """Let a standby take over the lease, and return its lease."""
     standby = Standby(
         may=lambda: True, stands=lambda _: False, alive=lambda: None, get_ahead=lambda: None
     )

@@ -62,7 +62,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 
 def hear(engine: Engine, *names: str, now: int | None = None) -> None:
-    """Ingest one visit of each named vehicle."""
+    """Let the engine ingest one visit of each named vehicle."""
     now = time.time_ns() if now is None else now
     sent = [
         Message(Kind.OBSERVATION, key(n), wire.encode(batch(n, 1, now - SECOND, [0.8])), "")
@@ -78,7 +78,7 @@ def later() -> int:
 
 
 def rows(engine: Engine, now: int | None = None, **parameters: str) -> list[dict[str, object]]:
-    """Return the cells of the answer to a query."""
+    """Return the cells in the engine's answer to a map query."""
     tiles = engine.queries.answer(
         query.parse(parameters), lambda _: True, time.time_ns() if now is None else now
     )

@@ -50,7 +50,7 @@ class Map:
 
 @pytest.fixture
 def busy() -> Map:
-    """Return a map with a cell that five vehicles visited, after its publication."""
+    """Return a map with one public cell that five vehicles visited after its publication."""
     made = Map()
     made.visit(0.0, 1, 2, 3, 4, 5)
     assert made.seen(1.0) == []

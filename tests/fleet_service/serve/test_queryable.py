@@ -36,7 +36,7 @@ FAILURES = (
 
 
 def texts(session: zenoh.Session, selector: str) -> list[str]:
-    """Return all replies and errors as texts, sorted because Zenoh does not order them."""
+    """Return all replies and errors to a query as texts, sorted because Zenoh does not order them."""
     return sorted(
         part.payload.to_string()
         for reply in session.get(selector)
@@ -98,7 +98,7 @@ def test_a_query_with_a_too_large_answer_is_refused_with_a_hint(session: zenoh.S
 def nothing(
     query: MapQuery, wanted: Callable[[int], bool], only: int | None
 ) -> Iterator[tuple[int, bytes]]:
-    """Return an answer without tiles."""
+    """Return an answer of the map that contains no tile."""
     return iter(())
 
 

@@ -31,7 +31,7 @@ EVERYWHERE = "*/*/*"
 
 
 class Machine:
-    """Service with --standby, in threads of this process."""
+    """Service with the option --standby, run in threads of this process."""
 
     def __init__(self, name: str, router: ZenohSettings, bucket: BucketServer, root: Path) -> None:
         archive = {"path": str(root), **bucket.settings}

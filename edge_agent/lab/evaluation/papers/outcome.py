@@ -52,7 +52,7 @@ class PaperRow(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """Return the unit of the row."""
+        """Return the unit of the row's numbers."""
         _, _, unit = self.what.rpartition("[")
         return unit.removesuffix("]") if "[" in self.what else "1"
 
@@ -87,7 +87,7 @@ class PlotPanel(NamedTuple):
 
 
 class Heat(NamedTuple):
-    """One panel with a colour map of numbers, rows by columns."""
+    """One panel of a plot: a table of numbers shown as colours."""
 
     title: str
     x: str
@@ -108,7 +108,7 @@ class PaperPlot(NamedTuple):
 
 @dataclass(frozen=True)
 class PaperTable:
-    """One table of the report."""
+    """One table of a reproduction's report."""
 
     title: str
     rows: tuple[PaperRow, ...]

@@ -59,7 +59,7 @@ def summary(done: Reproduction) -> str:
 
 
 def markdown_tables(tables: Sequence[PaperTable]) -> str:
-    """Return the tables as Markdown."""
+    """Return the tables of a reproduction as Markdown."""
     parts = []
     for table in tables:
         head = ("", *COLUMNS, "bar of matched", "")
@@ -74,7 +74,7 @@ def markdown_tables(tables: Sequence[PaperTable]) -> str:
 
 
 def markdown_elements(elements: Sequence[Element]) -> str:
-    """Return the list of elements as a Markdown table."""
+    """Return the list of a paper's elements (equations, tables, figures) as a Markdown table."""
     lines = ["| paper | element | verdict | why | where |", "|---|---|---|---|---|"]
     for element in elements:
         where = f"`{element.where}`" if element.where else ""
@@ -84,7 +84,7 @@ def markdown_elements(elements: Sequence[Element]) -> str:
 
 
 def report_markdown(done: Reproduction) -> str:
-    """Return the complete report as Markdown."""
+    """Return the complete report of a reproduction as Markdown."""
     notes = "\n".join(f"- {note}" for note in done.notes)
     parts = (
         f"# Paper {done.paper}: {done.title}",

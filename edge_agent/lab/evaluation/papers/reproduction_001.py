@@ -54,7 +54,7 @@ class MotionRun:
     reported: dict[str, Estimates]
 
     def values(self, name: str) -> Values:
-        """Return the measures of the filter called `name`."""
+        """Return the measures of the estimates by the filter called `name`."""
         return means(self.batch, self.reported[name])
 
 

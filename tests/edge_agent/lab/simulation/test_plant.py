@@ -65,8 +65,8 @@ def rolling(
 def run(
     x: FloatArray, p: FloatArray, u: FloatArray, seconds: float, dt: float = 1e-3
 ) -> FloatArray:
-    """Simulate `seconds` with constant inputs, and return the wheels' output (columns of `Wheel`,
-    4).
+    """Simulate a vehicle for `seconds` with constant inputs, and return the output of its wheels
+    (columns of `Wheel`, 4).
     """
     w = np.zeros((len(Wheel), 4))
     advance(x, p, u, w, dt, round(seconds / dt))

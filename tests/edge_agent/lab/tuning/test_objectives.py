@@ -37,7 +37,7 @@ ESTIMATOR = tune.ESTIMATOR
 
 @pytest.fixture(scope="module")
 def drives() -> TuningSet:
-    """Return three short drives of the training set."""
+    """Return three short simulated drives of the training set."""
     return record(TRAIN[:3], 4.0)
 
 

@@ -34,7 +34,7 @@ STILL = study_report.GIVEN["fixed"]
 
 @pytest.fixture(scope="module")
 def drives() -> StudySet:
-    """Return two of the search drives, six seconds each."""
+    """Return the first two drives of the study's search set, six seconds each."""
     return record(TRAIN[:2])
 
 
