@@ -115,7 +115,7 @@ class AgentConfig(MonitoringSettings):
 
 
 class ArchiveSettings(Settings):
-    """Location of the archive."""
+    """Settings of the archive: its folder, and the bucket of its second copy."""
 
     path: Path | None = Field(
         default=None, description="folder, one service per archive; `--archive` takes precedence"

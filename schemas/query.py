@@ -28,7 +28,7 @@ _FIXES: Final = {
 
 
 class Format(StrEnum):
-    """Data format of an answer."""
+    """Data format of an answer to a map query."""
 
     ARROW = "arrow"
     GEOJSON = "geojson"

@@ -15,7 +15,7 @@ from schemas.wire import Alert
 
 
 def read_tile(payload: bytes) -> pa.Table:
-    """Return the cells of one tile."""
+    """Return the cells of one tile, decoded from the bytes of its message."""
     return pa.ipc.open_stream(payload).read_all()
 
 

@@ -61,7 +61,7 @@ def write_archive(root: Path, world: SyntheticFleet, segment_rows: int = 20_000)
 
 
 def make_chunks(world: SyntheticFleet, hours: int = 6) -> Iterator[Rows]:
-    """Yield rows in order of time, in chunks of `hours` hours each."""
+    """Yield rows of observations in order of time, in chunks of `hours` hours each."""
     rng = np.random.default_rng(world.seed)
     bias = rng.normal(0.0, 0.04, world.vehicles)
     spans = world.days * 24 // hours

@@ -90,7 +90,7 @@ class SteadyClock:
         return even
 
     def moment(self) -> TimeNow:
-        """Return the time, together with how certain it is."""
+        """Return the service's time, with its bounds and its certainty (see `TimeNow`)."""
         now = self.now()
         wall = self._wall()
         seen = self._seen + self._steady() - self._began

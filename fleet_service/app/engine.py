@@ -69,7 +69,7 @@ class Engine:
             raise
 
     def _open(self) -> None:
-        """Load the state from the archive and create the parts."""
+        """Load the state from the archive, and create the parts of the service."""
         config = self._config
         root = self._root
         self.counts: Counter[str] = Counter()
@@ -91,7 +91,7 @@ class Engine:
 
     @property
     def state(self) -> ServiceState:
-        """Return the current state."""
+        """Return the current state of the service: map, alerts and admitted batches."""
         return self._shared.state
 
     def reload_state(self, before: Callable[[], None]) -> None:

@@ -45,7 +45,7 @@ from schemas.errors import InputError
 def handle_requests(
     engine: Engine, config: ServiceConfig, root: Path, stop: threading.Event
 ) -> str | None:
-    """Handle the waiting requests; return a line for the operator, or None."""
+    """Handle the waiting erasure requests; return a line for the operator, or None."""
     rows = answered = 0
     for question in erasure_requests.open_requests(root):
         try:

@@ -102,7 +102,7 @@ class HistoricalMaps:
                 left.end()
 
     def close(self) -> None:
-        """End the idle process."""
+        """End the process that rebuilds past maps, if it is idle."""
         if process := self._keep_process(None):
             process.end()
 

@@ -107,7 +107,9 @@ class Service:
         self._followed = False  # by a service that has the lease now
 
     def run(self, stop: threading.Event) -> None:
-        """Serve until `stop` is set; then flush, acknowledge and stop."""
+        """Serve until `stop` is set; then write the waiting rows to disk, acknowledge them, and
+        stop.
+        """
         if self.engine.holding.lease is not None:
             self.engine.holding.lease.serves = self._works
         try:

@@ -157,5 +157,5 @@ class SegmentLog(Generic[Batch]):
         return self.end()
 
     def close(self) -> None:
-        """Stop the thread after its current write."""
+        """Stop the thread that writes segments, after its current write."""
         self._thread.shutdown()

@@ -126,7 +126,7 @@ def _erase_or_request(root: Path, wanted: Erasure, config: str | None) -> Erasur
 
 @contextmanager
 def _sync_copy(root: Path, path: str | None) -> Iterator[None]:
-    """Synchronise the archive's bucket copy, if any, after the block.
+    """Run the block, which erases data, and then synchronise the archive's bucket copy, if any.
 
     Raises:
         InputError: the settings of the copy are unknown, and nothing was done; or the copy could

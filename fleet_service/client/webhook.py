@@ -140,7 +140,7 @@ class Webhook:
         return [*out, f"webhook: {self.lost_count} alerts were lost"] if self.lost_count else out
 
     def metrics(self) -> list[Metric]:
-        """Return counters of alerts and the length of the queue."""
+        """Return counters of alerts and the length of the queue, as metrics."""
         alerts = {name: float(self.counts[name]) for name in ("delivered", *LOSSES)}
         return [
             Metric("webhook_alerts", "counter", "Alerts by outcome", alerts, "outcome"),

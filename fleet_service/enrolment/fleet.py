@@ -109,7 +109,7 @@ class Enrolment(Settings):
 
     @property
     def names(self) -> list[str]:
-        """Return all names."""
+        """Return all enrolled names, of all roles."""
         return [
             *self.routers,
             *self.services,

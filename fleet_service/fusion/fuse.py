@@ -126,12 +126,12 @@ class Fusion:
 
     @property
     def cell(self) -> IntArray:
-        """Cell number of every slot, (size,)."""
+        """Cell number of every slot (stored cell and sector), (size,)."""
         return self.live.key[: self.size] // grid.SECTORS
 
     @property
     def sector(self) -> SmallArray:
-        """Heading sector of every slot, (size,)."""
+        """Heading sector of every slot (stored cell and sector), (size,)."""
         return (self.live.key[: self.size] % grid.SECTORS).astype(np.int8)
 
     @property

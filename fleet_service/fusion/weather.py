@@ -163,7 +163,7 @@ def _accumulate_clock(
 
 
 def no_reports() -> Reports:
-    """Return weather reports with zero rows."""
+    """Return an empty set of weather reports (arrays with zero rows)."""
     nothing = np.zeros(0, np.int64)
     never = np.zeros(0)
     return Reports(nothing, nothing, never, never, never, np.zeros((0, mugrid.BINS)))

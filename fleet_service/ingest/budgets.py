@@ -53,7 +53,9 @@ class Bucket:
 
 
 class NewCells:
-    """Limit on how many cells each vehicle may report that no vehicle has reported before."""
+    """Limit per vehicle on reports about new cells, that is, cells that no vehicle has reported
+    before.
+    """
 
     def __init__(self, at_once: float = NEW_CELLS_AT_ONCE) -> None:
         self._budgets = Bucket(at_once, NEW_CELLS_PER_HOUR)

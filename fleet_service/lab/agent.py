@@ -92,7 +92,7 @@ class Errors:
 
     @staticmethod
     def draw(rng: Generator, vehicles: int, model: ErrorModel = CLEAN) -> Errors:
-        """Draw the errors of a fleet."""
+        """Draw the persistent errors of the vehicles of a fleet at random."""
         relative = model.bias * rng.normal(size=vehicles)
         return Errors(
             relative + model.tyres + np.where(np.arange(vehicles) % 2, model.half, 0.0),
@@ -159,7 +159,7 @@ def reading_noise(rng: Generator, along: IntArray, tails: float = np.inf) -> Flo
 
 
 def draw_reports(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
-    """Draw the reports of visits (n,)."""
+    """Draw the reports that simulated vehicles send about visits (n,)."""
     model = errors.model
     who = p.vehicle
     relative = NOISE_AT_LIMIT + NOISE_PER_SHARE * (1.0 - p.share)

@@ -84,7 +84,7 @@ class Found:
 
 
 def drive_seed(fleet: Fleet, seed: int, found: Found) -> None:
-    """Simulate one seed and add the results to `found`."""
+    """Simulate the drive of a fleet with one seed, and add the scores and alerts to `found`."""
     rng = np.random.default_rng([seed, 1])
     place = town.draw_town(rng, fleet.minutes, CHANGING)
     errors = Errors.draw(rng, VEHICLES)

@@ -143,8 +143,9 @@ def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
 def score_rules(
     v: Visits, town: Town, at: tuple[int, ...], vehicles: int, where: BoolArray | bool = True
 ) -> list[Scores]:
-    """Return the scores of each of RULES at the minutes `at`, for the cells in `where` that a
-    vehicle with enough grip used to measure the friction has reported.
+    """Return the scores of each of the simple fusion rules RULES at the minutes `at`. They include
+    the cells in `where` that were reported by a vehicle with enough grip used to measure the
+    friction.
     """
     sent = vehicle_posteriors(v.vehicle, v.reports.reading, v.reports.std, vehicles)
     asked = 60.0 * np.array(at, float)

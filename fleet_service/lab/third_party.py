@@ -305,7 +305,9 @@ def count_cold(rng: Generator) -> int:
 
 
 def measure_cold(seed: int) -> dict[str, float]:
-    """Return quantiles of `count_cold` over COLD_SEEDS fleets."""
+    """Return quantiles, over COLD_SEEDS fleets, of the number of passes over ice until a new
+    service raises an alert (`count_cold`).
+    """
     found = np.array([count_cold(np.random.default_rng([seed, 31, k])) for k in range(COLD_SEEDS)])
     return {
         "cold.ice_passes.median": float(np.median(found)),

@@ -100,7 +100,7 @@ class RareMessages(logging.Filter):
         self._more: Counter[str] = Counter()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return True if the record may be logged."""
+        """Return True if the message may be logged."""
         text = str(record.msg)
         if time.monotonic() - self._passed.get(text, -LOG_S) < LOG_S:
             self._more[text] += 1

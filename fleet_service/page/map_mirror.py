@@ -145,7 +145,7 @@ class MapMirror:
             ]
 
     def tiles(self) -> list[int]:
-        """Return all tiles that have cells."""
+        """Return the numbers of all tiles that have cells."""
         with self._lock:
             return [tile for tile, held in self._tiles.items() if len(held.cells)]
 

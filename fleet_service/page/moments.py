@@ -59,7 +59,7 @@ class Moments:
 
     @property
     def has_archive(self) -> bool:
-        """Return True if an archive is given."""
+        """Return True if an archive is given, which provides older maps."""
         return self._root is not None
 
     def times(self) -> list[int]:
@@ -67,7 +67,7 @@ class Moments:
         return sorted({*self._files(), *self._recent.times()})[-MOST:]
 
     def tiles(self, moment: int) -> list[int]:
-        """Return the tiles that had cells at a moment."""
+        """Return the numbers of the tiles that had cells at a past moment."""
         return list(self._at(moment))
 
     def encoded(self, moment: int, tile: int, level: int) -> bytes:

@@ -43,7 +43,7 @@ class FeatureRoutes:
         self._turns = PastTurns()
 
     def paths(self) -> dict[str, Callable[[Request], Awaitable[Response]]]:
-        """Return the handlers by path."""
+        """Return the request handlers by URL path."""
         return {
             "/conformance": self.conformance,
             "/collections": self.collections,
@@ -125,7 +125,7 @@ class FeatureRoutes:
         return JSONResponse(answer, media_type=GEOJSON, headers={"Cache-Control": "no-store"})
 
     async def item(self, request: Request) -> Response:
-        """Return one feature with its present values."""
+        """Return one feature (one heading in one cell) with its present values."""
         place = request_params.parse_feature_id(request.path_params["feature"])
         table = await run_in_threadpool(
             self._cells, FeatureQuestion(_place_box(place), after=place - 1, limit=1)
@@ -147,7 +147,7 @@ class FeatureRoutes:
 
     def _cells(self, question: FeatureQuestion) -> pa.Table:
         """Return the requested cells ordered by key. If there are more cells than the limit, one
-        additional row is returned.
+        additional row is returned, which shows that a next page exists.
 
         Raises:
             InputError: a service refused the query.

@@ -59,7 +59,7 @@ class Reader:
         self._tried = -AGAIN_S
 
     def run(self, stop: threading.Event) -> None:
-        """Receive data until `stop` is set."""
+        """Receive tiles and alerts until `stop` is set."""
         session = zenoh_session.open_session(self._connection, stop)
         if session is None:
             return

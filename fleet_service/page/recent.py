@@ -44,7 +44,7 @@ class RecentMoments:
             self._kept.popitem(last=False)
 
     def times(self) -> list[int]:
-        """Return the moments, oldest first."""
+        """Return the times of the stored moments [s since 1970], oldest first."""
         return list(self._kept)
 
     def at(self, moment: int) -> dict[int, Records] | None:

@@ -122,7 +122,9 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
 def update_publication(
     file: DatexFile, world: MapMirror, reader: Reader, stop: threading.Event
 ) -> None:
-    """Keep a publication consistent with the received alerts until `stop` is set."""
+    """Keep the DATEX II publication in `file` consistent with the received alerts until `stop` is
+    set.
+    """
     seen = -1
     while not stop.wait(GATHER_S):
         if not reader.is_served or (world.alerts_heard == seen and not file.is_due):

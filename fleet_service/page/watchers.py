@@ -103,7 +103,7 @@ class Watchers:
             self._watchers.pop(watcher.queue, None)
 
     async def run(self) -> None:
-        """Send changes to the browsers until cancelled."""
+        """Send changes of the map to the browsers until the task is cancelled."""
         beaten = 0.0
         while True:
             await asyncio.sleep(FLUSH_S)
@@ -116,7 +116,7 @@ class Watchers:
                 self._tell(_encode_event("beat", self._beat()))
 
     def close(self) -> None:
-        """End all streams."""
+        """End the event streams of all browsers."""
         for watcher in list(self._watchers.values()):
             self._put(watcher, None)
 

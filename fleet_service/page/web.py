@@ -157,7 +157,7 @@ class Routes:
         return JSONResponse(RoadMap(lines, []).as_json() | {"learned": True})
 
     async def areas(self, _: Request) -> Response:
-        """Return the areas with data, those with the most alerts first."""
+        """Return the areas of the map that have cells, those with the most alerts first."""
         named = self._of.roads.places if self._of.roads is not None else []
         return JSONResponse(await run_in_threadpool(areas.found_in, self._of.world, named))
 

@@ -63,7 +63,7 @@ class Ownership:
 
     @property
     def is_lost(self) -> bool:
-        """Return True if another service has taken over."""
+        """Return True if another service has taken over the archive."""
         return self.lease is not None and self.lease.lost
 
     @property
@@ -84,7 +84,7 @@ class Ownership:
             self.lease.release(self.to if self.leaves else "")
 
     def close(self) -> None:
-        """Release the lease and the lock."""
+        """Release the lease, and the file lock of the folder."""
         self.release()
         if self.copy is not None:
             self.copy.close()

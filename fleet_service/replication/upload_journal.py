@@ -98,7 +98,7 @@ class UploadJournal:
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Close the journal."""
+        """Close the file of the journal."""
         self._file.close()
 
 

@@ -1,1 +1,1 @@
-"""Output of the map: cells, tiles, answers to queries, alerts."""
+"""Output of the fleet service to readers: map cells, tiles, answers to queries, alerts."""

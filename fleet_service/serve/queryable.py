@@ -90,7 +90,7 @@ class _QueuedQuery:
 
 @dataclass
 class _Answered:
-    """Flag: True if an answer is complete."""
+    """Flag of one step of an answer: `whole` is True unless more replies follow in a later step."""
 
     whole: bool = True
 

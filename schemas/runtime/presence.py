@@ -41,13 +41,13 @@ class PresenceTracker:
 
     @property
     def active(self) -> set[ServiceToken]:
-        """Return the active tokens."""
+        """Return the liveliness tokens that are active now."""
         with self._guard:
             return set(self._here)
 
     @property
     def lost_tokens(self) -> set[ServiceToken]:
-        """Return the tokens that were active and are no longer."""
+        """Return the tokens that were active earlier and are no longer active."""
         with self._guard:
             return set(self._withdrawn)
 

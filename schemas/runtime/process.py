@@ -26,7 +26,7 @@ class LogLine(str):
     __slots__ = ("values",)
 
     def __new__(cls, text: str, **values: object) -> LogLine:
-        """Create a line from text for people and values for programs."""
+        """Create a log line from text for people and values for programs."""
         line = super().__new__(cls, text)
         line.values = values
         return line

@@ -132,12 +132,12 @@ def remove_damaged_lines(folder: Path) -> int:
 
 
 def _month_files(folder: Path) -> list[Path]:
-    """Return the files with the numbers of all months."""
+    """Return the files with the permanent vehicle numbers of all months."""
     return [path for path in sorted(folder.glob(f"*{ENDING}")) if _MONTH.fullmatch(path.stem)]
 
 
 def _undamaged_lines(data: bytes) -> Iterator[tuple[int, int]]:
-    """Yield pseudonym and number of every undamaged line."""
+    """Yield pseudonym and permanent number of every undamaged line of a file."""
     for at in range(0, len(data) - _LINE + 1, _LINE):
         pseudonym, number = (int.from_bytes(data[at + k : at + k + 8], signed=True) for k in (0, 8))
         if data[at : at + _LINE] == _encode_line(pseudonym, number):

@@ -93,7 +93,9 @@ def compute_part(path: Path, damaged: Damaged) -> pa.Table | None:
 
 
 def roll_up(table: pa.Table) -> pa.Table:
-    """Return statistics of observations per cell, sector and hour, sorted in this order."""
+    """Return additive statistics of observations (sums, counts, extremes) per cell, sector and
+    hour, sorted in this order.
+    """
     rows = segments.rows_of(table)
     hour = rows["leave_time"] // HOUR_NS
     order = np.lexsort((hour, rows["sector"], rows["cell"]))

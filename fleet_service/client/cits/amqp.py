@@ -70,7 +70,7 @@ class _AmqpEvents(MessagingHandler):
         self._send_queued()
 
     def on_send(self, _: Any) -> None:  # noqa: ANN401
-        """Send the messages that another thread queued."""
+        """Send to the interchange the messages that another thread queued."""
         self._link.is_waking = False
         self._send_queued()
 
@@ -177,7 +177,7 @@ class AmqpLink:
             self.injector.trigger(ApplicationEvent("send"))
 
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connection to the interchange."""
         self.injector.trigger(ApplicationEvent("leave"))
         self._thread.join(5.0)
         self.injector.close()

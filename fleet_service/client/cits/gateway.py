@@ -68,7 +68,7 @@ class Witness:
         self.refused = self.silent = 0
 
     def close(self) -> None:
-        """Close the session."""
+        """Close the Zenoh session."""
         self._session.close()
 
     def publish_report(self, body: bytes, _: Mapping[str, Any]) -> None:
