@@ -386,8 +386,8 @@ class BucketReplica:
             )
 
     def _download_missing(self, there: Mapping[str, int]) -> int:
-        """Download the files that only the bucket has; return their number. Also remove files that
-        the bucket lacks from the journal.
+        """Download the files that only the bucket has; return their number. Also remove from the
+        journal the entries of files that the bucket lacks.
         """
         local = self._list_files(FOLDERS)
         for name in self._copied.copy_stamps():

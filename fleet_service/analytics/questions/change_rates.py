@@ -143,8 +143,9 @@ def _band_name(one: str | int) -> str:
 
 
 def _fit_class(counted: pa.Table) -> dict[str, float | int | None]:
-    """Return the rate of change for one class of values (a temperature band or a part of the day),
-    with an interval computed from days drawn with replacement.
+    """Return the rate at which roads become slippery or recover, for one class of values (a
+    temperature band or a part of the day), with an interval computed from days drawn with
+    replacement.
     """
     columns = {
         name: counted[name].to_numpy().astype(float)

@@ -1,4 +1,4 @@
-"""Columns of the stored cells for reading, and operations on their rows."""
+"""State of the stored cells as columns for readers, and operations on the rows of cells."""
 
 from __future__ import annotations
 

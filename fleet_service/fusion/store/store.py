@@ -247,8 +247,8 @@ class Store:
         return place
 
     def _rebuild_pairs(self, least: int, most: int) -> None:
-        """Delete the records of vehicles in cells whose last report was before `least` [s], and
-        make room for `most` such records.
+        """Delete the pair records (one per vehicle and cell) whose last report was before `least`
+        [s], and make room for `most` pair records.
         """
         state = self.state
         old = state.pairs
