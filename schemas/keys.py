@@ -156,8 +156,8 @@ class ServiceToken(NamedTuple):
         return self.key_under(SERVES)
 
     def key_under(self, root: str) -> str:
-        """Return the key of the token under another root: CLAIMS for a service that will serve the
-        region, or WAITS for a standby service.
+        """Return the key of the token under another root: CLAIMS for a service that serves or will
+        soon serve the region, WAITS for a standby service.
         """
         return f"{root}/{self.region.replace('*', _ALL)}/{self.service}/{self.start}"
 

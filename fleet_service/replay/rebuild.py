@@ -289,7 +289,9 @@ def _recorded_result(rows: segments.Rows) -> RecordedResult:
 def _join_parts(
     parts: list[tuple[Observations, RecordedResult]],
 ) -> tuple[Observations, RecordedResult]:
-    """Return the parts of a table joined into one, in order."""
+    """Return the parts of a day's observations, and of their recorded results, joined into one, in
+    order.
+    """
     of = Observations(
         **{
             f.name: np.concatenate([getattr(o, f.name) for o, _ in parts])

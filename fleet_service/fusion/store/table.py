@@ -172,9 +172,9 @@ def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
 
 
 def places_for(entries: int, most: float) -> int:
-    """Return the number of places of a table for 35 % more than `entries` at a load of `most`. For
-    records of vehicles in cells, which live three hours, this allows for the growth of another
-    hour.
+    """Return the length of a hash table (number of places) that has room for 35 % more than
+    `entries` when at most a share `most` of the places is in use. For records of vehicles in cells,
+    which live three hours, this allows for the growth of another hour.
     """
     return max(LEAST, int(1.35 * entries / most))
 
