@@ -59,7 +59,8 @@ class Opened:
 def open_page(
     path: Path | str, *, phone: bool = False, ratio: float = 1.0, unbound: bool = False
 ) -> Iterator[Opened]:
-    """Yield a file or an address, opened in the browser. Skip the test if there is no browser.
+    """Open a file or an address in the browser, and yield the page. Skip the test if there is no
+    browser.
 
     Args:
         path: file of this machine, or address.

@@ -120,7 +120,7 @@ class Image:
 
 
 def time_start(image: Image) -> float:
-    """Return the time [s] until a service of the image is ready. The service must not compile
+    """Start a service of the image, and return the time [s] until it is ready. It must not compile
     anything.
     """
     port = "127.0.0.1:0"

@@ -37,7 +37,7 @@ RETRY = {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1
 
 def make_enrolment(**changed: object) -> Enrolment:
     """Return an enrolment of two routers, a service, a reader and two vehicles; `changed` replaces
-    fields.
+    fields of the enrolment.
     """
     names = {
         "services": [SERVICE],

@@ -100,8 +100,8 @@ def ambiguous_classes(root: Path) -> dict[str, list[str]]:
 
 
 def light_import(root: Path) -> tuple[float, int, list[str]]:
-    """Return time [ms] and number of loaded modules of importing the contract package, and the
-    heavy libraries loaded with it.
+    """Import the contract package in a new process. Return the time [ms], the number of loaded
+    modules, and the heavy libraries among them.
     """
     words = (
         f"import sys, time; before = set(sys.modules); begun = time.perf_counter(); {LIGHT}; "

@@ -78,7 +78,9 @@ class LowerVertices:
             )
 
     def triangle_sets(self) -> tuple[FloatArray, FloatArray]:
-        """Return the sets of mismatch and of step, (5, 3) each: left foot, peak, right foot."""
+        """Return the fuzzy sets of the mismatch and of the step of ln R, (5, 3) each: left foot,
+        peak, right foot.
+        """
         return _triangle_sets(self.peaks, self.feet), _triangle_sets(self.out_peaks, self.out_feet)
 
     def step(self, mismatch: float) -> float:
@@ -133,7 +135,9 @@ def _triangle_sets(peaks: tuple[float, ...], feet: tuple[float, ...]) -> FloatAr
 
 
 def _membership_weights(sets: FloatArray, mismatch: float) -> FloatArray:
-    """Return the memberships (5,) of a mismatch in the sets. The outer sets are shoulders."""
+    """Return the memberships (5,) of a mismatch in the five sets. Beyond the outer peaks the
+    membership in the outer set is 1.
+    """
     weight = np.zeros(SETS)
     for k, (left, peak, right) in enumerate(sets):
         if mismatch <= peak:

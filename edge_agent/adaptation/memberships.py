@@ -144,7 +144,7 @@ class Memberships:
                 )
 
     def to_vector(self) -> FloatArray:
-        """Return the free parameters for an optimiser, shape (30,): the fields one after the other."""
+        """Return the free parameters for an optimiser, (30,): all fields, one after the other."""
         return np.array([number for name in LENGTHS for number in getattr(self, name)])
 
     @classmethod
@@ -174,9 +174,7 @@ class Memberships:
 
     @staticmethod
     def bounds() -> tuple[FloatArray, FloatArray]:
-        """Return the lower and upper limits of the vector, (30,) each: the range of an optimiser's
-        search.
-        """
+        """Return the lower and upper limits of the optimiser's vector, (30,) each."""
         lower = [-0.95, -0.8, -0.3, 0.1, 1.0, -0.4, -0.2, -0.02, 0.0, 0.02, -0.1, -0.1]
         lower += [0.3, 2.5, 0.5, 0.1]
         upper = [-0.5, -0.1, 0.3, 2.0, 10.0, -0.02, 0.0, 0.02, 0.3, 0.6, 0.1, 0.1]

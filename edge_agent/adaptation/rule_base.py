@@ -39,7 +39,7 @@ WIDE = (0.1, 0.35)  # [rad] angles between which the maps of real steering leave
 
 
 class RuleBase(NamedTuple):
-    """Parameters of the rules: a ramp (foot, peak) per set, and the consequents.
+    """Parameters of the fuzzy rules: a ramp (foot, peak) per set, and the consequents.
 
     If `by_sets` is False, `plain_share` with the parameters `plain` replaces the fuzzy rules of
     the share of evidence.
@@ -87,8 +87,8 @@ def is_high(value: float, ramp: FloatArray) -> float:
 
 @compiled
 def forgetting_rate(rules: RuleBase, wheels: float) -> float:
-    """Return the rate [1/s], added to the usual one, at which offsets, slope and bank return to
-    their prior.
+    """Return the rate [1/s] at which offsets, slope and bank return to their prior, in addition to
+    the usual rate.
 
     `wheels` is the innovation mismatch of the wheels [1].
     """
@@ -97,7 +97,9 @@ def forgetting_rate(rules: RuleBase, wheels: float) -> float:
 
 @compiled
 def wide_noise(rules: RuleBase, angle: float) -> float:
-    """Return the factor on R of an axle whose wheels are steered by `angle` [rad]."""
+    """Return the factor on the measurement noise R of an axle whose wheels are steered by `angle`
+    [rad].
+    """
     return math.exp(rules.ln_noise * is_high(abs(angle), rules.wide))
 
 

@@ -157,8 +157,8 @@ def braking_from(horizon: Horizon) -> FloatArray:
     """Return the braking energy per mass up to each metre (M,) [m^2/s^2]: half the square of the
     speed that can be removed by braking between the car and that metre.
 
-    The braking uses the lower end of the friction interval, and is at most comfortable. An unknown
-    road is assumed to have UNKNOWN_LOWER.
+    The friction is the lower end of its interval, or UNKNOWN_LOWER on an unknown road. The
+    deceleration is at most a comfortable one.
     """
     lower = np.where(np.isfinite(horizon.mu_lower), horizon.mu_lower, UNKNOWN_LOWER)
     return np.asarray(np.cumsum(np.minimum(GRAVITY * lower, COMFORT)))

@@ -250,8 +250,8 @@ class LocalMap:
         return self._all
 
     def _look_up(self, key: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]:
-        """Return belief, basis, time of last observation, time of receipt and number of vehicles of
-        places (n,).
+        """Return belief, basis, time of last observation, time of receipt and number of vehicles
+        for places (n,).
         """
         whole = self._all_cells()
         if not len(whole.key):

@@ -133,8 +133,8 @@ class Lookout:
         self._poses = poses
 
     def believe(self, places: IntArray, beliefs: tuple[FloatArray, FloatArray] | None) -> None:
-        """Update the friction beliefs of the vehicles' filters, which are combined with the map as
-        a prior.
+        """Combine the friction beliefs of the vehicles' filters with the map as a prior, and store
+        the quantiles of the result.
 
         Args:
             places: (N,) current place (cell·4 + sector) of each vehicle, -1 where unknown.

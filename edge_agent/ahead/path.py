@@ -84,8 +84,8 @@ class Path(NamedTuple):
 def to_plane(
     latitude: FloatArray, longitude: FloatArray, pose: Pose
 ) -> tuple[FloatArray, FloatArray]:
-    """Return east and north coordinates [m] relative to the car; the error is below a centimetre
-    within a kilometre.
+    """Return east and north coordinates [m] of a point relative to the car; the error is below a
+    centimetre within a kilometre.
     """
     east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
     return (np.asarray(longitude) - pose.longitude) * east, (
@@ -162,8 +162,8 @@ class GivenRoute:
         return path_along("route", ahead, pose, length) if len(ahead) > 1 else None
 
     def _match_position(self, line: FloatArray, run: FloatArray, pose: Pose) -> float | None:
-        """Return the distance along the route [m] at which the car is: the next matching point
-        after the last one, with the same heading.
+        """Return the car's distance along the route [m], at the point that best fits its position
+        and heading. Points soon after the last match are preferred.
 
         Return None if no point matches.
         """

@@ -82,8 +82,8 @@ def limit_of(horizons: list[Horizon]) -> float:
 
 
 class SteadyLimit:
-    """Limit with hysteresis: it decreases immediately, and increases only after the new limit was
-    higher for HOLD_S.
+    """Speed limit with hysteresis: it decreases immediately, and increases only after the new limit
+    was higher for HOLD_S.
     """
 
     def __init__(self) -> None:
@@ -91,7 +91,9 @@ class SteadyLimit:
         self._higher_since: int | None = None
 
     def update(self, limit: float, now: int) -> bool:
-        """Process a new limit [m/s] at the time `now` [ns]; return True if the value changed."""
+        """Process a new speed limit [m/s] at the time `now` [ns]; return True if the steady limit
+        changed.
+        """
         if limit < self.value:
             self._higher_since = None
             changed = self.value - limit >= FALL_STEP or self.value == math.inf

@@ -70,7 +70,8 @@ class MapPrior:
         visit: FloatArray,
         map_beliefs: dict[int, FloatArray | None],
     ) -> FloatArray:
-        """Return the beliefs of the vehicles combined with the map, (N, 32) probabilities.
+        """Return the friction beliefs of the vehicles' filters combined with the map, (N, 32)
+        probabilities.
 
         Args:
             keys: (N,) current place (cell·4 + sector) of each vehicle, NOWHERE where unknown.

@@ -49,7 +49,9 @@ class RequestLog:
         self._boxes: deque[tuple[Box, int]] = deque(maxlen=MOST_BOXES)
 
     def request_again(self) -> None:
-        """Clear the log, so that everything is requested again after a session has been reopened."""
+        """Clear the log of requested boxes, so that everything is requested again after a session
+        has been reopened.
+        """
         self._boxes.clear()
 
     def missing_boxes(self, path: Path, pose: Pose, within: float) -> list[Box]:
@@ -122,8 +124,8 @@ def _in_order(tiles: IntArray) -> list[int]:
 
 
 def _split_path(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
-    """Return (first, last) metre of parts of the path that together contain every wanted point,
-    each with a small bounding box.
+    """Return (first, last) metre of parts of the path that together contain every wanted point.
+    Each part has a small bounding box.
     """
     found: list[tuple[int, int]] = []
     first = last = -1

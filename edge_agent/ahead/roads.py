@@ -132,8 +132,8 @@ def _follow_way(
 
 
 def _heading_of_way(way: list[int], places: dict[int, tuple[float, float]], pose: Pose) -> float:
-    """Return the mean heading [rad] of the last three steps, because the cell centres along an
-    oblique road zigzag.
+    """Return the mean heading [rad] of the road's last three steps. A single step is not used,
+    because the cell centres along an oblique road zigzag.
     """
     last = [(0.0, 0.0), *(places[key] for key in way)][-4:]
     dx = last[-1][0] - last[0][0]

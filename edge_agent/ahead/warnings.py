@@ -56,7 +56,7 @@ class _Stretch:
 def update_warnings(
     active: tuple[Active, ...], horizons: list[Horizon], pose: Pose, known: LocalMap
 ) -> tuple[tuple[Active, ...], list[GripWarning]]:
-    """Return the active warnings after an update, and the warnings to report now.
+    """Update the active warnings from new horizons; return them, and the warnings to report now.
 
     Args:
         active: active warnings before the update.
@@ -138,8 +138,8 @@ def _find_runs(mask: BoolArray) -> list[tuple[int, int]]:
 
 
 def _by_place(stretches: list[_Stretch]) -> list[tuple[frozenset[int], list[_Stretch]]]:
-    """Group the stretches of several paths by common places; return (all places of the group, its
-    stretches) pairs.
+    """Group the slippery stretches of several paths by common places; return pairs (all places of
+    the group, stretches of the group).
     """
     groups: list[tuple[frozenset[int], list[_Stretch]]] = []
     for stretch in stretches:

@@ -209,7 +209,9 @@ class Agent:
         ]
 
     def _warm_up(self) -> None:
-        """Load or compile the kernels before the loop starts, by one step with a temporary vehicle."""
+        """Run one step with a temporary vehicle, which loads or compiles the kernels before the
+        loop starts.
+        """
         t = np.zeros((1, 1))
         time = np.zeros((1, 1), dtype=np.int64)
         signals = np.full((1, 1, len(CHANNELS)), np.nan)

@@ -41,8 +41,8 @@ class Outcome(NamedTuple):
 
 
 def tasks_of(logs: Sequence[Path], vehicle: Path | None, folder: Path) -> list[Task]:
-    """Return one task per log. The estimates get the log's name in `folder`. The vehicle file is
-    next to the log unless `vehicle` is given.
+    """Return one task per log. The file of its estimates lies in `folder` and has the log's name.
+    The vehicle file lies next to the log unless `vehicle` is given.
 
     Raises:
         InputError: two logs have the same name, or estimates would replace a log.
@@ -108,8 +108,8 @@ def backfill_on_spark(
 
 
 def estimate_atomically(task: Task, estimator: str, memberships: Memberships | None) -> Outcome:
-    """Estimate one drive and write its file atomically, even if another process estimates the same
-    drive.
+    """Estimate one drive and write the estimates' file atomically, even if another process
+    estimates the same drive.
     """
     folder = task.out.parent
     with own_drafts(folder) as drafts:

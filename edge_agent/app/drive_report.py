@@ -40,7 +40,7 @@ _DEGREES: Final = 180.0 / math.pi
 
 @dataclass(frozen=True)
 class Panel:
-    """Plot of one quantity.
+    """Plot of one quantity of the estimates over time.
 
     Attributes:
         name, unit: name and unit of the quantity.
@@ -77,7 +77,7 @@ class RecordedDrive:
 
 
 def write_report(drive: RecordedDrive, path: Path) -> None:
-    """Write a report in the format given by the path's suffix.
+    """Write the report of a drive in the format given by the path's suffix.
 
     Raises:
         InputError: the suffix is unknown, or a required package is missing.

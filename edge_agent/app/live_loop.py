@@ -31,8 +31,8 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Progress:
-    """Progress of the loop: duration of the signals [s], number of blocks, number of late blocks,
-    the longest and the last delay [s].
+    """Progress of the live loop: duration of the signals [s], number of blocks, number of late
+    blocks, the longest and the last delay [s].
 
     `held` counts records that were not published, because their signals were not verified.
     """
@@ -72,8 +72,8 @@ def run_live_loop(
     options: LoopOptions,
     progress: Progress | None = None,
 ) -> Progress:
-    """Run the loop until the blocks end, the duration has passed or `stop` is set; then close the
-    open visits.
+    """Process blocks until the source ends, the duration has passed or `stop` is set; then close
+    the open visits.
 
     `progress` is updated during the run, and returned.
     """
@@ -134,8 +134,8 @@ def _offer_if_admitted(
 
 
 def final_counts(progress: Progress, publisher: Publisher) -> dict[str, float]:
-    """Return the final counts: records of all kinds together, observations separately, and blocks
-    and delays of the loop.
+    """Return the agent's final counts: records of all kinds together, observations separately, and
+    blocks and delays of the loop.
     """
     counts = publisher.counts
     seen = Kind.OBSERVATION

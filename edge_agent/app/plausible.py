@@ -82,8 +82,8 @@ class Plausibility:
 
     @property
     def median_speed_error(self) -> float:
-        """Return the median of |v_x − wheels| over the wheels' speed [1]; 0 for a car that did not
-        move.
+        """Return the median relative error [1] of the estimated v_x against the speed of the
+        wheels; 0 for a car that did not move.
         """
         away = np.concatenate(self.away) if self.away else np.zeros(0)
         return float(np.median(away)) if len(away) else 0.0

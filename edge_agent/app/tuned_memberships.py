@@ -162,8 +162,8 @@ def shipped_memberships(estimator: str) -> Memberships:
 
 
 def search_results(estimator: str) -> dict[str, list[Memberships]]:
-    """Return the results of all searches behind the shipped file, by kind of search; empty if the
-    file does not contain them.
+    """Return the results of all searches that led to the shipped file of memberships, by kind of
+    search; empty if the file does not contain them.
     """
     document = load_tuned(FOLDER / f"{estimator}.json").document
     return {
@@ -173,8 +173,8 @@ def search_results(estimator: str) -> dict[str, list[Memberships]]:
 
 
 def save_tuned(path: Path, document: Document) -> None:
-    """Write a document after a check by parsing, so that `load_tuned` accepts every file that is
-    written.
+    """Write a document with tuned memberships. It is parsed first, so that `load_tuned` accepts
+    every file that is written.
     """
     text = json.dumps(document.model_dump(), indent=1, ensure_ascii=False) + "\n"
     parse_tuned(text, f"tuned file {path}")

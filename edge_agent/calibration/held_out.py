@@ -44,8 +44,8 @@ class Prediction(NamedTuple):
 
 
 class HeldOut(NamedTuple):
-    """Result of learning: the calibration to write, the groups left out of it, and the mean
-    predictions without (`before`) and with it (`after`).
+    """Result of a validated calibration: the calibration to write, the groups left out of it, and
+    the mean predictions without (`before`) and with it (`after`).
     """
 
     calibration: Calibration
@@ -141,8 +141,8 @@ def restrict_groups(calibration: Calibration, groups: Sequence[str]) -> Calibrat
 
 
 def is_worse(tried: Sequence[Prediction], best: Sequence[Prediction]) -> bool:
-    """Return True if the predictions `tried` are worse than `best`: a lower mean log-likelihood, or
-    one drive with a longer contradiction.
+    """Return True if the predictions `tried` are worse than `best`: their mean log-likelihood is
+    lower, or one drive has the flag CONTRADICTION for longer.
     """
     lost = _mean_prediction(best).log_likelihood - _mean_prediction(tried).log_likelihood
     longer = max(new.contradicted - old.contradicted for new, old in zip(tried, best, strict=True))

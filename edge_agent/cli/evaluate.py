@@ -76,7 +76,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the evaluation; return 0 if every measured figure meets its target, else 1.
+    """Run the evaluation of the estimators; return 0 if every measured figure meets its target,
+    else 1.
 
     Raises:
         InputError: there are too few seeds, the folder cannot be created, or matplotlib is not

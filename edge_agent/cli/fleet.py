@@ -56,8 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the fleet until the duration has passed or a signal (SIGTERM, Ctrl-C) arrives; write the
-    true states before the end.
+    """Run the simulated fleet until the duration has passed or a signal (SIGTERM, Ctrl-C) arrives.
+    Before the end, write the file of the vehicles' true states.
 
     Return the exit code.
     """

@@ -210,7 +210,7 @@ def _tuning_drives(
 
 
 def _search_worth(score: Score, objective: str) -> float:
-    """Return the value of a search result, larger is better.
+    """Return the value by which search results are compared; larger is better.
 
     It is minus the cost of false and missed ice if the true friction is known, else the objective.
     """
@@ -274,8 +274,8 @@ def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
 
 
 def _run_searches(objective: Objective, ants: int, iterations: int, seed: int) -> dict[str, Result]:
-    """Run random search and ant colony from the same start, with the same positions and budget;
-    return the results by search.
+    """Run random search and ant colony from the same start vector, with the same candidate values
+    and budget; return the results by search.
     """
     problem = Problem(objective, choices(POSITIONS), Memberships().to_vector())
     results = {}
@@ -354,7 +354,7 @@ def _format_number(value: float | None, digits: int) -> str:
 
 
 def comparison_table(scores: dict[str, SplitScores]) -> str:
-    """Return the comparison of the searches as plain text, one row per search and set of drives."""
+    """Return the scores of each search as a plain-text table, one row per search and set of drives."""
     lines = [
         (
             f"{'':<8} {'drives':<9} {'interval score':>15} {'coverage':>9} "

@@ -40,7 +40,7 @@ class Parameter(IntEnum):
 def parameter_row(vehicle: Vehicle) -> FloatArray:
     """Return the parameters of `vehicle`, shape (15,), indexed by `Parameter`.
 
-    Stiffnesses of the vehicle file are means over the four wheels at static load. The row has
+    The stiffnesses in the vehicle file are means over the four wheels at static load. The row has
     stiffness per newton of load, which is valid for lightly and heavily loaded wheels. If the file
     gives a separate rear stiffness, the rear one is used for all wheels. The difference of the
     front axle from it is compliance, a state of the default estimator.
@@ -82,8 +82,8 @@ def parameter_table(vehicles: Sequence[Vehicle]) -> FloatArray:
 
 
 class Body(NamedTuple):
-    """Parameters that body and tyres use, as scalars instead of an array; see `inlined` for the
-    reason.
+    """Parameters of the vehicle that body and tyres use. They are scalars instead of an array; see
+    `inlined` for the reason.
     """
 
     mass: float

@@ -129,8 +129,8 @@ def _step_filter(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> b
 
 @compiled
 def _adapt_noise_and_shares(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> None:
-    """Compute the factors on R of both sub-filters and their information shares for the next
-    sample.
+    """Compute the factors on the measurement noise R of both sub-filters, and their information
+    shares, for the next sample.
     """
     motion = memory.motion
     keep = 0.5 ** (dt / WINDOW_S)

@@ -93,8 +93,8 @@ def make_bank(
     tyre: TyreOption | None = None,
     motion: MotionSetting | None = None,
 ) -> EstimatorBank:
-    """Return a bank of joint filters, one per vehicle. `tyre` and `motion` replace the default
-    options.
+    """Return a bank of paper 000's joint filters, one per vehicle. `tyre` and `motion` replace the
+    default options.
     """
     filters = new_filters(JointMemory, vehicles, tyre)
     set_motion(filters, MotionSetting() if motion is None else motion)

@@ -60,7 +60,7 @@ def create(
     memberships: Memberships | None = None,
     curve: Curve | None = None,
 ) -> EstimatorBank:
-    """Return a bank of estimators `name`, one per vehicle.
+    """Return a bank of estimators called `name`, one per vehicle.
 
     Args:
         name: a key of ESTIMATORS.

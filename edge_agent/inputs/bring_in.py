@@ -120,8 +120,8 @@ def _decode_frames(
 
 
 def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Database | None:
-    """Return the CAN database from `given`, the path on the command line; without it, that of the
-    profile; else None.
+    """Return the CAN database at the path `given` on the command line; without this path, the
+    profile's database; else None.
     """
     if given is not None:
         return read_dbc(given)

@@ -28,7 +28,8 @@ AIR_C: Final = (
 
 
 def context_values(name: str, values: FloatArray, active: Sequence[float] | None) -> FloatArray:
-    """Return the readings of a context signal in the log's unit, same shape.
+    """Return the readings of a context signal, converted to the unit of the signal log, in the same
+    shape.
 
     Args:
         name: name of the signal, one of CONTEXT.
@@ -88,7 +89,8 @@ def context_signals(profile: Profile) -> set[str]:
 def context_block(
     samples: int, vehicles: int, values: Mapping[str, FloatArray | BoolArray | float]
 ) -> FloatArray:
-    """Return the context (T, N, len(CONTEXT)) of a block from the values of a source.
+    """Return the context signals (T, N, len(CONTEXT)) of a block, from the values that a source
+    gives.
 
     Signals without a value are NaN (unknown). For sources without a profile, for example a
     simulation:

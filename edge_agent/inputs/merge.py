@@ -72,7 +72,7 @@ def merge_recordings(
     steering_ratio: float | None = None,
     shifts: Mapping[str, float] | None = None,
 ) -> Merged:
-    """Merge all recordings into one log.
+    """Merge all recordings into one signal log by a profile.
 
     Args:
         recordings: recordings of the sources.
@@ -139,8 +139,8 @@ def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tup
     """Return, for each channel, the index of the recording that has its signals, and its
     conversion.
 
-    A recording of a position receiver provides the position channels that the profile's signals do
-    not.
+    A recording of a position receiver provides those position channels for which the profile names
+    no signal.
     """
     found: dict[str, tuple[int, Channel]] = {}
     for name in (*CHANNELS, GROUND, *CONTEXT):
@@ -364,7 +364,9 @@ def _build_rows(
 
 
 def _row_rate(dense: Mapping[str, Series]) -> float:
-    """Return the row rate [Hz]: the rate of the fastest channel, rounded up to a usual rate."""
+    """Return the rate of the log's rows [Hz]: the rate of the fastest channel, rounded up to a
+    usual rate.
+    """
     fastest = max(1.0 / max(float(np.median(np.diff(one.t))), 1e-3) for one in dense.values())
     return next((rate for rate in RATES if rate >= 0.95 * fastest), RATES[-1])
 

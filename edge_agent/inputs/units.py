@@ -107,7 +107,7 @@ def unit_of_channel(channel: str, text: str) -> str | None:
 
 
 def to_si(channel: str, unit: str, wheel_radius: float | None) -> float | None:
-    """Return the factor from a unit to the signal log's unit.
+    """Return the factor that converts values from a unit to the signal log's unit.
 
     Return None if a speed at the rim requires a wheel radius that is not known.
     """

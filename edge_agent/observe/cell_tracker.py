@@ -153,7 +153,9 @@ def _update_course(track: CellTrack, latitude: float, longitude: float) -> None:
 
 @compiled
 def _stays_in_cell(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
-    """Return True if a fix still belongs to the visit, with the margins of cell and sector."""
+    """Return True if a position fix still belongs to the visit, also within the margins beyond cell
+    and sector.
+    """
     wide = CELL_MARGIN * (track.east - track.west)
     high = CELL_MARGIN * (track.north - track.south)
     off = np.mod(yaw - track.sector * (np.pi / 2) + np.pi, 2 * np.pi) - np.pi
@@ -166,7 +168,7 @@ def _stays_in_cell(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
 
 @compiled
 def _store_readings(track: CellTrack, fix: ReceiverSample, now: float) -> None:
-    """Store the position and the yaw of a sample in the track, where they are valid."""
+    """Store the position and the yaw of a sample in the vehicle's track, if they are valid."""
     if np.isfinite(fix.yaw):
         track.yaw_time = now
         track.yaw = fix.yaw

@@ -320,8 +320,8 @@ def _add_context(visit: Visit, context: FloatArray) -> None:
 
 @compiled
 def _update_felt_grip(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
-    """Update the grip according to the accelerometers, `dt` [s] after the previous sample. Without
-    accelerometer readings it stays infinite and excludes no friction.
+    """Update a visit's grip according to the accelerometers, `dt` [s] after the previous sample.
+    Without accelerometer readings this grip stays infinite and excludes no friction.
     """
     if np.isfinite(sample.ax + sample.ay):
         share = 1.0 - np.exp(-dt / FELT_S)
@@ -410,7 +410,7 @@ def _build_observations(
 
 
 def _context_columns(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
-    """Return the columns of controllers and surroundings for visits, (n,) each.
+    """Return the observation columns about controllers and surroundings for n visits, (n,) each.
 
     A flag is 1 if it was on at any sample. It is 0 if it was never on and was known at KNOWN_SHARE
     of the samples. Otherwise it is unknown.

@@ -20,8 +20,8 @@ _TIME = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}
 
 
 class TripEnds:
-    """Filter of trip ends for N vehicles. Call `advance` with each block, then `release_records`
-    with its records.
+    """Filter that removes the records near the ends of the trips of N vehicles. Call `advance` with
+    each block, then `release_records` with its records.
 
     Args:
         vehicles: number of vehicles.

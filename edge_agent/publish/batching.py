@@ -130,8 +130,8 @@ class Batcher:
 
 
 def _batch_ranges(time: IntArray, ready: int, rows: int) -> Iterator[tuple[int, int]]:
-    """Yield the range [first, last) of each batch, limited in rows and in time span, because a
-    replayed drive may be long.
+    """Yield the range [first, last) of the records of each batch. Its number of rows and its time
+    span are limited, because a replayed drive may be long.
     """
     first = 0
     for at in range(1, ready + 1):

@@ -459,8 +459,8 @@ class Outbox:
 
 
 def _keys_within(held: dict[int, int], first: int, last: int) -> list[int]:
-    """Return the keys of the batches with seq in [first, last]. A very large (hostile) range is not
-    iterated.
+    """Return the keys of the batches in the outbox with a sequence number in [first, last]. A very
+    large (hostile) range is not iterated.
     """
     if last - first < len(held):
         return [held[seq] for seq in range(first, last + 1) if seq in held]

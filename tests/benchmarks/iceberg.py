@@ -55,8 +55,8 @@ def _count_rows(table: pa.Table) -> Counter[str]:
 
 
 def count_different_rows(folder: Path) -> float:
-    """Return the number of differing rows over four rounds of compaction and registration, and
-    after retention has removed a day.
+    """Return the number of differing rows over four rounds of compaction and registration in
+    Iceberg, and after retention has removed a day.
     """
     root = folder / "archive"
     uri = f"sqlite:///{folder}/tables.db"

@@ -123,8 +123,8 @@ class Limit:
         self._memory = first_memory(first, speed)
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
-        """Return the means (T, N, 6) after each of the readings (T, N, 11), which are `gone`
-        seconds apart.
+        """Return the means of the filters' states (T, N, 6) after each of the readings (T, N, 11),
+        which are `gone` seconds apart.
         """
         samples, vehicles, _ = readings.shape
         out = np.empty((samples, vehicles, STATES))
@@ -171,8 +171,8 @@ class VectorLimit:
         return out
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
-        """Return the means (T, N/lanes, 6, lanes) after each reading. The readings have the layout
-        of `side_by_side` and are `gone` seconds apart.
+        """Return the means of the filters' states (T, N/lanes, 6, lanes) after each reading. The
+        readings have the layout of `side_by_side` and are `gone` seconds apart.
         """
         samples, blocks, _, lanes = readings.shape
         out = allocate_aligned(samples, blocks, STATES, lanes)

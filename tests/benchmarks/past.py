@@ -102,8 +102,8 @@ def _open_service(root: Path) -> Iterator[zenoh.Session]:
 
 
 def _time_answer(session: zenoh.Session, selector: str) -> tuple[float, list[pa.Table]]:
-    """Return the time [s] of an answer, and its tiles. Repeat the query while another past map is
-    being computed.
+    """Return the time [s] until the answer to a map query, and the tiles in this answer. Repeat the
+    query while another past map is being computed.
     """
     while True:
         began = time.perf_counter()
@@ -118,7 +118,9 @@ def _time_answer(session: zenoh.Session, selector: str) -> tuple[float, list[pa.
 
 
 def _time_queries(root: Path) -> tuple[list[float], int]:
-    """Return the time [s] of each query, and the number of cells in the answers."""
+    """Return the time [s] until the answer to each map query, and the number of cells in the
+    answers.
+    """
     rng = np.random.default_rng(0)
     step = 360.0 / (1 << grid.CELL_ZOOM)
     spent = []

@@ -43,8 +43,8 @@ PATIENCE_S: Final = 120.0
 
 
 def shards() -> list[Figure]:
-    """Measure a burst into one service and into two services that share its regions, with engines
-    alone and over Zenoh.
+    """Measure the time to ingest a burst of messages in one service, and in two services that share
+    its regions, with engines alone and over Zenoh.
     """
     sent = [_make_burst(k) for k in range(ROUNDS + 1)]
     alone = [statistics.median(engines_s(sent, split)) for split in (1, 2)]

@@ -114,8 +114,8 @@ def test_network_policies_reach_routers_but_never_services(overlay: str) -> None
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
 def test_every_container_is_shut_in_and_bounded(overlay: str) -> None:
-    """The containers satisfy the restricted profile of the pod security standards, which the
-    namespace enforces, and have further limits.
+    """The containers must satisfy the restricted profile of the pod security standards, which the
+    namespace enforces. They must also have limits of memory and a read-only file system.
     """
     for template in list_templates(build_overlay(overlay)):
         pod = template["spec"]

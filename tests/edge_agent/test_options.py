@@ -251,8 +251,8 @@ def test_every_option_of_every_command_is_in_a_table() -> None:
 
 
 def test_the_tests_that_show_an_option_give_it_to_the_command() -> None:
-    """Some options are tested in other modules. This test reads the source of those tests, and
-    checks that they use the option.
+    """Tests in other modules that are listed for an option must use this option. This test reads
+    their source.
     """
     texts = [
         path.read_text()

@@ -44,8 +44,8 @@ NEAR: Final = f"{LONGITUDE},{LATITUDE + 0.011},{LONGITUDE + 0.01},{LATITUDE + 0.
 
 
 def run(site: Site) -> list[Figure]:
-    """Measure twenty million observations and forty million states; in a quick run, eighty thousand
-    observations.
+    """Measure an archive of twenty million observations and forty million states (in a quick run,
+    eighty thousand observations), and return the figures.
     """
     millions = site.choose_amount(2000, 8) / 100
     shares = (0.1,) if site.quick else (0.1, 0.3)

@@ -38,7 +38,9 @@ Place = tuple[int, int]  # cell and sector
 
 
 def run(site: Site) -> list[Figure]:
-    """Run eight restarts with twenty alerts each; in a quick run, one restart with ten alerts."""
+    """Run eight restarts of the router with twenty alerts each (in a quick run, one with ten
+    alerts), and return the figures.
+    """
     each = site.choose_amount(20, 10)
     missing = 0
     waits = []

@@ -45,7 +45,9 @@ BATCHES: Final = 40  # of a spool
 
 
 def run(site: Site) -> list[Figure]:
-    """Change random bits in each kind of file, and count errors that were not detected."""
+    """Change random bits in each kind of file, count errors that were not detected, and return the
+    figures.
+    """
     logging.getLogger("fleet_service").setLevel(logging.ERROR)  # every damage says so
     logging.getLogger("edge_agent").setLevel(logging.ERROR)
     random_ = random.Random(site.seed)

@@ -207,8 +207,8 @@ def _find_memory_folder() -> str | None:
 
 
 def run(site: Site) -> list[Figure]:
-    """Run 5 000 histories of the log, 500 of the outbox and 600 of a service; in a quick run, 120
-    in total.
+    """Run 5 000 histories of the log, 500 of the outbox and 600 of a service (in a quick run, 120
+    in total), and return the figures.
     """
     logs = site.choose_amount(5000, 100)
     outboxes = site.choose_amount(500, 10)

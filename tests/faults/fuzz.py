@@ -139,8 +139,8 @@ def _make_honest(seq: int, now: int) -> Iterator[Message]:
 
 
 def _run_turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
-    """Process messages in one turn of the service's worker. Return 1 if anything failed except by a
-    refusal, otherwise 0.
+    """Process messages in one turn of the service's worker. Return 1 if a message caused any
+    failure except a refusal, otherwise 0.
     """
     try:
         engine.intake.ingest(messages, now)

@@ -72,8 +72,8 @@ class Load(NamedTuple):
 
 
 def run(site: Site) -> list[Figure]:
-    """Kill 200 times in ten rounds; in a quick run, five times in one round, with six agents and
-    weaker targets.
+    """Kill processes 200 times in ten rounds, and return the figures. A quick run kills five times
+    in one round, with six agents and weaker targets.
     """
     random_ = random.Random(site.seed)
     kills = 0

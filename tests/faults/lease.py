@@ -63,8 +63,8 @@ def judge_without_expiry(seeds: Iterable[int]) -> Judged:
 
 
 def run(site: Site) -> list[Figure]:
-    """Judge histories of the real protocol, and of two broken protocols in which violations must be
-    found.
+    """Judge histories of the real lease protocol, and of two broken protocols in which violations
+    must be found; return the figures.
     """
     first = 1000 * site.seed
     judged = judge_seeds(range(first, first + site.choose_amount(200, 12)))

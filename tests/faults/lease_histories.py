@@ -39,8 +39,9 @@ _SILENT: Final = logging.Logger("silent", logging.CRITICAL + 1)
 
 
 class Event(NamedTuple):
-    """Event of a history. A service with a lease number `serves` and knows batches, or it
-    `acknowledges` batches; at the end a reader `reads` all batches that count.
+    """Event of a history: a service with a lease number begins to serve and knows some batches
+    (`serves`), or acknowledges batches (`acknowledges`); at the end a reader finds the batches that
+    count (`reads`).
     """
 
     kind: str

@@ -11,8 +11,8 @@ from tests.faults.protocol_model import BROKEN, Rules, explore_states
 
 
 def run(site: Site) -> list[Figure]:
-    """Check all states with equal and different lease times, and check that the model finds each
-    broken protocol.
+    """Check all states of the model with equal and different lease times, and that the model finds
+    each broken protocol; return the figures.
     """
     checked = [
         explore_states(Rules(), most_turn=site.choose_amount(2, 1)),

@@ -111,7 +111,9 @@ def _visit(name: str, seq: int, when: int, trip: Trip, at: slice, mu: float) -> 
 
 
 class Town:
-    """Service of a town, its cars by day, and the tiles that a reader has stored."""
+    """Fleet service of a simulated town, the town's cars by day, and the tiles that a reader has
+    stored.
+    """
 
     def __init__(self, folder: Path, seed: int, public: int = PUBLIC) -> None:
         self._random = np.random.default_rng(seed)
@@ -243,7 +245,9 @@ def _slippery_delay(folder: Path, public: int) -> float:
 
 
 def run(site: Site) -> list[Figure]:
-    """Pursue a car of each street, and as a control a car on a map that shows every visit."""
+    """Pursue a car of each street, and as a control a car on a map that shows every visit; return
+    the figures.
+    """
     over: list[float] = []
     puts = 0
     streets: list[float] = []

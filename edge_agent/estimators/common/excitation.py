@@ -15,7 +15,9 @@ SLOT_S = 0.02
 
 
 class Excitation:
-    """Ring of time slots; each slot holds the largest force over load [1] of any wheel in its time."""
+    """Ring of time slots. Each slot has the largest force over load [1] that any wheel used during
+    the slot.
+    """
 
     time: Annotated[FloatArray, SLOTS]  # at which a slot began [s]
     used: Annotated[FloatArray, SLOTS]
@@ -50,7 +52,9 @@ def note_excitation(ring: Excitation, time: float, used: float) -> None:
 
 @compiled
 def _find_largest(ring: Excitation, time: float) -> None:
-    """Search all slots for `largest` again, because the slot of the previous maximum has expired."""
+    """Search all time slots for the largest grip used, because the slot of the previous maximum has
+    expired.
+    """
     ring.largest = 0.0
     for k in range(SLOTS):
         if ring.time[k] > time - UTILISED_WINDOW_S and ring.used[k] >= ring.largest:

@@ -80,7 +80,9 @@ def take_sample_in(
 
 @compiled
 def _reset_track(track: InputTrack) -> None:
-    """Reset the track to its state before the first sample, with the wheels straight ahead."""
+    """Reset the track of inputs to its state before the first sample, with the wheels straight
+    ahead.
+    """
     track.started = True
     track.position_time = -math.inf
     for wheel in range(4):

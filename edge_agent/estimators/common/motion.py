@@ -35,8 +35,8 @@ def has_diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
 
 @compiled
 def sliding_flag(row: FloatArray, track: InputTrack, vx: float, vy: float, mu: float) -> int:
-    """Return the health flag SLIDING if the longitudinal slip of any wheel is beyond the peak of
-    the tyre curve at the current inputs; else return 0.
+    """Return the health flag SLIDING if the longitudinal slip of any wheel lies beyond the peak of
+    the tyre curve; else return 0.
     """
     health = 0
     yaw_rate = track.inputs[S.YAW_RATE]

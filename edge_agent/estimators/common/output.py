@@ -34,7 +34,8 @@ def write_motion(
     var_y: float,
     var_rate: float,
 ) -> None:
-    """Write velocity [m/s], yaw rate [rad/s] and sideslip [rad] with their standard deviations.
+    """Write velocity [m/s], yaw rate [rad/s] and sideslip [rad] with their standard deviations to
+    the output.
 
     `var_x`, `var_y` and `var_rate` are the variances of v_x, v_y and the yaw rate.
     """
@@ -48,8 +49,8 @@ def write_motion(
 
 @compiled
 def write_states(output: FloatArray, mean: FloatArray, root: FloatArray, yaw_rate: int) -> None:
-    """Write the motion of a filter. States 0 and 1 of `mean` are v_x and v_y; `yaw_rate` is the
-    index of the yaw rate.
+    """Write the motion estimated by a filter to the output. States 0 and 1 of `mean` are v_x and
+    v_y; `yaw_rate` is the index of the yaw rate.
     """
     write_motion(
         output,
@@ -115,7 +116,9 @@ def write_unknown(output: FloatArray) -> None:
 
 @compiled
 def limit_friction(mean: FloatArray, root: FloatArray, i: int, largest_std: float) -> None:
-    """Clip the friction in state i to its range, and its standard deviation to `largest_std`."""
+    """Clip the friction, which is state i, to its possible range, and its standard deviation to
+    `largest_std`.
+    """
     mean[i] = min(max(mean[i], LOWER), UPPER)
     std = math.sqrt(variance(root, i))
     if std > largest_std:

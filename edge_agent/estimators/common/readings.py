@@ -41,7 +41,8 @@ POSITION_S = 1.5  # a longer silence of the receiver is reported
 
 @compiled
 def read_plausible(sample: FloatArray, now: FloatArray) -> int:
-    """Copy the readings of a sample (18,) to now (15,) and return the health flags.
+    """Copy the plausible readings of a sample (18,) to `now` (15,), and return the health flags for
+    missing and implausible readings.
 
     A reading that is missing, infinite or implausible becomes NaN in `now`.
     """

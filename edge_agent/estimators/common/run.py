@@ -43,7 +43,7 @@ def kernel_of(
     step: Callable[[Memory, Context, float], bool],
     report: Callable[[Memory, Context, FloatArray], float],
 ) -> Kernel:
-    """Return the kernel of a filter for `EstimatorBank`.
+    """Return the compiled kernel that `EstimatorBank` calls for a filter.
 
     Args:
         begin: begins the filter at the sample in memory.track.

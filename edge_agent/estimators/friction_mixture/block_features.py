@@ -109,8 +109,8 @@ def _steer_rate(memory: MixtureMemory, duration: float) -> float:
 def _compute_wheel_forces(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures
 ) -> int:
-    """Compute the force over load of the four wheels and the force part of `noise_std`; return the
-    health flags.
+    """Compute the force over load of the four wheels, and the part of `noise_std` that comes from
+    the noise of the forces; return the health flags.
     """
     health = 0
     loads = features.loads
@@ -314,8 +314,9 @@ def wheel_speed_jump(
 ) -> float:
     """Return the difference [m/s] between a wheel's speed and its smoothed speed; 0 where unknown.
 
-    The smoothed speed is advanced by the car's acceleration first. A wheel that spins up or locks
-    keeps its difference for several blocks; a bump in the road lasts one or two blocks.
+    Before the comparison, the smoothed speed is advanced by the car's acceleration. A wheel that
+    spins up or locks keeps its difference for several blocks; a bump in the road lasts one or two
+    blocks.
     """
     now = at_centre(memory.row, features, wheel)
     usual = memory.usual_rolling
@@ -359,8 +360,8 @@ def _compute_information(constants: Constants, features: BlockFeatures) -> None:
 def unexplained_slip_difference(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures
 ) -> float:
-    """Return the largest slip difference between left and right wheel of an axle that no force
-    explains.
+    """Return the largest slip difference between the left and right wheel of an axle, as far as
+    their forces do not explain it.
 
     The unit is linear force over load [1]. Wheels of unequal radius always differ in slip.
     Therefore the estimated difference of the radii is subtracted, with an allowance for its

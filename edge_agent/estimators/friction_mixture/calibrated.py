@@ -32,8 +32,8 @@ EACH_COMPLIANCE: Final = 0.003  # [rad] that another load and other tyres make o
 
 
 def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:
-    """Return the standard deviations (N, STATES) of the priors: `std` (STATES,), reduced where a
-    vehicle's calibration has a value.
+    """Return the standard deviations (N, STATES) of the states' priors: `std` (STATES,), reduced
+    for states to which a vehicle's calibration gives a value.
 
     The means do not change, because the calibration already corrects the signals (inputs.correct).
     """

@@ -84,8 +84,8 @@ def design_of(
     constants: Constants | None = None,
     curve: Curve | None = None,
 ) -> MixtureDesign:
-    """Return the tables of a filter. Studies pass other `constants`; other tyres need another
-    `curve`.
+    """Return the tables of a friction mixture. Studies pass other `constants`; other tyres need
+    another `curve`.
     """
     mu, prior = node_table(NODES)
     constants = constants or Constants()

@@ -48,7 +48,8 @@ def guard_penalty(grip: GripInUse, constants: Constants, side_mu: FloatArray) ->
 def reported_upper(grip: GripInUse, friction: Quantiles) -> float:
     """Return the upper end of the friction interval, raised to the grip in use if necessary.
 
-    The result may exceed 1.2, the end of the grid, because racing tyres do.
+    The result may exceed 1.2, the end of the friction grid, because the friction of racing tyres
+    does.
     """
     return max(friction.upper, grip.held + ABOVE)
 

@@ -77,8 +77,8 @@ def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
 def apply_road_change(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, metres: float
 ) -> None:
-    """Apply the road change over `metres`: move probability between nodes, and mix the state of
-    each node with the state of the probability that flows in.
+    """Apply a possible road change over `metres`: move probability between nodes, and mix the state
+    of each node with the states of the nodes from which probability comes.
     """
     count = active_nodes(memory)
     constants = design.constants

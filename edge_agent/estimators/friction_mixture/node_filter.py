@@ -69,8 +69,8 @@ def update_node(
     mean and scratch.root[j].
 
     R of the axles is larger still where the axles are distrusted, and where the inputs are steady.
-    Errors of curve and offsets then repeat from block to block; if they were treated as noise, the
-    filter would average them into stiffness and shape.
+    With steady inputs, errors of the tyre curve and of offsets repeat from block to block; if they
+    were treated as noise, the filter would average them into stiffness and shape.
 
     The function also writes the innovation and its theoretical variance without the inflation.
     """
@@ -244,8 +244,8 @@ def weigh_slopes(
 
 @compiled
 def slip_noise_correction(slope: float) -> float:
-    """Return one half minus the share of the slip noise variance that enters a residual where the
-    tyre curve has this slope.
+    """Return one half minus the share of the slip noise variance that enters a residual, for a
+    given slope of the tyre curve.
 
     A residual is the distance normal to the curve. On a line of slope k, the share k^2/(1 + k^2) of
     the slip noise enters it (errors in variables); at slope 1 this is one half, which
@@ -329,7 +329,7 @@ def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
 def take_rows(
     mean: FloatArray, root: FloatArray, node: NodeWorkspace, axle_penalty: float
 ) -> tuple[float, int]:
-    """Apply the innovations node.residual (6,) one by one.
+    """Update a node with the innovations node.residual (6,), one row after the other.
 
     Return (negative log-likelihood [nat] without constants, number of rows applied): half of the
     normalised squares plus the ln det S terms. `axle_penalty` scales the ln det S term of the

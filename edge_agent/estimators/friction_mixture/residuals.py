@@ -72,7 +72,8 @@ def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
 
 @compiled
 def slope_along(curve: TyreCurve, g_x: float, g_y: float, mu: float) -> float:
-    """Return the derivative of the longitudinal force by the linear longitudinal force.
+    """Return the derivative of the tyre's longitudinal force by the longitudinal force of a linear
+    tyre.
 
     It is 1 at small slip, 0 on the flat part of the curve, and limited to at least FLATTEST.
     """
@@ -238,7 +239,8 @@ def correct_forces(
 
 @compiled
 def share_by_sides(mean: float, most: float, most_other: float) -> float:
-    """Return the force over load of one side if both sides together have the mean `mean`.
+    """Return the force over load of the wheel on one side, if the wheels of both sides have the
+    mean `mean`.
 
     The sides are equal until the slippery side reaches its limit.
 

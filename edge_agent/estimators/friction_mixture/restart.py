@@ -204,8 +204,8 @@ def reset_to_wheel_speed(
 
 @compiled
 def free_speed(memory: MixtureMemory, features: BlockFeatures) -> float:
-    """Return the speed [m/s] of wheels that turn alike and without force, and therefore roll
-    freely; NaN if the wheels do not.
+    """Return the common speed [m/s] of wheels that roll freely, because they turn alike and without
+    force; NaN if they do not.
     """
     slowest = math.inf
     fastest = -math.inf

@@ -140,8 +140,8 @@ def _compute_velocities(
 
 @compiled
 def take_rolling(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
-    """Update node j with the velocity derived from the wheels; return the penalty for its
-    disagreement [nat].
+    """Update node j with the velocity derived from the wheels; return the penalty [nat] for the
+    difference from the node's own velocity.
     """
     rolling = memory.rolling
     constants = design.constants

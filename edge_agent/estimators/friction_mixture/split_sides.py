@@ -59,7 +59,8 @@ def triangular_cells(edges: tuple[float, ...]) -> list[Triangle]:
 
 
 def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
-    """Return the table of all nodes. Split nodes together have the prior probability `split_prior`.
+    """Return the friction and prior probability of all nodes. The split nodes together have the
+    prior probability `split_prior`.
 
     mu and prior (K,) are those of the single-friction nodes.
     """
@@ -86,7 +87,9 @@ def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
 
 
 def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
-    """Return the share of a triangular density that lies in each cell between the edges."""
+    """Return the probability that a triangular density has in each cell; `edges` are the borders of
+    the cells.
+    """
     left, middle, right, _ = triangle
     rising = np.clip(edges - left, 0.0, middle - left)
     falling = np.clip(right - edges, 0.0, right - middle)

@@ -95,7 +95,9 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
 
 @compiled
 def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Predict all nodes to the end of the block, and update the moments of the mixture."""
+    """Predict the state of all nodes to the end of the block, and update mean and covariance of the
+    mixture.
+    """
     block = memory.block
     constants = design.constants
     nominal = memory.nominal

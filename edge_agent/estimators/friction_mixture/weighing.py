@@ -146,8 +146,8 @@ def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
 
 @compiled
 def slip_meaning(features: BlockFeatures, vx: float) -> float:
-    """Return the share of slip evidence that counts at low speed: 0 up to SLOWEST_M_S, 1 from twice
-    that speed.
+    """Return the share of the evidence from slip that counts at this speed: 0 up to SLOWEST_M_S, 1
+    from twice that speed.
     """
     fastest = abs(vx)
     for wheel in range(4):
@@ -160,7 +160,8 @@ def slip_meaning(features: BlockFeatures, vx: float) -> float:
 def update_novelty(
     memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures, vx: float, vy: float
 ) -> None:
-    """Set features.new and memory.slip.axle_ended, and update the smoothed usual forces and slips.
+    """Set the memberships features.new ("forces or slips are new") and memory.slip.axle_ended ("the
+    slide has ended"), and update the smoothed usual forces and slips.
 
     (vx, vy) [m/s] is the mean velocity of the block.
     """
@@ -185,7 +186,7 @@ def update_novelty(
 
 @compiled
 def saturation(slip: float, mu: float) -> float:
-    """Return the membership of an axle in "slides" on friction `mu`.
+    """Return the membership of an axle in the fuzzy set "slides", on friction `mu`.
 
     It is 0 up to a slip (as linear force over load) of mu, and 1 from 1.5 mu on; 0 where the slip
     is unknown.
@@ -195,8 +196,8 @@ def saturation(slip: float, mu: float) -> float:
 
 @compiled
 def advance_usual(usual: FloatArray, i: int, now: float, keep: float) -> float:
-    """Return the distance of `now` from usual[i], and smooth usual[i] towards `now`. Without a
-    reading return 0.
+    """Return the difference of the value `now` from its usual value usual[i], and smooth usual[i]
+    towards `now`. Without a reading return 0.
     """
     if math.isnan(now):
         return 0.0

@@ -69,7 +69,7 @@ def slip_membership(memory: MixtureMemory, features: BlockFeatures) -> float:
 
 @compiled
 def front_slides_more(memory: MixtureMemory, features: BlockFeatures) -> bool:
-    """Return True if the largest deviation from the car's speed is that of a front wheel."""
+    """Return True if, of all wheels, a front wheel deviates most from the car's speed."""
     front = 0.0
     rear = 0.0
     for wheel in range(4):

@@ -171,7 +171,9 @@ def _with_friction(wheels: WheelInputs, mu: Four) -> WheelInputs:
 
 @inlined
 def _interpolate_inputs(track: InputTrack, share: float, force_x: Four, mu: Four) -> WheelInputs:
-    """Return the wheel inputs between the previous sample (share 0) and this one (share 1)."""
+    """Return the wheel inputs interpolated between the previous sample (`share` 0) and this sample
+    (`share` 1).
+    """
     before = track.inputs_before
     use = track.inputs
     keep = 1.0 - share

@@ -69,8 +69,8 @@ def return_to_prior(mean: FloatArray, root: FloatArray, metres: float, work: Flo
 
 @compiled
 def dependence_factor(demand: float, dt: float) -> float:
-    """Return the factor on the measurement standard deviation of a sample, `dt` [s] after the
-    previous one, at a force of `demand` [g].
+    """Return the factor on the measurement's standard deviation for a sample `dt` [s] after the
+    previous sample, at a force of `demand` [g].
 
     Model error lasts, so many samples count as one measurement. Without demand, only slip noise is
     left, which carries no information on friction.
@@ -80,8 +80,8 @@ def dependence_factor(demand: float, dt: float) -> float:
 
 @compiled
 def visible_share(demand: float) -> float:
-    """Return the share of friction's standard deviation that a measurement may use at a force of
-    `demand` [g]: near 0 at low demand, near 1 at high demand.
+    """Return the share of the friction's standard deviation that takes part in a measurement update
+    at a force of `demand` [g]: near 0 at low demand, near 1 at high demand.
     """
     used = (demand / DEMAND_HALF) ** 4
     return used / (1.0 + used)

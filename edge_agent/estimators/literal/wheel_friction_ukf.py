@@ -70,7 +70,9 @@ class FrictionRun:
 
 
 def estimate(given: GivenMotion, setting: UnscentedSetting) -> FrictionRun:
-    """Run the filter over a drive; return the friction of the four wheels at each sample."""
+    """Run the friction filter over a drive; return the friction of the four wheels at each sample,
+    and the share of failed factorisations.
+    """
     model = _Model(given, setting)
     steps = len(given.t)
     mu = np.empty((steps, STATES))
@@ -134,8 +136,8 @@ class _Model:
 
 
 def _root_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return U and s such that columns*columns' = U*s^2*U', by singular values, which are never
-    negative.
+    """Return the singular vectors U and values s of `columns`, so that columns*columns' = U*s^2*U'.
+    The values are never negative.
     """
     axes, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return axes, sizes

@@ -19,8 +19,8 @@ LARGEST_LAG_S: Final = 0.085  # devices of sound cars lie within .06 s
 
 
 def wheels_speak_late(axle: Fit, seconds: float) -> bool:
-    """Return True if the axle's yaw rate lags in the same direction as the measured wheel lag
-    `seconds`, and by more than half of it.
+    """Return True if the yaw rate from the wheels confirms the measured wheel lag `seconds`: its
+    own lag has the same sign and is larger than half of it.
     """
     return (
         axle.is_known

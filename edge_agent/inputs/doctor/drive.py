@@ -120,7 +120,7 @@ def over_ground(
 def prepare_drive(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None
 ) -> EvenDrive:
-    """Return signals (T, 18) as an evenly sampled, smoothed drive.
+    """Return a drive with the given signals (T, 18), evenly sampled and smoothed.
 
     Args:
         t: times (T,) [s].
@@ -235,8 +235,8 @@ def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
 
 
 def _nearest_yaw(t: FloatArray, yaw: FloatArray, at: FloatArray) -> FloatArray:
-    """Return the nearest reading of a sparse angle at each time; averaging across ±π would be
-    wrong.
+    """Return at each time the nearest reading of the yaw angle, which is recorded rarely. Averages
+    across ±π would be wrong.
     """
     good = np.flatnonzero(np.isfinite(yaw))
     if len(good) < 2:

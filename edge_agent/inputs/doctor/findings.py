@@ -266,8 +266,8 @@ def _find_scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) 
 def _holds_throughout(
     quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenDrive | None
 ) -> bool:
-    """Return True if all parts of the drive have the gain that the fault predicts. A slide does not
-    keep a constant gain.
+    """Return True if an identity has the gain that the fault predicts in all parts of the drive.
+    During slides the gain is not constant.
     """
     fault = verdict.faults[quantity]
     if (

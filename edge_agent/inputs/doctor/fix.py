@@ -51,8 +51,8 @@ def list_corrections(diagnosis: Diagnosis) -> list[Finding]:
 def apply_findings(
     findings: Sequence[Finding], profile: Profile, vehicle: Vehicle
 ) -> tuple[Profile, Vehicle, list[Finding]]:
-    """Return profile and vehicle corrected by the findings, and the findings that cannot be
-    corrected this way.
+    """Return profile and vehicle file corrected by the findings, and the findings that cannot be
+    corrected there.
     """
     channels = dict(profile.channels)
     left = list[Finding]()

@@ -269,7 +269,8 @@ def _bend_of(
 def _fit_with_priors(
     table: FloatArray, y: FloatArray, loose: tuple[float, ...], count: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the gains by robust least squares, and their standard deviations.
+    """Return the gains of an identity's terms by robust least squares, and their standard
+    deviations.
 
     The gains of the last columns have a prior with mean 0 and the standard deviations `loose`.
     """

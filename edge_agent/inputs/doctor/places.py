@@ -58,7 +58,9 @@ def _total_turn(angle: FloatArray) -> float:
 
 
 def _course_agreement(yaw: FloatArray, course: FloatArray) -> float:
-    """Return the mean cosine of the difference between yaw and course [rad]; 1 if they are equal."""
+    """Return the mean cosine of the difference between yaw and course over ground [rad]; 1 if both
+    are equal.
+    """
     return float(np.mean(np.cos(yaw - course)))
 
 

@@ -87,7 +87,7 @@ def _finite_or_none(value: object) -> object:
 
 
 def publishing_advice(diagnosis: Diagnosis) -> str:
-    """Return one line that states whether the log may be published, and otherwise what to do."""
+    """Return one line: the log may be published, or what to do before it may be published."""
     if diagnosis.is_passed:
         return "passed: units, signs, clocks and offsets agree with each other"
     if diagnosis.findings:

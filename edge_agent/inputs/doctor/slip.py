@@ -148,7 +148,7 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
     gains speed and while it loses speed.
 
     Spinning wheels turn too fast while they are driven, and braked wheels turn too slowly. A wrong
-    radius has the same effect all the time.
+    radius changes the ratio equally in both cases.
     """
     ratio = smooth_twice(drive.v_ground, 1.0) / np.where(
         drive.v == 0.0, np.nan, smooth_twice(drive.v, 1.0)
@@ -161,8 +161,8 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
 
 
 def spread_of_parts(beside: FloatArray) -> float:
-    """Return the standard deviation of a quantity between parts of a drive. A tilt of the sensor is
-    the same in all parts, a slide is not.
+    """Return the standard deviation of a quantity between parts of a drive. A tilt of the sensor
+    gives the same value in all parts, a slide does not.
     """
     parts = [
         float(np.nanmedian(part))

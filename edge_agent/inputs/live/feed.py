@@ -63,7 +63,9 @@ class Stamps:
 
     @property
     def lead(self) -> float:
-        """Return the seconds to add to the source's stamps; 0 where the stamps are used unchanged."""
+        """Return the seconds to add to the source's time stamps; 0 where the stamps are used
+        unchanged.
+        """
         least = min(self._before, self._lately)
         return 0.0 if -EARLY_S <= least < BELIEVED_S or least == float("inf") else least
 
@@ -121,8 +123,8 @@ class Feed(ABC):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening. A thread that hangs in a driver is not waited for longer than LEAVE_S;
-        see `listening`.
+        """Stop listening. Wait at most LEAVE_S for the thread, because it may hang in a driver; see
+        `listening`.
         """
         self.stopping.set()
         self._thread.join(LEAVE_S)

@@ -67,7 +67,7 @@ def decode_log(
     wanted: Iterable[str],
     buses: dict[str, int] | None = None,
 ) -> Recording:
-    """Return the signals `MESSAGE.SIGNAL` of a log.
+    """Return the signals of a CAN log by their full names `MESSAGE.SIGNAL`.
 
     Args:
         take: function that returns the log's frames.

@@ -45,7 +45,7 @@ _UNIT: Final = re.compile(r"^(?P<name>.*)[\[(](?P<unit>[^\[\](]*)[\])]\s*$")
 
 
 def read_table(path: Path, time: str | None = None, time_unit: str | None = None) -> Recording:
-    """Return the columns of a table as a recording.
+    """Return the columns of a CSV or Parquet table as a recording.
 
     Args:
         path: a CSV or Parquet file.

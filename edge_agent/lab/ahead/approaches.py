@@ -74,7 +74,7 @@ class _Raised:
 @dataclass
 class _Track:
     """Record of one car for each second: distance driven [m], speed [m/s], friction, and smallest
-    friction near the car. It also has the car's warnings by name.
+    friction near the car. It also contains the warnings given to the car.
     """
 
     metre: list[float] = field(default_factory=list)
@@ -86,8 +86,8 @@ class _Track:
 
 
 def approach_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
-    """Return the shares of approaches warned in time and the rates of false warnings over random
-    towns, with given routes and, for comparison, without.
+    """Return the share of approaches warned in time and the rate of false warnings over random
+    towns, for cars that know their route and for cars that do not.
     """
     found = {routed: Approaches() for routed in (True, False)}
     for seed in seeds:

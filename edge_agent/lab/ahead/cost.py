@@ -75,8 +75,8 @@ def draw_way(rng: np.random.Generator, metres: float) -> FloatArray:
 
 
 def cost_figures(seed: int, metres: float) -> list[Figure]:
-    """Return the megabytes per day and the used share of a processor core, with a given route and,
-    for comparison, without.
+    """Return the megabytes received per day and the used share of a processor core, for a car that
+    knows its route and for one that does not.
     """
     known = street_places()
     out = []

@@ -217,8 +217,8 @@ def _since_entry(place: IntArray) -> IntArray:
 
 
 def _maps_differ(place: IntArray, wrong: LocalMap, right: LocalMap, now: int) -> BoolArray:
-    """Return an array (T, N) that is True where exactly one of two maps says slippery and their
-    medians differ by more than 0.3.
+    """Return an array (T, N) that is True where only one of two maps shows a slippery road and
+    their median friction differs by more than 0.3.
     """
     keys, inverse = np.unique(place, return_inverse=True)
     one, other = (known.look_up(keys, now).mu for known in (wrong, right))

@@ -240,8 +240,8 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
 
 
 def _consistency_figures(results: Results) -> list[Figure]:
-    """Return the bounds of NEES and NIS, and the reliability of every estimator over all scenarios,
-    as figures.
+    """Return the bounds of NEES and NIS, and for every estimator the share of true frictions below
+    each stated quantile, as figures.
     """
     listed = []
     for measure in COMPONENTS if results.seeds else ():

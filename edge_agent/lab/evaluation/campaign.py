@@ -120,8 +120,8 @@ def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str],
 
 
 def _as_in_paper(estimator: str, batch: DriveSet) -> EstimatorBank:
-    """Return the bank for a paper's own conditions. An estimator without friction state is given
-    the true friction at the start.
+    """Return a bank of an estimator for a paper's own conditions. An estimator without friction
+    state gets the true friction at the start of the drives.
     """
     friction = float(batch.mu[0, 0])
     if estimator == "adaptive-federated-ckf":

@@ -169,7 +169,9 @@ def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTall
 
 
 def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
-    """Add coverage, false ice, false grip and interval score over all samples to the tally."""
+    """Add coverage, false ice, false grip and interval score over all samples of the town to the
+    tally.
+    """
     mu = drive.mu
     apart = ~drive.stood
     inside = (drive.lower <= mu) & (mu <= drive.upper)
@@ -373,8 +375,8 @@ class DetectionResults:
     def pool_towns(
         self, lengths: Sequence[str], kind: str, *, winter: bool | None = None
     ) -> DetectionTally:
-        """Return the pooled tally of towns of one kind: all of them, or with `winter` only those
-        with or without winter.
+        """Return the pooled tally of all towns of one kind. If `winter` is True or False, only
+        winter towns or only other towns are included.
         """
         found = DetectionTally()
         for length in lengths:

@@ -53,8 +53,8 @@ def seconds_of(name: str, share: float) -> Callable[[DetectionTally], float]:
 
 
 def rate_of(over: str, under: str) -> Callable[[DetectionTally], float]:
-    """Return a function that reads 1000 times the sum called `over` divided by the sum called
-    `under`.
+    """Return a function that reads a rate from a tally: 1000 times the sum called `over` divided by
+    the sum called `under`.
     """
     return lambda tally: 1e3 * tally.rate(over, under)
 

@@ -160,8 +160,8 @@ def stood_where_it_appeared(
 def _estimate_chunk(
     bank: EstimatorBank, t: FloatArray, signals: FloatArray, closes: BoolArray
 ) -> tuple[Estimates, FloatArray]:
-    """Return the estimates of a chunk with evidence, and (T, N) how much the belief favours
-    slippery road [nat].
+    """Return the estimates of a chunk of the drive with their evidence, and (T, N) by how much
+    [nat] the belief favours a slippery road.
     """
     if bank.beliefs() is None:
         return bank.advance(t, signals, closes), np.full(t.shape, np.nan)

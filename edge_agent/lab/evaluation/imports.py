@@ -177,7 +177,9 @@ def _largest_difference(one: FloatArray, other: FloatArray) -> float:
 
 
 def figures(folder: Path, seed: int, recorded: Path | None, seconds: int = DRIVE_S) -> list[Figure]:
-    """Return the figures of file import, with the numbers of values and formats they are based on."""
+    """Return the figures of file import, with the numbers of values and formats on which they are
+    based.
+    """
     wrong, compared = decode_errors(recorded, seed)
     largest, formats = same_estimates(folder, seed, seconds)
     return [

@@ -25,8 +25,8 @@ COMPONENTS = {
 
 
 def errors(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Return the errors (T, N) of the motion: vx, vy [m/s], yaw_rate [rad/s], beta (sideslip)
-    [rad].
+    """Return the errors (T, N) of the estimated motion: vx, vy [m/s], yaw_rate [rad/s], beta
+    (sideslip) [rad].
     """
     truth = batch.truth
     beta = np.arctan2(truth["true_vy"], np.maximum(truth["true_vx"], SLOWEST_M_S))
@@ -39,8 +39,8 @@ def errors(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def is_covered(batch: DriveSet, reported: Estimates) -> BoolArray:
-    """Return an array (T, N) that is True where the 90 % interval contains the mean friction of the
-    wheels.
+    """Return an array (T, N) that is True where the reported 90 % interval contains the true mean
+    friction of the wheels.
     """
     return np.asarray((reported.mu_lower <= batch.mu) & (batch.mu <= reported.mu_upper))
 
@@ -64,8 +64,8 @@ def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def nees(batch: DriveSet, reported: Estimates) -> FloatArray:
-    """Return the NEES: the squared error of (v_x, v_y) over its stated variance, per component, (T,
-    N).
+    """Return the NEES (normalised estimation error squared): the squared error of (v_x, v_y) over
+    its stated variance, per component, (T, N).
     """
     off = errors(batch, reported)
     return np.asarray(
@@ -129,8 +129,8 @@ def arrival(batch: DriveSet, reported: Estimates) -> FloatArray:
 
 
 def false_changes(batch: DriveSet, reported: Estimates) -> FloatArray:
-    """Return, per drive, how often the interval lies more than NEAR away from an unchanged friction
-    for at least HOLD_S.
+    """Return, per drive, how often the friction interval lies more than NEAR away from the constant
+    true friction for at least HOLD_S.
     """
     wrong = (reported.mu_upper < batch.mu - NEAR) | (reported.mu_lower > batch.mu + NEAR)
     hold = max(1, round(HOLD_S / float(batch.t[1, 0] - batch.t[0, 0])))

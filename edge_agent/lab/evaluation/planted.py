@@ -228,8 +228,8 @@ def doctor_verdict(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
 
 
 def figures(count: int, seed: int) -> list[Figure]:
-    """Return the shares of faults found and of drives passed, over all faults and drives with
-    accurate and inaccurate cars.
+    """Return two shares for accurate and inaccurate cars: faults that the doctor finds, and drives
+    that it passes.
 
     Drives without a fault show the false alarms. The same shares are measured in a winter town.
     """

@@ -122,7 +122,7 @@ def judge_log(path: Path) -> LogFigures:
 
 
 def replay_log(log: SignalLog, vehicle: Vehicle) -> tuple[FloatArray, int | None]:
-    """Return estimates (T, columns), and the number of urgent observations.
+    """Replay a log; return the estimates (T, columns), and the number of urgent observations.
 
     The number is None if the log has no position.
     """
@@ -235,15 +235,15 @@ def known_friction(
 
 
 def share_of(what: BoolArray, among: BoolArray) -> float:
-    """Return the share of the samples in `among` (T,) in which `what` (T,) is True; NaN if `among`
-    is empty.
+    """Return, of the samples where `among` (T,) is True, the share in which `what` (T,) is True
+    too; NaN if there are none.
     """
     return float(np.mean(what[among])) if among.any() else math.nan
 
 
 def root_mean_square(error: FloatArray, among: BoolArray) -> float:
-    """Return the root mean square of errors (T,) over the samples in `among` (T,); NaN if no error
-    is known there.
+    """Return the root mean square of errors (T,) over the samples where `among` (T,) is True; NaN
+    if no error is known there.
     """
     some = among & np.isfinite(error)
     return float(np.sqrt(np.mean(np.square(error[some])))) if some.any() else math.nan

@@ -76,8 +76,8 @@ class Tally:
     count: dict[str, int] = field(default_factory=dict)
 
     def add(self, name: str, value: FloatArray | BoolArray, among: BoolArray | None = None) -> None:
-        """Add the values (T, N), or only those `among` which is True, to the mean called `name`;
-        NaN are left out.
+        """Add values (T, N) to the mean called `name`, only those where `among` is True if it is
+        given; NaN are left out.
         """
         taken = np.asarray(value, dtype=np.float64)[slice(None) if among is None else among]
         taken = taken[np.isfinite(taken)]
@@ -85,7 +85,7 @@ class Tally:
         self.count[name] = self.count.get(name, 0) + taken.size
 
     def means(self) -> dict[str, float]:
-        """Return the mean by name; NaN without values.
+        """Return the mean of the added values by name; NaN without values.
 
         A name that ends in "_squared" is returned as the root of its mean, without that suffix.
         """
@@ -199,8 +199,8 @@ def tally_town(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatAr
 
 
 def baseline(tally: Tally, batch: DriveSet) -> None:
-    """Add two baselines to the tally: the score of the prior, and the v_x error of the mean of four
-    wheels.
+    """Add two baselines to the tally: the interval score of the prior, and the v_x error of the
+    mean speed of the four wheels.
     """
     radius = np.array([vehicle.wheel_radius for vehicle in batch.vehicles])
     off = (
@@ -214,8 +214,8 @@ def baseline(tally: Tally, batch: DriveSet) -> None:
 
 
 def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSet]:
-    """Simulate cars that stand on a slope, divided among the vehicle presets: with ordinary
-    sensors, and with inaccurate ones without torque.
+    """Simulate cars of all presets that stand on a slope, some with ordinary sensors, some with
+    inaccurate sensors and without torque.
     """
     batches = []
     for sensors in (USUAL, "rough"):

@@ -27,8 +27,8 @@ EDGES: Final = np.linspace(LOWER, UPPER, BINS + 1)
 
 
 def estimate_with_ranks(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates, FloatArray]:
-    """Return the bank's estimates of the drives, and the rank of the true friction in its posterior
-    once every EVERY_S, (K, N).
+    """Return the bank's estimates of the drives, and every EVERY_S the share of the posterior that
+    lies below the true friction (its rank), (K, N).
     """
     samples = len(batch.t)
     step = max(1, round(EVERY_S / float(batch.t[1, 0] - batch.t[0, 0])))

@@ -215,7 +215,9 @@ def world(values: dict[str, float]) -> str:
 
 
 def estimators(values: dict[str, float], prefix: str, suffix: str) -> list[str]:
-    """Return the part of each figure's name between `prefix` and `suffix`, each once, in order."""
+    """Return the estimators that occur in the figures' names between `prefix` and `suffix`, each
+    once, in order.
+    """
     found = [
         name[len(prefix) : -len(suffix)]
         for name in values
@@ -285,7 +287,7 @@ def verdict(shares: Sequence[float]) -> str:
 
 def consistency(values: dict[str, float]) -> str:
     """Return a Markdown table with one row per estimator: NEES and NIS over all scenarios, and the
-    share of values within their bounds.
+    share of instants at which they lie within their bounds.
     """
     names = estimators(values, "reliability.", ".below_05")
     rows = []

@@ -111,8 +111,8 @@ def ways() -> dict[str, list[MixtureDesign]]:
 
 
 def without_sets() -> MixtureDesign:
-    """Return the tables of the default filter without fuzzy sets, with strain and the consistency
-    test.
+    """Return the tables of the default filter for the variant without fuzzy sets, but with strain
+    and the consistency test.
     """
     design = design_of(Memberships(), adaptive=True)
     c = design.constants

@@ -348,8 +348,8 @@ def drive(
     now: tuple[float, float, float],
     keys: tuple[Key, Key],
 ) -> None:
-    """Advance a driver (d, g) and the route by one sample. Afterwards d[STEER] and d[FORCE] are the
-    actual controls.
+    """Advance a driver's state d and route state g by one sample. Afterwards d[STEER] and d[FORCE]
+    are the actual controls.
 
     `world` contains lanes and friction table; `w` the wheels at the last sample; `now` time [s],
     length of the sample [s] and acceleration by gravity along the road [m/s^2]; `keys` the random

@@ -24,8 +24,8 @@ EVERY: Final = 10  # blocks between two looks at the route
 
 
 def warned_ones(vehicles: int, share: float) -> BoolArray:
-    """Return an array (N,) that is True for drivers who are warned, evenly distributed over
-    accurate and rough vehicles.
+    """Return an array (N,) that is True for drivers who receive warnings. They are evenly
+    distributed over accurate and rough vehicles.
 
     Raises:
         InputError: the share is not between 0 and 1.

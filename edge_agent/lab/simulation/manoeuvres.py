@@ -62,7 +62,9 @@ Friction = float | Callable[[float, float], float] | TimedFriction
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """One row of the table of manoeuvres; `friction` and `speed` are defaults that may be replaced."""
+    """A manoeuvre, one row of the table; `friction` and `speed` are defaults that a caller may
+    replace.
+    """
 
     control: Control
     speed: float  # [m/s] at the start, and to be held unless the control does otherwise
@@ -72,15 +74,15 @@ class Manoeuvre:
 
 
 def jump(before: float, after: float, at: float) -> Callable[[float, float], float]:
-    """Return a friction function with value `before` up to `at` [m] along the track, and `after`
-    beyond.
+    """Return a function of the friction along the track: `before` up to the position `at` [m], and
+    `after` beyond.
     """
     return lambda x, _y: before if x < at else after
 
 
 def split(left: float, right: float) -> Callable[[float, float], float]:
-    """Return a friction function with value `left` on the left side of the track and `right` on the
-    right side.
+    """Return a function of the friction across the track: `left` on its left side and `right` on
+    its right side.
     """
     return lambda _x, y: left if y > 0.0 else right
 

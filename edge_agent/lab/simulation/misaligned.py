@@ -110,8 +110,8 @@ COLUMNS: Final = int(Misaligned.TORQUELESS) + 1
 
 
 def memory_of(rows: FloatArray, rate_hz: float) -> int:
-    """Return the largest clock delay in the rows (N, COLUMNS), in samples, plus one; 0 without a
-    delay.
+    """Return the number of past samples that must be stored: the largest clock delay in the rows
+    (N, COLUMNS), in samples, plus one; 0 without a delay.
     """
     lag = float(rows[:, Misaligned.LAG : Misaligned.LAG + DEVICES].max())
     return math.ceil(lag * rate_hz) + 1 if lag > 0.0 else 0

@@ -89,8 +89,8 @@ def stiffness_per_load(slope: float, degression: float, load: float, at_rest: fl
 
 @compiled
 def allowed_share(slip: float, limit: float) -> float:
-    """Return the share of the torque that slip control allows: 1 up to the slip `limit`, decreasing
-    to 0 at twice the limit.
+    """Return the share of the demanded torque that slip control allows: 1 up to the slip `limit`,
+    decreasing to 0 at twice this limit.
     """
     return min(max(2.0 - abs(slip) / limit, 0.0), 1.0)
 
@@ -99,8 +99,8 @@ def allowed_share(slip: float, limit: float) -> float:
 def wheel_torques(
     x: FloatArray, p: FloatArray, u: FloatArray, i: int, slip: float
 ) -> tuple[float, float]:
-    """Return the driving and the braking torque [N·m] at wheel `i` after the action of the
-    controllers at this slip.
+    """Return the driving and the braking torque [N·m] at wheel `i` after the controllers have
+    responded to its slip.
     """
     drive = u[Control.DRIVE, i]
     brake = u[Control.BRAKE, i]

@@ -47,8 +47,8 @@ RECORD: Final = 39
 
 @compiled
 def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: FloatArray) -> None:
-    """Fill `record` (RECORD,) with the true values at this instant under the inputs `u`. The
-    function also fills `w`.
+    """Fill `record` (RECORD,) with the true values of the vehicle at this instant, under the inputs
+    `u`. The function also fills `w`, the forces of the wheels.
     """
     wheel_forces(x, p, u, w)
     ax, ay, _ = body_accelerations(x, p, u, w)

@@ -129,8 +129,8 @@ def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, 
 
 
 def round_corners(corners: list[tuple[float, float]], radius: float) -> FloatArray:
-    """Return a line through the corners, with arcs of `radius` [m] at the inner corners; points a
-    quarter of a metre apart, (n, 2).
+    """Return a line along the corners, (n, 2), rounded by arcs of `radius` [m] at the inner
+    corners. Its points are a quarter of a metre apart.
     """
     line = [np.array(corners[0])]
     for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
@@ -236,8 +236,8 @@ def network_of(
 
 
 def _lane_table(lane: FloatArray) -> FloatArray:
-    """Return the table of the points of one lane, with heading and smoothed curvature. The profile
-    is not yet limited.
+    """Return the table of the points of one lane, with heading and smoothed curvature. Its speed
+    profile is not yet computed.
     """
     step = np.gradient(lane, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
@@ -251,7 +251,8 @@ def _lane_table(lane: FloatArray) -> FloatArray:
 def _plan_speeds(
     tables: list[FloatArray], limits: list[FloatArray], ways: list[list[int]], spacing: FloatArray
 ) -> None:
-    """Compute the profiles backwards from the lanes' ends, repeatedly until nothing changes.
+    """Compute the speed profiles of all lanes, backwards from their ends, repeatedly until nothing
+    changes.
 
     The braking that a point requires is at most the part of the budget that cornering leaves there.
     """

@@ -77,7 +77,9 @@ class Scenario:
         )
 
     def friction(self, t: FloatArray | float, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return μ at the times t [s] and points (x, y) [m], in the arrays' common shape."""
+        """Return the friction μ at the times t [s] and points (x, y) [m], in the arrays' common
+        shape.
+        """
         # copies: numpy warns who looks whether a broadcast view may be written, and the compiler
         # does at a first call
         t, x, y = (np.array(a, dtype=np.float64, order="C") for a in np.broadcast_arrays(t, x, y))

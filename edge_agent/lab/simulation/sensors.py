@@ -163,7 +163,7 @@ def sensors_named(name: str | Sensors) -> Sensors:
 
 def error_row(sensors: Sensors, origin: Origin, seed: int, index: int) -> FloatArray:
     """Return the sensor errors of vehicle `index`, shape (ERRORS,), with the columns of
-    ErrorColumn. Offsets and gain are drawn here.
+    ErrorColumn. Offsets and gains are drawn randomly.
     """
     north, east = origin.per_metre
     white = np.zeros(len(CHANNELS))

@@ -51,7 +51,9 @@ def optimise(
 def _mutate_vector(
     tally: SearchTally, parent: FloatArray, step: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Return an admissible random variation of the parent; the parent itself if none is found."""
+    """Return an admissible random variation of the vector `parent`; return `parent` if no
+    admissible vector is found.
+    """
     for _ in range(REDRAWS):
         child = tally.fit(rng.normal(parent, step * (tally.upper - tally.lower)))
         if tally.problem.admissible(child):

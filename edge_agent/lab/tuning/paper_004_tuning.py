@@ -44,8 +44,8 @@ Sets = Memberships | LowerVertices
 
 @dataclass(frozen=True)
 class LevelDrive:
-    """The drive at one noise level, one copy per seed, and the filter setting whose R matches the
-    noise.
+    """The tuning drive at one noise level, one copy per seed, and the filter setting whose R
+    matches this noise.
     """
 
     batch: DriveSet
@@ -120,8 +120,8 @@ def _run_filter(sets: Sets, drive: LevelDrive) -> Estimates:
 
 
 def visibility() -> list[FloatArray]:
-    """Return the visibility eta of every position at every vertex (31). Positions near the untuned
-    one are preferred.
+    """Return the visibility eta of every position at every vertex, for equation (31). It is larger
+    for positions near the untuned position.
     """
     preferred = np.exp(-0.5 * ((POSITIONS - 1.0) / PREFERENCE) ** 2)
     return [preferred] * len(LowerVertices().to_vector())

@@ -21,8 +21,8 @@ PREFIX: Final = "country.city"
 
 
 def simulate_city(sumo: Sumo, folder: Path, seed: int) -> list[Figure]:
-    """Simulate the drives, fuse the observations, and compare the map with the true friction. The
-    observations stay in `folder`/NAME for the country.
+    """Simulate the drives of the city, fuse their observations, and compare the map with the true
+    friction. The observations stay in `folder`/NAME for the country.
     """
     folder.mkdir(parents=True, exist_ok=True)
 

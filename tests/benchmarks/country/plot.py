@@ -15,7 +15,7 @@ COLOURS: Final = ("#0072b2", "#d55e00", "#009e73")
 
 
 def draw(course: Path, out: Path) -> None:
-    """Draw the plot from the files of a finished run.
+    """Draw memory, cells and waiting times of a finished country run from its files.
 
     Args:
         course: folder with `course.npz` and `waits.npz`.

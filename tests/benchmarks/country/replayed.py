@@ -60,7 +60,7 @@ class Chunk(NamedTuple):
 
 
 class Country:
-    """Home region and repeated drive of each vehicle.
+    """Simulated country: home region and repeated drive of each vehicle.
 
     Args:
         folder: folder of the city's observations.
@@ -112,7 +112,7 @@ class Country:
         return int(grid.interleave(np.array([x]), np.array([y]))[0])
 
     def encode_report(self, vehicle: int, turn: int, boot: int) -> tuple[str, bytes]:
-        """Return key and bytes of the report that a vehicle sends in a turn, dated now."""
+        """Return Zenoh key and bytes of the report that a vehicle sends in a turn, dated now."""
         drive = self.drives[self.drive[vehicle]]
         chunk = drive[(self.begin[vehicle] + turn % LOOP) % len(drive)]
         k = int(self.region[vehicle])

@@ -115,8 +115,8 @@ def test_one_vehicle_alone_warns_nobody() -> None:
 
 
 def test_alert_over_a_mere_bound_is_exported_with_its_own_grip() -> None:
-    """On the map the belief of ice ages before its alert ends, so that only a lower bound is left.
-    The warning must then have the friction of the alert.
+    """The map's belief of ice may age to a lower bound while the alert is still active. The warning
+    must then have the friction of the alert.
     """
     cache = make_local_map([cells(icy(), 0.1, basis=BOUND)])
     for key in icy():

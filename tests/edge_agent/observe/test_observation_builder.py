@@ -72,8 +72,8 @@ def test_any_split_of_the_samples_gives_the_same_records(seed: int) -> None:
 
 
 def test_an_observation_tells_its_visit() -> None:
-    """A car drives east through three cells at 10 m/s. The test checks times, pose, speed and the
-    friction at the end of the second visit.
+    """The observation of a visit must have its times, pose and speed, and the friction at its end.
+    A car drives east through three cells at 10 m/s.
     """
     samples = 25
     east = np.arange(samples)[:, None] * 1.0
@@ -164,8 +164,8 @@ def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
 
 
 def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
-    """At 14 m/s a car crosses a cell in less time than the window. Braking on dry road before the
-    cell must not count for ice in the cell.
+    """Braking on dry road before a cell must not count as grip on the ice in this cell. At 14 m/s a
+    car crosses a cell in less time than the estimator's window.
     """
     samples = 30
     east = np.arange(samples)[:, None] * 1.4
@@ -203,8 +203,8 @@ def observe_grip(observed: np.ndarray, east: np.ndarray) -> list[float]:
 
 
 def test_grip_felt_at_the_border_of_a_cell_may_be_of_its_neighbour() -> None:
-    """Braking that is closer to the border than the position error counts for neither cell. Braking
-    further inside counts for its own cell.
+    """Braking that is closer to the border than the position error must count for neither cell.
+    Braking further inside must count for its own cell.
     """
     east = np.arange(450)[:, None] * 0.1
     flat = np.zeros_like(east)

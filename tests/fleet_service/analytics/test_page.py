@@ -23,8 +23,8 @@ PLACED = [name for name, question in QUESTIONS.items() if question.colour]
 
 @pytest.fixture(scope="module")
 def pages(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Return the HTML page of every question whose answer has cells, by name. `frames` is a day of
-    `replay` in frames.
+    """Return the HTML page of every question whose answer has cells, by name. The page `frames`
+    shows the question `replay` in several frames.
     """
     folder = tmp_path_factory.mktemp("pages")
     more: dict[str, list[str]] = {name: [] for name in PLACED} | {"frames": ["--step", "21600"]}

@@ -102,8 +102,8 @@ def test_files_lie_by_date_and_zone_and_are_sorted_by_cell_and_time(tmp_path: Pa
 
 
 def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
-    """Record the operations that change the disk in a list, and die before the operation number
-    `die_at`.
+    """Record the operations that change the disk in a list, and simulate the death of the process
+    before the operation number `die_at`.
     """
     seen: list[str] = []
 

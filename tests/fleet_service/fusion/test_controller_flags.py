@@ -41,8 +41,8 @@ def make_acquainted(claims_on_dry: bool) -> Fusion:
 
 
 def ice_with(fusion: Fusion, *, flag: bool) -> bool:
-    """Return True if one value of ice and one visit with little grip use, with or without a flag,
-    raise an alert.
+    """Return True if one reported value of ice and one visit with little grip use, with or without
+    a flag, raise an alert.
     """
     who = np.array([3, FLAGGED])
     likelihood = np.concatenate([value(np.array([ICY]), 0.02), at_least(np.array([0.1]))])

@@ -14,8 +14,8 @@ LIVE = observations([3600.0], [50], value([0.8]), cell=CELL + 9)  # somebody rep
 
 
 def late(order: np.ndarray, parts: int) -> tuple[Fusion, list[tuple[np.ndarray, Updated]]]:
-    """Feed an hour's backlog after a live report, in an order and in `parts` parts. Return the
-    fusion, and for each part its rows and update.
+    """Fuse a live report and then an hour's backlog, in the given order and in `parts` parts.
+    Return the fusion, and for each part its rows and update.
     """
     fusion = Fusion(120.0)
     fusion.update(LIVE)

@@ -14,7 +14,9 @@ MISSING: Final = "no axe-core in .page/tools: make browser-test fetches it with 
 
 
 def findings(seen: Opened, tabs: tuple[str, ...] = TABS) -> list[str] | None:
-    """Return the serious findings, one text per finding, or None if axe-core is not installed."""
+    """Return the page's serious accessibility findings, one text per finding, or None if axe-core
+    is not installed.
+    """
     source = file_of("axe-core", "axe.min.js")
     if source is None:
         return None

@@ -106,7 +106,9 @@ def test_what_is_pulled_follows_the_alerts_and_is_gone_on_with(
 
 
 def pull(address: str) -> Callable[[], bytes]:
-    """Return a function that fetches the publication, or NOTHING while the page has none yet."""
+    """Return a function that fetches the page's DATEX II publication, or returns NOTHING while the
+    page has none yet.
+    """
 
     def fetch_publication() -> bytes:
         status, headers, body = ask(address, ROUTE)

@@ -116,8 +116,8 @@ def test_a_route_tells_the_deceleration_that_is_safe_at_95_percent(start: Start)
 
 
 def test_no_single_passage_shows_where_persons_are_kept_private(start: Start) -> None:
-    """One more pass must not change the published times and counts of a public cell, because they
-    are coarse.
+    """One more pass must not change the times and counts that a public cell shows, which are coarse
+    for this purpose.
     """
     engine = start(3)
     hear(engine, *(f"sim-{k:03}" for k in range(6)))
@@ -201,8 +201,8 @@ def test_a_restart_knows_who_was_there_with_and_without_a_checkpoint(
 
 @pytest.mark.parametrize("basis", ["checkpoint", "log"])
 def test_a_restart_does_not_show_a_lone_vehicle(start: Start, tmp_path: Path, basis: str) -> None:
-    """The vehicle must not show in a public cell, nor complete the count of vehicles of another
-    cell.
+    """After a restart, a lone vehicle must not appear in a public cell, and must not complete
+    another cell's count of vehicles.
     """
     beside: dict[str, Any] = {
         "latitude": [LATITUDE + 0.002],

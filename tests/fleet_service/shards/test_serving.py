@@ -58,8 +58,8 @@ CARS = 3
 
 @pytest.fixture(autouse=True)
 def nobody(session: zenoh.Session) -> None:
-    """Wait until no service has a token, because the router may learn of the end of the previous
-    test late.
+    """Wait until no service has a presence token, because the router may learn late that the
+    services of the previous test have ended.
     """
     until(lambda: not presence.active_tokens(session))
 
