@@ -289,7 +289,7 @@ def _recorded_result(rows: segments.Rows) -> RecordedResult:
 def _join_parts(
     parts: list[tuple[Observations, RecordedResult]],
 ) -> tuple[Observations, RecordedResult]:
-    """Return the parts of a day's observations, and of their recorded results, joined into one, in
+    """Return several parts of the observations, with their recorded results, joined into one, in
     order.
     """
     of = Observations(
