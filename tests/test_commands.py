@@ -1,4 +1,6 @@
-"""Both command lines: versions, examples, completion, Ctrl-C, negative numbers, and exit codes."""
+"""Tests of both command lines, `edge-agent` and `fleet-service`: versions, examples, completion,
+Ctrl-C, negative numbers, and exit codes.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Whole system in one process: recorded drives, agent, router, service, and a client that uses only
-Zenoh.
+"""Tests of the whole system in one process: recorded drives, agent, router, service, and a client
+that uses only Zenoh.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""The fuzzer finds a deliberately planted crash by coverage, and the committed seeds crash no
-parser.
+"""Tests that the fuzzer finds a deliberately planted crash by coverage, and that the committed
+seeds crash no parser.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Docstrings, names and pages keep the rules of language; ceilings per package and page only fall.
+"""Tests that docstrings, names and pages keep the rules of language: no figure of a package or page
+may exceed its ceiling.
 
 `python -m tests.language` lowers the ceilings, `python -m tests.language RULE` prints the texts
 that break a rule.

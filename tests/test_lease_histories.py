@@ -1,5 +1,5 @@
-"""Simulated histories of the lease in virtual time keep every promise, and deliberately broken
-protocols are detected.
+"""Tests that simulated histories of the lease in virtual time keep every promise, and that
+deliberately broken protocols are detected.
 """
 
 from __future__ import annotations

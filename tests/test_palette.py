@@ -1,4 +1,5 @@
-"""Colours of the map are distinguishable for every kind of colour vision and when printed in grey.
+"""Tests that the colours of the map are distinguishable for every kind of colour vision and when
+printed in grey.
 
 Colour vision deficiencies are simulated as by Machado, Oliveira and Fernandes (2009) at full
 severity. Distances are CIEDE2000 (Sharma, Wu and Dalal 2005).

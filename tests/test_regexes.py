@@ -1,4 +1,4 @@
-"""No regular expression of the product takes more than linear time."""
+"""Test that no regular expression of the product takes more than linear time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The results page and the results block of the root README are made from the stored figures."""
+"""Tests that the results page and the results block of the root README are made from the stored
+figures.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Work around the kernel of every bank: check the samples, and divide the vehicles equally among
-threads.
+"""Code that runs before the kernel of every bank: it checks the samples, and divides the vehicles
+equally among threads.
 
 Kernels release the interpreter's lock and share no state.
 """

@@ -1,5 +1,5 @@
-"""Benchmarks of a map of the past over Zenoh, and of the map after a restart compared with the map
-before.
+"""Benchmarks of queries of past maps over Zenoh, and of the map after a restart compared with the
+map before.
 """
 
 from __future__ import annotations

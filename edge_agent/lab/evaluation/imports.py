@@ -1,5 +1,5 @@
-"""Evaluation of file import: decoding compared with cantools, time to import a minute of a bus, and
-equality of a drive over all formats.
+"""Evaluation of file import: decoded values compared with cantools, time to import a minute of a
+bus, and equal estimates of one drive in all formats.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Plots of the evaluation, as in the papers, for the first seed: motion against truth, friction
-with its interval, adaptation, fuzzy sets.
+"""Plots of the evaluation, as in the papers, for the first seed: estimated and true motion,
+friction with its interval, adaptation, fuzzy sets.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests of the watchdog signals of a service: they stop when something next to the worker hangs."""
+"""Tests of the watchdog signals of a service: the signals stop when a thread other than the worker
+hangs.
+"""
 
 from __future__ import annotations
 

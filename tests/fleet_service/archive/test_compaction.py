@@ -1,5 +1,5 @@
 """Tests that compaction loses and doubles no row, wherever it is interrupted and whichever program
-reads.
+reads the archive.
 """
 
 from __future__ import annotations

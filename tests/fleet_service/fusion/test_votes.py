@@ -1,4 +1,6 @@
-"""Tests of the influence of votes on a cell: one vote per vehicle, many vehicles, change, trust."""
+"""Tests of the influence of votes on a cell: one vote per vehicle, many vehicles, a changed road,
+and trust in vehicles.
+"""
 
 from __future__ import annotations
 

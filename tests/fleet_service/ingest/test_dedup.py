@@ -1,5 +1,5 @@
-"""Tests of dedup: admitted batches equal those found with a plain set, and the number of remembered
-batches is bounded.
+"""Tests of the removal of duplicate batches: admitted batches equal those found with a plain set,
+and the number of remembered batches is bounded.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tests of validation: each rule, and malicious bytes."""
+"""Tests of the validation of messages: each rule, and malicious bytes."""
 
 from __future__ import annotations
 

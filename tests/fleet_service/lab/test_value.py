@@ -1,4 +1,6 @@
-"""Tests of the value to users: road-hours, alerts and simple rules in towns with known friction."""
+"""Tests of the evaluation of the map's value to users: road-hours, alerts and simple rules in towns
+with known friction.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests that failed answers carry an error, because a client would take no answer for a map without
-data.
+"""Tests that failed answers carry an error, because a client would mistake a missing answer for a
+map without data.
 """
 
 from __future__ import annotations
