@@ -193,7 +193,7 @@ _CATEGORIES: Final = {
 
 
 def find_patterns(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield line number and text of the literal patterns in a file."""
+    """Yield line number and text of each regular expression that a file contains as a literal."""
     for node in ast.walk(parse(path)):
         if (
             isinstance(node, ast.Call)
@@ -208,7 +208,7 @@ def find_patterns(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def find_all() -> list[Found]:
-    """Return the suspicious patterns of the product's code."""
+    """Return the suspicious regular expressions in the product's code."""
     return [
         Found(f"{path.relative_to(ROOT)}:{line}", pattern)
         for folder in PRODUCT

@@ -1,8 +1,8 @@
 """Tests that no form of output gives a colour value to unmeasured cells.
 
-They test the first promise of the project: unknown road is never shown as dry. If only lower bounds
-of a cell's μ are known, or a report used little grip, the median of μ is mostly the prior. The
-prior's median has the colour of wet asphalt.
+They test the promise that unknown road is never shown as dry. If only lower bounds of a cell's μ
+are known, or a report used little grip, the median of μ is mostly the prior. The prior's median has
+the colour of wet asphalt.
 """
 
 from __future__ import annotations

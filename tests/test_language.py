@@ -1,5 +1,5 @@
-"""Tests that docstrings, names and pages keep the rules of language: no figure of a package or page
-may exceed its ceiling.
+"""Tests that docstrings, names and pages keep the rules of language: no count of broken rules may
+exceed the ceiling of its package or page.
 
 `python -m tests.language` lowers the ceilings, `python -m tests.language RULE` prints the texts
 that break a rule.

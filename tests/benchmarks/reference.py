@@ -17,7 +17,7 @@ OMEGA = 7
 def move(
     points: FloatArray, row: FloatArray, before: FloatArray, now: FloatArray, gone: float
 ) -> FloatArray:
-    """Return the states (P, 6) after `gone` seconds by Heun's rule, the process function f.
+    """Return the states (P, 6) after `gone` seconds by Heun's rule. This is the process function f.
 
     Args:
         points: states (P, 6).
@@ -104,5 +104,5 @@ def compute_response(
 
 
 def predict_measurement(points: FloatArray) -> FloatArray:
-    """Return a_x, a_y and yaw rate (P, 3) of states (P, 6), the measurement function h."""
+    """Return a_x, a_y and yaw rate (P, 3) of states (P, 6). This is the measurement function h."""
     return points[:, 2:5]

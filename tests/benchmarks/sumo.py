@@ -72,8 +72,8 @@ class Sumo:
         self._run_program("python", f"{self._home}/tools/randomTrips.py", *words.split(), *more)
 
     def drive_trips(self, seconds: int, step_s: float, seed: int, *more: str) -> Path:
-        """Simulate the trips. Return a Parquet file with the position of each vehicle at each step,
-        in SUMO's columns.
+        """Simulate the trips with SUMO. Return a Parquet file with the position of each vehicle at
+        each step, in SUMO's columns.
         """
         out = "--fcd-output fixes.parquet --fcd-output.geo --precision.geo 8"
         words = f"-n net.xml -r routes.xml {out} --step-length {step_s} -e {seconds} --seed {seed}"

@@ -211,8 +211,8 @@ def read_settings(running: Cluster, pod: str) -> str:
 
 
 def open_reader(running: Cluster) -> zenoh.Session:
-    """Return a reader's session at the routers, with its own certificate if the routers require
-    one.
+    """Return a reader's Zenoh session at the routers, with its own certificate if the routers
+    require one.
     """
     name = next(pod.name for pod in running.pods if "router" not in pod.name)
     shipped = ServiceConfig.model_validate_json(read_settings(running, name)).zenoh

@@ -22,7 +22,7 @@ Name = tuple[str, int, int, int]  # vehicle, boot, region, seq
 
 @dataclass(frozen=True)
 class Census:
-    """Counts after all load has ended.
+    """Counts of batches and rows after all load has ended.
 
     Attributes:
         stored: batches that were committed to an outbox.

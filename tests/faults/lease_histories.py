@@ -352,8 +352,8 @@ class ServiceHistory:
             lease.release()
 
     def _begin_serving(self, lease: Lease) -> set[int]:
-        """List the bucket, write the fence (the batches of earlier holders that count), and begin
-        to serve. Return the batches that the service knows.
+        """List the objects in the bucket, write the fence (the batches of earlier holders that
+        count), and begin to serve. Return the batches that the service knows.
         """
         self._world.sleep(self._random.uniform(0.0, 0.3))
         number = lease.term.number

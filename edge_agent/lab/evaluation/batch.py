@@ -1,4 +1,6 @@
-"""Simulation of several drives of one scenario as a batch, and their estimation."""
+"""Simulation of several drives of one scenario as a batch, and estimation of their motion and
+friction by a bank.
+"""
 
 from __future__ import annotations
 

@@ -267,7 +267,7 @@ def _health_problems(port: int) -> list[str]:
 
 
 def figures(folder: Path, seconds: float, kills: int = KILLS) -> list[Figure]:
-    """Return the number of lost samples by kind of source, and the number of crashes."""
+    """Return the number of lost samples by kind of source, and the number of agents that failed."""
     found = []
     for kind in COUNTED:
         missing, sent = count_lost(kind, folder, seconds)

@@ -9,7 +9,7 @@ from edge_agent.dynamics.parameters import Parameter
 
 
 class Motion(IntEnum):
-    """Index of a state variable of one vehicle."""
+    """Index of a state variable of one simulated vehicle."""
 
     VX = 0  # [m/s]
     VY = 1

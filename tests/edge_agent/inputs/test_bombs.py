@@ -60,7 +60,9 @@ def write_mcap_bomb(path: Path) -> Path:
 
 
 def write_mdf_bomb(path: Path) -> Path:
-    """Write a measurement of LARGE zeros in compressed (DZ) blocks, and return its path."""
+    """Write an MDF file with a measurement of LARGE zeros in compressed (DZ) blocks, and return its
+    path.
+    """
     asammdf = pytest.importorskip("asammdf")
     values = np.zeros(LARGE // 16)
     with asammdf.MDF(version="4.10") as file:

@@ -141,8 +141,8 @@ def test_unsettled_batches_are_resent_oldest_first_at_growing_intervals(path: Pa
 
 
 def silence_route(outbox: Outbox, now: float = 0.0) -> float:
-    """Store batches without any answer until the route counts as silent, and return the time then
-    [s].
+    """Store batches without any answer until the route counts as silent, and return the simulated
+    time [s] at that moment.
     """
     outbox.store([draft()], now)
     while outbox.store([draft()], now)[0].fresh:

@@ -63,7 +63,7 @@ def fill(root: Path, segments: int, count: int, seed: int = 0) -> Writer:
 
 
 def identities(root: Path, kind: Kind) -> list[tuple[int, int]]:
-    """Return (boot, seq) of all rows that a reader finds, sorted."""
+    """Return (boot, seq) of all rows in an archive, sorted."""
     return sorted(
         (row["boot"], row["seq"])
         for table in reading.read_tables(root, kind, ["boot", "seq"])

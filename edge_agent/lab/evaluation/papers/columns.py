@@ -27,7 +27,9 @@ def means(batch: DriveSet, reported: Estimates) -> Values:
 
 
 def without_noise(spec: DriveSpec, make: BankMaker) -> tuple[DriveSet, Estimates]:
-    """Simulate a drive with error-free sensors and estimate it; return the drive and the estimates."""
+    """Simulate a drive with error-free sensors, and estimate its motion and friction; return the
+    drive and the estimates.
+    """
     batch = ideal(spec)
     return batch, estimates(make(batch.vehicles), batch)
 

@@ -73,7 +73,7 @@ BOTH: Final = {"improved": AdaptiveSetting(), "FKF": FKF}
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
-    """Run all drives of the paper. `seeds` are the seeds of the drives with ordinary sensors."""
+    """Run all drives of paper 001. `seeds` are the seeds of the drives with ordinary sensors."""
     done = Reproduction(
         "001", "Adaptive fuzzy federated cubature filter", adaptive_federated_ckf.ELEMENTS
     )

@@ -145,7 +145,7 @@ def run_drive(spec: DriveSpec, tyre: TyreOption | None) -> ForceRun:
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
-    """Run both drives of the paper. `seeds` are the seeds of the drives with ordinary sensors."""
+    """Run both drives of paper 002. `seeds` are the seeds of the drives with ordinary sensors."""
     done = Reproduction(
         "002", "Weighted cubature filters with tyre-force compensation", compensated_wckf.ELEMENTS
     )

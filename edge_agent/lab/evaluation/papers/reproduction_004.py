@@ -101,8 +101,8 @@ def run_noise(
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
-    """Run both experiments. `seeds` are the seeds of the noise, and of the drives with ordinary
-    sensors.
+    """Run both experiments of paper 004. `seeds` are the seeds of the noise, and of the drives with
+    ordinary sensors.
     """
     done = Reproduction(
         "004", "Fuzzy cubature filter tuned by an ant colony", paper_aco_fckf.ELEMENTS
