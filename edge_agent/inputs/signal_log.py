@@ -49,8 +49,8 @@ class SignalLog:
     context: FloatArray | None = None  # (T, len(CONTEXT)), where a column of it is there
 
     def blocks(self, start_ns: int, rows: int = BLOCK_ROWS) -> Iterator[Block]:
-        """Yield the log in order, in blocks of at most `rows` samples. `start_ns` is the [ns UTC]
-        of t = 0.
+        """Yield the samples of the log in order, in blocks of at most `rows` samples. `start_ns` is
+        the [ns UTC] of t = 0.
         """
         for first in range(0, len(self.t), rows):
             t = self.t[first : first + rows, None]

@@ -26,7 +26,9 @@ _NOW = START + 10 * PERIOD_NS
 
 
 def public() -> list[Figure]:
-    """Measure the cost of public cells [µs]: per cell that is read, and per visit that is fused."""
+    """Measure the time [µs] per read cell and per fused visit with public cells, and its ratio to
+    the time with a map that shows every visit.
+    """
     private, public = _Map(1), _Map(LEAST)
     seen, plain = (1e6 * s / CELLS for s in time_in_turn(public.read, private.read))
     # a turn each of warm-up and ROUNDS

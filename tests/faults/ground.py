@@ -134,8 +134,8 @@ class Ground:
 
 @contextmanager
 def open_ground(network: Network) -> Iterator[Ground]:
-    """Yield a service behind the network, and connected honest parties of which each got an
-    acknowledgement.
+    """Yield a running service behind the routers, and connected honest parties. Each of these
+    parties has received an acknowledgement.
     """
     config = ServiceConfig(
         zenoh=settings(network.endpoints[ROUTERS[0]], network.folder),

@@ -217,7 +217,7 @@ def silent_seconds(house: House) -> float:
 
 
 def build_wheel(house: House) -> Path:
-    """Build the wheel of this source tree once, and return its path."""
+    """Build the wheel of this source tree unless it exists, and return its path."""
     built = house.folder / "dist"
     if not list(built.glob("*.whl")):
         build = [sys.executable, "-m", "build", "--wheel", "--outdir", str(built), str(ROOT)]
@@ -227,8 +227,8 @@ def build_wheel(house: House) -> Path:
 
 
 def install_demo(house: House) -> Path:
-    """Create an environment with all packages that `gripmap demo` needs once, and return its
-    folder.
+    """Create an environment with all packages that `gripmap demo` needs, unless it exists, and
+    return its folder.
     """
     place = house.folder / "demo-venv"
     if not place.exists():

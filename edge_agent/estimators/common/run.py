@@ -25,7 +25,7 @@ from schemas.vehicle import Vehicle
 
 
 class PaperMemory:
-    """Memory of one vehicle that all filters from papers have in common."""
+    """Memory for one vehicle that the filters of all papers have in common."""
 
     row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
     track: InputTrack

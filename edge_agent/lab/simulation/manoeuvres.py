@@ -258,8 +258,8 @@ def standing(_now: Moment) -> tuple[float, float]:
 
 
 def stop_and_go(now: Moment) -> tuple[float, float]:
-    """Repeat: drive straight for eight seconds, stop with 2.5 m/s^2 and wait for the rest of six
-    seconds, as at traffic lights.
+    """Repeat: drive straight for eight seconds, then stop with 2.5 m/s^2 and stand, six seconds in
+    total, as at traffic lights.
     """
     go = now.t % 14.0 < 8.0
     return steer_to(now, now.x + preview(now), 0.0), min(hold(now), 2.0) if go else -2.5

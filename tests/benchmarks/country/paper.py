@@ -1,5 +1,5 @@
-"""Extrapolation to ten times the vehicles: the country's measured costs times the
-expected numbers.
+"""Extrapolation to ten times the vehicles: the country's measured costs, multiplied by the expected
+numbers of observations and cells.
 """
 
 from __future__ import annotations
