@@ -134,8 +134,8 @@ class Ground:
 
 @contextmanager
 def open_ground(network: Network) -> Iterator[Ground]:
-    """Yield a running service behind the routers, and connected honest parties. Each of these
-    parties has received an acknowledgement.
+    """Yield the environment of the attacks: a running service behind the routers, and sessions of
+    honest parties.
     """
     config = ServiceConfig(
         zenoh=settings(network.endpoints[ROUTERS[0]], network.folder),
