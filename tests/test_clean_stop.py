@@ -25,6 +25,7 @@ def there(tmp_path: Path) -> Iterator[Stage]:
         yield there
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_agent_and_service_settle_and_leave(there: Stage, number: signal.Signals) -> None:
     (load,) = there.loads

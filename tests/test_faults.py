@@ -127,6 +127,7 @@ def test_the_census_sees_a_lost_batch_and_doubled_rows(kept: list[Batch], tmp_pa
     assert read_journals([journal]).longest_wait(since=2.0) == 1.5
 
 
+@pytest.mark.campaign
 def test_no_history_on_a_disk_that_forgets_loses_or_doubles_anything() -> None:
     found_bugs = (
         1064,

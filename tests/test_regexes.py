@@ -26,6 +26,7 @@ def test_linear_pattern_is_not_accused(pattern: str) -> None:
     assert not regexes.is_superlinear(pattern)
 
 
+@pytest.mark.campaign
 def test_product_has_no_superlinear_pattern() -> None:
     found = regexes.find_all()
     assert not found, "\n".join(f"{one.place}: {one.pattern}" for one in found)

@@ -110,6 +110,7 @@ def test_an_unknown_ending_is_refused(tmp_path: Path) -> None:
     assert drive_report.ENDINGS == (".html", ".png", ".svg", ".pdf")
 
 
+@pytest.mark.campaign
 def test_straight_drive_leaves_all_values_in_the_window(tmp_path: Path) -> None:
     """The plot of a track straight to the north must not be taller than the window."""
     write_report(drive_of(), tmp_path / "drive.html")

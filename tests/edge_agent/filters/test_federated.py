@@ -208,6 +208,7 @@ def test_an_update_by_downdates_is_the_orthogonal_update() -> None:
     assert cov == pytest.approx(other_cov, abs=1e-9)
 
 
+@pytest.mark.campaign
 def test_downdate_filter_is_the_textbook_filter_on_a_linear_system() -> None:
     rng = np.random.default_rng(21)
     n = 4

@@ -87,6 +87,7 @@ def test_bomb_is_refused_with_a_bounded_memory(
     assert resource.getrlimit(resource.RLIMIT_AS) == before
 
 
+@pytest.mark.campaign
 def test_memory_is_bounded_and_given_back(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     with (

@@ -11,6 +11,7 @@ from edge_agent.lab.simulation import SimulatedFleet
 from schemas.mugrid import STEPS_PER_NAT
 
 
+@pytest.mark.campaign
 def test_a_longer_way_costs_more_and_a_route_less_than_none() -> None:
     known = cost.street_places()
     short, long = (

@@ -10,6 +10,7 @@ from fleet_service.analytics import example
 from fleet_service.analytics.synthetic import SyntheticFleet
 
 
+@pytest.mark.campaign
 def test_the_example_draws_its_figures(
     tmp_path: Path, archive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -147,6 +147,7 @@ def begun(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
     return found
 
 
+@pytest.mark.campaign
 def test_a_process_answers_one_question_after_the_other(
     asker: historical_maps.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
 ) -> None:
@@ -159,6 +160,7 @@ def test_a_process_answers_one_question_after_the_other(
     assert begun[0].poll() is not None
 
 
+@pytest.mark.campaign
 def test_a_process_that_died_while_nobody_asked_is_begun_anew(
     asker: historical_maps.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
 ) -> None:

@@ -58,6 +58,7 @@ print(sorted(kernels() - warm))
 """
 
 
+@pytest.mark.campaign
 def test_a_ready_service_compiles_nothing() -> None:
     heard = subprocess.run(
         [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False

@@ -169,6 +169,7 @@ def test_what_it_left_half_done_is_not_done_twice(tmp_path: Path) -> None:
     assert len(public(tmp_path, Kind.OBSERVATION)) == 2 * ROWS
 
 
+@pytest.mark.campaign
 def test_readers_see_every_row_once_while_it_runs(tmp_path: Path) -> None:
     fill(tmp_path, 30, 5)
     whole = identities(tmp_path, Kind.OBSERVATION)

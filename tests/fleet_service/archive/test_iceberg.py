@@ -42,6 +42,7 @@ def uri(root: Path) -> str:
     return f"sqlite:///{root.parent}/tables.db"
 
 
+@pytest.mark.campaign
 def test_compacted_files_are_registered_once_and_the_log_never(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -187,6 +187,7 @@ def test_what_is_delivered_twice_is_admitted_once() -> None:
     np.testing.assert_array_equal(np.sort(kept), np.arange(len(visits)))
 
 
+@pytest.mark.campaign
 def test_federated_reset_is_inverse_variance_and_newest_is_the_last() -> None:
     seconds = np.arange(3.0)
     place = np.zeros(3, np.int64)

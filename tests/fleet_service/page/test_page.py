@@ -23,6 +23,8 @@ from tests.fleet_service.page.conftest import Drive, RunningPage
 from tests.structure import ROOT
 from tests.waiting import until
 
+pytestmark = pytest.mark.campaign  # a browser takes seconds to start
+
 PICTURES: Final = ROOT / ".page"
 READY: Final = "body[data-ready]"
 ICE, SNOW, WET, DRY, RATHER, RATHER_NOT, LITTLE, HOLLOW = range(8)

@@ -25,6 +25,8 @@ from tests.fleet_service.page.test_page import (
 )
 from tests.waiting import until
 
+pytestmark = pytest.mark.campaign  # a browser takes seconds to start
+
 WALL: Final = {"width": 3840, "height": 2160}
 _HEARD: Final = """() => {
   globalThis.beeps = 0;

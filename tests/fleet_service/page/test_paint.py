@@ -27,6 +27,8 @@ from tests.fleet_service.page.test_page import (
     waits,
 )
 
+pytestmark = pytest.mark.campaign  # a browser takes seconds to start
+
 PLACES: Final = 12
 # Squares of known ground in a row, of two tiles; says how many points of each colour there are in
 # the row's middle.

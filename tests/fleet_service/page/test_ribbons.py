@@ -20,6 +20,8 @@ from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import Drive, RunningPage, page_of
 from tests.fleet_service.page.test_page import ICE, cell_of, look, near, open_map, waits
 
+pytestmark = pytest.mark.campaign  # a browser takes seconds to start
+
 ASIDE: Final = 1  # cells from the reported positions to the road of the map, as receivers err
 STREET: Final = "Main Street"
 _DRAWN: Final = "document.body.dataset.kinds?.split(',')[{kind}] == {count}"

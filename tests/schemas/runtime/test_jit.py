@@ -63,6 +63,7 @@ def test_a_full_disk_under_the_cache_costs_only_the_cache(tmp_path: Path) -> Non
     assert not list((tmp_path / "cache").rglob("*.nbc"))
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("place", ["/proc/nowhere", ""])
 def test_without_a_writable_cache_kernels_compile_at_each_start(tmp_path: Path, place: str) -> None:
     """A service account without a home folder and a read-only container must cause no traceback and
@@ -85,6 +86,7 @@ def test_without_a_writable_cache_kernels_compile_at_each_start(tmp_path: Path, 
     )
 
 
+@pytest.mark.campaign
 def test_a_cache_that_others_may_write_is_not_used(tmp_path: Path) -> None:
     (tmp_path / "kernels").mkdir()
     (tmp_path / "kernels" / "__init__.py").touch()

@@ -51,6 +51,7 @@ def test_the_roc_plot_shows_belief_slip_flag_and_oracle(tmp_path: Path) -> None:
     assert line_of("aco-fckf").colour in text
 
 
+@pytest.mark.campaign
 def test_a_plot_is_a_picture_or_print_and_an_estimator_has_its_colour(
     drives: dict[str, PlottedDrive], tmp_path: Path
 ) -> None:
