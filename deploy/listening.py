@@ -54,7 +54,7 @@ LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 
 @dataclass
 class Drive:
-    """Result of one drive, computed from the simulator's true values."""
+    """Result of one simulated drive, computed from the simulator's true values."""
 
     slid: set[tuple[int, int]] = field(
         default_factory=set

@@ -1,3 +1,3 @@
-"""The contract between vehicles, service and clients: messages, tables on disk, keys and
-queries.
+"""The contract (common definitions) between vehicles, service and clients: messages, tables on
+disk, keys and queries.
 """

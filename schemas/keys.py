@@ -1,5 +1,5 @@
-"""Zenoh keys of the contract: the topics with their messages and quality of service. Keys are built
-and parsed only here.
+"""Zenoh keys of the contract (common definitions of vehicles, service and clients): the topics with
+their messages and quality of service. Keys are built and parsed only here.
 
 A region's quadkey is split into chunks of 4, 3 and 3 digits, a tile's into 4, 3, 3 and 4, so that
 wildcards select areas of different size: `gripmap/v1/map/1200/320/*/*` is a zone (zoom 7).
@@ -176,8 +176,8 @@ def parse_served(key: str, root: str = SERVES) -> ServiceToken:
 
 
 class Parsed(NamedTuple):
-    """Parts of a concrete key: topic, quadint and name. Quadint or name is None if the topic has
-    none.
+    """Parts of a concrete key (without wildcards): topic, quadint (number of a grid square) and
+    name. Quadint or name is None if the topic has none.
     """
 
     topic: Topic

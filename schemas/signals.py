@@ -1,8 +1,8 @@
 """The signals of a vehicle: names, order in an array, units, and health flags.
 
-A block of signals is a float array (T, N, len(CHANNELS)) for T samples of N vehicles; NaN is a
-missing reading. Axes are ISO 8855: x forward, y left, z up; yaw, steering and lateral quantities
-are positive to the left.
+Signals are stored in blocks. A block is a float array (T, N, len(CHANNELS)) for T samples of N
+vehicles; NaN is a missing reading. Axes are ISO 8855: x forward, y left, z up; yaw, steering and
+lateral quantities are positive to the left.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class C(IntEnum):
 
 
 class S(IntEnum):
-    """Index of a channel on the last axis of a block of signals. For a quantity with one channel
+    """Index of a channel on the last axis of an array of signals. For a quantity with one channel
     per wheel, it is the index of the front left wheel (fl).
     """
 

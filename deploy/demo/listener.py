@@ -51,8 +51,8 @@ class Listener:
         self.session.close()
 
     def progress(self) -> str:
-        """Return one line of text: number of cells, how many are measured and by several vehicles,
-        and number of active alerts.
+        """Return one line of text: the number of known cells, how many of them are measured, how
+        many several vehicles visited, and the number of active alerts.
         """
         with self._lock:
             cells = pa.concat_tables(self.tiles.values()) if self.tiles else None

@@ -46,8 +46,8 @@ class AtLeast:
         *,
         threads: int = 1,
     ) -> edge_agent.Estimates:
-        """Return estimates for samples: times t (T, N) [s], signals (T, N, 18) in the order of
-        schemas.signals.CHANNELS, NaN where a reading is missing.
+        """Return estimates for samples of N vehicles: times t (T, N) [s], and signals (T, N, 18) in
+        the order of schemas.signals.CHANNELS, with NaN where a sensor value is missing.
         """
         del closes, threads  # no visits, one thread
         values = np.zeros((*t.shape, ONE_FRICTION))

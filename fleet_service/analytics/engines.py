@@ -158,8 +158,8 @@ class QueryEngine:
 
 def has_value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
     """Return a condition that is true for rows with a value of mu, and false for rows with only a
-    lower bound. A row has a value if the vehicle used at least the share EXCITED_SHARE of mu (see
-    the contract).
+    lower bound. A row has a value if the vehicle used at least the share EXCITED_SHARE of mu (the
+    rule is in `schemas/README.md`).
 
     NaN is larger than any number in both engines, so it is checked explicitly.
     """

@@ -1,10 +1,10 @@
-"""Rebuilding of the map and the hourly statistics (roll-up) of an archive from raw observations,
-zone by zone, on this machine or on Spark.
+"""Rebuilding of the map and the hourly statistics (roll-up) of an archive from raw observations, on
+this machine or on Spark. The archive is processed zone by zone (a zone is a map square of zoom 7).
 
     OUT/map/date=2026-01-31/zone=q1202310/20260131T070000Z.parquet   the map of one moment, all
                                                                      visited cells
-    OUT/rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet  a part per compacted file, all
-                                                                     days
+    OUT/rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet  statistics, one file per
+                                                                     compacted file, all days
 
 Once the vehicles' weights are known, cells do not depend on each other. A zone therefore needs its
 own rows and those of a margin around it, and gives the same result as a replay of the whole
@@ -75,7 +75,8 @@ def require_empty(out: Path) -> None:
 
 
 def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
-    """Rebuild all zones; yield the result of each zone, in order.
+    """Rebuild all zones (map squares of zoom 7) of an archive; yield the result of each zone, in
+    order.
 
     Raises:
         InputError: there are no compacted observations, a file has a newer version, or the engine
@@ -102,8 +103,8 @@ def zones_of(root: Path) -> list[int]:
 
 
 def rebuild_zone(wanted: Rebuild, zone: int) -> RebuildResult:
-    """Rebuild one zone. Repeated or concurrent calls write the same files, so the result is the
-    same as after one call.
+    """Rebuild one zone (map square of zoom 7) of an archive. Repeated or concurrent calls write the
+    same files, so the result is the same as after one call.
 
     Raises:
         InputError: a file has a newer version.

@@ -48,7 +48,7 @@ class SyntheticFleet:
 
 
 def write_archive(root: Path, world: SyntheticFleet, segment_rows: int = 20_000) -> None:
-    """Write the inbox of an archive in order of time, one segment after another.
+    """Write the inbox of an archive in order of time, one segment (file of new rows) after another.
 
     Raises:
         OSError: the disk is full.
@@ -197,8 +197,8 @@ def _make_likelihoods(
     rng: np.random.Generator, mu: FloatArray, used: FloatArray, excited: BoolArray
 ) -> ByteArray:
     """Return the log-likelihoods of the reports, (n, 32), in steps of 1/16 nat. The likelihood of a
-    value of mu falls on both sides of the value. The likelihood of a lower bound falls only below
-    the grip used.
+    reported value of mu falls both below and above this value. The likelihood of a lower bound
+    falls only below the grip that was used.
     """
     distance = (mugrid.CENTRES - np.where(excited, mu, used)[:, None]).astype(np.float32)
     flank = rng.uniform(0.02, 0.08, (2, len(mu), 1)).astype(np.float32)

@@ -32,8 +32,8 @@ class TimeNow(NamedTuple):
 
     Attributes:
         now: the time.
-        slack: how far the time of a report may lie beyond `now`, because reports in the archive are
-            that late already.
+        slack: how far the time of a report may lie beyond `now`, because the archive already
+            contains reports with such times.
         doubt: how much further beyond `now` it may lie so that the report is only kept waiting, and
             not refused for good.
         least: lower bound of the true time.

@@ -50,7 +50,7 @@ class PastQuery(NamedTuple):
         at: the moment [ns].
         lateness_s: allowed lateness of the service [s].
         only: the only selected tile; None for any.
-        public: number of recent vehicles from which on readers may see a cell.
+        public: smallest number of recent vehicles with which readers may see a cell.
     """
 
     query: MapQuery
@@ -107,7 +107,9 @@ class HistoricalMaps:
             process.end()
 
     def _ask_process(self, question: PastQuery) -> tuple[_Process, bytes]:
-        """Return a process that is answering the query, and the head of its first reply."""
+        """Return a process that is answering the query, and the head (tile number and length) of
+        its first reply.
+        """
         if process := self._keep_process(None):
             with suppress(BrokenPipeError, ChildProcessError):  # it has just left
                 return process, process.ask(question)
@@ -141,7 +143,7 @@ class _Process:
         self.out = self._child.stdout
 
     def ask(self, question: PastQuery) -> bytes:
-        """Send a query to the process; return the head of the first reply."""
+        """Send a query to the process; return the head (tile number and length) of the first reply."""
         self._in.write(encode_question(question))
         self._in.flush()
         return self.head()

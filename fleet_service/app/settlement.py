@@ -75,7 +75,7 @@ class Settlement:
 
     @property
     def newest_segment(self) -> Cut:
-        """Return the position of the last written segment."""
+        """Return the position of the last written segment (file of new rows)."""
         return self._log.newest
 
     def run_between_segments(self, work: Callable[[], T], stop: threading.Event) -> T | None:

@@ -99,7 +99,7 @@ class SharedState:
 
     Args:
         state: state loaded from the archive.
-        public_vehicles: number of vehicles from which on readers may see a cell.
+        public_vehicles: smallest number of vehicles with which readers may see a cell.
 
     Attributes:
         guard: lock that is held while the map is changed or read.

@@ -39,8 +39,8 @@ class _Load(Generic[Batch]):
         return sum(len(part["row"]) for waiting in list(self.waiting.values()) for part in waiting)
 
     def take(self, other: _Load[Batch]) -> None:
-        """Append the waiting rows, and the segments already written, of another load to this
-        one.
+        """Append to this load (rows that are written together) the content of another load: rows
+        that wait for the disk, their batches, and segments that are already written.
         """
         for kind, waiting in other.waiting.items():
             self.waiting[kind] = self.waiting[kind] + waiting

@@ -40,8 +40,8 @@ class StretchAlert:
         latitude, longitude: centre [deg].
         bbox: west, south, east, north [deg].
         mu, mu_lower, mu_upper, p_slippery: values of the cell with the lowest mu.
-        vehicles: number of vehicles that measured the cell with the most vehicles.
-        reason: reason from the last cell that changed the stretch.
+        vehicles: largest number of vehicles that measured any one cell of the stretch.
+        reason: reason stated by the alert of the cell that changed the stretch last.
         points: latitude and longitude [deg] of the cells from one end to the other; branches are
             left out.
     """

@@ -1,5 +1,6 @@
 """Belief about the friction of one cell (32 probabilities), and its change by ageing and by votes.
-A vote is the effect of one vehicle's visit. All functions are compiled.
+A vote is the effect of one visit (one pass of a vehicle through the cell). All functions are
+compiled.
 
 Legend
     p    belief about the fleet's common reading of the road: probability per bin (32,)
@@ -7,7 +8,7 @@ Legend
     L    likelihood of one visit, from its bytes                                (32,)
     B    bias kernel: B[i, j] = P(the vehicle reads μ_j on a road of μ_i)  (32, 32), rows sum to 1
     L̃    B·L divided by its mean: the vote of a vehicle with its own bias        (32,)
-    s    strength of a vote: new part × trust × P(the visit was in this cell)   [-]
+    s    strength of a vote: share of new information × trust × P(the visit was in this cell) [-]
     h    P(the road changed within Δt), 1 - exp(-Δt / CHANGE_S)                 [-]
 
 Arithmetic is in single precision, which takes half the memory of double precision. Only two digits
@@ -195,8 +196,9 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
     """Age a belief in place: diffusion over `drift_s` [s] with reflecting ends, then a possible
     sudden change of the road over `change_s` [s].
 
-    A uniform belief stays uniform and a non-decreasing one non-decreasing. Therefore time alone
-    never lowers an upper end below the prior's. `padded` (34 or more) is scratch memory.
+    A uniform belief stays uniform and a non-decreasing one non-decreasing. Therefore the passage of
+    time alone never lowers the upper end of the belief's interval below that of the prior. `padded`
+    (34 or more) is scratch memory.
     """
     if drift_s > 0.0:
         whole = _DIFFUSION * drift_s
@@ -225,8 +227,8 @@ def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -
 
 @refcount_free_inlined
 def kind_of(evidence: ByteArray) -> int:
-    """Return VALUE if the likelihood falls by at least VALUE_DROP_STEPS towards the highest
-    friction, so that it limits μ from above. Return BOUND if it is only a lower bound.
+    """Return the kind of a likelihood: VALUE if it falls by at least VALUE_DROP_STEPS towards the
+    highest friction, so that it limits μ from above; BOUND if it is only a lower bound of μ.
     """
     least = np.uint8(255)
     for i in range(_BINS):

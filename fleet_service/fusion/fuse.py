@@ -136,8 +136,8 @@ class Fusion:
 
     @property
     def waiting(self) -> int:
-        """Number of observations in the lateness window, in which late arrivals are still sorted
-        in. An observation that affects several cells counts once per cell.
+        """Number of observations in the lateness window (the recent past in which late arrivals are
+        still sorted in). An observation that affects several cells counts once per cell.
         """
         return self.store.waiting
 

@@ -224,7 +224,7 @@ def note_value(
     cells: RecordArray, row: int, entries: RecordArray, entry: int, strength: float
 ) -> None:
     """Add the value of an entry (an observation in one cell) to the running means of its cell: kind
-    of manoeuvre, grip used, and the error that it shares with others.
+    of manoeuvre, grip used, and the part of its error that it shares with other vehicles.
 
     The entry's weight is smaller if the vehicle used less grip or stated a wider interval.
     """

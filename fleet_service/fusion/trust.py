@@ -109,8 +109,8 @@ def compare_reports(
 def judge_flag(
     reporters: RecordArray, row: int, peers: RecordArray, entries: RecordArray, entry: int
 ) -> None:
-    """Compare a slip controller's intervention with the newest value that another vehicle recently
-    gave in this cell; count a confirmation or a contradiction.
+    """Compare an intervention of a vehicle's slip controller (a flag) with the newest value that
+    another vehicle recently gave in this cell; count a confirmation or a contradiction of the flag.
 
     A value supports a side (slippery or not) only if it is at least its standard deviation away
     from SLIPPERY. The vehicle's own value of the same visit is not a confirmation, because the flag
@@ -144,8 +144,9 @@ def judge_flag(
 def _note_shape(
     peers: RecordArray, vehicle: int, used: float, difference: float, variance: float
 ) -> None:
-    """Record how a vehicle's values in one cell change with the grip that it used. Its gain error
-    is the same in both values and therefore cancels.
+    """Record how a vehicle's values in one cell change with the grip that it used. The differences
+    between its values are recorded, because its gain error is the same in all of them and therefore
+    cancels.
     """
     this = peers[vehicle]
     this.used_squares += np.float32(used * used / variance)

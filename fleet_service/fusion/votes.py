@@ -68,8 +68,8 @@ _WITNESS_SLOPE: Final = UNKNOWN_SHAPE.alarm
 @refcount_free_inlined
 def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scratch: Bins) -> None:
     """Set the kind of an entry's vote (VALUE, or BOUND for a lower bound), its mean, standard
-    deviation and P(slippery). The likelihood is left in `scratch`. An entry is an observation in
-    one cell.
+    deviation and P(slippery). The likelihood is written to `scratch`. An entry is an observation in
+    one cell, and its vote is the effect on the belief.
 
     If the vehicle reported a value (`reported` (3,) is not NaN), these numbers are taken from the
     report, even if only a part of its likelihood is used.

@@ -69,8 +69,8 @@ class Arrivals(NamedTuple):
 
 
 class Votes(NamedTuple):
-    """Votes of a batch, arrays of shape (k,): row of the observation, slot (cell and sector), and
-    P(the vehicle was in this cell).
+    """Votes of a batch, arrays of shape (k,). A vote is the effect of one observation on one cell:
+    row of the observation, slot (cell and sector), and P(the vehicle was in this cell).
 
     Among the votes of one observation, the vote for its own cell comes first.
     """
@@ -93,7 +93,8 @@ class Marks(NamedTuple):
 def absorb_votes(
     state: State, weather: Weather, arrivals: Arrivals, votes: Votes, most: int
 ) -> BoolArray:
-    """Add the votes of a batch to the lateness windows of their cells, and update the beliefs.
+    """Add the votes of a batch (effects of its observations on cells) to the lateness windows of
+    their cells, and update the beliefs.
 
     Every memory pool must have space for k votes. Return a mask of observations (n,) that were left
     out, because `most` observations of their vehicle already wait in the same cell. For an
@@ -118,8 +119,8 @@ def _absorb_votes(
     marks: Marks,
     scratch: Bins,
 ) -> int:
-    """Add the votes to the windows of their cells and fill the marks; return the number of stale
-    windows, which must be computed again.
+    """Add the votes (effects of observations on cells) to the windows of their cells and fill the
+    marks; return the number of stale windows, which must be computed again.
     """
     cells = state.live.cells
     windows = state.windows

@@ -109,8 +109,8 @@ class _Fields(NamedTuple):
         )
 
     def heads(self) -> Heads:
-        """Return the heads (fields other than records) of the messages. A missing `first_held` is
-        replaced with 1, the lowest sequence number.
+        """Return the heads (fields other than records) of the messages. A missing field
+        `first_held` is replaced with 1, the lowest sequence number.
         """
         data = self.data.tobytes()
         texts = {

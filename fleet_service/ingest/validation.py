@@ -61,7 +61,9 @@ RANGES: Final = {
 
 
 class Clock(NamedTuple):
-    """The service's clock, and how far the time of a record may be from it, all in ns."""
+    """Time of the service's clock, and how far the time of a record may be before or after it, all
+    in ns.
+    """
 
     now: int
     ahead: int

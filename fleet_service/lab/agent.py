@@ -10,11 +10,12 @@ Legend
     m, z   m = μ·(1 + b + k) + a, and the reading z = m + σ(m)·e                       (n,)
     e      a standard normal, correlated along a drive                                 (n,)
 
-A visit with s ≥ .6 ("excited") sends ln p(z | μ) = -(z - μ)² / 2σ(μ)² - ln σ(μ). Apart from the
-errors b, a and k, this likelihood is calibrated: each visit's e alone is standard normal, even
-though successive e are correlated. Any other visit sends a lower bound, the grip used. Above the
-bound its likelihood has a slope of at most half a nat, which differs between vehicles (see the
-contract of the log-likelihood). Both likelihoods are rounded to bytes as in the messages.
+A visit (pass through one cell) with s ≥ .6 ("excited") sends ln p(z | μ) = -(z - μ)² / 2σ(μ)² - ln
+σ(μ). Apart from the errors b, a and k, this likelihood is calibrated: each visit's e alone is
+standard normal, even though successive e are correlated. Any other visit sends a lower bound, the
+grip used. Above the bound its likelihood has a slope of at most half a nat, which differs between
+vehicles (`schemas/mugrid.py` defines the log-likelihood). Both likelihoods are rounded to bytes as
+in the messages.
 """
 
 from __future__ import annotations

@@ -88,8 +88,10 @@ def drive_command(vehicles: int, seconds: float, world: World) -> Drive:
 
 
 def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float]:
-    """Return figures of one drive: interval coverage of the cells that SEVERAL vehicles visited,
-    error of μ in the measured ones of these cells, alerts, and counts of observations.
+    """Return figures of one drive, by name. They include the share of cells whose 90 % interval
+    contains the true friction, among cells that at least SEVERAL vehicles visited; the error of μ,
+    among those of these cells in which friction was measured; and the numbers of alerts and
+    observations.
     """
     folder = folder / world.prefix.removeprefix("fusion.")
     drive(folder)
@@ -119,8 +121,8 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
 
 
 def raised_alerts(fusion: Fusion, o: Observations) -> list[Alert]:
-    """Fuse the observations second by second, as a service does; return the alerts that were
-    raised.
+    """Fuse the observations of a drive second by second, as a service does; return the alerts that
+    were raised.
     """
     alerts = Alerts(fusion)
     raised = []
@@ -191,7 +193,9 @@ def read_observations(path: Path) -> dict[str, Any]:
 
 
 def driven_in(folder: Path) -> DrivenVisits:
-    """Return the reports of the drive in a folder, together with the true values."""
+    """Read the files of a simulated drive from a folder; return the vehicles' reports together with
+    the true values.
+    """
     truth = pq.read_table(folder / TRUTH)
     _, vehicle = np.unique(truth["vehicle"].to_numpy(zero_copy_only=False), return_inverse=True)
     enter = truth["enter_time"].cast(pa.int64()).to_numpy()
@@ -200,7 +204,9 @@ def driven_in(folder: Path) -> DrivenVisits:
 
 
 def observations_in(columns: dict[str, Any]) -> Observations:
-    """Return columns as observations for the fusion; each row is a separate batch."""
+    """Return columns of a drive as observations for the fusion; each row is given as a separate
+    batch.
+    """
     n = len(columns["cell"])
     with_likelihood = np.full(n, columns["log_likelihood"].shape[1] > 0)
     identity = {

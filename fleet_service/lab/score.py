@@ -29,8 +29,8 @@ LEVELS: Final = np.linspace(0.05, 0.95, 19)
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of k answers of the map, each column (k,). An answer is the belief about one cell at
-    one time.
+    """Scores of k answers of the map, each attribute a column (k,). An answer is the belief about
+    one cell at one time.
 
     `vehicles` is the number of distinct excited vehicles that had visited the cell, that is,
     vehicles that used enough grip to measure the friction. `slippery` is the answer's P(slippery),
@@ -192,8 +192,8 @@ def of_class(s: Scores, n: int) -> Scores:
 
 
 def by_surface(s: Scores) -> dict[str, float]:
-    """Return the share of true frictions inside the 90 % interval, separately for each
-    of SURFACES.
+    """Return the share of true frictions inside the 90 % interval, for each kind of road in
+    SURFACES separately.
     """
     return {
         name: coverage(s.taken((s.truth > above) & (s.truth <= to)))

@@ -41,8 +41,10 @@ VALUED: Final = 0.3  # of such passes look like values: a tenth to a third with 
 
 
 def bound_excess(used: float, path: str) -> float:
-    """Return how far the lower end of the map's interval exceeds the grip that was used, or the
-    prior's lower end if that is larger.
+    """Return how far the lower end of the map's interval of friction lies above the larger of two
+    numbers: the grip that was used, and the prior's lower end. BOUNDED vehicles have used the grip
+    `used`. `path` is the form in which they report it: protobuf or JSON, as posterior or as
+    likelihood.
 
     BOUNDED vehicles have used the grip `used`. `path` is the form in which they report it: protobuf
     or JSON, as posterior or as likelihood.

@@ -58,8 +58,8 @@ class TownTraffic(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """Answers of the map and of the two simple rules at each reading of the map, with the true
-    friction, (readings, CELLS).
+    """Answers of the map and of the two simple rules each time the map is read, with the true
+    friction; arrays of shape (times, CELLS).
     """
 
     truth: FloatArray
@@ -163,8 +163,8 @@ def read_map(place: Town, traffic: TownTraffic) -> Readings:
 
 def count_unnoticed(place: Town, warned: BoolArray) -> FloatArray:
     """Return, for each cell that became slippery, the minutes until the first warning;
-    UNNOTICED_MOST if there was none until then. `warned` is the mask of warned cells at each
-    reading.
+    UNNOTICED_MOST if there was none until then. `warned` is the mask of warned cells each time the
+    map is read.
     """
     moments = np.arange(-(-BEGIN // STEP) * STEP, MINUTES + 1, STEP)
     out = []

@@ -31,7 +31,7 @@ class MirroredTile:
         cells: records of the cells.
         version: number of changes so far.
         heard: time at which the tile was received [s since 1970].
-        made: encoded blocks by zoom level, kept for the next request.
+        made: blocks (encoded cells of the tile) by zoom level, kept for the next request.
     """
 
     cells: Records = field(default_factory=lambda: _EMPTY)

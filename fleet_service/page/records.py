@@ -52,7 +52,8 @@ LEAST_LEVEL: Final = grid.TILE_ZOOM
 
 
 class TileBlock(NamedTuple):
-    """Block for a browser: a complete tile, or only its changes.
+    """Block (encoded records of map cells) for a browser: all records of a tile, or only its
+    changes.
 
     Attributes:
         tile: quadint (number) of the tile, zoom 14.
@@ -159,8 +160,8 @@ def aggregate_worst(records: Records, level: int) -> Records:
 
 
 def changed_records(before: Records, after: Records) -> Records:
-    """Return the records that must be applied to `before` to get `after`; all are ordered by
-    place.
+    """Return the records that must be applied to the records `before` to obtain `after`; all are
+    ordered by place.
     """
     places = np.union1d(before["place"], after["place"])
     old, new = (np.zeros(len(places), RECORD) for _ in range(2))

@@ -124,7 +124,7 @@ class Watchers:
         return {"now": time.time(), "heard": self._world.heard, **self._state()}
 
     def push(self, changes: list[TileBlock]) -> None:
-        """Send changed blocks to the browsers whose view they touch."""
+        """Send changed blocks (encoded cells of tiles) to the browsers whose view they touch."""
         lines: dict[tuple[int, int], bytes] = {}  # of (tile, level): made once for all who watch it
         for watcher in list(self._watchers.values()):
             found = []

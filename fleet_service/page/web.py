@@ -187,8 +187,9 @@ class Routes:
         return JSONResponse(found)
 
     async def blocks(self, request: Request) -> Response:
-        """Return the requested `tiles` as encoded blocks of records at a zoom `level`, now or at
-        the time `at`. With `borrowed`, cells estimated from neighbours are included.
+        """Return the requested `tiles` as blocks (encoded records of their cells) at a zoom
+        `level`, now or at the time `at`. With `borrowed`, cells estimated from neighbours are
+        included.
         """
         wanted = request_params.parse_tiles(request)
         level = request_params.parse_level(request)

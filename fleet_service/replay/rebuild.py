@@ -282,7 +282,9 @@ def replay(
 
 
 def _recorded_result(rows: segments.Rows) -> RecordedResult:
-    """Return lateness and vote weight of rows as recorded at the first fusion."""
+    """Return lateness and vote weight of archived rows, as the service recorded them when it first
+    fused these rows.
+    """
     return RecordedResult(rows["late"].astype(bool), rows["late_by"], rows["weight"])
 
 
@@ -318,7 +320,9 @@ def _select_rows(
 def _fuse_epochs(
     fusion: Fusion, o: Observations, before: RecordedResult, heard: Heard
 ) -> Iterator[Updated]:
-    """Fuse rows epoch by epoch, in order of the time at which they were first fused."""
+    """Fuse rows epoch by epoch (minutes of the fusion), in order of the time at which they were
+    first fused.
+    """
     time = o.time + before.late_by
     order = np.argsort(time, kind="stable")
     o, before = _select_rows(o, before, order)

@@ -25,8 +25,8 @@ _END: Final = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # a message without a head: t
 
 
 def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
-    """Return cells as an Arrow batch in the schema of the map, with their age at `now` [ns]. `mu`
-    is null for a cell with only a lower bound.
+    """Return cells of the map as an Arrow batch in the schema of the map, with their age at `now`
+    [ns]. `mu` is null for a cell with only a lower bound.
     """
     latitude, longitude = grid.centre(cells.cell)
     west, south, east, north = grid.bounds(cells.cell)

@@ -102,7 +102,9 @@ class PublicCells:
 
     @contextmanager
     def follow(self, o: Observations) -> Iterator[None]:
-        """Update the public copy after observations that the caller fuses inside this context."""
+        """Provide a context in which the caller fuses observations; at the end of the context,
+        update the public copy of the cells.
+        """
         now = int(o.time.max(initial=0))
         self.publish(now)
         yield

@@ -74,7 +74,7 @@ class Answering(NamedTuple):
 
 @dataclass(order=True)
 class _QueuedQuery:
-    """Expensive query that waits or is partly answered.
+    """Expensive query that waits in the queue, or that has received a part of its replies.
 
     Attributes:
         rank: time [s] at which the query would be finished on an idle service.
@@ -90,7 +90,9 @@ class _QueuedQuery:
 
 @dataclass
 class _Answered:
-    """Flag of one step of an answer: `whole` is True unless more replies follow in a later step."""
+    """Result of one step in which a query is answered: `whole` is True if the answer is complete
+    after this step, and False if more replies follow in a later step.
+    """
 
     whole: bool = True
 
@@ -183,8 +185,8 @@ class MapQueryable:
             self._refuse(request, _past_is_busy())
 
     def _wait_for_past(self, request: zenoh.Query, wanted: MapQuery) -> None:
-        """Answer a query about a past map after the earlier such queries; refuse it if it waits
-        longer than PAST_WAIT_S.
+        """Answer a query about a past map when all earlier queries of this kind have been answered;
+        refuse it if it waits longer than PAST_WAIT_S.
         """
         try:
             if self._past.acquire(timeout=PAST_WAIT_S):
@@ -295,8 +297,8 @@ class MapQueryable:
 
 
 def _key_filter(request: zenoh.Query) -> tuple[Callable[[int], bool], int | None]:
-    """Return two items: a function that accepts tiles whose key matches the query's key, and the
-    only such tile if the key names one (else None).
+    """Return two items about the tiles that match a query's key: a function that accepts such
+    tiles, and the tile if the key names exactly one (else None).
     """
     expression = request.key_expr
     only = _tile_of_key(str(expression))

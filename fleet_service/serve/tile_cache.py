@@ -168,5 +168,5 @@ def _common_bounds(
 
 
 def selected_by(cells: pa.RecordBatch) -> dict[str, NDArray[Any]]:
-    """Return the columns by which queries select cells, as arrays by name."""
+    """Return, as arrays by name, the columns of a tile by which queries select cells."""
     return {name: cells[name].to_numpy() for name in SELECTED_BY}

@@ -27,8 +27,8 @@ _SHIFT: Final = np.uint64(58)
 
 
 class Visitors:
-    """Recent vehicles of each slot (cell and sector) of a fusion. Each vehicle is one bit of 64, in
-    each part of a time window.
+    """Recent vehicles of each slot (cell and sector) of a fusion. The time window is divided into
+    parts; in each part, a vehicle that visited is one bit of 64.
 
     Args:
         fusion: owner of the slots; it must process observations before they are passed to `add`.
@@ -53,7 +53,7 @@ class Visitors:
 
     @property
     def newest(self) -> int:
-        """Return the time [ns] at which the newest part of the window begins."""
+        """Return the time [ns] at which the newest part of the time window begins."""
         return self._part * PART_NS
 
     def count(self, slots: IntArray, now: int) -> IntArray:
@@ -104,7 +104,7 @@ class Visitors:
             self._bits = longer
 
     def _move_on(self, part: int) -> None:
-        """Begin the window's part number `part` and drop parts that are too old."""
+        """Begin the part with number `part` of the time window, and drop parts that are too old."""
         ago = part - self._part
         if ago > 0:
             self._bits[:, ago:] = self._bits[:, : max(PARTS - ago, 0)]

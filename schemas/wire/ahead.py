@@ -1,5 +1,5 @@
-"""Message about the road ahead of a vehicle: warnings, and the horizon as a sequence of road
-segments ("runs").
+"""Encoder and decoder of the message about the road ahead of a vehicle: warnings, and the horizon
+(the road ahead) as a sequence of road segments ("runs").
 """
 
 from __future__ import annotations
@@ -103,7 +103,8 @@ def encode_ahead(outlook: Outlook) -> bytes:
 
 
 def decode_ahead(payload: bytes) -> Outlook:
-    """Return the outlook in the bytes of a message.
+    """Decode the bytes of a message about the road ahead; return the outlook (warnings and
+    horizon).
 
     Raises:
         WireError: the payload is not an Ahead message, or its columns have different lengths.

@@ -148,7 +148,7 @@ def head_of(kind: Kind, payload: bytes, encoding: str) -> Head | None:
 
 
 def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
-    """Read one batch; the inverse of `encode` for every column that was sent.
+    """Decode the bytes of one batch; the inverse of `encode` for every column that was sent.
 
     Raises:
         WireError: the payload is too large or not the expected message, a required column is

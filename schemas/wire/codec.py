@@ -1,5 +1,5 @@
-"""Encoding of batches, acknowledgements and alerts as bytes. `schemas.wire.batches` decodes
-batches.
+"""Encoding of batches, acknowledgements and alerts as bytes, and decoding of acknowledgements and
+alerts. `schemas.wire.batches` decodes batches.
 
 A batch is sent as protobuf (`application/protobuf;gripmap.v1.ObservationBatch`) or as the JSON
 mapping of the same message (`application/json`), so that a person can publish one from a command
@@ -224,7 +224,7 @@ def encode_ack(vehicle: str, streams: list[StreamAck], time: int = 0) -> bytes:
 
 
 def decode_ack(payload: bytes) -> tuple[str, list[StreamAck]]:
-    """Return the vehicle and the streams of an acknowledgement.
+    """Decode the bytes of an acknowledgement; return its vehicle and its streams.
 
     Raises:
         WireError: the payload is not an Ack message, or has a kind of batch that this version does
@@ -273,7 +273,7 @@ def encode_alert(alert: Alert) -> bytes:
 
 
 def decode_alert(payload: bytes) -> Alert:
-    """Return the alert in the bytes of a message.
+    """Decode the bytes of a message; return the alert.
 
     Raises:
         WireError: the payload is not an Alert message.
@@ -289,7 +289,7 @@ def encode_standing(alerts: Sequence[Alert]) -> bytes:
 
 
 def decode_standing(payload: bytes) -> list[Alert]:
-    """Return the active alerts in the bytes of a tile's message.
+    """Decode the bytes of a tile's message; return the active alerts of the tile.
 
     Raises:
         WireError: the payload is not a StandingAlerts message, or too large.

@@ -21,8 +21,8 @@ _HOUR_S: Final = 3600
 
 def expression(t: Table, maps: Table) -> Table:
     """Return a table of the shares `held` and `compatible`. It has one row for each basis
-    (measured, borrowed from neighbours, or bound) and each number of hours between snapshot and
-    value.
+    (measured, estimated from neighbouring cells, or only a lower bound) and each number of hours
+    between snapshot and value.
     """
     t = t.filter(has_value(t)).select(
         "cell",

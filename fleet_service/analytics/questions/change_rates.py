@@ -8,7 +8,8 @@ times. The probability that they differ in this after a time Δ is
 
     λ   rate of change of the road, as in the fusion (CHANGE_S is 1/λ)                      [1/s]
     e   probability that two readings of the same road differ because of errors
-    m   probability that readings of two roads differ; π is the class's share of slippery values
+    m   probability that readings of two roads differ; π is the share of slippery values in the
+        class (a temperature band, or a part of the day)
 
 This is the fusion's own model of change (`fleet_service/fusion/README.md`). λ and e are
 maximum-likelihood estimates over bins of Δ. Roads of a region change together, so pairs of values

@@ -1,5 +1,5 @@
-"""`contract`: for each link of a road network, whether the friction that a contract requires was
-kept, and the longest breach.
+"""`contract`: for each link of a road network, whether the friction that a maintenance contract
+requires was kept, and the longest breach.
 
 A link is divided into pieces of PIECE_M, and the worst piece counts, so that ice on a tenth of the
 link is not averaged away. Values are collected in time slots of SLOT_S. They are averaged per
@@ -59,8 +59,8 @@ _ROW: Final[dict[str, pa.DataType]] = {
 
 
 def expression(t: Table, places: Table) -> Table:
-    """Return the mean of each vehicle's values, per piece of a link and slot, with the mean of the
-    variances that the vehicle reported.
+    """Return the mean of each vehicle's values of mu, for each piece of a link and each time slot,
+    with the mean of the variances that the vehicle reported.
 
     Args:
         t: observations.
@@ -105,8 +105,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def slot_intervals(found: pa.Table) -> dict[str, FloatArray]:
-    """Return mean and 90 % interval of mu for each slot, computed from the values of its vehicles.
-    The column `first` is the row number of the slot's first vehicle.
+    """Return mean and 90 % interval of mu for each piece of a link and each time slot, computed
+    from the values of its vehicles.
 
     The error of a mean is the larger of two estimates: from the spread between vehicles, and from
     the intervals that they reported.

@@ -1,5 +1,5 @@
 """The README file of an archive: folders, and every column with unit and meaning, generated from
-the contract.
+the contract (the tables in `schemas/tables.py`).
 """
 
 from __future__ import annotations

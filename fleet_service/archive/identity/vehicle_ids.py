@@ -7,7 +7,7 @@ pseudonym in the archive changes each month.
                                 service writes a file of its own
 
 A car must not count as two independent sources because a month has ended, or because it claims to
-be another car. The files per month serve restarts and replays, which know only pseudonyms. If a
+be another car. Restarts and replays know only pseudonyms, so they read the files per month. If a
 line is lost or damaged, a replay counts the vehicle as two; there is no other effect. A service
 therefore checks the lines at start, counts damaged lines and removes them. The vehicle's next batch
 writes its line again.

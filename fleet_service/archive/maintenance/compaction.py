@@ -111,8 +111,8 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
 
 
 class _Rest(NamedTuple):
-    """Segments that are not compacted yet, oldest first, and for each the partitions to which an
-    earlier, interrupted run already moved rows.
+    """Segments (files of new rows) that are not compacted yet, oldest first. For each segment, the
+    partitions (date and zone) to which an earlier, interrupted run already moved rows.
     """
 
     root: Path

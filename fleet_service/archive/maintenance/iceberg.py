@@ -192,8 +192,8 @@ def _plain_schema(schema: pa.Schema) -> pa.Schema:
 
 
 def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> RegistrationResult:
-    """Bring an Iceberg table up to date in one commit: remove missing and changed files, and add
-    new files.
+    """Bring an Iceberg table up to date in one commit: remove the entries of files that are missing
+    or have changed on disk, and add new files.
     """
     there = {_file_url(root, place, path): path for path in layout.compacted_files(root, kind)}
     mine = {

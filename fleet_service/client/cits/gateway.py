@@ -39,8 +39,8 @@ class Sending(NamedTuple):
 
 
 class Receiving(NamedTuple):
-    """Settings for receiving DENM: address at the interchange, filter on the messages, and vehicle
-    name for the reports made from them.
+    """Settings for receiving DENM: address at the interchange, filter on the messages, and the
+    vehicle name under which reports are made from received DENM.
     """
 
     source: str

@@ -44,7 +44,7 @@ UInt16Array = NDArray[np.uint16]
 
 
 class CellRecord:
-    """A slot: one visited cell and sector. Its belief is stored in another array, see
+    """A slot (storage of one visited cell and sector). Its belief is stored in another array, see
     `belief.unpack_belief`.
 
     Attributes:
@@ -85,8 +85,9 @@ class CellRecord:
 
 
 class EntryRecord:
-    """Entry of the lateness window: one observation in one cell, younger than the checkpoint. The
-    fields that a commit reads are in the first of its two cache lines.
+    """Entry of the lateness window (the observations younger than the checkpoint): one observation
+    in one cell. A commit moves an entry into the final state; the fields that it reads are in the
+    first of the entry's two cache lines.
 
     Attributes:
         previous, following: neighbouring entries of the slot's window, in order of time.

@@ -108,8 +108,9 @@ class Store:
         return len(self.state.free_entries) - int(self.state.used[FREE_ENTRIES])
 
     def due_windows(self, before: int) -> tuple[IntArray, IntArray]:
-        """Return the lateness windows that contain observations older than `before` [ns]: first the
-        windows without a value of friction, then those with a value, sorted by cell.
+        """Return the lateness windows (recent observations of one cell) that contain observations
+        older than `before` [ns]: first the windows without a value of friction, then those with a
+        value, sorted by cell.
 
         Values that leave the window are compared with other values to compute trust. The order of
         these comparisons must not depend on the order of arrival, so windows with values are
