@@ -8,8 +8,8 @@ Kalman filter", Sustainability 2023, 15, 13446 (paper 001). Motion and sub-filte
 variance over a window, and the rate of that mismatch. The information shares follow from the
 predicted residuals, (30) to (33): beta_i = min(1, c/gamma_i), normalised.
 
-Friction is not a state of the filter. It is set by hand (section 4.1), here to DRY, and the bank
-reports the friction prior.
+Friction is not a state of the filter. It is set by hand (section 4.1), here to DRY (a dry road).
+The bank reports the prior distribution of friction as its result.
 
 ELEMENTS lists each element of the paper and every departure with its reason.
 """
@@ -60,8 +60,8 @@ class AdaptiveMemory(FederatedMemory):
 
 
 class AdaptiveDesign:
-    """Parameters that are set by hand: friction of the four wheels [1] and levels of the fuzzy
-    rules.
+    """Parameters that are set by hand: friction of the four wheels [1], and output values (levels)
+    of the fuzzy rules.
     """
 
     friction: Annotated[FloatArray, 4]

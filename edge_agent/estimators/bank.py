@@ -71,15 +71,15 @@ class EstimatorBank:
 
         Args:
             t: (T, N) measurement time [s]; a sample whose time does not increase is skipped, and
-                health reports it.
+                its health flags say so.
             signals: (T, N, 18) in the order of schemas.signals.CHANNELS; NaN is a missing reading.
-            closes: (T, N), True at the first sample that belongs to a new visit; None for no
-                visits.
+            closes: (T, N), True at the first sample of a new visit (the passage of one map cell);
+                None: the bank does not separate visits.
             threads: number of threads that share the vehicles; changes no bit of the result.
 
         Returns:
-            Estimates at the same samples. Only `evidence` contains NaN, at all samples that are
-            neither closes nor jumps.
+            Estimates at the same samples. Only `evidence` contains NaN, namely at all samples at
+            which neither a visit ends nor friction jumps.
 
         Raises:
             InputError: an array has the wrong shape for the bank, or threads is below 1.
@@ -119,8 +119,8 @@ class EstimatorBank:
         """Return the current beliefs about friction on the 32 bins of the friction grid, or None.
 
         The result is a pair of (N, 32) arrays: log(posterior/uniform) of the filter, and the
-        log-likelihood of the current visit so far. Each row has maximum 0. Return None where the
-        estimator has no belief on the grid.
+        log-likelihood of the measurements in the current visit (passage of one map cell) so far.
+        Each row has maximum 0. Return None where the estimator has no belief on the grid.
         """
         if self._beliefs is None:
             return None

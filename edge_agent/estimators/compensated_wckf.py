@@ -5,13 +5,14 @@ Chen, Cai, Chen, Xu, Jiang, Sun, "Design of vehicle running states-fused estimat
 Kalman filters and tire force compensation method", IEEE Access 2019, doi
 10.1109/ACCESS.2019.2925370 (paper 002).
 
-Filter WCKF-A: 19 states [v_x, v_y, r, tau x 4, omega x 4, F_x x 4, F_x' x 4], measurement [r, tau x
-4, omega x 4] (30) to (32), see `drive_wheel`. Tyre forces: Magic Formula (12), compensated by (33).
-Filter WCKF-B: states [v_x, v_y, r], measurement [r, a_x, a_y] (35), (36). Both filters compute R
-from a weighted moving window (25), see `adaptation.windows`.
+Filter WCKF-A: 19 states [v_x, v_y, r, tau x 4, omega x 4, F_x x 4, F_x' x 4] (yaw rate r; torque,
+speed and force of each wheel), measurement [r, tau x 4, omega x 4] (30) to (32), see `drive_wheel`.
+Tyre forces: Magic Formula (12), compensated by (33). Filter WCKF-B: states [v_x, v_y, r],
+measurement [r, a_x, a_y] (35), (36). Both filters compute R from a weighted moving window (25), see
+`adaptation.windows`.
 
-Friction is not a state of the filters. It is set by hand, here to DRY, and the bank reports the
-friction prior.
+Friction is not a state of the filters. It is set by hand, here to DRY (a dry road). The bank
+reports the prior distribution of friction as its result.
 
 `EstimatorBank.memory("mean")` returns the states of WCKF-A, and `memory("compensated")` the
 compensated forces; the paper's figures compare A with B. ELEMENTS lists each element of the paper

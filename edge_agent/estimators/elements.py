@@ -1,4 +1,4 @@
-"""List entries that describe how the code implements each equation, table and figure of a paper.
+"""Record type `Element`: how the code implements one equation, table or figure of a paper.
 
 The module of each paper has its own list. Documentation and reports are generated from these lists.
 """

@@ -43,9 +43,10 @@ FOUR_FRICTIONS = int(Column.WHEELS) + 12
 
 
 class _View:
-    """Descriptor that returns one column of all samples as a view.
+    """Descriptor that returns one column of the output of all samples, as a view of the array.
 
-    The view is created at each access, because a live loop reads few columns.
+    The view is created only when the column is read, which saves time in a live loop that reads few
+    columns.
     """
 
     def __init__(self, place: Column) -> None:

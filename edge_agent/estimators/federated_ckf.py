@@ -6,14 +6,14 @@ electric vehicle", IEEE Access 2021, doi 10.1109/ACCESS.2021.3081443. Motion fil
 `gaussian/federated_motion`. Friction filter: state [mu_fl, mu_fr, mu_rl, mu_rr], random walk (28).
 It also has two sub-filters, with measurements [a_x, a_y, r] and [a_y, r] (40) to (48), fused by
 (51), (52). The friction filter uses the estimated motion, and the tyres of the motion filter use
-the estimated friction (figure 3). Information shares by (54).
+the estimated friction (figure 3). The information shares of the sub-filters follow from (54).
 
 The printed Q = I and R = 10 000 (57) are a sensible tuning where slip stiffness is proportional to
 friction; `literal.federated_friction` contains the friction filter as printed. On a real tyre
 stiffness does not depend on friction. Therefore R here is sensor noise plus model error, and the
-estimate returns to the prior over the metres driven. An unobservable friction then becomes as
-uncertain as the prior. ELEMENTS lists each element of the paper and every departure with its
-reason.
+estimate returns to the prior with the distance driven, so that a friction that is not observed
+becomes as uncertain as the prior. ELEMENTS lists each element of the paper and every departure with
+its reason.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def make_bank(
     motion: MotionSetting | None = None,
 ) -> EstimatorBank:
     """Return a bank of paper 000's joint filters, one per vehicle. `tyre` and `motion` replace the
-    default options.
+    default options of the tyre model and of the motion filter.
     """
     filters = new_filters(JointMemory, vehicles, tyre)
     set_motion(filters, MotionSetting() if motion is None else motion)

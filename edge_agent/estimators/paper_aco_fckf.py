@@ -6,7 +6,7 @@ vehicle networking applications", IEEE Access 2019, doi 10.1109/ACCESS.2019.2895
 
 State [v_x, v_y, a_x, a_y, r, mu], input [omega, delta], measurement [a_x, a_y, r] (below equation
 29); motion (1) to (3), Dugoff tyres (7) to (12), cubature filter (13) to (28), fuzzy factor on R
-(30), fuzzy sets tuned by the ant colony (31) to (33).
+(30), fuzzy sets tuned by ant colony optimisation (31) to (33).
 
 ELEMENTS lists each element of the paper and every departure with its reason. Friction is limited to
 its range, and its standard deviation to that of the prior.
@@ -133,7 +133,7 @@ def make_bank(
     memberships: Memberships | LowerVertices,
     setting: Setting | None = None,
 ) -> EstimatorBank:
-    """Return a bank of filters, one per vehicle. `setting` replaces the default, which is for
+    """Return a bank of filters, one per vehicle. `setting` replaces the default, which describes
     ordinary sensors and an unknown road.
     """
     chosen = Setting() if setting is None else setting

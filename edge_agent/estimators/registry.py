@@ -2,10 +2,11 @@
 
 `aco-fckf`, `fckf` and `ckf` are one filter: a Rao-Blackwellised mixture over friction with
 square-root cubature filters as its nodes. They differ in the fuzzy adaptation of the measurement
-noise: tuned by the ant colony, untuned, or none. The filter is based on paper 004 and departs from
-it in these points: kinematic prediction; wheel speed as a measurement; force from torque; residuals
-by total least squares; friction as a mixture instead of a state; stiffness, leaks and offsets as
-states; bounded adaptation in the direction of the errata.
+noise: tuned by ant colony optimisation, untuned, or none. The filter is based on paper 004 and
+departs from it in these points: kinematic prediction; wheel speed as a measurement; force from
+torque; residuals by total least squares; friction as a mixture instead of a state; stiffness, leaks
+(gravity in tilted accelerometers) and offsets as states; bounded adaptation in the direction of the
+errata.
 """
 
 from __future__ import annotations
@@ -65,8 +66,8 @@ def create(
     Args:
         name: a key of ESTIMATORS.
         vehicles: nominal vehicles, N of them.
-        memberships: the fuzzy sets. Estimators in TUNED require them; in other estimators they
-            replace the untuned sets.
+        memberships: the fuzzy sets of the noise adaptation. Estimators in TUNED require them; in
+            other estimators they replace the untuned sets.
         curve: tyre curve in place of the default one; only for `aco-fckf`, `fckf` and `ckf`.
 
     Raises:

@@ -1,11 +1,11 @@
 """Readings of one vehicle, prepared for a filter that steps once per sample.
 
 This module refuses implausible readings, detects gaps in time, replaces missing inputs and computes
-the grip in use. A reading that is missing, infinite or implausible is NaN in `now`; the filter
-leaves out that row of the measurement. Where the filter needs a reading as an input, `inputs` holds
-a replacement: zero and r*v_x for the accelerations, the last value for yaw rate and steering, and
-the wheel's share of m*a_x for torque. A missing wheel speed stays NaN, and that wheel is assumed to
-roll freely.
+the grip in use. A reading that is missing, infinite or implausible is NaN in `now`; the filter then
+leaves out the measurement equation that needs it. Where the filter needs a reading as an input,
+`inputs` holds a replacement: zero and r*v_x for the accelerations, the last value for yaw rate and
+steering, and for torque the wheel's share of the force m*a_x. A missing wheel speed stays NaN, and
+that wheel is assumed to roll freely.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ STEPPED = 2
 
 
 class InputTrack:
-    """State of one vehicle's input stream that is kept between samples."""
+    """Values of one vehicle's input signals that are kept from one sample to the next."""
 
     started: bool
     time: float  # of the last sample [s]
@@ -56,7 +56,8 @@ def take_sample_in(
 ) -> tuple[int, int, float]:
     """Process sample (18,) of a vehicle at `time` [s].
 
-    Return (health flags, REFUSED | BEGUN | STEPPED, seconds since the sample before).
+    Return (health flags; REFUSED, BEGUN or STEPPED: the filter skips the sample, starts at it or
+    steps to it; seconds since the previous sample).
     """
     begins = not track.started
     dt = time - track.time
@@ -80,7 +81,7 @@ def take_sample_in(
 
 @compiled
 def _reset_track(track: InputTrack) -> None:
-    """Reset the track of inputs to its state before the first sample, with the wheels straight
+    """Reset the record of inputs to its state before the first sample, with the wheels straight
     ahead.
     """
     track.started = True
@@ -103,7 +104,7 @@ def _store_inputs(track: InputTrack) -> None:
 @compiled
 def _fill_inputs(track: InputTrack, row: FloatArray, anew: bool) -> None:
     """Fill `inputs` from the readings, and replace missing values. If the last argument is True,
-    previous inputs do not serve as replacements.
+    values of earlier samples are not used as replacements.
     """
     now = track.now
     use = track.inputs
@@ -145,7 +146,8 @@ def _grip_used(track: InputTrack, row: FloatArray) -> float:
 def wheel_force(row: FloatArray, track: InputTrack, wheel: int, step: float) -> float:
     """Return the longitudinal force F_x = (T - J*omega')/R [N] of a wheel (paper 000, equation 10).
 
-    The two inputs that give omega' are `step` [s] apart.
+    omega' is the difference of the wheel speeds of two samples, which are `step` [s] apart, over
+    that time.
     """
     gain = track.inputs[S.OMEGA + wheel] - track.inputs_before[S.OMEGA + wheel]
     turning = 0.0 if math.isnan(gain) or step <= 0.0 else gain / step

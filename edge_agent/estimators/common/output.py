@@ -2,8 +2,8 @@
 
 The papers' filters report friction as the median and the 5 % and 95 % quantiles of a Gaussian,
 clipped to the range of the friction grid. These filters cannot separate the evidence of one visit
-from their prior. Therefore their bank has no evidence, and the agent publishes friction with its
-interval.
+(the passage of one map cell) from their prior. Therefore their bank has no evidence, and the agent
+publishes friction with its interval.
 """
 
 from __future__ import annotations
@@ -74,8 +74,9 @@ def write_quality(
 
 @compiled
 def write_friction(output: FloatArray, first: int, mu: float, std: float) -> None:
-    """Write the median, 5 % and 95 % quantiles of friction into columns `first` to `first` + 2, and
-    with the friction of the vehicle (`first` is Column.MU) P(mu < SLIPPERY_MU).
+    """Write the median, 5 % and 95 % quantiles of friction into columns `first` to `first` + 2. If
+    these are the columns of the whole vehicle (`first` is Column.MU), also write P(mu <
+    SLIPPERY_MU).
 
     `mu` and `std` are mean and standard deviation; each quantile is clipped to the range of the
     grid.
@@ -93,7 +94,8 @@ def write_friction(output: FloatArray, first: int, mu: float, std: float) -> Non
 @compiled
 def write_prior(output: FloatArray, first: int) -> None:
     """Write the median, 5 % and 95 % quantiles of the uniform prior, for an unknown road, into
-    columns `first` to `first` + 2, and with the friction of the vehicle P(mu < SLIPPERY_MU).
+    columns `first` to `first` + 2. If these are the columns of the whole vehicle, also write P(mu <
+    SLIPPERY_MU).
     """
     if first == Column.MU:
         output[Column.P_SLIPPERY] = (SLIPPERY_MU - LOWER) / (UPPER - LOWER)
@@ -116,7 +118,7 @@ def write_unknown(output: FloatArray) -> None:
 
 @compiled
 def limit_friction(mean: FloatArray, root: FloatArray, i: int, largest_std: float) -> None:
-    """Clip the friction, which is state i, to its possible range, and its standard deviation to
+    """Clip state i, the friction, to its possible range, and its standard deviation to at most
     `largest_std`.
     """
     mean[i] = min(max(mean[i], LOWER), UPPER)

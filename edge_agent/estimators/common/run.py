@@ -25,7 +25,7 @@ from schemas.vehicle import Vehicle
 
 
 class PaperMemory:
-    """Memory for one vehicle that the filters of all papers have in common."""
+    """Fields that the records of all papers' filters have in common; one record per vehicle."""
 
     row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
     track: InputTrack
@@ -46,7 +46,7 @@ def kernel_of(
     """Return the compiled kernel that `EstimatorBank` calls for a filter.
 
     Args:
-        begin: begins the filter at the sample in memory.track.
+        begin: starts the filter at the sample in memory.track.
         step: predicts by the given seconds and updates; returns False if the filter has diverged.
         report: writes motion and friction into the output; returns the friction [1] that is used to
             decide whether a wheel slides.
@@ -102,7 +102,7 @@ def new_filters(
     """Return an array of records of type `kind`, one per vehicle, with the vehicle's parameters in
     `row`.
 
-    All other fields are zero, as the kernel requires before the first sample.
+    All other fields are zero: this tells the kernel that no sample has been processed.
     """
     filters = records(kind, len(vehicles))
     filters["row"] = parameter_table(vehicles)

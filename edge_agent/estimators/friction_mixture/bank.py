@@ -35,7 +35,7 @@ def mixture_bank(
     parameters.
 
     `spreads` and `means` (N, STATES) are standard deviations and means of the priors of the states.
-    The default is the prior of the design.
+    By default they are the priors in the tables of `design`.
     """
     context = records(MixtureContext, 1)
     put_record(context["design"][0], design)
@@ -89,7 +89,8 @@ def _advance_filters(
 def close_visit(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, evidence: FloatArray
 ) -> None:
-    """Write the evidence (32,) of the visit that ends, and start the next visit from the prior.
+    """Write the evidence (32,) of the visit (passage of one map cell) that ends, and start the next
+    visit from the prior.
 
     The evidence is the log-likelihood of the visit's measurements on the friction grid, with
     maximum 0.
@@ -109,7 +110,7 @@ def close_visit(
 
 @compiled
 def write_estimates(memory: MixtureMemory, design: MixtureDesign, output: FloatArray) -> None:
-    """Write the current estimates of a vehicle's filter into `output`, except health."""
+    """Write the current estimates of a vehicle's filter into `output`, except the health flags."""
     if not memory.started:
         report_prior(design, output)
         return

@@ -21,8 +21,8 @@ def report_beliefs(
     own: FloatArray,
     visit: FloatArray,
 ) -> None:
-    """Write the friction belief and the visit evidence of each filter on the 32 bins of the
-    friction grid.
+    """Write the friction belief of each filter, and its evidence from the current visit (passage of
+    one map cell), on the 32 bins of the friction grid.
 
     `own` (N, 32) receives log(posterior/uniform), `visit` (N, 32) the log-likelihood of the current
     visit so far. Each row has maximum 0.

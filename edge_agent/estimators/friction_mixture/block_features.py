@@ -1,11 +1,12 @@
-"""Inputs of the measurement equations (`BlockFeatures`), computed from the sums of a block of
-samples.
+"""Inputs of the measurement equations (`BlockFeatures`), computed from the sums of a block (the
+samples within 0.05 s).
 
 Longitudinal force comes from torque, F_x = (T - J*omega')/R. Where torque or speed is missing, the
-force m*a_x is divided among the axles, with a correspondingly larger standard deviation
-(`drive_split.py`). An accelerometer measures gravity on a slope or bank, and the tyres must provide
-the same force. Therefore slope and bank count as force; offsets of the sensor do not. Lateral axle
-forces come from m*a_y and Iz*r' (paper 004, equation 2; errata 000 on signs and arms).
+force m*a_x is divided among the axles, with a larger standard deviation, because this division is
+uncertain (`drive_split.py`). On a slope or bank an accelerometer also measures gravity, and the
+tyres must carry exactly this force. Therefore the forces here include slope and bank; offsets of
+the sensor are subtracted. Lateral axle forces come from m*a_y and Iz*r' (paper 004, equation 2;
+errata 000 on signs and arms).
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ LIKELY = 2.0  # and of what is unknown of the radii
 
 @compiled
 def block_features(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> int:
-    """Fill all fields of `features` except duration and speed, which the caller sets; return the
-    health flags.
+    """Compute the inputs of the measurement equations from the sums of the block, and write them to
+    `features`; return the health flags. The caller has already set duration and speed.
     """
     row = memory.row
     last = memory.last
@@ -79,8 +80,8 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
 
 @compiled
 def mean_or(block: BlockSums, channel: int, otherwise: float) -> float:
-    """Return the mean of the valid samples of a channel in the block, or `otherwise` if the channel
-    has no valid sample.
+    """Return the mean of the valid samples of a channel in the block (the samples within 0.05 s),
+    or `otherwise` if the channel has no valid sample.
     """
     return block.sums[channel] / block.counts[channel] if block.counts[channel] > 0 else otherwise
 
@@ -99,7 +100,8 @@ def _average_kinematics(block: BlockSums, features: BlockFeatures) -> None:
 
 @compiled
 def _steer_rate(memory: MixtureMemory, duration: float) -> float:
-    """Return the rate of change of the mean front steering angle within the block [rad/s]."""
+    """Return the rate of change of the mean front steering angle within the block (the samples
+    within 0.05 s) [rad/s]."""
     now = memory.last.delta
     before = memory.last.delta_before
     return float(0.5 * (now[0] + now[1] - before[0] - before[1]) / duration)
@@ -109,8 +111,8 @@ def _steer_rate(memory: MixtureMemory, duration: float) -> float:
 def _compute_wheel_forces(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures
 ) -> int:
-    """Compute the force over load of the four wheels, and the part of `noise_std` that comes from
-    the noise of the forces; return the health flags.
+    """Compute the longitudinal force over load of the four wheels, and the part of their noise
+    (`features.noise_std`) that comes from the forces; return the health flags.
     """
     health = 0
     loads = features.loads
@@ -154,8 +156,8 @@ def _compute_wheel_forces(
 
 @compiled
 def lone_axle(memory: MixtureMemory, features: BlockFeatures) -> int:
-    """Return the only axle with known torque, 0 front or 1 rear; return -1 if torque is known on
-    both axles or on no axle.
+    """Return 0 if torque is known on the front axle only, 1 if on the rear axle only, and -1 if on
+    both axles or on neither.
     """
     known = 0
     axle = -1
@@ -197,8 +199,9 @@ def axle_force(memory: MixtureMemory, features: BlockFeatures, axle: int) -> flo
 
 @compiled
 def _compute_side_forces(memory: MixtureMemory, features: BlockFeatures) -> None:
-    """Compute the lateral force over load of both axles, its derivatives by the leak of gravity and
-    by a_y, and each wheel's share of the axle load.
+    """Compute the lateral force over load of both axles, and each wheel's share of the axle load.
+    Also compute the derivatives of the force by a_y, and by the leak (the share of a_y that is
+    gravity felt by the rolled body).
 
     The lateral force is NaN if a_y is missing.
     """
@@ -230,7 +233,7 @@ def _compute_side_forces(memory: MixtureMemory, features: BlockFeatures) -> None
 
 @compiled
 def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
-    """Set the lateral force of an axle to NaN where its slip or the yaw moment was not measured;
+    """Set the lateral force of an axle to NaN if its slip or the yaw moment was not measured;
     return the health flags.
     """
     health = 0
@@ -250,8 +253,9 @@ def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
 
 @compiled
 def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> None:
-    """Fill `features.noise_std` and the slip noise: combine the noise of slip and force. Each of
-    the two enters the total-least-squares residual with half of its variance.
+    """Write the standard deviation of each measurement residual to `features.noise_std`, and the
+    noise of the slips. The residual is a total-least-squares distance between slip and force. The
+    noise of each enters with half of its variance.
     """
     row = memory.row
     constants = design.constants
@@ -314,9 +318,9 @@ def wheel_speed_jump(
 ) -> float:
     """Return the difference [m/s] between a wheel's speed and its smoothed speed; 0 where unknown.
 
-    Before the comparison, the smoothed speed is advanced by the car's acceleration. A wheel that
-    spins up or locks keeps its difference for several blocks; a bump in the road lasts one or two
-    blocks.
+    Before the comparison, the smoothed speed is advanced by the car's acceleration. The comparison
+    distinguishes a wheel that spins up or locks, whose difference lasts for several blocks (of 0.05
+    s), from a bump in the road, which lasts one or two.
     """
     now = at_centre(memory.row, features, wheel)
     usual = memory.usual_rolling
@@ -342,10 +346,11 @@ def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
 
 @compiled
 def _compute_information(constants: Constants, features: BlockFeatures) -> None:
-    """Compute informs_x and informs_y of both axles: the share (0 to 1) with which deviations of
-    the stiffness states count in the axle's slips.
+    """Compute informs_x and informs_y of both axles: factors, 0 to 1, on the effect that the
+    stiffness states have on the slips of the axle.
 
-    At small forces the stiffness suggested by slip is only noise.
+    The factors are near 0 at small forces, because the stiffness that slip then suggests is only
+    noise.
     """
     for axle in range(2):
         along = max(abs(features.force[2 * axle]), abs(features.force[2 * axle + 1]))
@@ -360,12 +365,12 @@ def _compute_information(constants: Constants, features: BlockFeatures) -> None:
 def unexplained_slip_difference(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures
 ) -> float:
-    """Return the largest slip difference between the left and right wheel of an axle, as far as
-    their forces do not explain it.
+    """Return the largest slip difference between the left and right wheel of an axle, over both
+    axles, minus the part that their forces explain.
 
-    The unit is linear force over load [1]. Wheels of unequal radius always differ in slip.
-    Therefore the estimated difference of the radii is subtracted, with an allowance for its
-    uncertainty.
+    Slip is expressed as the force over load of a linear tyre [1]. Wheels of unequal radius always
+    differ in slip. Therefore the estimated difference of the radii is subtracted, with an allowance
+    for its uncertainty.
     """
     row = memory.row
     block = memory.block
@@ -399,8 +404,8 @@ def grip_demand(features: BlockFeatures) -> float:
     """Return the larger force over load of the two axles [1]; a missing lateral force counts as
     zero.
 
-    The two wheels of an axle are combined, because the share of an almost unloaded inner wheel is
-    unreliable.
+    The forces of the two wheels of an axle are added, because force over load of an almost unloaded
+    inner wheel would be unreliable.
     """
     most = 0.0
     for axle in range(2):

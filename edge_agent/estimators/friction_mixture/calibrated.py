@@ -33,9 +33,10 @@ EACH_COMPLIANCE: Final = 0.003  # [rad] that another load and other tyres make o
 
 def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:
     """Return the standard deviations (N, STATES) of the states' priors: `std` (STATES,), reduced
-    for states to which a vehicle's calibration gives a value.
+    for those states that a vehicle's calibration has measured.
 
-    The means do not change, because the calibration already corrects the signals (inputs.correct).
+    The means of the priors stay as they are, because the signals have already been corrected by the
+    calibration (inputs.correct).
     """
     spreads = np.repeat(std[None, :STATES], len(vehicles), axis=0)
     for row, vehicle in zip(spreads, vehicles, strict=True):
@@ -55,7 +56,7 @@ def means_of(vehicles: Sequence[Vehicle], mean: FloatArray) -> FloatArray:
     vehicle where it is known.
 
     Understeer learned from drives takes precedence over the value computed from the axle data of
-    the vehicle file. Without both, the mean over all vehicles is used.
+    the vehicle file. If neither exists, the mean over all vehicles is used.
     """
     means = np.repeat(mean[None, :STATES], len(vehicles), axis=0)
     for row, vehicle in zip(means, vehicles, strict=True):

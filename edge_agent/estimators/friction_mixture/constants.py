@@ -1,9 +1,9 @@
-"""All numbers of the friction mixture, with unit and reason: one table, and one record for the
-kernels.
+"""All constants of the friction mixture with unit and reason, as a table for readers and as a
+record for the compiled kernels.
 
 Values marked (vehicle) follow from typical uncertainty of a vehicle and its sensors: mass 3 %,
 inertia 5 %, stiffness 10 to 12 %, torque 3 %, and white noise and offsets of ordinary inertial
-sensors. Values marked (errata) were measured.
+sensors. Values marked (errata) were measured; the errata of the papers describe how.
 """
 
 from __future__ import annotations

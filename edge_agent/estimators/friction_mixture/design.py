@@ -48,7 +48,8 @@ class MixtureDesign(NamedTuple):
 
 
 def nominal_states(constants: Constants) -> Nominal:
-    """Return the prior (mean, standard deviation, return time) of the states of a node."""
+    """Return the prior of the states of a node (filter of one friction hypothesis): mean, standard
+    deviation, and time within which a state returns to the prior."""
     mean = np.zeros(STATES)
     std = np.ones(STATES)
     time = np.full(STATES, np.inf)

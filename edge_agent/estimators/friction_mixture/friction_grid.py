@@ -1,5 +1,5 @@
-"""The friction hypotheses: a fixed grid of nodes with its prior, road change, quantiles and
-evidence.
+"""The friction hypotheses (nodes) on a fixed grid, and the operations on their probabilities:
+prior, change of the road, quantiles and evidence.
 
 Legend
     mu          node values, equidistant in sqrt(mu)              (K,)
@@ -69,8 +69,8 @@ def change_road(
 
 @compiled
 def multiply_likelihood(w: FloatArray, log_likelihood: FloatArray) -> None:
-    """Multiply the probabilities w (K,) by exp(log_likelihood) and normalise. `log_likelihood` (K,)
-    must be about 0 or below.
+    """Multiply the probabilities w (K,) by exp(log_likelihood) and normalise. The largest value of
+    `log_likelihood` (K,) must be near 0, so that exp does not overflow.
     """
     total = 0.0
     for j in range(w.shape[0]):
@@ -82,8 +82,8 @@ def multiply_likelihood(w: FloatArray, log_likelihood: FloatArray) -> None:
 
 @compiled
 def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> float:
-    """Return the q-quantile of mu under a density that is linear between nodes and constant beyond
-    the first and last node.
+    """Return the q-quantile of mu (friction). The density is linear between nodes (grid values) and
+    constant beyond the first and last node.
     """
     count = mu.shape[0]
     total = 0.0
@@ -106,7 +106,8 @@ def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> floa
 
 @compiled
 def probability_below(mu: FloatArray, prior: FloatArray, w: FloatArray, limit: float) -> float:
-    """Return P(mu < limit) under the density of `quantile`, for a limit between two nodes."""
+    """Return P(mu < limit) of the friction mu, for a limit between two nodes (grid values). The
+    density is the same as in `quantile`."""
     count = mu.shape[0]
     below = total = 0.0
     for j in range(count + 1):

@@ -1,5 +1,5 @@
-"""The grip in use as a lower limit of friction: values below it are penalised and never reported as
-the upper end.
+"""The grip in use (force over load) as a lower limit of friction: smaller frictions get a penalty,
+and the upper end of the reported interval is never below the grip in use.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ def note_grip(grip: GripInUse, ax: float, ay: float, dt: float) -> None:
 
 @compiled
 def guard_penalty(grip: GripInUse, constants: Constants, side_mu: FloatArray) -> float:
-    """Return the penalty [nat] of a node whose friction side_mu (2,) lies below the grip in use."""
+    """Return the penalty [nat] of a friction hypothesis (node): side_mu (2,) is its friction on the
+    left and right. The penalty is 0 unless this friction lies below the grip in use."""
     lack = grip.slow - constants.guard_margin - 0.5 * (side_mu[0] + side_mu[1])
     return float(min(0.5 * (max(lack, 0.0) / constants.guard_std) ** 2, LARGEST_LOSS))
 
@@ -64,7 +65,7 @@ def lower_while_sliding(slides: float, used: float, lower: float) -> float:
     grip in use.
 
     Args:
-        slides: membership in "a wheel slides" [1].
+        slides: fuzzy degree to which a wheel slides, 0 to 1.
         used: grip used within the last second, of the axle that uses more [1].
         lower: lower end according to the node probabilities [1].
     """

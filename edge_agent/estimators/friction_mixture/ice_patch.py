@@ -1,13 +1,14 @@
 """Model of short ice patches: on bridges, in shade, where water ran over the road.
 
-After a few metres without grip demand, the estimator lowers the lower end of the friction interval,
-because the road may be icy again. The median is unaffected. In the mixture the road changes only
-once in hundreds of metres, so that learned friction lasts. With the mixture alone, the lower end
-would fall to ice only long after the car has passed a patch.
+After a few metres without large tyre forces, the estimator lowers the lower end of the friction
+interval, because the road may be icy again. The median is unaffected. The mixture assumes that the
+road changes only once in hundreds of metres, so that learned friction lasts. With the mixture
+alone, the lower end would fall to ice only long after the car has passed a patch.
 
-Therefore this module stores, for each ice node, the probability that the car is now on a patch.
-Within the length of a patch this probability grows to the prior of the node minus the mixture's
-weight. Evidence against ice reduces it. Only the reported lower end uses this probability.
+Therefore this module stores, for each ice node (hypothesis of low friction), the probability that
+the car is now on a patch. Within the length of a patch this probability grows to the prior of the
+node minus the mixture's weight. Evidence against ice reduces it. Only the reported lower end uses
+this probability.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ def grow_patches(memory: MixtureMemory, design: MixtureDesign, metres: float) ->
 
 @compiled
 def shrink_patches(patch: FloatArray, weight: FloatArray, log_likelihood: FloatArray) -> None:
-    """Reduce the patch probabilities (PATCH_NODES,) where the block's likelihood is smaller under
-    the patch than under the mixture of all nodes (K,).
+    """Reduce the patch probabilities (PATCH_NODES,) of those ice hypotheses that explain the
+    measurements of the block (0.05 s) worse than the mixture of all nodes (K,) does.
     """
     usual = 0.0
     for j in range(weight.shape[0]):

@@ -1,5 +1,5 @@
 """Intake of a sample: rejection of impossible readings, a filter of the yaw rate, and the sums of
-the block.
+the block (the samples within 0.05 s).
 
 Missing readings are replaced: a_x by zero and a_y by r*v_x, both with the process noise of a random
 walk; the yaw rate by the speed difference of the rear wheels; steering by its last value. All other
@@ -44,8 +44,8 @@ LOST_AY = 0.7  # [m/s/s^.5] random walk without a_y or yaw rate
 def take_sample(
     memory: MixtureMemory, design: MixtureDesign, time: float, sample: FloatArray
 ) -> tuple[int, bool]:
-    """Add a sample to the block; return the health flags of the sample, and True if the block is
-    complete.
+    """Add a sample to the block (the samples within 0.05 s); return the health flags of the sample,
+    and True if the block is complete.
     """
     last = memory.last
     dt = time - last.time
@@ -78,7 +78,8 @@ def take_sample(
 
 @compiled
 def begin_block(memory: MixtureMemory) -> None:
-    """Clear the sums and begin a new block at the last sample."""
+    """Clear the sums and begin a new block (the samples within the next 0.05 s) at the last
+    sample."""
     last = memory.last
     block = memory.block
     block.time = last.time
@@ -128,8 +129,8 @@ def _filter_yaw_rate(memory: MixtureMemory, dt: float) -> None:
 
 @compiled
 def _drop_outlier(value: float, used: float, read: float) -> float:
-    """Return the accelerometer's reading, or NaN if it is far from both the last used and the last
-    read value.
+    """Return the accelerometer's reading, or NaN if it is far both from the last accepted value and
+    from the last value of the signal.
     """
     jumps = abs(value - read) > JUMP_M_S2 and abs(value - used) > JUMP_M_S2
     return math.nan if jumps else value
@@ -139,8 +140,8 @@ def _drop_outlier(value: float, used: float, read: float) -> float:
 def _integrate_motion(
     memory: MixtureMemory, constants: Constants, dt: float, ax: float, ay: float, turning: bool
 ) -> None:
-    """Integrate the velocity gained since the block began, in the current vehicle axes, over a step
-    of dt [s].
+    """Integrate the velocity that the vehicle has gained since the block (0.05 s) began over a
+    further step of dt [s]. It is expressed in the current vehicle axes.
 
     The solution is exact for inputs that are constant over dt. `ax` and `ay` [m/s^2] are NaN where
     missing; `turning` is True if the yaw rate is known.

@@ -23,7 +23,8 @@ class PlanarVector:
 
 
 class VelocityGain:
-    """Velocity [m/s] gained since the block began, in the current vehicle axes."""
+    """Velocity [m/s] that the vehicle has gained since the block (0.05 s) began, in the current
+    vehicle axes."""
 
     measured: PlanarVector  # by the measured accelerations
     leak_y: PlanarVector  # the part of it from a_y
@@ -92,7 +93,7 @@ class RollingMotion:
 
 
 class WheelSlip:
-    """Slip indicators that are derived from the wheel speeds alone."""
+    """Indicators of sliding wheels that are derived from the wheel speeds alone."""
 
     held: float  # membership of the last second in "a wheel slides" [1]
     begins: float  # what this block adds to it [1]
@@ -188,7 +189,7 @@ def new_filters(
     processed.
 
     `means` and `spreads` (N, STATES) are the means and standard deviations of the state priors; the
-    return times are those of `nominal`.
+    times within which states return to the prior are those of `nominal`.
     """
     filters = records(MixtureMemory, len(rows))
     prior = filters["nominal"]

@@ -1,5 +1,5 @@
-"""Operations on all nodes: mixing after a road change, moment matching, and replacement of diverged
-nodes.
+"""Operations on all nodes (filters of one friction hypothesis each): mixing after a road change,
+moment matching, and replacement of diverged nodes.
 
 Legend
     m_j, P_j, w_j   mean (n,), covariance (n, n) and probability of node j
@@ -42,14 +42,15 @@ LARGEST_DRIFT = 0.5
 
 @compiled
 def active_nodes(memory: MixtureMemory) -> int:
-    """Return the number of active nodes: NODES, or ALL_NODES while the split nodes are active."""
+    """Return the number of active nodes (friction hypotheses): NODES, or ALL_NODES while those of
+    split roads are active too."""
     return ALL_NODES if memory.split else NODES
 
 
 @compiled
 def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Activate the split nodes at the first sign of a split road, and deactivate them once they are
-    improbable.
+    """Activate the nodes of split roads (different friction left and right) at the first sign of
+    such a road, and deactivate them once they are improbable.
     """
     weight = memory.weight
     visit = memory.visit_weight
@@ -77,8 +78,9 @@ def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
 def apply_road_change(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, metres: float
 ) -> None:
-    """Apply a possible road change over `metres`: move probability between nodes, and mix the state
-    of each node with the states of the nodes from which probability comes.
+    """Account for a possible change of the road within `metres`: move probability between nodes
+    (friction hypotheses). The state of a node is mixed with the states of the nodes from which its
+    probability comes.
     """
     count = active_nodes(memory)
     constants = design.constants
@@ -118,7 +120,8 @@ def mix_node(
     overall_mean: FloatArray,
     overall_covariance: FloatArray,
 ) -> None:
-    """Mix one node with the whole mixture: mean (n,) and covariance (n, n) are changed in place."""
+    """Mix the state of one node (friction hypothesis) with that of the whole mixture: mean (n,) and
+    covariance (n, n) are changed in place."""
     if zeta < LEAST_MIXING:
         return
     n = mean.shape[0]
@@ -168,8 +171,8 @@ def match_moments(
 def reset_diverged(
     mean: FloatArray, root: FloatArray, weight: FloatArray, constants: Constants
 ) -> None:
-    """Reset diverged nodes: each gets the state of the most probable node, and a weight of almost
-    zero.
+    """Reset diverged nodes (filters of one friction hypothesis): each gets the state of the most
+    probable node, and a weight of almost zero.
     """
     best = int(np.argmax(weight))
     for j in range(weight.shape[0]):

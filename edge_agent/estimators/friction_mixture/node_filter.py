@@ -8,9 +8,11 @@ Legend
     D           derivative of the rows by a state that they depend on linearly
 
 The measurement rows are nonlinear only in velocity and stiffness. Therefore the third-degree
-cubature rule is applied in these four dimensions. Leak, steering, shape and gain enter exactly, by
-the derivative D (a Rao-Blackwellised rule). Rows are applied one after the other (Potter 1963): L
-<- L*(I - g*f*f'), with g such that no covariance is ever subtracted.
+cubature rule is applied in these four dimensions. The rows are linear in the other states: leak
+(gravity that a tilted accelerometer measures), steering error, shape of the tyre curve and gain of
+torque. These enter exactly, by the derivative D (a Rao-Blackwellised rule). Rows are applied one
+after the other (Potter 1963): L <- L*(I - g*f*f'), with g such that no covariance is ever
+subtracted.
 """
 
 from __future__ import annotations
@@ -50,8 +52,8 @@ DOUBTED = 0.05  # of distrust_noise, at the brink of it
 
 
 class NodeUpdate(NamedTuple):
-    """Result of the measurement update of one node, such as its log-likelihood and its number of
-    rows.
+    """Result of the measurement update of one node: its log-likelihood, the number of measurement
+    rows used, and similar values.
     """
 
     log_likelihood: float  # with the inflated R and the price of sliding [nat]
@@ -68,11 +70,12 @@ def update_node(
     """Run the cubature update of node j with R times `inflation`. The update changes the node's
     mean and scratch.root[j].
 
-    R of the axles is larger still where the axles are distrusted, and where the inputs are steady.
-    With steady inputs, errors of the tyre curve and of offsets repeat from block to block; if they
-    were treated as noise, the filter would average them into stiffness and shape.
+    R (measurement noise) of the axles' rows is increased further if these rows contradict the
+    model, and while the inputs are steady. With steady inputs, errors of the tyre curve and of
+    offsets repeat from block to block; if they were treated as noise, the filter would average them
+    into stiffness and shape.
 
-    The function also writes the innovation and its theoretical variance without the inflation.
+    The function also writes the innovation and the variance expected for it without `inflation`.
     """
     constants = design.constants
     nominal = memory.nominal
@@ -117,10 +120,11 @@ def update_node(
 
 @compiled
 def linearize_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
-    """Fill node.derivative of node j, compute node.force at the node's mean, and return the penalty
-    of sliding [nat].
+    """Compute node.derivative and, at the node's mean state, node.force of node j; return the
+    penalty [nat] for sliding wheels.
 
-    Leak and offset of a_y change the same forces, so one derivative gives the other.
+    The leak (gravity in a_y when the body rolls) and the offset of a_y change the same forces.
+    Therefore the derivative by the one is computed from the derivative by the other.
     """
     constants = design.constants
     curve = design.curve
@@ -176,7 +180,8 @@ def linearize_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratc
 def _by_wheel_speeds(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int
 ) -> None:
-    """Compute the derivatives of the rows by the wheel radii and by the lag of the wheel speeds.
+    """Compute the derivatives of the rows by the four wheel radii, and by the time lag of the wheel
+    speed signals.
 
     Each wheel's row depends on the speed of this wheel. One evaluation with all four radii changed
     gives all derivatives, because the radii hardly change the rows of the axles. node.force must
@@ -210,8 +215,8 @@ def _by_wheel_speeds(
 def weigh_slopes(
     curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, flat: float, node: NodeWorkspace
 ) -> float:
-    """Fill node.noise with the noise variances of the rows at node.slip, and return the penalty of
-    sliding [nat].
+    """Compute node.noise, the noise variances of the measurement rows at node.slip; return the
+    penalty [nat] for sliding wheels.
 
     The penalty applies to wheels on the flat part of the curve: a sliding wheel may have any slip,
     so its probability density is low.
@@ -308,16 +313,16 @@ def doubted_noise(trust: Trust, constants: Constants) -> float:
 
 @compiled
 def rear_noise(memory: MixtureMemory, constants: Constants) -> float:
-    """Return the factor on R of the rear axle's rows while the front axle is already on another
-    surface.
+    """Return the factor on R (measurement noise) of the rear axle's rows. It is above 1 while the
+    front axle is already on another surface than the rear axle.
     """
     return constants.rear_unlike if memory.last.time < memory.slip.rear_unlike_until else 1.0
 
 
 @compiled
 def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
-    """Return the penalty [nat] of a node's vehicle and sensor states: half of their squared
-    distance from the prior in standard deviations. `mean` has shape (n,).
+    """Return the penalty [nat] for deviations of a node's vehicle and sensor states from their
+    prior: half the sum of the squared deviations in standard deviations. `mean` has shape (n,).
     """
     total = 0.0
     for i in range(NodeState.LN_KX, mean.shape[0]):
@@ -331,9 +336,9 @@ def take_rows(
 ) -> tuple[float, int]:
     """Update a node with the innovations node.residual (6,), one row after the other.
 
-    Return (negative log-likelihood [nat] without constants, number of rows applied): half of the
-    normalised squares plus the ln det S terms. `axle_penalty` scales the ln det S term of the
-    axles; the rows of the wheels have no such term.
+    Return (negative log-likelihood [nat] without constants, number of rows applied): the first is
+    half of the normalised squared innovations plus the ln det S terms. `axle_penalty` scales the ln
+    det S term of the axles; the rows of the wheels have no such term.
     """
     loss = 0.0
     used = 0
@@ -376,8 +381,8 @@ def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> Non
 def predict_node(
     memory: MixtureMemory, scratch: Scratch, j: int, turn_cos: float, turn_sin: float
 ) -> None:
-    """Predict node j to the end of the block: exact rotation, gained velocity, process variances
-    scratch.process.
+    """Predict the state of node j to the end of the block (0.05 s): rotate the velocity by the yaw
+    angle, add the gained velocity, and add the process variances scratch.process.
 
     The prediction is affine, so cubature is exact: covariance <- F*L*(F*L)' + diag(noise). Vehicle
     and sensor states return to their prior by the factors scratch.keep. The function changes

@@ -1,11 +1,11 @@
 """The reported friction interval, with levels at both ends that give the stated coverage.
 
-Evidence is tempered so that a repeated error does not count twice. Therefore, after many
-measurements, the node probabilities are wider than the actual errors. Without measurements they
-equal the prior, which has the right width. The level of the upper end moves from one case to the
-other with the information gained, which is the divergence of the node probabilities from the prior
-(Kullback and Leibler 1951). It moves further for a car that matches its vehicle file
-(`trust.nominal_agreement`).
+The filter weakens (tempers) evidence so that a repeated error does not count twice. Therefore,
+after many measurements, the node probabilities are wider than the actual errors. Without
+measurements they equal the prior, which has the right width. The level of the upper end moves from
+one case to the other with the information gained, which is the divergence of the node probabilities
+from the prior (Kullback and Leibler 1951). It moves further if the car behaves as its vehicle file
+predicts (`trust.nominal_agreement`).
 
 P(mu < SLIPPERY_MU) is computed from the same node probabilities. Therefore it tends to be too close
 to that of the prior.
@@ -50,8 +50,8 @@ def find_interval(
     """Compute median, interval and P(mu < SLIPPERY_MU) of friction from the probabilities (NODES,) of the
     single-friction nodes.
 
-    `patch` (PATCH_NODES,) are the probabilities of a possible ice patch. `blended` (NODES,) is
-    scratch. `likeness`, 0 to 1, is the agreement of the car with its vehicle file.
+    `patch` (PATCH_NODES,) are the probabilities that the car is on an ice patch. `blended` (NODES,)
+    is scratch. `likeness`, 0 to 1, is the agreement of the car with its vehicle file.
     """
     friction.median = quantile(design.mu, design.prior, weight, 0.5)
     friction.upper = upper_end(design, weight, likeness)
@@ -68,8 +68,8 @@ def find_interval(
 def upper_end(design: MixtureDesign, weight: FloatArray, likeness: float) -> float:
     """Return the upper end of the friction interval for node probabilities (NODES,).
 
-    The level is chosen so that the true friction lies above the result in at most one case of
-    twenty.
+    The quantile level is chosen so that the true friction lies above the result in at most one case
+    of twenty.
     """
     learned = 0.0
     for j in range(weight.shape[0]):

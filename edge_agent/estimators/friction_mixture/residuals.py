@@ -1,4 +1,5 @@
-"""The measurement equations of one node: residuals between slip and force by total least squares.
+"""The measurement equations of one node (filter of one friction hypothesis): distances of slip and
+force from the tyre curve, by total least squares.
 
 Legend
     mu          friction of the node under the wheel's side [1]
@@ -54,8 +55,8 @@ def curve_distance(along: float, across: float) -> float:
 
 @compiled
 def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
-    """Return the velocity (forward, left) [m/s] gained in the block, corrected by the leak,
-    offsets, slope and bank in state x (n,).
+    """Return the velocity (forward, left) [m/s] gained in the block (0.05 s), corrected by the
+    states in x (n,): leak of gravity, sensor offsets, slope and bank.
 
     An offset of a_y has the same effect as an offset of a_x, rotated by 90 degrees.
     """
@@ -98,10 +99,10 @@ def find_slips(
     node: NodeWorkspace,
 ) -> None:
     """Fill node.slip with the slips of wheels and axles at node.point, a state at the beginning of
-    the block.
+    the block (0.05 s).
 
     `mean` (n,) is the node's mean. Where the force is too small to distinguish stiffness from slip
-    noise, the log stiffness of the point is moved towards the mean.
+    noise, the logarithm of stiffness in node.point is moved towards that of `mean`.
     """
     x = node.point
     slip = node.slip
@@ -143,8 +144,8 @@ def steering_offset(x: FloatArray, features: BlockFeatures) -> float:
     """Return the true minus the measured steering angle of the front wheels [rad], positive to the
     left, for state x (n,).
 
-    The front axle yields to its own lateral force: steering column and bushings of production cars
-    yield up to 35 mrad/g.
+    The difference includes the compliance of the front axle: steering column and bushings of
+    production cars yield up to 35 mrad per g of lateral acceleration.
     """
     lagged = x[NodeState.STEER] + x[NodeState.LAG_STEER] * features.steer_rate
     return float(
@@ -158,8 +159,8 @@ def steering_offset(x: FloatArray, features: BlockFeatures) -> float:
 def find_shape_force(
     curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace
 ) -> None:
-    """Fill node.shape_force at node.slip: the change of force over load per standard deviation of
-    the curve's shape.
+    """Compute node.shape_force: the change of force over load at node.slip if the shape of the tyre
+    curve changes by one standard deviation.
 
     side_mu (2,) is the friction under the left and right wheels.
     """
@@ -189,8 +190,9 @@ def correct_forces(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Fill node.force and node.slip_at_force with the measured values, corrected by the leak,
-    offsets, torque gain and shape of node.point.
+    """Compute node.force, the measured force over load, and node.slip_at_force, the slip that the
+    tyre curve gives for it. Both are corrected by the states in node.point: leak of gravity,
+    offsets, torque gain and curve shape.
 
     Without torque only the sum of both sides is measured. On a split road the slippery side then
     takes at most SPLIT_LIMIT of its friction, and the other side takes the rest. The unequal forces
@@ -277,8 +279,8 @@ def find_residuals(
     node: NodeWorkspace,
     out: FloatArray,
 ) -> None:
-    """Compute out (6,): the distance e of each row at node.slip and node.force, NaN where a reading
-    of the row is missing.
+    """Compute out (6,): for each measurement row, the distance e of node.slip and node.force from
+    the tyre curve; NaN if a reading of the row is missing.
     """
     slip = node.slip
     force = node.force

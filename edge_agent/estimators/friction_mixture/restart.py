@@ -1,5 +1,5 @@
 """Start and restart of a filter: at the first sample, after a gap in time, and when wheel speeds
-contradict every node for a long time.
+contradict every friction hypothesis (node) for a long time.
 """
 
 from __future__ import annotations
@@ -97,7 +97,8 @@ def start_vehicle(
 
 @compiled
 def forget_vehicle(memory: MixtureMemory) -> None:
-    """Reset the vehicle and sensor states in the moments of the mixture to their prior."""
+    """Reset the vehicle and sensor states in the mean and covariance of the mixture to their
+    prior."""
     nominal = memory.nominal
     covariance = memory.overall_covariance
     for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
@@ -110,7 +111,8 @@ def forget_vehicle(memory: MixtureMemory) -> None:
 
 @compiled
 def put_split_to_sleep(memory: MixtureMemory) -> None:
-    """Deactivate the split nodes, and normalise the weights of the other nodes."""
+    """Deactivate the nodes of split roads (different friction left and right), and normalise the
+    weights of the other nodes."""
     if not memory.split:
         return
     memory.split = False
@@ -124,7 +126,8 @@ def put_split_to_sleep(memory: MixtureMemory) -> None:
 
 @compiled
 def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
-    """Set v_x of all nodes to `speed` [m/s] and v_y to zero.
+    """Set v_x of all nodes (filters of one friction hypothesis each) to `speed` [m/s] and v_y to
+    zero.
 
     If `speed` is NaN, all nodes keep the mixture's v_x with standard deviation `spread` [m/s].
     """
@@ -146,10 +149,10 @@ def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
 
 @compiled
 def bridge_gap(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
-    """Bridge a gap of dt [s] and return the health flag RESET.
+    """Continue the filter after a gap of dt [s] without samples; return the health flag RESET.
 
-    Friction returns towards the prior over the metres driven during the gap, and the motion
-    restarts.
+    The friction estimate moves towards the prior according to the metres driven during the gap, and
+    the motion estimate restarts.
     """
     last = memory.last
     now = memory.last.now
@@ -181,7 +184,7 @@ def reset_to_wheel_speed(
     If wheels have agreed for a long time, vehicle states and friction are reset together with the
     motion. If wheels have just begun to roll without force, after a slide, only the motion is
     reset. Without a reset, nodes that assume these wheels slide would not recover, because the tyre
-    curve is flat there. The larger noise during a slide causes neither of these resets.
+    curve is flat there. The larger measurement noise during a slide does not cause a reset.
     """
     rolling = memory.rolling
     if not math.isnan(rolling.ahead):
@@ -204,8 +207,8 @@ def reset_to_wheel_speed(
 
 @compiled
 def free_speed(memory: MixtureMemory, features: BlockFeatures) -> float:
-    """Return the common speed [m/s] of wheels that roll freely, because they turn alike and without
-    force; NaN if they do not.
+    """Return the common speed [m/s] of the wheels if all turn alike and without force, that is,
+    roll freely; otherwise return NaN.
     """
     slowest = math.inf
     fastest = -math.inf

@@ -2,11 +2,11 @@
 axle does not slide.
 
 A tyre beyond its peak does not keep a constant slip: it locks or spins up within a tenth of a
-second unless a controller acts, and four tyres never do so alike. Therefore four wheels that agree
-for a second give the speed, apart from the slip that their force needs. Without this rule, the
-filter could explain a lasting accelerometer offset only by four wheels sliding on ice. This
-explanation fits any data, so the filter would keep it forever. In the same way, a rear axle with
-hardly any lateral force does not slide sideways, so it gives the lateral velocity.
+second unless a controller acts, and four tyres never do so alike. Therefore, if four wheels agree
+for a second, the speed is computed from them with the slip that their force needs. Without this
+rule, the filter could explain a lasting accelerometer offset only by four wheels sliding on ice.
+This explanation fits any data, so the filter would keep it forever. In the same way, a rear axle
+with hardly any lateral force does not slide sideways, so the lateral velocity is computed from it.
 """
 
 from __future__ import annotations

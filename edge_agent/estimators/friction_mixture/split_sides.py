@@ -1,9 +1,9 @@
 """Split roads: a low friction under one side of the vehicle and a high friction under the other,
 either way round.
 
-The friction of each side is divided into cells of a coarse grid. A node represents a triangular
-density around the middle of its cell that extends to the middles of the neighbouring cells.
-Therefore a friction between two nodes is covered by both.
+The friction of each side is divided into cells of a coarse grid. A node (friction hypothesis)
+represents a triangular density around the middle of its cell that extends to the middles of the
+neighbouring cells. Therefore both nodes cover a friction that lies between them.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def triangular_cells(edges: tuple[float, ...]) -> list[Triangle]:
 
 
 def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
-    """Return the friction and prior probability of all nodes. The split nodes together have the
-    prior probability `split_prior`.
+    """Return the friction under both sides and the prior probability of all nodes (friction
+    hypotheses). The split nodes together have the prior probability `split_prior`.
 
     mu and prior (K,) are those of the single-friction nodes.
     """
@@ -101,8 +101,8 @@ def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
 
 @compiled
 def project_weights(w: FloatArray, share: FloatArray, out: FloatArray) -> None:
-    """Compute out (K,): the probabilities of the single-friction nodes plus those of the split
-    nodes.
+    """Compute out (K,): the probabilities of the nodes with one friction, plus those of the split
+    nodes (different friction left and right).
 
     `share` (SPLIT_NODES, K) distributes the probability of each split node over the K nodes.
     """

@@ -1,10 +1,10 @@
-"""Processing of one sample of one vehicle: update the sums of the block and, at its end, run one
-step of the mixture.
+"""Processing of one sample of one vehicle: add the sample to the sums of the block (the samples
+within 0.05 s) and, at the end of the block, run one step of the mixture.
 
 Order at the end of a block: road change and mixing; measurement update of every node at the state
-of the block's beginning; update of the node weights with the evidence tempered by demand;
-adaptation of R; prediction to the block's end. Within a block, the same exact kinematics advance
-the velocity.
+of the block's beginning; update of the node weights with evidence that counts more at larger tyre
+forces; adaptation of R; prediction to the block's end. Within a block, the same exact kinematics
+advance the velocity.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def step(
 
 @compiled
 def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Process the block that ends: run one step of the mixture with its sums. The next block begins
-    at the time of the last sample.
+    """Process the block (the samples within 0.05 s) that ends: run one step of the mixture with its
+    sums. The next block begins at the time of the last sample.
     """
     features = scratch.features
     features.duration = memory.last.time - memory.block.time
@@ -95,8 +95,8 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
 
 @compiled
 def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Predict the state of all nodes to the end of the block, and update mean and covariance of the
-    mixture.
+    """Predict the states of all nodes (friction hypotheses) to the end of the block (0.05 s), and
+    update mean and covariance of the mixture.
     """
     block = memory.block
     constants = design.constants
@@ -162,8 +162,8 @@ def conclude_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scr
 
 @compiled
 def _find_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Compute median and interval of the friction under the left wheels, under the right wheels,
-    and of the mean of both.
+    """Compute median and interval of three frictions: that under the left wheels, that under the
+    right wheels, and the mean of both.
     """
     if memory.split:
         _find_side(memory, design, scratch, LEFT, memory.friction_left)
@@ -203,8 +203,8 @@ def turned_velocity(
 ) -> tuple[float, float]:
     """Return the mixture's current (v_x, v_y) [m/s] in vehicle axes.
 
-    Since the block began, the vehicle has turned by an angle with this cosine and sine, and has
-    gained the velocity `gain`.
+    Since the block (0.05 s) began, the vehicle has turned by an angle with this cosine and sine,
+    and has gained the velocity `gain`.
     """
     x = memory.overall_mean
     gained_x, gained_y = gained_velocity(gain, x)

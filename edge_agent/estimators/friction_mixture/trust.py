@@ -1,4 +1,5 @@
-"""Trust in the model: its strain, and a test for contradictions between model and measurements.
+"""Trust in the model: its strain (deviation of states from the prior), and a test for
+contradictions between model and measurements.
 
 **Strain** is the chi-square of the estimated vehicle and sensor states against their prior, divided
 by the degrees of freedom that have been learned (Birge 1932). Errors have common causes: where
@@ -10,10 +11,10 @@ also an input of the rules that decide how much of the evidence on friction is u
 that the axles' innovations have FACTOR times the stated variance. The second happens with delayed
 steering signals or on the banking of a race track. Ice that explains the data does not count
 against the model, nor do unusual states alone. Log-likelihood ratios against the model add up to
-`odd` [nat] and fade within minutes. Straight driving, on which the model cannot fail, does not
-count for it. At `odd_least` the filter draws no conclusions: the interval returns to the prior, the
-axles do not affect the motion, and states learned meanwhile are reset. The test leaves out slides,
-slippery road and walking pace (`unexplained_ratio`).
+`odd` [nat] and fade within minutes. Straight driving, during which the model cannot fail, does not
+count in favour of the model. At `odd_least` the filter draws no conclusions: the interval returns
+to the prior, the axles do not affect the motion, and states learned meanwhile are reset. The test
+leaves out slides, slippery road and walking pace (`unexplained_ratio`).
 
 After `patience` [s] without a possible test the model is tried again. Each further contradiction
 makes that time four times as long, because sensors do not repair themselves. A motion reset by the
@@ -51,7 +52,8 @@ SLOW_PEAK = 6.0
 def update_consistency(
     memory: MixtureMemory, design: MixtureDesign, duration: float, ratio: float, health: int
 ) -> None:
-    """Update memory.trust with the states, the innovations and the health of the block.
+    """Update memory.trust with the states, the innovations and the health flags of the block (0.05
+    s).
 
     `ratio` is the sum of the axles' squared innovations of the block over their stated variance.
     """
@@ -119,9 +121,11 @@ def slippery_probability(memory: MixtureMemory, design: MixtureDesign) -> float:
 
 @compiled
 def belief_strain(cost: float, learned: float, prior: float) -> float:
-    """Return the strain: chi-square per degree of freedom of a belief with penalty `cost` [nat].
+    """Return the strain (chi-square per degree of freedom) of the estimated vehicle and sensor
+    states. `cost` [nat] is half of their chi-square against the prior.
 
-    `learned` is the number of learned degrees of freedom. The result is 1 if nothing was learned.
+    `learned` is the number of degrees of freedom that measurements have determined. The result is 1
+    if nothing was learned.
     """
     return (2.0 * cost + prior) / (learned + prior)
 
@@ -130,8 +134,8 @@ def belief_strain(cost: float, learned: float, prior: float) -> float:
 def degrees_of_freedom(covariance: FloatArray, nominal: Nominal) -> float:
     """Return the effective number of learned vehicle and sensor states.
 
-    Each state counts by the share of its prior variance that the measurements have removed;
-    `covariance` (n, n).
+    Each state counts by the share of its prior variance that the measurements have removed.
+    `covariance` (n, n) is that of the current estimate.
     """
     total = 0.0
     for i in range(NodeState.LN_KX, covariance.shape[0]):
@@ -141,23 +145,24 @@ def degrees_of_freedom(covariance: FloatArray, nominal: Nominal) -> float:
 
 @compiled
 def strained_noise(trust: Trust, constants: Constants) -> float:
-    """Return the factor on R of the axles that follows from the strain."""
+    """Return the factor on R (measurement noise) of the axles that follows from the strain
+    (deviation of the states from their prior)."""
     factor = (trust.strain / constants.strain_usual) ** constants.strain_power
     return float(min(max(factor, constants.strain_least), constants.strain_most))
 
 
 @compiled
 def nominal_agreement(trust: Trust, constants: Constants) -> float:
-    """Return the agreement of the car with its vehicle file, 0 to 1; 0 if the strain is at least
-    the usual one.
+    """Return the agreement of the car with its vehicle file, 0 to 1. It is 0 if the strain
+    (deviation of the states from their prior) has its usual value or more.
     """
     return max(1.0 - trust.strain / constants.strain_usual, 0.0)
 
 
 @compiled
 def used_evidence_share(trust: Trust, constants: Constants) -> float:
-    """Return the share of the evidence that is used: it decreases as a contradiction grows, and is
-    0 once the contradiction is accepted.
+    """Return the share of the evidence that is used: it decreases as evidence grows that the
+    measurements contradict the model, and is 0 once this is accepted.
     """
     return max(1.0 - (trust.odd / constants.odd_least) ** 2, 0.0)
 

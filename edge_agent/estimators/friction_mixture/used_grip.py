@@ -1,8 +1,8 @@
-"""Reported grip in use: force over load of the axle that uses more, smoothed over SMOOTH_S.
+"""Reported grip in use: the larger force over load of the two axles, smoothed over SMOOTH_S.
 
-The demand that weights the evidence on friction is not smoothed. The report is smoothed because it
-takes the largest value of the last second: the largest of twenty noisy blocks would show the sensor
-noise more than the tyres.
+The report takes the largest value of the last second. It is smoothed because the largest of twenty
+noisy blocks would show the sensor noise more than the tyres. The value that weights the evidence on
+friction is not smoothed.
 
 Where torque is missing, the brakes are assumed to load both axles in proportion to their load. ABS
 and brake-force distribution do so near the limit. A fixed share would demand more of an unloaded

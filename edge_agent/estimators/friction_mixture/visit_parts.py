@@ -1,5 +1,5 @@
-"""Friction jumps inside a visit: detection, and evidence of the part of the visit before the
-surface changed.
+"""Friction jumps inside a visit (passage of one map cell): detection, and evidence of the part of
+the visit before the surface changed.
 
 The belief of a visit starts from the prior and follows the road, so at the end it describes only
 the last surface. In addition, the most informative belief of the visit so far is kept, measured by
@@ -38,15 +38,16 @@ KNOWING = 0.7
 
 @compiled
 def begin_part(memory: MixtureMemory, design: MixtureDesign) -> None:
-    """Begin a new part of the visit, without evidence so far."""
+    """Begin a new part of the visit (the stretch of the map cell on one surface), without evidence
+    so far."""
     copy_vector(memory.surest, design.prior)
     memory.information = 0.0
 
 
 @compiled
 def end_part(memory: MixtureMemory, design: MixtureDesign, evidence: FloatArray) -> None:
-    """Update the most informative belief of the visit. If friction has jumped, write the evidence
-    (32,) of the part that ends, and begin the next part.
+    """Update the most informative belief of the visit (passage of one map cell). If friction has
+    jumped, write the evidence (32,) of the part that ends, and begin the next part.
     """
     if memory.split:
         return

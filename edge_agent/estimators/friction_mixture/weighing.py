@@ -1,5 +1,5 @@
-"""Weights of the friction nodes after a block: likelihoods tempered by the rules, and adaptation of
-R.
+"""Weights of the friction hypotheses (nodes) after a block of 0.05 s: likelihoods that fuzzy rules
+weaken (temper), and adaptation of the measurement noise R.
 
 While nothing changes, errors of the tyre curve and of offsets repeat from block to block. Therefore
 the evidence of such blocks counts less. Where a bend becomes icy the forces stay the same and the
@@ -39,8 +39,8 @@ LEAST_DEMAND = 1e-3  # [1] below it no evidence is left
 
 @compiled
 def apply_measurement(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Apply the block's measurements: update all nodes, recompute their weights, and adapt the
-    measurement noise R.
+    """Apply the measurements of the block (0.05 s): update all nodes, recompute their weights, and
+    adapt the measurement noise R.
     """
     update_all(memory, design, scratch)
     temper_evidence(memory, design, scratch)
@@ -54,8 +54,8 @@ def apply_measurement(memory: MixtureMemory, design: MixtureDesign, scratch: Scr
 
 @compiled
 def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Update every active node; store the NIS (normalised squared innovation) and the predictive
-    log-likelihood of the mixture.
+    """Update every active node (filter of one friction hypothesis); store the NIS (normalised
+    squared innovation) and the predictive log-likelihood of the mixture.
     """
     inflation = max(design.constants.correlation_time / scratch.features.duration, 1.0)
     count = active_nodes(memory)
@@ -97,9 +97,9 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
 def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Replace scratch.log_likelihood by the tempered evidence of the block for each node [nat].
 
-    A node below the grip in use gets its penalty at any demand. At full distrust no evidence is
-    used. Without accelerations, yaw rate or steering, sliding cannot be distinguished from rolling,
-    so no evidence on friction is used either.
+    A node (friction hypothesis) below the grip in use gets its penalty however small the tyre
+    forces are. At full distrust no evidence is used. Without accelerations, yaw rate or steering,
+    sliding cannot be distinguished from rolling, so no evidence on friction is used either.
     """
     constants = design.constants
     features = scratch.features
@@ -130,8 +130,8 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
 
 @compiled
 def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
-    """Charge a node for its vehicle states that moved away from the prior, and return the charge
-    [nat].
+    """Return the charge [nat] of a node: how much its log-likelihood is reduced because its vehicle
+    states moved away from the prior.
 
     `price` is the change of the node's penalty. A negative charge (refund) never exceeds the amount
     charged before. Tempered evidence charges this cost only in part, while the measurement has
@@ -160,8 +160,8 @@ def slip_meaning(features: BlockFeatures, vx: float) -> float:
 def update_novelty(
     memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures, vx: float, vy: float
 ) -> None:
-    """Set the memberships features.new ("forces or slips are new") and memory.slip.axle_ended ("the
-    slide has ended"), and update the smoothed usual forces and slips.
+    """Compute two fuzzy truth values, 0 to 1: features.new ("forces or slips are new") and
+    memory.slip.axle_ended ("the slide has ended"). Update the smoothed usual forces and slips.
 
     (vx, vy) [m/s] is the mean velocity of the block.
     """
@@ -186,7 +186,7 @@ def update_novelty(
 
 @compiled
 def saturation(slip: float, mu: float) -> float:
-    """Return the membership of an axle in the fuzzy set "slides", on friction `mu`.
+    """Return the fuzzy truth value, 0 to 1, of "the axle slides" on friction `mu`.
 
     It is 0 up to a slip (as linear force over load) of mu, and 1 from 1.5 mu on; 0 where the slip
     is unknown.
@@ -223,8 +223,8 @@ def axle_slip(row: FloatArray, features: BlockFeatures, vx: float, vy: float, ax
 
 @compiled
 def adapt_noise(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Update the windowed innovation variances, and the factors on the measurement noise R for the
-    next block.
+    """Update the innovation variances of the last blocks, and the factors on the measurement noise
+    R for the next block (0.05 s).
     """
     keep = math.exp(-scratch.features.duration / design.constants.window)
     for group in range(2):

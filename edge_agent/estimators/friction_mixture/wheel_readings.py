@@ -1,5 +1,5 @@
-"""Checks of a wheel speed signal: impossible jumps, and the step width (resolution) of its
-readings.
+"""Checks of the wheel speed signals: impossible jumps, and resolution (smallest step between
+different readings).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def refuse_jumps(row: FloatArray, now: FloatArray) -> int:
 
 @compiled
 def note_step(last: LastInputs, wheel: int, omega: float) -> None:
-    """Update the estimated step width of a wheel speed signal with a reading.
+    """Update the estimated resolution (smallest step) of a wheel speed signal with a reading.
 
     A speed that stays constant over several readings and then jumps is quantised in steps.
     """

@@ -47,7 +47,7 @@ def update_slip(memory: MixtureMemory, constants: Constants, features: BlockFeat
 
 @compiled
 def slip_membership(memory: MixtureMemory, features: BlockFeatures) -> float:
-    """Return the membership of the block in "a wheel slides", 0 to 1."""
+    """Return the fuzzy truth value, 0 to 1, of "a wheel slides" in the block (0.05 s)."""
     slowest = math.inf
     fastest = -math.inf
     spin = 0.0
@@ -69,7 +69,7 @@ def slip_membership(memory: MixtureMemory, features: BlockFeatures) -> float:
 
 @compiled
 def front_slides_more(memory: MixtureMemory, features: BlockFeatures) -> bool:
-    """Return True if, of all wheels, a front wheel deviates most from the car's speed."""
+    """Return True if the wheel that deviates most from the car's speed is a front wheel."""
     front = 0.0
     rear = 0.0
     for wheel in range(4):

@@ -1,5 +1,5 @@
-"""Scratch records for intermediate results of one block of one vehicle. A step writes each field
-before it reads it.
+"""Scratch records for intermediate results of one block of one vehicle. Nothing is kept between
+steps: a step writes each field before it reads it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from schemas.numeric import FloatArray
 
 
 class BlockFeatures:
-    """Inputs of the measurement equations for one block.
+    """Inputs of the measurement equations for one block (the samples within 0.05 s).
 
     The mean velocity of the block is rotation(cos, sin)*v + gains, with v at the block's beginning.
     The order of wheels is fl, fr, rl, rr, and of axles front, rear. The order of measurement rows
@@ -64,7 +64,7 @@ class BlockFeatures:
 
 
 class NodeSlip:
-    """Slip of wheels and axles at one state of a node."""
+    """Slip of wheels and axles computed at one state vector of a node (friction hypothesis)."""
 
     along: Annotated[FloatArray, 4]  # g_x, linear force over load [1]
     across: Annotated[FloatArray, 4]  # g_y
@@ -129,7 +129,7 @@ class Scratch:
 
 
 class MixtureContext:
-    """Design and scratch memory that the filters of a thread share."""
+    """Tables of the filter (`design`) and scratch memory that the filters of a thread share."""
 
     design: MixtureDesign
     scratch: Scratch

@@ -2,8 +2,9 @@
 000 and 001.
 
 State [v_x, v_y, a_x, a_y, r, r'] (the papers use the moment Gamma = I_z*r' instead of r').
-Sub-filter 1 measures [a_x, a_y, r], sub-filter 2 [a_y, r] (000, below equation 53). A step: share
-the information (15) to (17), predict (21) to (25), update (31) to (39), fuse (49), (50).
+Sub-filter 1 measures [a_x, a_y, r], sub-filter 2 [a_y, r] (000, below equation 53). Equations of
+one step: share the information (15) to (17), predict (21) to (25), update (31) to (39), fuse (49),
+(50).
 
 Departures from the papers: (1) Both sub-filters use the same measured a_y and r. Therefore each
 sub-filter uses twice the variance, so that the fused estimate equals that of one filter. (2)
@@ -88,7 +89,7 @@ class FederatedMotion:
 
 
 class FederatedMemory(PaperMemory):
-    """Memory that the filters of papers 000 and 001 have in common."""
+    """Fields that the memory records of the filters of papers 000 and 001 have in common."""
 
     motion: FederatedMotion
 
@@ -104,8 +105,8 @@ class SubFilter(NamedTuple):
 
 
 def set_motion(filters: RecordArray, setting: MotionSetting) -> None:
-    """Write the setting of the motion filter into the filter records; call this once, before the
-    first sample.
+    """Write the settings of the motion filter into the filter records of all vehicles; call this
+    once, before the first sample.
     """
     motion = filters["motion"]
     # of the rounded squares: the square roots are those of before, bit for bit, where nothing is

@@ -78,10 +78,10 @@ def propagate_points(
 
     Inputs change linearly from the previous sample to this one. With `by_torque`, longitudinal
     forces come from the wheels' torque, z is the yaw acceleration, and friction (4,) is given. The
-    velocity then follows only the states a_x and a_y, which measurements correct for drag and
-    slopes. Without `by_torque`, forces come from slip and z is the friction of all wheels. With
-    `by_motor`, longitudinal forces come from the torque of each axle's motor, half to each wheel; z
-    is still friction.
+    velocity is then integrated from the states a_x and a_y alone; the measurements correct these
+    states for drag and slopes. Without `by_torque`, forces come from slip and z is the friction of
+    all wheels. With `by_motor`, longitudinal forces come from the torque of each axle's motor, half
+    to each wheel; z is still friction.
     """
     slowest = abs(columns[0, 0])
     for p in range(1, POINTS):

@@ -72,8 +72,9 @@ def dependence_factor(demand: float, dt: float) -> float:
     """Return the factor on the measurement's standard deviation for a sample `dt` [s] after the
     previous sample, at a force of `demand` [g].
 
-    Model error lasts, so many samples count as one measurement. Without demand, only slip noise is
-    left, which carries no information on friction.
+    The factor has two reasons. Errors of the model last, so the samples within that time count as
+    one measurement. Without force, only slip noise is left, which carries no information on
+    friction.
     """
     return math.sqrt(max(INDEPENDENT_S / dt, 1.0) * (1.0 + (DEMAND_HALF / max(demand, 1e-2)) ** 4))
 

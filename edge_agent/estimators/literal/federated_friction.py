@@ -2,9 +2,9 @@
 motion.
 
 State mu_fl, mu_fr, mu_rl, mu_rr, a random walk (28); measurements [a_x, a_y, r] and [a_y, r] (53);
-F_x from wheel torque (10). Information shares by (54), which gives more information to the worse
-sub-filter. They start from one half, because a start from zero divides by zero. (52) uses P_f, not
-its inverse. Cubature points by singular values (40), (41).
+F_x from wheel torque (10). The information shares follow from (54), which gives more information to
+the worse sub-filter. Both shares start at one half, because the printed start at zero divides by
+zero. Equation (52) uses P_f, not its inverse. The cubature points use singular values (40), (41).
 
 Legend: beta_i share of sub-filter i; P_i = P_f/beta_i, Q_i = Q/beta_i (15) to (20).
 """
