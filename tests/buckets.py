@@ -38,7 +38,7 @@ class BucketServer:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Return the part of a service's configuration that names this bucket."""
+        """Return the entries of a service's configuration that name this server's bucket."""
         return {"copy": self.url, "store": self.store}
 
     def start(self) -> None:

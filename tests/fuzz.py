@@ -74,7 +74,9 @@ class Parser(NamedTuple):
 
 
 class Result(NamedTuple):
-    """Counts of a fuzzing run of one parser."""
+    """Counts of one fuzzing run of a parser: executions, stored inputs (corpus), executed lines,
+    crashes and hangs.
+    """
 
     executions: int
     corpus: int

@@ -52,7 +52,7 @@ Shown: TypeAlias = dict[str, list[Metric]]
 
 
 def command_actions(program: str) -> Iterator[tuple[Any, list[argparse.Action]]]:
-    """Yield each command of a program with its options and arguments."""
+    """Yield each command of a program, together with the command's options and arguments."""
     for command in COMMAND_LINES[program].COMMANDS:
         parser = argparse.ArgumentParser(add_help=False)
         importlib.import_module(command.module).add_arguments(parser)
@@ -127,7 +127,9 @@ def settings_page() -> str:
 
 
 def tables_page() -> str:
-    """Return the Markdown page of all tables of the contract."""
+    """Return the Markdown reference page that lists the columns of all tables in
+    `schemas/tables.py`.
+    """
     parts = ["# Tables\n\nNames, types, units and meanings come from `schemas/tables.py`.\n"]
     for title, fields in TABLES.items():
         parts.append(f"\n## {title}\n\n| column | type | unit | meaning |\n|---|---|---|---|\n")
@@ -139,7 +141,9 @@ def tables_page() -> str:
 
 
 def all_metrics(root: Path) -> Shown:
-    """Return all metrics of an agent and of a service with a new archive in `root`."""
+    """Return all metrics that an agent and a service export. The service is created with a new
+    archive in the folder `root`.
+    """
     config = ServiceConfig()
     engine = Engine(config, root)
     try:

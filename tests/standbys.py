@@ -112,7 +112,7 @@ class Host:
         return any(line.startswith(start) for line in self.part.read_lines())
 
     def close(self) -> None:
-        """Kill the service if it still runs, and close its links."""
+        """Kill the service if it is still running, and close its links to router and bucket."""
         self.to_router.close()
         self.to_bucket.close()
         self.part.send_signal(signal.SIGCONT)

@@ -157,7 +157,9 @@ def test_links_of_pages_lead_to_files_and_headings() -> None:
 
 
 def test_pages_have_no_reference_links_which_the_link_test_cannot_follow() -> None:
-    """Pages must not define links at their end. Figures belong into generated blocks instead."""
+    """Pages must not define reference links at their end, because the test of links cannot follow
+    them. Figures belong into generated blocks (parts of a page that a program writes) instead.
+    """
     reference = re.compile(r"^\[[^\]]+\]: \S|\]\[[\w.]+\]", re.MULTILINE)
     for page in list_pages():
         assert not reference.findall(page.read_text(encoding="utf-8")), page

@@ -1,4 +1,6 @@
-"""Benchmark of the encoding: time and size of an observation in a message and in Parquet."""
+"""Benchmark of the encoding of observations: time and size of one observation in a message and in
+Parquet.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Benchmark of the fusion: processor time per observation on one thread for updates, commits and
-trust.
+"""Benchmark of the fusion: processor time per observation on one thread. It includes updates of
+beliefs, commits (final storage of older observations) and the computation of trust in vehicles.
 """
 
 from __future__ import annotations
@@ -93,7 +93,9 @@ def fill_fusion(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.r
 
 
 def split_batches(o: Observations) -> Iterator[Observations]:
-    """Yield observations in batches, as many as the service takes in one turn."""
+    """Yield observations in batches, each with as many observations as the service processes in one
+    turn of its worker.
+    """
     for rows in np.array_split(np.arange(len(o.time)), max(len(o.time) // BATCH, 1)):
         yield o.take(rows)
 

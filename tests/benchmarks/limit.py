@@ -80,9 +80,10 @@ def first_memory(first: FloatArray, speed: float) -> FloatArray:
     """Return the initial filters as rows (N, doubles) in the layout of the kernels' C structures.
 
     Args:
-        first: first readings (N, 11).
+        first: first readings (N, 11): ax, ay, yaw rate, steering angles delta and wheel speeds
+            omega.
         speed: initial speed [m/s].
-        memberships: fuzzy memberships.
+        memberships: parameters of the fuzzy sets.
     """
     setting = Setting()
     (count, inputs) = first.shape
@@ -113,9 +114,10 @@ class Limit:
 
         Args:
             parameters: vehicle parameters (N, 12).
-            first: first readings (N, 11): ax, ay, yaw rate, delta, omega.
+            first: first readings (N, 11): ax, ay, yaw rate, steering angles delta and wheel speeds
+                omega.
             speed: initial speed [m/s].
-            memberships: fuzzy memberships.
+            memberships: parameters of the fuzzy sets.
         """
         self._library = compile_library("kernel.c", "-fopenmp")
         self._parameters = np.ascontiguousarray(parameters)
@@ -123,8 +125,8 @@ class Limit:
         self._memory = first_memory(first, speed)
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
-        """Return the means of the filters' states (T, N, 6) after each of the readings (T, N, 11),
-        which are `gone` seconds apart.
+        """Run all filters over the readings (T, N, 11), which are `gone` seconds apart. Return the
+        mean of each filter's state after each reading, (T, N, 6).
         """
         samples, vehicles, _ = readings.shape
         out = np.empty((samples, vehicles, STATES))
@@ -171,8 +173,9 @@ class VectorLimit:
         return out
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
-        """Return the means of the filters' states (T, N/lanes, 6, lanes) after each reading. The
-        readings have the layout of `side_by_side` and are `gone` seconds apart.
+        """Run all filters over the readings, which are `gone` seconds apart and have the layout of
+        `side_by_side`. Return the mean of each filter's state after each reading, (T, N/lanes, 6,
+        lanes).
         """
         samples, blocks, _, lanes = readings.shape
         out = allocate_aligned(samples, blocks, STATES, lanes)

@@ -250,7 +250,9 @@ def pushed_ms(on: Stage) -> float:
 
 
 def bytes_per_cell(on: Stage) -> float:
-    """Return the uncompressed bytes of the page's data blocks, per cell."""
+    """Return the mean number of uncompressed bytes per cell in the page's data blocks (encoded
+    cells).
+    """
     tiles = ",".join(map(str, on.town.tiles))
     with urllib.request.urlopen(f"{on.address}blocks?tiles={tiles}", timeout=30) as answer:
         return len(answer.read()) / CELLS

@@ -70,12 +70,14 @@ def list_records(document: bytes) -> list[ET.Element]:
 
 
 def is_over(record: ET.Element) -> bool:
-    """Return True if a situation record states its end."""
+    """Return True if a situation record of a DATEX II publication states the end of the situation."""
     return record.find(".//com:overallEndTime", _SPACES) is not None
 
 
 def is_valid() -> Callable[[bytes], bool] | None:
-    """Return a function that validates DATEX II publications, or None without the schema."""
+    """Return a function that validates DATEX II publications, or None if the schema is not
+    installed.
+    """
     if not SCHEMA.exists():
         print(f"  the schema of DATEX II is not at {SCHEMA}", file=sys.stderr)
         return None
@@ -86,11 +88,11 @@ def is_valid() -> Callable[[bytes], bool] | None:
 
 
 def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
-    """Return two counts over STEPS publications: invalid publications, and situations that were not
-    ended although their alert was over.
+    """Make STEPS DATEX II publications of simulated alerts. Return two numbers: invalid
+    publications, and situations that were not ended although their alert was over.
 
-    Alerts of cells on a road come and go at random. A count is NaN without the schema, or if hardly
-    any alert ended.
+    The alerts of cells on a road begin and end at random. A count is NaN if the schema is not
+    installed, or if hardly any alert ended.
     """
     rng = np.random.default_rng(SEED)
     stretches = Stretches()
@@ -234,8 +236,8 @@ def measured_cells(table: pa.Table) -> set[int]:
 
 
 def can_open(reader: str, address: str) -> bool:
-    """Return True if a program reads all features of the page, and reads a lower bound as a feature
-    without a value of μ.
+    """Return True if a program, such as GDAL, reads all features (map cells) that the page offers.
+    Features with only a lower bound of the friction μ must have no value of μ in the program.
     """
     script = READERS[reader].format(address=address) + _COUNT
     done = subprocess.run(
@@ -250,7 +252,7 @@ def can_open(reader: str, address: str) -> bool:
 
 
 def ogrinfo_opens(address: str) -> bool:
-    """Return True if GDAL's program ogrinfo lists all features of the page's OGC API."""
+    """Return True if GDAL's program ogrinfo lists all features (map cells) of the page's OGC API."""
     words = ["ogrinfo", "-ro", "-al", "-q", f"OAPIF:{address}", "grip"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
     held = done.stdout.count("OGRFeature(grip)") == street.count_known("ice", "passed", "wet")

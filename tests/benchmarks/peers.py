@@ -18,7 +18,9 @@ PYTHON_STEPS = 300  # enough for a median: these are slow
 
 
 class Problem(NamedTuple):
-    """Input of the compared filters: vehicle, readings, first speed, and time step."""
+    """Input of the compared filters: vehicle parameters, sensor readings, speed at the first
+    reading, and time between readings.
+    """
 
     row: FloatArray  # (12,) of the vehicle
     readings: FloatArray  # (T, 11)
@@ -43,8 +45,8 @@ class Peer(NamedTuple):
 
 
 def by_numpy(problem: Problem) -> FloatArray:
-    """Run a cubature filter on NumPy arrays, with all points moved together. Return the last mean
-    (6,).
+    """Run a cubature filter on NumPy arrays, with all sigma points computed together. Return the
+    mean (6,) after the last reading.
     """
     mean, cov, noise, R = problem.start()
     n = len(mean)
@@ -66,7 +68,9 @@ def by_numpy(problem: Problem) -> FloatArray:
 
 
 def by_filterpy(problem: Problem) -> FloatArray:
-    """Run filterpy's cubature filter over the readings. Return the last mean (6, 1)."""
+    """Run filterpy's cubature filter over the readings. Return the mean (6, 1) after the last
+    reading.
+    """
     from filterpy.kalman import CubatureKalmanFilter
 
     inputs: dict[str, FloatArray] = {}
@@ -90,8 +94,8 @@ def by_filterpy(problem: Problem) -> FloatArray:
 
 
 def by_stonesoup(problem: Problem) -> FloatArray:
-    """Run Stone Soup's cubature predictor and updater over the readings. Return the last mean (6,
-    1).
+    """Run Stone Soup's cubature predictor and updater over the readings. Return the mean (6, 1)
+    after the last reading.
     """
     from stonesoup.models.measurement.linear import LinearGaussian
     from stonesoup.models.transition.base import TransitionModel

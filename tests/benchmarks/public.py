@@ -44,7 +44,9 @@ def public() -> list[Figure]:
 
 
 class _Map:
-    """Map of CELLS published cells, each visited by one more vehicle since its publication."""
+    """Map of CELLS cells that readers may see. Each cell was visited by one more vehicle since
+    readers last received it.
+    """
 
     def __init__(self, least: int) -> None:
         fusion = Fusion(120.0)

@@ -31,8 +31,8 @@ AGREE = 1e-6  # how far C and Python may be apart in v_x, v_y and yaw rate over 
 
 
 class Drive:
-    """Recorded manoeuvre, repeated as often as needed, as signals and as the C kernel's
-    readings.
+    """Simulated manoeuvre, repeated as often as needed, in two forms: as all 18 signals for the
+    estimator, and as the 11 of these signals that the C kernel reads ("readings").
     """
 
     def __init__(self) -> None:
@@ -58,8 +58,9 @@ class Drive:
     def repeat_samples(
         self, samples: int, vehicles: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return times (T, N), signals (T, N, 18) and readings (T, N, 11) for T samples and N
-        vehicles.
+        """Return times (T, N), all signals (T, N, 18), and the readings (T, N, 11), which are the
+        signals that the C kernel uses, for T samples of N vehicles. The manoeuvre is repeated if it
+        is shorter than T samples.
         """
         index = np.arange(samples) % len(self.t)
         t = np.repeat((np.arange(samples) * self.gone)[:, None], vehicles, axis=1)
@@ -74,7 +75,7 @@ Kind = TypeVar("Kind", Limit, VectorLimit)
 
 
 def make_limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> Kind:
-    """Return a bank of C filters in the state of the drive's first sample."""
+    """Return a bank of filters in C for N vehicles, each in the state of the drive's first sample."""
     rows = parameter_table([drive.vehicle] * vehicles)
     return kind(
         rows, np.repeat(drive.readings[:1], vehicles, 0), speed, shipped_memberships(TUNED[NAME])
@@ -82,7 +83,8 @@ def make_limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> K
 
 
 def same_filter(drive: Drive) -> float:
-    """Check that C and Python give the same estimates. Return the speed at the first sample [m/s].
+    """Check that the filter in C and the filter in Python give the same estimates. Return the speed
+    at the first sample [m/s].
 
     Raises:
         ArithmeticError: the estimates differ.
@@ -185,7 +187,7 @@ def bank() -> list[Figure]:
 
 def vs_simd(drive: Drive, speed: float, vehicles: int = 1000, samples: int = 200) -> float:
     """Return the duration of the bank divided by that of C with vehicles side by side in SIMD
-    vectors, one thread each.
+    vectors. Both use one thread.
 
     Every vehicle has its own noise, so that an error that mixes up vector lanes is found.
 

@@ -60,7 +60,9 @@ class SerializedReader:
         return int(found)
 
     def read_bytes(self) -> bytes:
-        """Return bytes that follow their length in LEB128."""
+        """Read a length n, stored in LEB128 (variable-length integer), and return the n bytes after
+        it.
+        """
         size = 0
         for shift in range(0, 63, 7):
             byte = self.read_number("B")
@@ -71,11 +73,13 @@ class SerializedReader:
         return self._data[self._at - size : self._at]
 
     def read_text(self) -> str:
-        """Return a UTF-8 text that follows its length."""
+        """Read a text, stored as its length in bytes and then its bytes in UTF-8; return the text."""
         return self.read_bytes().decode()
 
     def read_encoding(self) -> zenoh.Encoding:
-        """Return an encoding, stored as the number of its name and a schema."""
+        """Read a Zenoh encoding, stored as a number that stands for its name and a text for its
+        schema; return the encoding.
+        """
         name = ENCODINGS.get(self.read_number("H"), "")
         schema = self.read_text()
         return zenoh.Encoding(";".join(part for part in (name, schema) if part))
@@ -99,7 +103,9 @@ def _encoding(encoding: zenoh.Encoding) -> bytes:
 
 
 def _sample(sample: zenoh.Sample) -> bytes:
-    """Return a received sample, serialized for the client, without attachment and timestamp."""
+    """Return a sample that the router's session received, serialized for the client, without
+    attachment and timestamp.
+    """
     congestion = int(sample.congestion_control == zenoh.CongestionControl.BLOCK)
     priority = 1 + PRIORITIES.index(sample.priority)
     quality = priority | congestion << 3 | int(sample.express) << 4

@@ -45,7 +45,9 @@ START_S = 300.0  # the first start compiles the kernels, on a busy machine
 
 
 class Site:
-    """Folders of a deployment below another root, with other ports."""
+    """Site (test deployment): the folders of a deployment, moved below another root folder, and its
+    ports, replaced by free ones.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -60,7 +62,7 @@ class Site:
             path.write_text(json.dumps(json.loads(path.read_text()) | changed))
 
     def localize_paths(self, text: str) -> str:
-        """Return a text with folders and ports replaced by those of this site."""
+        """Return a text with folders and ports replaced by those of this site (test deployment)."""
         places = {"/etc/gripmap": "etc", "/var/lib/gripmap": "lib", "/var/cache/gripmap": "cache"}
         for place, folder in places.items():
             text = text.replace(place, str(self.root / folder))

@@ -34,7 +34,7 @@ START_NS = 1_767_225_600_000_000_000  # 2026-01-01
 
 @dataclass(frozen=True)
 class MadeUp:
-    """Synthetic output of an estimator bank, which does not depend on signals."""
+    """Synthetic output of an estimator bank. It does not depend on the vehicles' signals."""
 
     vx: FloatArray
     vy: FloatArray
@@ -59,7 +59,7 @@ def estimates(
     samples: int, vehicles: int, seed: int = 0, mu: float | None = None, used: float = 0.1
 ) -> MadeUp:
     """Return random estimates, or with `mu` estimates of this friction with a narrow interval.
-    Every sample has evidence.
+    Every sample has a random log-likelihood of friction.
     """
     rng = np.random.default_rng(seed)
     shape = (samples, vehicles)
@@ -79,8 +79,8 @@ def estimates(
 def ground(
     east: Lengths, north: Lengths, yaw: Lengths, *, rate_hz: float = 10.0, fix_every: int = 1
 ) -> Block:
-    """Return a block of vehicles at positions (east, north) [m] with headings `yaw` [rad], all of
-    shape (T, N). Every `fix_every`-th sample has a position.
+    """Return a block (signals of some samples) of vehicles at positions (east, north) [m] with
+    headings `yaw` [rad], all of shape (T, N). Every `fix_every`-th sample has a position.
     """
     shape = east.shape
     t = np.repeat(np.arange(shape[0])[:, None] / rate_hz, shape[1], axis=1)
@@ -94,8 +94,8 @@ def ground(
 
 
 def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
-    """Return a block of vehicles that turn at random and lose their positions now and then; some
-    have no yaw.
+    """Return a block (signals of some samples) of vehicles that turn at random and lose their
+    positions now and then; some have no yaw.
     """
     rng = np.random.default_rng(seed)
     yaw = np.cumsum(rng.normal(0.0, 0.1, (samples, vehicles)), axis=0)
@@ -112,7 +112,9 @@ def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
 
 @dataclass
 class Watch:
-    """Tracks and open visits of the vehicles of a test."""
+    """State of the vehicles of a test between blocks of samples: their tracks (recent positions)
+    and their open visits (cells that they have not left yet).
+    """
 
     tracks: RecordArray
     open: OpenVisits
@@ -120,11 +122,13 @@ class Watch:
 
     @staticmethod
     def of(vehicles: int, config: AgentConfig | None = None) -> Watch:
-        """Return the tracks and open visits of vehicles before the first sample."""
+        """Return the state (tracks and open visits) of vehicles before the first sample."""
         return Watch(new_tracks(vehicles), OpenVisits.before_any(vehicles), config or AgentConfig())
 
     def step(self, block: Block, output: MadeUp) -> tuple[Located, RecordBlock, RecordBlock]:
-        """Process one block. Return located vehicles, observations and states."""
+        """Process one block of samples. Return the located vehicles, and the observations and
+        states that they report.
+        """
         self.tracks, located = locate_vehicles(self.tracks, block.t, block.signals)
         reported = cast("Estimates", output)  # which has more, of what nobody reads here
         self.open, observations, states = build_records(
@@ -134,7 +138,7 @@ class Watch:
 
 
 def part(block: Block, rows: slice) -> Block:
-    """Return those samples of a block that a slice selects."""
+    """Return a block with those samples of the given block that the slice `rows` selects."""
     return Block(block.t[rows], block.time[rows], block.signals[rows])
 
 

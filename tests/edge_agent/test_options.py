@@ -272,7 +272,9 @@ def test_the_tests_that_show_an_option_give_it_to_the_command() -> None:
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with two drives, their vehicle files, memberships and a configuration."""
+    """Return a folder with two drives, their vehicle files, a file of memberships (parameters of
+    fuzzy sets) and a configuration.
+    """
     folder = tmp_path_factory.mktemp("given")
     for k in (0, 1):
         files = ["--out", str(folder / f"{k}.parquet"), "--vehicle-out", str(folder / f"{k}.json")]
@@ -332,8 +334,8 @@ def test_every_option_of_a_live_command_changes_what_is_driven(
 
 @cache
 def run_search(folder: Path, *words: str) -> tuple[object, list[str]]:
-    """Run a quick search. Return its memberships, scores and budget, and the names of the files
-    that it wrote.
+    """Run a quick search for good memberships (parameters of fuzzy sets). Return the memberships
+    found, scores and budget, and the names of the files that it wrote.
     """
     folder.mkdir(parents=True)
     with contextlib.chdir(folder):
@@ -399,7 +401,7 @@ def test_replay_depends_on_log_vehicle_estimator_and_configuration(tmp_path: Pat
 def record_blocks(
     scenario: str = "test", seed: int = 4, rate: float = 50.0, seconds: float = 12.0
 ) -> tuple[Block, SimulatedFleet]:
-    """Return the blocks of a small fleet joined into one, and the fleet."""
+    """Simulate a small fleet. Return its blocks of samples joined into one block, and the fleet."""
     fleet = SimulatedFleet(scenario, vehicles=2, seed=seed, rate_hz=rate)
     source = blocks(fleet, rate)
     parts = [next(source) for _ in range(round(10 * seconds))]

@@ -131,8 +131,9 @@ def _ensure_archive(site: Site, root: Path, observations: int) -> Path:
 
 
 def _last_day(root: Path, to: Path, old: int) -> Path:
-    """Create an archive of links to the files of `root`, and return its folder. It contains the
-    last day and, if `old` is not 0, the other days moved back by `old` times MAP_DAYS.
+    """Create an archive in the folder `to` from links to the files of the archive `root`, and
+    return `to`. The new archive contains the last day and, if `old` is not 0, the other days moved
+    back by `old` times MAP_DAYS.
     """
     shutil.copytree(root / "keys", to / "keys") if (root / "keys").exists() else None
     days = sorted({folder.name for folder in root.glob("observations/date=*")})

@@ -39,8 +39,8 @@ QUEUED: Final = 20.0  # messages of its queue for each
 
 @dataclass
 class Made:
-    """Simulated service: a real engine, a queue of batches, and the number of bytes that reached
-    the routers.
+    """Simulated service: a real engine, and a queue of batches that wait for it. It also counts the
+    bytes that reached the routers.
     """
 
     cars: int

@@ -44,8 +44,8 @@ class Census:
 
 
 class Told(NamedTuple):
-    """Content of the journals: records and time [s] of every stored batch, and time of every
-    settled batch.
+    """Content of the load generators' journals: number of records and time [s] of every batch
+    stored in an outbox, and time [s] of every batch that an acknowledgement settled.
     """
 
     stored: dict[Name, tuple[int, float]]
@@ -84,7 +84,7 @@ def read_journals(journals: Iterable[Path]) -> Told:
 
 
 def compare_with_archive(journals: Iterable[Path], archive: Path) -> Census:
-    """Compare the journals with the whole archive, and return the counts."""
+    """Compare the load generators' journals with all rows of the archive, and return the counts."""
     stored, settled = read_journals(journals)
     held, doubled, rows = _count_archived(archive, {name[:2] for name in stored})
     doubled = max(doubled, _doubled_outside(archive))

@@ -189,7 +189,7 @@ Go = Callable[[Host, random.Random, float], None]
 
 
 class Way(NamedTuple):
-    """Kind of failure, and the lease time [s] of the service that fails."""
+    """Kind of failure of a service, and the lease time [s] of this service."""
 
     go: Go
     end: Callable[[Host, random.Random], None] = lambda host, _: host.part.kill()

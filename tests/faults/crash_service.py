@@ -58,7 +58,7 @@ NEARLY: Final = 0.01  # likewise, of a cell that was dropped for a week's rest a
 
 
 class Sent(NamedTuple):
-    """Batch as its vehicle stores it; `time` is that of its last row [ns]."""
+    """Batch as its vehicle stores it; `time` is the time of the batch's last row [ns]."""
 
     vehicle: str
     seq: int

@@ -52,7 +52,9 @@ def list_places() -> list[tuple[int, float, float]]:
 
 
 def make_visit(name: str, seq: int, now: int) -> Batch:
-    """Return a batch with one visit of a vehicle that drives along the road repeatedly."""
+    """Return a batch with one visit to a cell. Over successive sequence numbers, the vehicle drives
+    along the road repeatedly.
+    """
     cell, latitude, longitude = list_places()[(seq + hash_of(name)) % CELLS]
     mu = FLOODED_MU if name == FLOODER else 0.75 + 0.01 * (hash_of(name) % 10)
     return batch(name, seq, now, [mu], cell=[cell], latitude=[latitude], longitude=[longitude])

@@ -197,7 +197,7 @@ class VirtualStop:
         return self._is_set
 
     def set(self) -> None:
-        """Set the event; waits return at their end."""
+        """Set the event. Threads that wait for it continue when their waiting time is over."""
         self._is_set = True
 
     def wait(self, seconds: float) -> bool:

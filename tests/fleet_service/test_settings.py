@@ -83,8 +83,8 @@ def of_service(look: Callable[[Service], object]) -> Show:
 
 
 def let_in(made: Service) -> list[bool]:
-    """Return for each of 60 messages of 40 kB from each of two vehicles whether it passes the rate
-    limit.
+    """Let two vehicles each send 60 messages of 40 kB. Return, for each message, True if the rate
+    limit admits it.
     """
     return [
         made.inbox._limits.allows(key(name), 40_000)

@@ -1,5 +1,5 @@
-"""Batches that the tests of the contract share. Run as a program, this module writes the recorded
-messages of version 1 (see `__main__`).
+"""Example batches for the tests of the contract (messages and tables in `schemas`). Run as a
+program, this module writes the recorded messages of version 1 (see `__main__`).
 """
 
 from __future__ import annotations

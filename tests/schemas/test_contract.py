@@ -1,4 +1,6 @@
-"""Tests of the contract: keys, the friction grid, configuration, vehicle file and queries."""
+"""Tests of the contract (common definitions in `schemas`): keys, the friction grid, configuration,
+vehicle file and queries.
+"""
 
 from __future__ import annotations
 

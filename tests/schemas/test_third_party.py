@@ -1,5 +1,5 @@
-"""Tests that a third party can take part with the contract alone: without compiler, science
-library, agent or service.
+"""Tests that a third party can take part with the contract (package `schemas`) alone: without
+compiler, science library, agent or service.
 """
 
 from __future__ import annotations

@@ -112,7 +112,9 @@ class Country:
         return int(grid.interleave(np.array([x]), np.array([y]))[0])
 
     def encode_report(self, vehicle: int, turn: int, boot: int) -> tuple[str, bytes]:
-        """Return Zenoh key and bytes of the report that a vehicle sends in a turn, dated now."""
+        """Return Zenoh key and bytes of the report that a vehicle sends in one turn (period of
+        PERIOD_S), dated now.
+        """
         drive = self.drives[self.drive[vehicle]]
         chunk = drive[(self.begin[vehicle] + turn % LOOP) % len(drive)]
         k = int(self.region[vehicle])
@@ -143,8 +145,8 @@ def _compute_shares(count: int) -> FloatArray:
 
 
 def _cut_chunks(columns: dict[str, Any], who: int, corner: IntArray) -> list[Chunk]:
-    """Return the visits of one vehicle in order of time, ROWS per chunk. A remainder of fewer
-    visits is left out.
+    """Divide the visits of one vehicle, in order of time, into chunks of ROWS visits; return the
+    chunks. If fewer than ROWS visits remain at the end, they are left out.
     """
     mine = np.flatnonzero(columns["vehicle"] == who)
     mine = mine[np.argsort(columns["leave_time"][mine], kind="stable")]

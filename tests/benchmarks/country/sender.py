@@ -43,8 +43,8 @@ class Waits:
                 self.acked[first - 1 : last, vehicle] = now
 
     def summarize(self, since: float) -> dict[str, float]:
-        """Return the numbers of batches sent and waiting, and the 99 % quantile [s] of the waits
-        that finished after `since`.
+        """Return the number of batches sent, the number that still wait for their acknowledgement,
+        and the 99 % quantile [s] of the waits that ended after `since`.
         """
         # a copy: it is written meanwhile
         put = self.put

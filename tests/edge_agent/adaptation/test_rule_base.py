@@ -1,5 +1,5 @@
-"""Tests of the fuzzy rules: memberships rise between foot and peak, and each rule has the effect
-that its table states.
+"""Tests of the fuzzy rules: the membership (degree to which a value belongs to a fuzzy set) rises
+between foot and peak of the set, and each rule has the effect that its table states.
 """
 
 import math

@@ -42,7 +42,9 @@ def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) ->
 def cells(
     key: IntArray, mu: float, *, width: float = 0.1, basis: int = local_map.MEASURED, at: int = NOW
 ) -> ReceivedCells:
-    """Return received cells that all have the friction `mu` with an interval of ± `width`."""
+    """Return cells in the form in which a car receives them; all have the friction `mu` with an
+    interval of ± `width`.
+    """
     said = np.full(len(key), mu)
     slippery = np.full(len(key), 1.0 if mu + width < 0.4 else 0.0 if mu - width > 0.4 else 0.5)
     belief = local_map.belief_of(said - width, said, said + width, slippery)

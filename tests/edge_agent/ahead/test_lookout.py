@@ -1,5 +1,6 @@
-"""Tests of cars that receive the map over real sessions: warnings from alerts and from the map,
-also after a lost router, and no warning from forged messages.
+"""Tests of cars that look ahead, that is, receive the map of the road ahead over real sessions:
+warnings from alerts and from the map, also after a lost router, and no warning from forged
+messages.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of a live trip: nothing is published before the signals have passed the doctor, and the
-next trip uses the calibration that this trip learned.
+"""Tests of a live trip: nothing is published before the signals have passed the signal doctor (a
+check for sensor faults), and the next trip uses the calibration that this trip learned.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ def source(drive: Recorded) -> Generator[Block]:
 
 
 def drive_trip(trip: Trip, drive: Recorded) -> tuple[list[bool], list[Block]]:
-    """Drive a trip and wait for the doctor's result. Return for each block whether it was admitted,
-    and the estimator's input.
+    """Drive a trip and wait for the result of the signal doctor (a check for sensor faults). Return
+    two lists with one item per block of samples: True if the block was admitted, and the block that
+    the estimator received.
     """
     admitted = []
     blocks = []

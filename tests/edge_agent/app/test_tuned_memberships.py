@@ -1,5 +1,5 @@
-"""Tests of files with tuned memberships: they state their origin, and an invalid file is refused
-with the name of the field.
+"""Tests of files with tuned memberships (parameters of fuzzy sets): they state their origin, and an
+invalid file is refused with the name of the field.
 """
 
 import json
@@ -29,7 +29,9 @@ Change = Callable[[dict[str, Any]], object]
 
 
 def document(memberships: Memberships | None = None) -> dict[str, Any]:
-    """Return a complete file of tuned memberships, as parsed JSON."""
+    """Return the content of a complete file of tuned memberships (parameters of fuzzy sets), as
+    parsed JSON.
+    """
     score = {"interval_score": 0.5, "coverage": 0.9, "log_likelihood": 1.5, "nis_ratio": 0.9}
     return {
         "estimator": "aco-fckf",

@@ -285,8 +285,9 @@ def summarize_reports(estimates: Estimates) -> dict[str, float]:
 
 
 def inside(filters: np.ndarray) -> dict[str, float]:
-    """Return figures of the filter's internal states over one drive, by name: node probabilities,
-    penalties, means and standard deviations of the states, strain.
+    """Return figures of the filter's internal states over one drive, by name. They include
+    probabilities of the friction nodes, penalties of the nodes, means and standard deviations of
+    the states, and strain (misfit of the vehicle model).
     """
     weight = filters["weight"]
     split = filters["split"]
@@ -324,7 +325,9 @@ def inside(filters: np.ndarray) -> dict[str, float]:
 
 
 def mean_of_known(values: FloatArray, where: FloatArray) -> float:
-    """Return the mean of `values` at which `where` is finite, or 0 if there are none."""
+    """Return the mean of those elements of `values` for which `where` is finite, or 0 if there are
+    none.
+    """
     there = np.isfinite(where)
     return float(values[there].mean()) if there.any() else 0.0
 

@@ -1,4 +1,6 @@
-"""Tests of the novelty of a block: force or lateral slip that differs from its usual value."""
+"""Tests of novelty: whether the force or the lateral slip in a block of samples differs from its
+usual value.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ ICE = 0.18
 
 
 class Bend:
-    """Car in a steady left bend, whose axles slip as the test sets."""
+    """Car in a left bend with constant speed and curvature. The test sets how much the axles slip."""
 
     def __init__(self) -> None:
         """Create a car that has driven on a road with grip until its slip is the usual value."""
@@ -47,7 +49,7 @@ class Bend:
 
     def drive_block(self, slip: float, *, force: float = BEND, seconds: float = BLOCK_S) -> float:
         """Drive for `seconds` with a lateral slip and a lateral force (as a share of the load).
-        Return the membership of the last block in the fuzzy set "new".
+        Return, for the last block of samples, its degree of membership in the fuzzy set "new".
         """
         slope = self.memory["row"][0, Parameter.SLOPE_Y]
         across = -slip / slope * SPEED_M_S
@@ -65,7 +67,7 @@ class Bend:
 
     @property
     def ice_ended(self) -> float:
-        """Return the membership in the fuzzy set "the ice has ended"."""
+        """Return the degree of membership in the fuzzy set "the ice has ended"."""
         return float(self.memory["slip"]["axle_ended"][0])
 
 

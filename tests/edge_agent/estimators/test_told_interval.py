@@ -51,7 +51,7 @@ def find_told_interval(
     Args:
         weight: probabilities of the friction nodes.
         patch: probability of an ice patch.
-        likeness: degree of agreement with the vehicle file.
+        likeness: degree to which the car agrees with its vehicle file.
     """
     contexts = records(MixtureContext, 1)
     put_record(contexts["design"][0], DESIGN)

@@ -1,5 +1,6 @@
-"""Tests of strain and contradiction: model strain separates cars that match their file from others;
-contradiction is found per axle, and ice does not cause it.
+"""Tests of trust in the vehicle model: strain (misfit of model and measurements) separates cars
+that match their vehicle file from others; contradictions between model and measurements are found
+per axle, and ice does not cause any.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ SLOW = {"FATC11", "CGW1", "Kombi_02", "Gateway_72"}  # once a second
 
 
 def told_at(t: float) -> dict[str, float]:
-    """Return the true context values at a time."""
+    """Return the true values of the context signals at a time."""
     flags = {name: float(first <= t < last) for name, (first, last) in FLAGS_AT.items()}
     return flags | {"air_temperature": AIR, "wiper": WIPES}
 
@@ -227,8 +227,8 @@ def test_a_table_fills_the_context_and_keeps_its_rows(tmp_path: Path) -> None:
 
 
 def live_blocks(values: dict[str, float], every: int, blocks: int, profile: Profile) -> FloatArray:
-    """Return context (T, 5) of live rows from a 50 Hz source that sends `values` in every
-    `every`-th message.
+    """Return the context signals (T, 5) that `LiveRows` makes if a 50 Hz source sends `values` in
+    every `every`-th message.
     """
     clock = Steered()
     feed = Scripted("bus", clock)

@@ -39,7 +39,7 @@ class Steered(HostClock):
 
 
 class Scripted(Feed):
-    """Source that delivers readings given by the test."""
+    """Simulated source of signals, which delivers the readings that the test gives it."""
 
     def listen(self) -> None:
         self.stopping.wait()

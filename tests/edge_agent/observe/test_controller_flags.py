@@ -23,7 +23,7 @@ RATE = 100
 def drive(
     on: FloatArray, omega: FloatArray | float = 50.0
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return times, signals and context of one car whose ABS flag is `on` (T,)."""
+    """Return times (T, 1) [s], signals and context signals of one car whose ABS flag is `on` (T,)."""
     t = np.arange(len(on))[:, None] / RATE
     signals = np.full((len(on), 1, len(CHANNELS)), np.nan)
     signals[..., S.OMEGA : S.OMEGA + 4] = np.broadcast_to(omega, len(on))[:, None, None]
@@ -34,7 +34,9 @@ def drive(
 
 
 def seconds(*parts: tuple[float, float]) -> FloatArray:
-    """Return a flag (T,) that has each value for the given number of seconds."""
+    """Return a flag (T,) from pairs (duration [s], value): it has each value for the given
+    duration.
+    """
     return np.concatenate([np.full(round(length * RATE), value) for length, value in parts])
 
 

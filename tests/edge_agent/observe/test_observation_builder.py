@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 
 def join_records(records: list[RecordBlock]) -> dict[str, np.ndarray]:
-    """Return the columns of several blocks, one after the other, with the columns `vehicle` and
-    `urgent`.
+    """Join the records of several blocks of samples; return their columns, with the additional
+    columns `vehicle` and `urgent`.
     """
     columns = {
         name: np.concatenate([r.columns[name] for r in records]) for name in records[0].columns
@@ -147,7 +147,7 @@ def test_only_slippery_visits_are_urgent(mu: float, used: float, urgent: bool) -
 
 def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
     """Braking that ends just before the border must not count as grip used in the next cell,
-    although it remains in the estimator's window for a second.
+    although the estimator reports the largest grip of the last second.
     """
     samples = 60
     east = np.arange(samples)[:, None] * 0.5
@@ -164,8 +164,9 @@ def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
 
 
 def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
-    """Braking on dry road before a cell must not count as grip on the ice in this cell. At 14 m/s a
-    car crosses a cell in less time than the estimator's window.
+    """Braking on dry road before a cell must not count as grip on the ice in this cell. The
+    estimator reports the largest grip of the last second, and at 14 m/s a car crosses a cell in
+    less time.
     """
     samples = 30
     east = np.arange(samples)[:, None] * 1.4

@@ -29,7 +29,9 @@ def draft(
     records: int = 1,
     size: int = 0,
 ) -> Draft:
-    """Return a batch whose payload contains its seq and first_held."""
+    """Return a batch whose payload contains its sequence number (`seq`) and the lowest stored
+    number (`first_held`).
+    """
     return Draft(
         vehicle,
         kind,
@@ -101,7 +103,9 @@ def test_an_acknowledgement_of_what_is_not_held_changes_nothing(path: Path) -> N
 
 
 def test_stored_batches_survive_a_kill_and_are_due_under_their_name(path: Path) -> None:
-    """Batches that a killed process had stored must be due again under their old identifiers."""
+    """A new process must send the batches that a killed process had stored, under their old
+    identifiers.
+    """
     script = f"""
 import os, pathlib, signal
 from edge_agent.publish.batching import Draft

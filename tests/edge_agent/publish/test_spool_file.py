@@ -20,7 +20,9 @@ BATCHES = 120
 
 
 def store_batches(path: Path) -> dict[int, bytes]:
-    """Store some hundred batches on disk, and return their payloads by seq."""
+    """Store some hundred batches in an outbox on disk, and return their payloads by sequence
+    number.
+    """
     random_ = random.Random(7)
     payloads = [random_.randbytes(random_.choice((60, 190, 900))) for _ in range(BATCHES)]
     outbox = Outbox(path, boot=5)

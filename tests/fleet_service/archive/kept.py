@@ -59,7 +59,9 @@ COLUMNS: Final = (
 
 
 def now_of(turn: int) -> int:
-    """Return the time [ns] at which a round of messages is received."""
+    """Return the time [ns] at which the service receives the messages of a round (step of the
+    simulated drive).
+    """
     return MIDNIGHT + (turn - ROUNDS // 2) * ROUND_NS
 
 
@@ -105,7 +107,7 @@ def make_state(turn: int, vehicle: int) -> Batch:
 
 
 def messages(turn: int) -> Iterator[Message]:
-    """Yield all messages that the vehicles send in one round."""
+    """Yield all messages that the vehicles send in one round (step of the simulated drive)."""
     for vehicle in range(VEHICLES):
         for one, key in (
             (make_observations(turn, vehicle), keys.observation_key),

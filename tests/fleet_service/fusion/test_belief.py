@@ -1,4 +1,6 @@
-"""Tests of the theorems of one cell's belief: how time and votes may change it."""
+"""Tests of theorems about the belief about one cell: how time and votes (effects of single visits)
+may change the belief.
+"""
 
 from __future__ import annotations
 

@@ -39,7 +39,8 @@ def road(found: dict[int, FloatArray], sector: int = 0) -> Fusion:
     """Return a fusion after visits to cells east of CELL.
 
     Args:
-        found: log-likelihoods (n, 32) of the visits by steps east of CELL, each by new vehicles.
+        found: log-likelihoods (n, 32) of the visits to a cell, by the number of steps east of CELL;
+            new vehicles visit each cell.
         sector: sector of the visits.
     """
     fusion = Fusion(120.0)

@@ -137,8 +137,8 @@ def test_gentle_value_a_little_below_grip_may_be_a_soft_tyre(used: float, witnes
 
 
 def count_witnesses(mu: float, used: float, tail: float) -> int:
-    """Return the number of vehicles that count as sources of ice after one vehicle's value of `mu`.
-    The value's log-likelihood of dry road is `tail` [nat].
+    """Fuse one vehicle's value of `mu`, and return the number of vehicles (0 or 1) whose report
+    then supports an alert of ice. `tail` is the value's log-likelihood of dry road [nat].
     """
     fusion = Fusion(120.0)
     tailed = np.maximum(value([mu], 0.03), np.where(mugrid.CENTRES > 0.5, tail, -12.0))

@@ -1,5 +1,5 @@
-"""Tests of the influence of votes on a cell: one vote per vehicle, many vehicles, a changed road,
-and trust in vehicles.
+"""Tests of the influence of votes (effects of single visits) on the belief about a cell: one vote
+per vehicle, many vehicles, a changed road, and trust in vehicles.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ PARTS: Final = {
 
 
 def cells(part: Part) -> IntArray:
-    """Return the cells of a part of the street, (n,)."""
+    """Return the cells (n,) of one part (stretch with one surface) of the street."""
     places = [(x, y) for x in part.dx for y in part.dy]
     x, y = (np.array(one, np.int64) for one in zip(*places, strict=True))
     return grid.interleave(MIDDLE[0] + x, MIDDLE[1] + y)

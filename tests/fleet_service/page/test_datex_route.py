@@ -37,7 +37,9 @@ CELLS = [(TILE << 14) + k for k in range(3)]
 
 @contextmanager
 def made_up_service(session: zenoh.Session) -> Iterator[None]:
-    """Answer map queries for one cell of the region, so that the region counts as served."""
+    """Act as a service: answer map queries for one cell of the region, so that the page regards the
+    region as served.
+    """
     fusion = Fusion(120.0)
     fusion.update(observations([0.0], [1], value([0.3])))
     payload = arrow_stream(batch_of(view_cells(fusion, np.arange(1), START), START))

@@ -42,7 +42,7 @@ def lease_on(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
 
 
 def standby_of(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
-    """Let a standby take over the lease, and return its lease."""
+    """Let a standby service take over the lease, and return the lease of the standby."""
     standby = Standby(
         may=lambda: True, stands=lambda _: False, alive=lambda: None, get_ahead=lambda: None
     )
@@ -114,8 +114,8 @@ def test_holder_repairs_a_damaged_lease_and_keeps_it() -> None:
 
 
 def test_failed_renewal_uses_its_turn_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A renewal after a failed one must use another turn, because the failed write may take effect
-    late.
+    """A renewal of the lease after a failed one must use another turn (serial number of renewals),
+    because the write that failed may still take effect later.
     """
     bucket = MemoryBucket()
     holder = lease_on(bucket, "one", 0.5)

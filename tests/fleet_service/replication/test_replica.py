@@ -36,8 +36,8 @@ Make = Callable[[Path], BucketReplica]
 
 @pytest.fixture
 def make(bucket: BucketServer) -> Iterator[Make]:
-    """Yield a function that starts a bucket copy of an archive; the copies are closed
-    at the end.
+    """Yield a function that starts a bucket copy of an archive. At the end of the test all copies
+    are closed.
     """
     made: list[BucketReplica] = []
 
@@ -57,7 +57,9 @@ def there(bucket: BucketServer) -> dict[str, bytes]:
 
 
 def fill_log(root: Path, copy: BucketReplica | None, seeds: range = range(3)) -> SegmentLog[int]:
-    """Return a log with settled segments of both kinds."""
+    """Return a segment log that has written segments (files of new rows) of both kinds,
+    observations and states, to disk, and to the bucket if a copy is given.
+    """
     log: SegmentLog[int] = SegmentLog(root, NAME, None if copy is None else copy.upload_segments)
     Pseudonyms(root / "keys").of("sim-001", 0)
     for seed in seeds:

@@ -26,8 +26,8 @@ COLUMN, ROW = (int(part[0]) for part in grid.deinterleave(np.array([CELL])))
 
 
 def icy(vehicles: list[int]) -> tuple[Fusion, Alerts, list[bool]]:
-    """Let vehicles report ice in a cell one after the other. Return the fusion, its alerts, and for
-    each vehicle whether it raised an alert.
+    """Let vehicles report ice in a cell one after the other. Return the fusion, its alerts, and a
+    list that is True for each vehicle whose report raised an alert.
     """
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)

@@ -19,7 +19,7 @@ LATER_S = 2 * PERIOD_NS / SECOND
 
 
 class Map:
-    """Fusion with its public cells, the part that readers can see."""
+    """Fusion of some cells, together with the public copy of these cells that readers see."""
 
     def __init__(self) -> None:
         self.fusion = Fusion(120.0)
@@ -50,7 +50,9 @@ class Map:
 
 @pytest.fixture
 def busy() -> Map:
-    """Return a map with one public cell that five vehicles visited after its publication."""
+    """Return a map with one public cell (a cell that readers see), which five vehicles visited
+    after it was published.
+    """
     made = Map()
     made.visit(0.0, 1, 2, 3, 4, 5)
     assert made.seen(1.0) == []

@@ -31,8 +31,8 @@ class Made:
         self.now += COST_S
 
     def turn(self, seconds: float = 0.0) -> int:
-        """Simulate a turn of the worker that takes `seconds` in addition to publishing tiles.
-        Return the number of published tiles.
+        """Simulate one turn of the service's worker: other work for `seconds`, and then the
+        publication of tiles. Return the number of published tiles.
         """
         self.now += seconds
         before = len(self.puts)

@@ -22,14 +22,16 @@ from schemas.thresholds import GRAVITY, SLIPPERY_MU, SURFACES
 
 @pytest.fixture(scope="module")
 def driven() -> tuple[DriveSet, FloatArray]:
-    """Return the drives of six cars with realistic sensor errors, forty seconds in a town, and the
-    largest share of the grip used by any wheel (T, 6).
+    """Return the drives of six cars with realistic sensor errors, forty seconds in a town, and, for
+    each sample and car, the largest share of the available grip that any wheel used, (T, 6).
     """
     return real_world.town(FIGURES, 6, 40.0)
 
 
 def saying(batch: DriveSet, lower: float, upper: float) -> Estimates:
-    """Return estimates of a drive with the true motion and a constant friction."""
+    """Return made-up estimates of a drive: the true motion, and a constant friction interval from
+    `lower` to `upper`.
+    """
     output = np.zeros((*batch.t.shape, ONE_FRICTION))
     for column, name in ((Column.VX, "vx"), (Column.VY, "vy"), (Column.YAW_RATE, "yaw_rate")):
         output[..., column] = batch.truth[f"true_{name}"]

@@ -262,8 +262,8 @@ ONLY = {
 def two(
     manoeuvre: str, mounted: Misalignment
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray], FloatArray]:
-    """Return the channels of a drive with ideal sensors, those of the same drive with misaligned
-    sensors, and the parameters of the misalignment.
+    """Simulate a drive twice: with ideal sensors and with misaligned sensors. Return the channels
+    of the first drive, the channels of the second, and the parameters of the misalignment.
     """
     exact, _ = simulate_manoeuvre(manoeuvre, sensors="ideal")
     reported, _ = simulate_manoeuvre(manoeuvre, sensors=Sensors(mounted=mounted), seed=5)

@@ -28,16 +28,17 @@ CHOICES = [np.linspace(0.0, 1.0, POSITIONS)] * VERTICES
 
 
 def bowl(seed: int) -> Objective:
-    """Return a separable objective: one parabola per vertex with its maximum at a random position.
-    The maximum is 0.
+    """Return an objective whose vertices (tuned parameters) do not interact: it is the sum of one
+    parabola per vertex, each with its maximum at a random position (value of the parameter). The
+    maximum is 0.
     """
     top = np.random.default_rng(seed).integers(POSITIONS, size=VERTICES) / (POSITIONS - 1)
     return lambda vector: -float(np.sum((vector - top) ** 2))
 
 
 def decoy(seed: int) -> Objective:
-    """Return a deceptive objective: at every vertex the slope leads away from the best position.
-    The maximum is VERTICES.
+    """Return a deceptive objective: for every vertex (tuned parameter) the slope leads away from
+    the best position (value of the parameter). The maximum is VERTICES.
     """
     top = np.random.default_rng(seed).integers(POSITIONS, size=VERTICES) / (POSITIONS - 1)
 

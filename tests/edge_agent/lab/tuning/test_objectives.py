@@ -105,8 +105,8 @@ def test_interval_score_is_least_at_the_true_quantiles() -> None:
 
 
 def test_inflated_noise_does_not_win_the_innovation_likelihood(drives: TuningSet) -> None:
-    """Innovations must be less likely with 4.5 R than with R, although fewer of them exceed their
-    bound.
+    """The likelihood of the innovations must be lower with a measurement noise of 4.5 R than with
+    the right R, although fewer innovations exceed their bound with 4.5 R.
     """
     usual, inflated = (
         scores_of(Memberships(ln_scales=(s, s)), drives, ESTIMATOR) for s in (0.0, 1.5)
@@ -246,8 +246,8 @@ def test_another_drive_of_the_set_gives_another_worth(drives: TuningSet) -> None
 
 
 def test_drives_of_one_s_own_are_searched_on(tmp_path: Path) -> None:
-    """Recorded drives without true friction must be usable for tuning. Their score is the
-    prediction of the next measurement, on the last third of the recordings.
+    """A user's recorded drives, in which the true friction is unknown, must be usable for tuning.
+    Their score is the prediction of the next measurement, on the last third of the recordings.
     """
     logs = []
     found = []
