@@ -38,13 +38,15 @@ class Horizon(NamedTuple):
     """Knowledge of the map about one path ahead, for each of M metres; NaN where unknown.
 
     Attributes:
-        path: the path with its M metres.
-        key: map cell and sector of each metre (cell·4 + sector), NONE where nothing is known.
+        path: the path, divided into M steps of one metre.
+        key: map cell and heading sector of each metre (cell·4 + sector), NONE where nothing is
+            known.
         mu: median; NaN also where only lower bounds are known.
         mu_lower, mu_upper: 5 % and 95 % quantiles.
         p_slippery: P(mu < 0.4).
         age_s: time since the last observation [s].
-        basis: local_map.UNKNOWN, BOUND, MEASURED or BORROWED.
+        basis: origin of the values: UNKNOWN, BOUND (only a lower bound), MEASURED or BORROWED (from
+            neighbouring places), of local_map.
         slippery: True if the metre justifies a warning.
         alerted: True if an alert is active there.
         safe_speed: [m/s]; NaN where unknown, because nothing is known about the safe speed of an
@@ -71,8 +73,8 @@ def horizon_length(speed: float) -> float:
 
 
 def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
-    """Return the horizon (the map's knowledge about each metre) along a path at the time `now` [ns
-    UTC].
+    """Return the horizon (knowledge of the map about each metre) along a path, at the time `now`
+    [ns UTC].
     """
     places, inverse = np.unique(path.places, return_inverse=True)
     found = known.look_up(places, now)
@@ -114,8 +116,8 @@ def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
 
 
 def justifies_warning(found: PlaceBelief) -> BoolArray:
-    """Return an array (n,) that is True where a place is slippery with enough certainty for a
-    warning.
+    """Return an array (n,) of booleans: True if a place (map cell with heading sector) is slippery
+    with enough certainty for a warning.
     """
     firm = (
         (found.basis == MEASURED)
@@ -157,8 +159,8 @@ def braking_from(horizon: Horizon) -> FloatArray:
     """Return the braking energy per mass up to each metre (M,) [m^2/s^2]: half the square of the
     speed that can be removed by braking between the car and that metre.
 
-    The friction is the lower end of its interval, or UNKNOWN_LOWER on an unknown road. The
-    deceleration is at most a comfortable one.
+    The braking uses the lower end of the friction interval, or UNKNOWN_LOWER on an unknown road. It
+    is limited to a comfortable deceleration.
     """
     lower = np.where(np.isfinite(horizon.mu_lower), horizon.mu_lower, UNKNOWN_LOWER)
     return np.asarray(np.cumsum(np.minimum(GRAVITY * lower, COMFORT)))

@@ -1,9 +1,9 @@
 """Local copy of the map around one car, limited in size; old knowledge fades to unknown. The module
 is pure; time is an argument.
 
-The belief (probabilities of friction) of a cell is reconstructed from the values in a tile: lower
-end, median and upper end of μ, and P(slippery). It then fades as in the fleet's map: with time, the
-probability grows that the road has changed, and a changed road is unknown.
+The belief about a cell (probabilities of friction) is reconstructed from the values in a tile:
+lower end, median and upper end of μ, and P(slippery). It then fades as in the fleet's map: with
+time, the probability grows that the road has changed, and a changed road is unknown.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def belief_of(
     lower: FloatArray, mu: FloatArray, upper: FloatArray, slippery: FloatArray
 ) -> FloatArray:
     """Return probabilities on the friction grid (n, 32) for n cells, computed from the values in a
-    tile; `mu` may be NaN.
+    map tile; `mu` may be NaN.
 
     `lower`, `mu` and `upper` are the 5 %, 50 % and 95 % quantiles, `slippery` is P(slippery). The
     distribution function is linear between these values.
@@ -99,8 +99,8 @@ NOTHING: Final = ReceivedCells(
 
 
 class LocalMap:
-    """Map cache of one car: the tiles received last, with up to MOST_CELLS cells in total, and
-    active alerts.
+    """Local map of one car: the map tiles received last, with up to MOST_CELLS cells in total, and
+    the active alerts.
     """
 
     def __init__(self, most_cells: int = MOST_CELLS) -> None:
@@ -148,7 +148,7 @@ class LocalMap:
 
     def store_standing_alerts(self, tile: int, alerts: list[Alert], now: int) -> list[int]:
         """Replace the active alerts of a tile by `alerts`; return the keys (cell·4 + sector) of the
-        places that changed.
+        places whose alerts changed.
         """
         stand = {alert.cell * grid.SECTORS + alert.sector: alert for alert in alerts}
         news = [
@@ -173,10 +173,11 @@ class LocalMap:
             del self._alerts[key]
 
     def look_up(self, key: IntArray, now: int) -> PlaceBelief:
-        """Return the current knowledge about the places with the keys `key` (n,).
+        """Return the current knowledge about n places, given by their keys (cell·4 + sector), `key`
+        (n,).
 
-        An alert for the opposite direction also counts for this direction, unless better friction
-        was measured here after it: ice and water are not limited to a lane.
+        Ice and water are not limited to a lane. Therefore an alert for the opposite direction also
+        counts for this direction, unless a better friction was measured here afterwards.
         """
         belief, basis, last, at, vehicles = self._look_up(key)
         alerted = np.zeros(len(key), np.bool_)
@@ -229,8 +230,9 @@ class LocalMap:
         )
 
     def belief_at(self, key: int, now: int) -> FloatArray | None:
-        """Return the current belief about one place, as probabilities (32,); None if the map has no
-        recent measured value of it.
+        """Return the current belief about one place (map cell with heading sector), as
+        probabilities (32,) on the friction grid; None if the map has no recent measured value of
+        the place.
         """
         belief, basis, last, at, _ = self._look_up(np.array([key]))
         if basis[0] != MEASURED or now - at[0] > HELD_S * NS:
@@ -250,8 +252,8 @@ class LocalMap:
         return self._all
 
     def _look_up(self, key: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]:
-        """Return belief, basis, time of last observation, time of receipt and number of vehicles
-        for places (n,).
+        """Return, for n places (map cells with heading sector): belief, basis (origin of the
+        values), time of the last observation, time of receipt and number of observing vehicles.
         """
         whole = self._all_cells()
         if not len(whole.key):

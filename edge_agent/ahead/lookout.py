@@ -1,7 +1,7 @@
-"""Lookout: computes the view ahead of each vehicle once a second on a separate thread, and
-immediately when alerts change.
+"""Lookout: computes the map's values for the road ahead of each vehicle. It does so once a second
+on a separate thread, and immediately when alerts change.
 
-The estimation loop only reports positions (`see`), which never blocks.
+The estimation loop only passes positions to it, by `see`, which never waits.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ class LookoutCounts:
     subscribers: dict[str, MapSubscriber] = field(default_factory=dict)
 
     def total_of(self, what: str) -> int:
-        """Return the sum of the counter called `what` over the map subscribers of all vehicles."""
+        """Return the sum of the counter with the name `what` over the map subscribers of all
+        vehicles."""
         return sum(one.counts[what] for one in self.subscribers.values())
 
     def values(self) -> dict[str, float]:
@@ -85,10 +86,10 @@ class Lookout:
     """Thread that looks ahead for several vehicles, which are identified by name.
 
     Args:
-        names: the vehicles; row k of the poses is vehicle k.
+        names: the vehicles; row k of the poses belongs to vehicle k.
         hear: called with the vehicle's name and each warning, on the lookout's thread.
-        route_of: returns the given route of vehicle k, or None to follow the roads visible in the
-            map.
+        route_of: returns the route that the user gave for vehicle k, or None to follow the roads
+            visible in the map.
         listening: returns True for a vehicle that looks ahead; by default all vehicles do.
         on_horizons: called with the vehicle's name, its horizons and its pose after each look.
     """
@@ -158,7 +159,7 @@ class Lookout:
         self._here = np.column_stack([mugrid.quantiles(informed, q) for q in (0.5, 0.05, 0.95)])
 
     def outlook(self, name: str) -> Outlook | None:
-        """Return the last view ahead of a vehicle; None before the first one."""
+        """Return the last result of looking ahead for a vehicle; None before the first one."""
         return self._watchers[self._number[name]].outlook
 
     def close(self, within_s: float = 1.0) -> None:
@@ -255,8 +256,8 @@ class Lookout:
 def paths_ahead(
     pose: Pose, route: GivenRoute | None, subscriber: MapSubscriber, length: float
 ) -> list[Path]:
-    """Return the possible paths ahead: the given route, else the roads visible in the map, else
-    straight on.
+    """Return the possible paths ahead: the route given by the user, else the roads visible in the
+    map, else one path straight on.
 
     The caller must hold the subscriber's lock.
     """

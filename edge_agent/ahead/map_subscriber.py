@@ -74,7 +74,8 @@ class MapSubscriber:
 
     @property
     def local_map(self) -> LocalMap:
-        """Return the local copy of the map; the caller must hold the lock."""
+        """Return the local copy of the map; the caller must have acquired the lock of the
+        subscriber."""
         return self._map
 
     @property
@@ -91,8 +92,8 @@ class MapSubscriber:
         """Subscribe and send queries along the possible paths, the most likely first. The call does
         not wait for an answer.
 
-        Alerts are subscribed to for the first `within` metres; the map is requested further ahead,
-        see `RequestLog.missing_boxes`.
+        The subscription to alerts covers the first `within` metres of the paths. Map cells are also
+        requested beyond that, see `RequestLog.missing_boxes`.
         """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
         back = bool(routers - self._routers)
@@ -127,7 +128,8 @@ class MapSubscriber:
             self._map.drop_old(pose.time)
 
     def publish_view(self, payload: Callable[[], bytes]) -> None:
-        """Publish the view ahead on the vehicle's own Zenoh key, if there is a subscriber."""
+        """Publish the encoded outlook (the map's values for the road ahead) on the vehicle's own
+        Zenoh key, if there is a subscriber."""
         if self._publisher.matching_status.matching:  # type: ignore[attr-defined] # stub: bool
             self._publisher.put(payload())
             self.counts["told"] += 1

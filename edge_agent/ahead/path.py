@@ -1,4 +1,4 @@
-"""Path ahead in steps of one metre, with the cells and sectors of the map for each metre. The
+"""Path ahead in steps of one metre, with the map cells and heading sectors of each metre. The
 module is pure.
 
 Legend
@@ -54,9 +54,9 @@ class Path(NamedTuple):
     """One possible path ahead of the car.
 
     Attributes:
-        kind: "route" (given), "road" (visible in the map) or "corridor" (straight on).
+        kind: "route" (given by the user), "road" (visible in the map) or "corridor" (straight on).
         distance: (M,) [m].
-        places: (M, C) keys.
+        places: (M, C) keys of the map places of each metre.
         curvature: (M,) [1/m], positive to the left; NaN where unknown.
         x, y: (M,) [m] east and north of the car.
     """
@@ -106,8 +106,8 @@ def path_along(
 ) -> Path:
     """Return the path along a line (n, 2) [m] that begins at the car, at most `length` [m] long.
 
-    `first` (n,) are known keys of places at the line's points. They take precedence over the keys
-    computed from the positions.
+    `first` (n,) are the keys of map places (cell·4 + sector) at the line's points, as far as known.
+    They take precedence over the keys computed from the positions.
     """
     run = _distance_along(line)
     count = max(int(min(run[-1], length)), 1)
@@ -163,7 +163,7 @@ class GivenRoute:
 
     def _match_position(self, line: FloatArray, run: FloatArray, pose: Pose) -> float | None:
         """Return the car's distance along the route [m], at the point that best fits its position
-        and heading. Points soon after the last match are preferred.
+        and heading. Points shortly after the point matched last are preferred.
 
         Return None if no point matches.
         """

@@ -2,8 +2,8 @@
 VelocityLimit.
 
 The limit is the speed from which the vehicle can brake comfortably to the safe speed of each place
-ahead. It decreases immediately, but increases only after the new limit was higher for HOLD_S, so
-that it does not fluctuate. An unmeasured road gives no limit.
+ahead. It decreases immediately. It increases only after the computed limit has been higher for
+HOLD_S, so that it does not fluctuate. An unmeasured road gives no limit.
 
 Autoware subscribes to `/planning/scenario_planning/max_velocity_candidates`
 (tier4_planning_msgs/msg/VelocityLimit). The message is published in the form of rmw_zenoh: CDR,
@@ -63,8 +63,8 @@ def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
 
 
 def cautious_bound(mu: FloatArray, mu_lower: FloatArray) -> FloatArray:
-    """Return the friction that a road exceeds with a probability of 99.5 %, from its median and 5 %
-    quantile; NaN if unknown.
+    """Return the friction that a road exceeds with a probability of 99.5 %, computed from the
+    median and the 5 % quantile of its friction; NaN if unknown.
     """
     below = np.nan_to_num(mu - mu_lower)
     return np.asarray(np.maximum(mu_lower - CAUTION * below, LEAST_GRIP))
@@ -82,8 +82,8 @@ def limit_of(horizons: list[Horizon]) -> float:
 
 
 class SteadyLimit:
-    """Speed limit with hysteresis: it decreases immediately, and increases only after the new limit
-    was higher for HOLD_S.
+    """Speed limit with hysteresis: it decreases immediately, and increases only after the computed
+    limit has been higher for HOLD_S.
     """
 
     def __init__(self) -> None:
@@ -91,8 +91,8 @@ class SteadyLimit:
         self._higher_since: int | None = None
 
     def update(self, limit: float, now: int) -> bool:
-        """Process a new speed limit [m/s] at the time `now` [ns]; return True if the steady limit
-        changed.
+        """Process a computed speed limit [m/s] at the time `now` [ns]. Return True if the output of
+        the hysteresis, the limit that is sent to the planner, has changed.
         """
         if limit < self.value:
             self._higher_since = None
@@ -113,7 +113,8 @@ class SteadyLimit:
 
 
 def encode_limit(limit: float, now: int) -> bytes:
-    """Return a VelocityLimit as CDR, little endian; inf is written as FREE."""
+    """Encode a speed limit as the message VelocityLimit in CDR, little endian; inf (no limit) is
+    written as the value FREE."""
     sender = SENDER.encode() + b"\0"
     speed = min(limit, FREE)
     body = struct.pack("<iIfB3x", now // NS, now % NS, speed, 1) + struct.pack(

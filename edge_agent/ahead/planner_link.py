@@ -43,8 +43,8 @@ class PlannerLink:
         self._session = open_session(self._settings)
 
     def receive_horizons(self, _: str, horizons: list[Horizon], pose: Pose) -> None:
-        """Compute the speed limit from the horizons; publish it if it changed or the last message
-        is REPEAT_S old.
+        """Compute the speed limit from the horizons (knowledge of the map about each metre ahead).
+        Publish it if it changed or the last message is REPEAT_S old.
         """
         changed = self._limit.update(limit_of(horizons), pose.time)
         if self._session is None or not (changed or pose.time - self._sent >= REPEAT_S * NS):

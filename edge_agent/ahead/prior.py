@@ -1,9 +1,9 @@
 """The map as prior knowledge about the friction in the vehicle's current cell. It never affects
 published records. The module is pure.
 
-The estimator runs without the map: its recursion, and the published evidence of a visit, are
-bit-equal with and without a map. In addition, this module computes the belief of an estimator that
-had started the visit with the map's belief:
+The estimator runs without the map: its recursion, and the published evidence of a visit (passage of
+one cell), are bit-equal with and without a map. In addition, this module computes the belief of an
+estimator that had started the visit with the map's belief:
 
     q(μ)  ∝  [(1 - h)·w⁻(μ) + h·u(μ)] · m(μ)/u(μ)     at the border of a cell
     p_M   ∝  q · L            p  =  (1 - β')·p_M + β'·w            inside the cell
@@ -58,8 +58,8 @@ class MapPrior:
         self._found = np.full(vehicles, SHARE)  # now
 
     def entered_vehicles(self, keys: IntArray) -> list[int]:
-        """Return the indices of the vehicles that entered another place since the last step. `step`
-        needs the map's beliefs for them.
+        """Return the indices of the vehicles that entered another place (map cell with heading
+        sector) since the last step. `step` needs the map's beliefs for them.
         """
         return np.flatnonzero(keys != self._key).tolist()
 
@@ -76,7 +76,8 @@ class MapPrior:
         Args:
             keys: (N,) current place (cell·4 + sector) of each vehicle, NOWHERE where unknown.
             own: (N, 32) log(posterior/uniform) of each filter.
-            visit: (N, 32) log-likelihood of the current visit so far.
+            visit: (N, 32) log-likelihood of the measurements in the current visit (passage of one
+                place) so far.
             map_beliefs: the map's belief for the vehicles in `entered_vehicles`; None where the map
                 knows nothing.
         """

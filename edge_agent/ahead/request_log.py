@@ -1,9 +1,10 @@
 """Choice of map requests: narrow boxes along the path ahead, so that a day needs megabytes and not
 gigabytes. The module is pure.
 
-The fleet service publishes a changed tile as a whole, every second: about 50 kB in a busy town. A
-car needs only the part along its path, and not every second, but it must hear of ice immediately.
-Therefore it requests narrow boxes along its path, and subscribes to the alerts of the tiles there.
+The fleet service publishes every changed map tile completely, each second: about 50 kB in a busy
+town. A car needs only the part along its path, and not every second, but it must hear of ice
+immediately. Therefore it requests narrow boxes along its path, and subscribes to the alerts of the
+tiles there.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ class RequestLog:
     def missing_boxes(self, path: Path, pose: Pose, within: float) -> list[Box]:
         """Return the boxes to request now along a path, and record them as requested.
 
-        The result is empty while recently requested boxes cover the first `within` [m] of the path.
-        Otherwise the boxes cover all missing parts of the path.
+        `within` is a length [m]. The result is empty while recently requested boxes cover that
+        length of the path. Otherwise the boxes cover all missing parts of the path.
         """
         latitude, longitude = to_degrees(path.x[::STEP], path.y[::STEP], pose)
         open_ = np.ones(len(latitude), np.bool_)
@@ -124,8 +125,8 @@ def _in_order(tiles: IntArray) -> list[int]:
 
 
 def _split_path(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
-    """Return (first, last) metre of parts of the path that together contain every wanted point.
-    Each part has a small bounding box.
+    """Return pairs (first metre, last metre): parts of the path that together contain every wanted
+    point. Each part has a small bounding box.
     """
     found: list[tuple[int, int]] = []
     first = last = -1

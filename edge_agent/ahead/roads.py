@@ -4,8 +4,8 @@ the other.
 One place follows another if it lies within about two cells in front of it, and its sector is a
 possible heading for a vehicle that comes from there. At a fork all roads are followed, the
 straightest first. After its last known place, the straightest road is continued straight on over
-the length of a corridor. The car requests the map along its path, so without this extension the
-known road would never grow.
+the length of a corridor. This extension lets the known road grow, because the car requests the map
+only along its path.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ class _Neighbours:
         self.side = side
 
     def next_places(self, here: tuple[float, float], heading: float, cells: float) -> list[int]:
-        """Return the keys of places that may follow the present place on a road, the most likely
-        first, at most one per road.
+        """Return the keys (cell·4 + sector) of places that may follow the present place on a road,
+        the most likely first, at most one per road.
         """
         reach = cells * self.side
         found = []
@@ -111,7 +111,8 @@ class _Neighbours:
 def _follow_way(
     graph: _Neighbours, way: list[int], pose: Pose, length: float, forks: list[list[int]]
 ) -> list[int]:
-    """Follow a road from the places in `way` to its end; append branches at forks to `forks`.
+    """Follow a road that begins with the places (keys) in `way` to its end; append the other
+    branches at forks to `forks`.
 
     Return the keys of the places along the road.
     """

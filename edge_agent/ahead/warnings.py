@@ -1,8 +1,8 @@
 """Warnings about slippery stretches of road: issued when a stretch comes within reach, updated when
 it changes, ended when it is over. The module is pure.
 
-The reach is the stopping distance before the stretch at the present speed: reaction, a margin, and
-braking at the lower end of friction on the road up to the stretch.
+The reach is the distance that the car needs to stop before the stretch. It consists of the distance
+during the driver's reaction, a margin, and braking with the lower end of the friction interval.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def update_warnings(
         active: active warnings before the update.
         horizons: horizons of all possible paths, the most likely first.
         pose: pose of the car.
-        known: the local copy of the map.
+        known: the local copy of the map in the car.
     """
     issued: list[GripWarning] = []
     speed = pose.speed + GAIN if pose.speed > SLOWEST else 0.0
@@ -103,7 +103,8 @@ def update_warnings(
 
 
 def _slippery_stretches(horizon: Horizon, speed: float) -> list[_Stretch]:
-    """Return the slippery stretches of a horizon; stretches at most LINK_M apart are joined."""
+    """Return the slippery stretches of a horizon (knowledge of the map about each metre ahead);
+    stretches at most LINK_M apart are joined."""
     brakes = np.concatenate([[0.0], braking_from(horizon)])
     begins = math.ceil(
         speed * (REACTION_S + UPDATE_S) + MARGIN_M
@@ -138,8 +139,8 @@ def _find_runs(mask: BoolArray) -> list[tuple[int, int]]:
 
 
 def _by_place(stretches: list[_Stretch]) -> list[tuple[frozenset[int], list[_Stretch]]]:
-    """Group the slippery stretches of several paths by common places; return pairs (all places of
-    the group, stretches of the group).
+    """Group slippery stretches of several paths that have places (map cells with heading sector) in
+    common. Return one pair per group: all its places, and all its stretches.
     """
     groups: list[tuple[frozenset[int], list[_Stretch]]] = []
     for stretch in stretches:

@@ -1,1 +1,2 @@
-"""Functions behind the commands: live loop, replay of logs, estimators by name, metrics."""
+"""Functions that the commands of `edge-agent` call: live loop, replay of logs, estimators by name,
+metrics."""

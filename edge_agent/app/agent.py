@@ -1,4 +1,5 @@
-"""The agent: connects estimator bank, pipeline and publisher in the live loop.
+"""The agent: connects the estimator bank, the pipeline that makes records from estimates, and the
+publisher in the live loop.
 
 It corresponds to `fleet_service.app.service`. Signals come from an `AgentSource`. Additional parts
 that use the vehicles' Zenoh sessions, such as warnings of the road ahead, are `AgentPart`s.
@@ -53,7 +54,7 @@ class AgentOptions:
         vehicles: vehicle files.
         names: names under which the vehicles publish.
         config: configuration of the agent.
-        estimator: name of the estimator; None for the configuration's.
+        estimator: name of the estimator; None for the one named in the configuration.
         memberships: fuzzy sets that replace the estimator's own.
         duration_s: time to drive [s].
     """
@@ -70,10 +71,10 @@ class AgentSource(NamedTuple):
     """Source of the vehicles' signals.
 
     Attributes:
-        blocks: blocks of samples, in real time or faster.
+        blocks: blocks (consecutive samples of all vehicles), in real time or faster.
         is_admitted: returns True if the records of the current block may be published.
         health_problems: returns one message per problem of the source.
-        end: called when the loop has ended.
+        end: function that is called when the loop has ended.
     """
 
     blocks: Iterator[Block]
@@ -92,12 +93,13 @@ class AgentPart(Protocol):
         """Start the part, before the agent processes the first block."""
 
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:
-        """Update the part from the pipeline after a block; `admitted` is True if the block's
-        records are published.
+        """Update this part of the agent from the pipeline after a block of samples; `admitted` is
+        True if the records of the block are published.
         """
 
     def close_part(self) -> Mapping[str, float]:
-        """Stop the part, and return its counts for the agent's last line of output."""
+        """Stop this part of the agent, and return its counts for the agent's last line of
+        output."""
 
 
 class Agent:
@@ -116,8 +118,8 @@ class Agent:
         self._publisher: Publisher | None = None
 
     def drive(self) -> int:
-        """Process blocks in real time until the source ends, the duration has passed or a signal
-        (SIGTERM, Ctrl-C) arrives; then shut down.
+        """Process blocks of samples in real time until the source ends, the duration has passed or
+        a signal (SIGTERM, Ctrl-C) arrives; then shut down.
 
         Print a line of counts and return 0.
         """
@@ -209,8 +211,8 @@ class Agent:
         ]
 
     def _warm_up(self) -> None:
-        """Run one step with a temporary vehicle, which loads or compiles the kernels before the
-        loop starts.
+        """Run one step with a temporary vehicle, so that the kernels are loaded or compiled before
+        the loop starts.
         """
         t = np.zeros((1, 1))
         time = np.zeros((1, 1), dtype=np.int64)
@@ -223,7 +225,7 @@ class Agent:
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Yield an event that SIGTERM and Ctrl-C set; a second signal ends the process at once."""
+    """Yield an event that is set by SIGTERM or Ctrl-C; a second signal ends the process at once."""
     stop = threading.Event()
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 

@@ -1,8 +1,8 @@
 """Estimation of many recorded drives in parallel, on threads of this machine or on Spark.
 
-Threads are sufficient, because the kernels and Parquet release the interpreter lock; the compiled
-code is loaded only once. Both engines run the same function for each drive and write the same
-bytes.
+On one machine the drives run on threads of one process, which loads the compiled code once: kernels
+and Parquet release the interpreter lock. Both engines run the same function for each drive and
+write the same bytes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from schemas.vehicle import load_vehicle
 
 
 class Task(NamedTuple):
-    """Task: a signal log, the vehicle that recorded it, and the file for its estimates."""
+    """Task of the estimation: a signal log, the vehicle that recorded it, and the path for its
+    estimates."""
 
     log: Path
     vehicle: Path
@@ -33,7 +34,8 @@ class Task(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Result of a task: the number of estimated samples, or the reason of a failure."""
+    """Result of the estimation of one drive: the number of estimated samples, or the reason of a
+    failure."""
 
     task: Task
     samples: int

@@ -44,10 +44,11 @@ class Panel:
 
     Attributes:
         name, unit: name and unit of the quantity.
-        column: column of the estimates.
+        column: column of the estimates that contains the quantity.
         scale: factor from the column's unit to the displayed unit.
-        band: columns of lower and upper end, or the column of the standard deviation.
-        fixed: ends of the axis; None to fit the axis to the values.
+        band: columns with lower and upper end of the interval, or the column with the standard
+            deviation.
+        fixed: smallest and largest value on the axis; None to fit the axis to the values.
     """
 
     name: str
@@ -113,8 +114,8 @@ def curve_of(
 
 
 def thin_parts(count: int) -> list[slice]:
-    """Return slices of a curve of `count` samples. Each slice becomes one point of the plot, and
-    there are at most MOST_POINTS slices.
+    """Divide the `count` samples of a curve into at most MOST_POINTS slices and return the slices.
+    Each slice becomes one point of the plot.
     """
     step = max(1, math.ceil(count / MOST_POINTS))
     return [slice(k, min(k + step, count)) for k in range(0, count, step)]

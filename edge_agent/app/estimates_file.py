@@ -37,7 +37,7 @@ WHEEL_COLUMNS = tuple(
 
 
 def prepare_path(field: str, path: Path) -> Path:
-    """Create the folder of a path, and return the path.
+    """Create the folder in which the file `path` will lie, and return the path.
 
     Raises:
         InputError: the path is a folder, or its folder cannot be written.
@@ -82,7 +82,8 @@ def _table_writer(path: Path, field: str = "out") -> Any:  # noqa: ANN401 a clas
 
 
 class EstimatesFile:
-    """Writer of estimates, block by block. The file gets its name only when it is complete.
+    """Writer of a file of estimates, one block of samples after the other. The file gets its final
+    name only when it is complete.
 
     Raises:
         InputError: the path cannot be written, or its suffix is not one of ENDINGS.
@@ -107,7 +108,8 @@ class EstimatesFile:
         self._opened.__exit__(kind, error, trace)
 
     def write(self, t: FloatArray, estimates: Estimates) -> None:
-        """Add a block to the file: times t (T, 1) and the estimates of a bank with one vehicle."""
+        """Add a block of T samples to the file: times t (T, 1) and the estimates of a bank with one
+        vehicle."""
         self._writer.write_table(estimates_table(t, estimates))
 
 

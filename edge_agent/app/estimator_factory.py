@@ -1,5 +1,5 @@
-"""Estimator banks by name, with shipped or given memberships; estimators of other packages are
-included.
+"""Creation of estimator banks by name. Their memberships (fuzzy sets) are those in this package, or
+those that the caller gives. Estimators of other installed packages are included.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from schemas.vehicle import Vehicle
 
 
 def known_estimators() -> dict[str, str]:
-    """Return all estimators by name, with a one-line description. Estimators of other packages are
-    included.
+    """Return all estimators by name, with a one-line description. Estimators of other installed
+    packages are included.
     """
     others = {
         name: f"from {point.value}"
@@ -31,9 +31,10 @@ def bank_of(
     """Return a bank of estimators, one per vehicle.
 
     Args:
-        estimator: a key of `known_estimators()`; NAME@CURVE uses the tyre curve of another package.
+        estimator: a key of `known_estimators()`; NAME@CURVE uses the tyre curve CURVE of another
+            installed package.
         vehicles: nominal vehicles, N of them.
-        memberships: fuzzy sets instead of the shipped ones.
+        memberships: fuzzy sets that replace those in this package.
 
     Raises:
         InputError: the estimator or the tyre curve is unknown, no vehicle is given, memberships are

@@ -1,8 +1,9 @@
 """Provider for a Kuksa databroker: writes the friction at the vehicle over kuksa.val.v2.
 
-`Vehicle.ADAS.ESC.RoadFriction.*` are percent, as float. `Vehicle.Exterior.RoadSurfaceCondition`
-(VSS pull request 892) is a word. An unknown value is written as a data point without a value, so
-that no outdated value stays in the broker.
+The signals `Vehicle.ADAS.ESC.RoadFriction.*` are floats in percent. The signal
+`Vehicle.Exterior.RoadSurfaceCondition` (VSS pull request 892) is a word such as "ICE". If a value
+is unknown, a data point without a value is written. Otherwise the broker would continue to show the
+outdated value.
 """
 
 from __future__ import annotations

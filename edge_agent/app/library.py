@@ -113,7 +113,7 @@ def plot(
     estimates: dict[str, pa.Table], *, truth: pa.Table | None = None, title: str = ""
 ) -> Figure:
     """Plot speed and friction with its 90 % interval over time, for several estimators by name.
-    `truth` is a simulated log with the true values.
+    `truth` is a simulated log; its true friction and speed are also plotted.
 
     Raises:
         InputError: matplotlib is not installed.

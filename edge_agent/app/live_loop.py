@@ -1,9 +1,9 @@
-"""Live loop: passes blocks of samples in real time through the pipeline to the publisher, until it
-is stopped.
+"""Live loop: passes blocks of samples in real time through the pipeline (estimation and records) to
+the publisher, until the loop is stopped.
 
-The loop waits so that no block is processed before its time. A block counts as late if it is
-finished more than its own length behind real time. No block is skipped: a loop that fell behind
-catches up as fast as possible.
+The loop waits so that no block is processed before its time. A block counts as late if its
+processing ends more than the block's own duration behind real time. No block is skipped: a loop
+that fell behind catches up as fast as possible.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class LoopOptions(NamedTuple):
         clock: monotonic clock [s].
         is_admitted: returns True if the records of a block may be published; other records are
             held back and counted.
-        after: called after each block.
+        after: function that is called after each block of samples.
     """
 
     on_status: Callable[[Progress], None] = lambda _: None
@@ -72,8 +72,8 @@ def run_live_loop(
     options: LoopOptions,
     progress: Progress | None = None,
 ) -> Progress:
-    """Process blocks until the source ends, the duration has passed or `stop` is set; then close
-    the open visits.
+    """Process blocks of samples until the source ends, the duration has passed or `stop` is set;
+    then close the open visits (passages of a map cell).
 
     `progress` is updated during the run, and returned.
     """
@@ -134,8 +134,8 @@ def _offer_if_admitted(
 
 
 def final_counts(progress: Progress, publisher: Publisher) -> dict[str, float]:
-    """Return the agent's final counts: records of all kinds together, observations separately, and
-    blocks and delays of the loop.
+    """Return the agent's final counts: all records, the observations among them, and blocks and
+    delays of the loop.
     """
     counts = publisher.counts
     seen = Kind.OBSERVATION

@@ -1,4 +1,4 @@
-"""Plausibility check of a replay's estimates: it gives a summary line, and the exit code
+"""Plausibility check of the estimates of a replayed log: it gives a summary line, and the exit code
 IMPLAUSIBLE for implausible estimates.
 """
 
@@ -30,8 +30,8 @@ def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
     """Return the grip in use according to the accelerometers (T,) [1], smoothed over SMOOTHED_S; 0
     where a reading is missing.
 
-    The estimate `mu_utilised` is not suitable here, because it is the maximum of the last second:
-    on a road that has just become slippery it exceeds the available grip.
+    The estimate `mu_utilised` is not used here: it is the maximum of the last second, so on a road
+    that has just become slippery it exceeds the available grip.
     """
     used = np.nan_to_num(np.hypot(signals[:, S.AX], signals[:, S.AY])) / GRAVITY
     step = float(np.median(np.diff(t))) if len(t) > 1 else SMOOTHED_S
@@ -41,7 +41,8 @@ def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
 
 @dataclass
 class Plausibility:
-    """Counters over the blocks of one replay. The plausibility check is computed from them."""
+    """Counters over the blocks of samples of one replayed log. The plausibility check is computed
+    from them."""
 
     radius: float
     first: float = np.inf
@@ -54,8 +55,8 @@ class Plausibility:
     away: list[FloatArray] = field(default_factory=list)
 
     def add(self, t: FloatArray, signals: FloatArray, estimates: Estimates) -> None:
-        """Add a block of the replay: t (T, 1), signals (T, 1, 18) and the estimates of these
-        samples.
+        """Add a block of samples of the replayed log: t (T, 1), signals (T, 1, 18) and the
+        estimates of these samples.
         """
         wheels = signals[:, 0, S.OMEGA : S.OMEGA + 4]
         some = np.isfinite(wheels).any(axis=1)

@@ -1,4 +1,4 @@
-"""Publisher of a command: opened from the configuration, and closed with its final counts."""
+"""Opening of a command's publisher as configured, and closing with a report of the final counts."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def open_publisher(
     estimator: str,
     on_open: Callable[[str, zenoh.Session], None] = lambda *_: None,
 ) -> Publisher:
-    """Return a started publisher with the configured outbox. `on_open(name, session)` is called
-    with each vehicle's session.
+    """Return a started publisher with the configured outbox (store of unsent records).
+    `on_open(name, session)` is called with each vehicle's session.
 
     Raises:
         InputError: Zenoh rejects its settings, or the outbox is in use or unusable.
@@ -61,7 +61,8 @@ def close_publisher(
     """Wait at most `drain_s` seconds for acknowledgements and close the publisher. Print counts and
     the values `more` as one line of JSON on stdout.
 
-    Unsettled records stay in the outbox for the next start.
+    Records without an acknowledgement stay in the outbox (store on disk) and are sent after the
+    next start.
     """
     from edge_agent.app.live_loop import final_counts
 

@@ -23,7 +23,8 @@ _NUMBER: Final = re.compile(r"\d+(\.\d+)?")
 
 
 class PublisherState(Protocol):
-    """Interface of a publisher's status: the values that show whether its records arrive."""
+    """Interface of a publisher as far as it is needed here: values that show whether its records
+    arrive."""
 
     @property
     def links(self) -> int:
@@ -47,8 +48,8 @@ class PublisherState(Protocol):
 
 
 class SignalWatch:
-    """Watch of a source: the times at which its blocks last had a position, a wheel speed and a
-    turning wheel.
+    """Observer of a signal source: it records when the source's blocks last contained a position, a
+    wheel speed and a turning wheel.
 
     Args:
         clock: monotonic clock [s].
@@ -94,7 +95,7 @@ def reasons_not_publishing(
     records can be published.
 
     Args:
-        watch: watch that has seen the blocks.
+        watch: observer through which the source's blocks have passed.
         publisher: status of the publisher.
         endpoints: routers that the publisher tries to reach.
         troubles: problems reported by the sources and by the signal doctor.

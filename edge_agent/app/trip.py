@@ -1,10 +1,11 @@
 """Live trip: the signal doctor verifies the signals, and a calibration is learned from them. The
 result is stored next to the outbox.
 
-Nothing is published before the doctor has passed the signals, in this trip or in an earlier one
-with the same vehicle file and profile. A trip is examined in parts of PART_S. The calibration is
-learned from each part that passes; a part that shows a fault revokes the approval. Learned values
-are used from the next trip on, because an estimator's vehicle does not change during a trip.
+Nothing is published before the doctor has found the signals free of faults. This may have been in
+an earlier trip with the same vehicle file and profile. A trip is examined in parts of PART_S. The
+calibration is learned from each part that passes; a part with a fault ends the publishing until a
+later part passes. Learned values are used from the next trip on, because an estimator's vehicle
+does not change during a trip.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ log = logging.getLogger(__name__)
 
 
 class Known(BaseModel):
-    """Stored knowledge about a car: `passed` (True if its signals passed the signal doctor), and in
-    `drives` the sensor errors estimated from each part of its trips.
+    """Stored knowledge about a car: `passed` is True if the signal doctor found no fault in its
+    signals; `drives` are the sensor errors estimated from each part of its trips.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -63,7 +64,7 @@ class Trip:
     Args:
         vehicle: vehicle file of the car.
         profile: profile that maps its signals.
-        path: file of the stored knowledge; it need not exist.
+        path: file with the stored knowledge about the car; it need not exist.
         trusted: True to publish regardless of the doctor's findings.
     """
 
@@ -117,7 +118,8 @@ class Trip:
                 yield replace(block, signals=mended[:, None])
 
     def learn_rest(self) -> None:
-        """Start the examination of the last part of the trip, to learn from it."""
+        """Start the examination of the last part of the trip, so that the calibration is also
+        learned from it."""
         self._start_examination(final=True)
 
     def close(self) -> None:

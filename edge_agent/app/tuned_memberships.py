@@ -1,5 +1,5 @@
-"""Files of tuned memberships: the membership functions, their scores, and the command that
-reproduces them.
+"""Files of tuned memberships (fuzzy sets): their membership functions, their scores, and the
+command that reproduces them.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class Record(BaseModel):
 
 
 class Score(Record):
-    """Scores of one set of memberships on one set of drives; null if the true friction is
-    unknown.
+    """Scores of one set of memberships (fuzzy sets) on one set of drives. Scores that need the true
+    friction are null if it is unknown.
     """
 
     interval_score: Annotated[
@@ -74,7 +74,8 @@ class Budget(Record):
 
 
 class Provenance(Record):
-    """Origin of the scores in a file: all parameters needed to compute these scores again."""
+    """Origin of the scores in a file of memberships: all parameters needed to compute these scores
+    again."""
 
     command: str
     seed: Annotated[int, Field(ge=0)]
@@ -104,7 +105,8 @@ class Document(Record):
 
 @dataclass(frozen=True)
 class Tuned:
-    """A parsed file of tuned memberships: the valid memberships, and the complete document."""
+    """A parsed file of tuned memberships (fuzzy sets): the validated memberships, and the complete
+    document."""
 
     memberships: Memberships
     document: Document
@@ -114,8 +116,8 @@ def parse_tuned(text: str | bytes, where: str) -> Tuned:
     """Return the tuned memberships in a document.
 
     Raises:
-        InputError: a field is missing, unknown, not a finite number, or a vertex is out of order or
-            out of range.
+        InputError: a field is missing, unknown, not a finite number, or a vertex (corner of a fuzzy
+            set) is out of order or out of range.
     """
     try:
         document = Document.model_validate_json(text)

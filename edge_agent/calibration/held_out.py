@@ -3,7 +3,8 @@
 A calibration has several groups of quantities (radii, steering, inertial unit, clocks, torque). A
 group is kept only if the vehicle with this group predicts held-out drives at least as well as
 without it. Two conditions decide: the predictive log-likelihood of the estimator's own innovations
-does not decrease, and the time in the state `CONTRADICTION` does not increase.
+does not decrease, and the time with the health flag CONTRADICTION (measurements contradict the
+model) does not increase.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ Drive: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 class Prediction(NamedTuple):
-    """Score of a vehicle with a certain calibration: it shows how well the vehicle predicts the
-    measurements of one drive.
+    """Score of a calibration on one drive: how well a filter with this calibration predicts the
+    measurements.
     """
 
     log_likelihood: float  # of the innovations [nat/s]
@@ -64,8 +65,8 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
     prediction of held-out drives.
 
     Raises:
-        InputError: no drive has enough excitation, or a single drive is too short to hold a part
-            out.
+        InputError: no drive has enough excitation, or there is only one drive and it is too short
+            to be cut in two.
     """
     whole = learn_calibration(drives, vehicle)
     folds = split_folds(drives)

@@ -1,5 +1,5 @@
-"""Systematic errors of one car's sensors, learned from its own drives: for each quantity the mean
-over the drives with its standard deviation.
+"""Systematic errors of one car's sensors, learned from its own drives: for each quantity its mean
+over the drives, and the standard deviation of that mean.
 
     quantity          from
     radius_fl … rr    speed of each wheel against the mean of the four in calm moments, minus the
@@ -113,8 +113,8 @@ deviation that the regression states for QUANTITY.
 def learn_calibration(
     drives: Sequence[tuple[FloatArray, FloatArray]], vehicle: Vehicle
 ) -> Calibration:
-    """Return the calibration of a vehicle learned from its drives, each a pair (t (T,), signals (T,
-    18)).
+    """Return the calibration of a vehicle learned from its drives, each a pair (t (T,) [s], signals
+    (T, 18)) of times and readings.
 
     Raises:
         InputError: no drive has enough excitation.
@@ -172,8 +172,8 @@ def _posterior_of(
     """Return the posterior (mean, standard deviation) of a quantity from the estimates of several
     drives (n,).
 
-    `unknown` is the standard deviation stated by the best drive. If it is not 0, the estimates were
-    already moved towards the usual value.
+    `unknown` is the standard deviation stated by the best drive. If it is not 0, the estimates
+    already include the prior; their median is then not moved towards the prior mean again.
     """
     sound = SOUND.get(kind, 0.0)
     centre = float(np.median(values))
@@ -251,8 +251,8 @@ def trace_steering(drive: EvenDrive) -> DriveEstimates:
 
 
 def _estimate_radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
-    """Return, for each wheel, how much faster it turns than the mean of the four (relative),
-    corrected for yaw and slip.
+    """Return, for each wheel, how much faster it turns than the mean of the four wheels, as a
+    relative difference, corrected for yaw and slip.
     """
     calm = (
         (drive.moving > 0) & (np.abs(drive.v_dot) < CALM) & (np.abs(drive.v * drive.r) < STRAIGHT)
@@ -274,8 +274,8 @@ def _force_gain(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
     vehicle file.
 
     The acceleration comes from the wheel speeds, because an accelerometer pitches with the body.
-    Slope, air and rolling resistance are one constant term of the fit, because they do not vary
-    with acceleration.
+    Slope, air and rolling resistance do not vary with acceleration. Therefore the fit represents
+    them by one constant term.
     """
     rows = (drive.moving > 0) & np.isfinite(drive.torque) & np.isfinite(drive.v_dot)
     if np.sum(rows & (np.abs(drive.v_dot) > PULLED)) < LEAST_S * RATE_HZ:
@@ -286,11 +286,12 @@ def _force_gain(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
 
 
 def _wheel_slips(drive: EvenDrive, vehicle: Vehicle, rows: BoolArray) -> FloatArray:
-    """Return the slips of the wheels minus their mean (n, 4), from the driving force of each axle
-    and its rolling resistance.
+    """Return, for n samples, the slip of each wheel minus the mean slip of the four wheels, (n, 4).
+    Slip is computed from the driving force of each axle and its rolling resistance.
 
-    The accelerometer measures the force of the tyres minus that of the air, also on slopes. Its
-    offset is estimated by the difference between its reading and dv/dt.
+    The driving force comes from the accelerometer, which measures tyre force minus air drag, also
+    on slopes. The offset of the accelerometer is estimated as the difference between its reading
+    and dv/dt, and subtracted.
     """
     if vehicle.drive_split_front is None:
         return np.zeros((int(rows.sum()), 4))

@@ -22,8 +22,8 @@ from schemas.runtime.jit import inlined
 
 @inlined
 def spread_points(mean: FloatArray, sqrt_cov: FloatArray, points: FloatArray) -> None:
-    """Fill the cubature points (n, 2n): column j is m + sqrt(n)*L[:, j], and column n + j is m -
-    sqrt(n)*L[:, j].
+    """Compute the cubature points (n, 2n) of mean m and covariance root L: column j is m +
+    sqrt(n)*L[:, j], and column n + j is m - sqrt(n)*L[:, j].
     """
     n = mean.shape[0]
     size = math.sqrt(n)
@@ -37,13 +37,15 @@ def spread_points(mean: FloatArray, sqrt_cov: FloatArray, points: FloatArray) ->
 def gather_points(
     points: FloatArray, noise_std: FloatArray, pace: float, mean: FloatArray, sqrt_cov: FloatArray
 ) -> None:
-    """Compute mean and sqrt_cov of propagated points (n, 2n) with process noise pace*q. Afterwards
-    `points` contains the deviations from the mean.
+    """Compute mean (n,) and sqrt_cov (n, n), the root of the covariance, from propagated points (n,
+    2n). Process noise with standard deviations pace*q is added. Afterwards `points` contains the
+    deviations from the mean.
 
     The mean is the first point plus the mean deviation from it, so that large offsets lose no
     digits. The covariance is summed and factorised, at half the cost of an orthogonal
-    transformation. A pivot is at least its own process noise variance, because the earlier states
-    explain only the deviations.
+    transformation. A pivot of the factorisation (variance of a state given the states before it) is
+    never less than the state's own process noise variance. If rounding makes it smaller, it is set
+    to that variance.
     """
     n, count = points.shape
     weight = 1.0 / count

@@ -60,9 +60,9 @@ def update_by_downdate(
     """Run the measurement update in place as in paper 003: the factor L is downdated with the
     columns of U = P_xz*S^-T/2, one after the other.
 
-    Arguments as in `householder.update`. Return the same values, and True if a downdate was
-    refused. In that case `update` performs the step, because its orthogonal transformation cannot
-    fail.
+    Arguments as in `householder.update`. Return the same values, and True if a downdate was refused
+    because the result would not be a covariance. In that case `householder.update`, which cannot
+    fail, performs the step instead.
     """
     n, points = state_deviations.shape
     rows = innovation.shape[0]

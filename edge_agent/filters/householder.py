@@ -28,8 +28,8 @@ LOG_TWO_PI = math.log(2.0 * math.pi)
 
 @compiled
 def triangularize(a: FloatArray, rows: int, columns: int) -> None:
-    """Replace a[:rows, :columns] by its lower-triangular factor, which has the same a*a'; the
-    diagonal is not negative.
+    """Replace a[:rows, :columns] by its lower-triangular factor, which has the same product a*a'
+    and no negative element on the diagonal.
 
     The method is Householder reflections from the right; entries right of the diagonal become zero.
     Requires columns >= rows.
@@ -105,7 +105,8 @@ def update(
         work: (k + n, points + k) or larger.
 
     Returns:
-        number of rows used, log-likelihood of the innovation [nat], nu' S^-1 nu.
+        number of rows used, log-likelihood of the innovation [nat], and nu' S^-1 nu (normalised
+        squared innovation).
 
     The array [[Z, diag(r)], [X, 0]] becomes [[S^1/2, 0], [P_xz*S^-T/2, L_new]].
     """

@@ -1,4 +1,5 @@
-"""Points of a sigma rule computed from a mean and a square root of the covariance, and the reverse.
+"""Conversion between a mean with a square root of the covariance and the points of a sigma rule, in
+both directions.
 
 Legend
     m, L        mean (n,) and sqrt_cov, lower triangular, covariance P = L*L'            (n, n)

@@ -7,8 +7,8 @@ Legend
     nu          innovation, measured minus predicted
 
 No variance is ever subtracted from another, so variances cannot become negative. Rows with
-independent noise may be applied in any order. The deviations f of the remaining rows change with L,
-and `apply_projection` updates them in the same way.
+independent noise may be applied in any order. An update changes L, and with it the deviations f of
+the rows that remain; `apply_projection` updates these deviations.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def potter_factors(f: FloatArray, noise: float) -> tuple[float, float]:
 def apply_projection(
     mean: FloatArray, root: FloatArray, f: FloatArray, step: float, gain: float
 ) -> None:
-    """Compute mean (n,) += L*f*step and root L (n, k or more) <- L*(I - gain*f*f'), with f (k,).
-    Columns of L beyond k are unchanged.
+    """Apply the update of one row to the mean and to the covariance root L (n, k or more): mean
+    (n,) += L*f*step and L <- L*(I - gain*f*f'), with f (k,). Columns of L beyond k are unchanged.
     """
     for i in range(mean.shape[0]):
         along = 0.0
@@ -59,8 +59,9 @@ def carlson_update(
 ) -> tuple[float, float]:
     """Update the filter with a `reading` of state i itself with noise `variance` > 0.
 
-    Return (innovation squared over a, a). L stays triangular (Carlson 1973): its rows are rotated
-    by 2 x 2 rotations whose cosines come from sums of squares only. gain (n,) is scratch.
+    Return (squared innovation divided by a, a), where a is the innovation variance. L stays
+    triangular (Carlson 1973): its rows are rotated by 2 x 2 rotations whose cosines come from sums
+    of squares only. gain (n,) is scratch.
     """
     n = mean.shape[0]
     for k in range(n):
