@@ -63,6 +63,6 @@ def encode_log_likelihood(log_likelihood: NDArray[np.floating[Any]]) -> ByteArra
 
 def decode_log_likelihood(steps: ByteArray) -> FloatArray:
     """Return log-likelihoods ℓ (…, 32) [nat] from their bytes. Each value lies between -255/16 and
-    0. The largest value of a row is 0 if the sender follows the contract.
+    0. The largest value of a row is 0 if the sender encoded it as `encode_log_likelihood` does.
     """
     return steps.astype(np.float64) / -STEPS_PER_NAT

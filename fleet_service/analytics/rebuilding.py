@@ -47,7 +47,9 @@ class Rebuild(NamedTuple):
 
 
 class RebuildResult(NamedTuple):
-    """Result for one zone: number of cells of the map, and number of roll-up files."""
+    """Result for one zone (map square of zoom 7): number of cells of the map, and number of files
+    of hourly statistics (roll-up).
+    """
 
     zone: int
     cells: int

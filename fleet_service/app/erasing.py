@@ -118,8 +118,8 @@ def _run_erasure(
 def _reload_service(
     engine: Engine, before: Callable[[], None], stop: threading.Event
 ) -> bool | None:
-    """Call `before`, then load the service's state again, between two segments. Return True, or
-    None if the service stops first.
+    """Call `before`, then load the service's state again. This happens between two segments (files
+    of new rows), so all accepted rows are on disk. Return True, or None if the service stops first.
     """
 
     def work() -> bool:

@@ -1,7 +1,7 @@
 """The running service. One worker thread connects Zenoh and the engine.
 
 subscribers ─► inbox ─► worker: ingest ─► alerts at once
-                                flush ─► thread: segment on disk ─► acknowledgements
+                                flush ─► thread: rows on disk ─► acknowledgements
                                 tiles once a second, with the time that is left
 queryables  ─► answers, in Zenoh's threads
 """
@@ -171,8 +171,8 @@ class Service:
         return holding.is_lost
 
     def _hanging(self) -> str | None:
-        """Return a description of a part outside the worker that has died or hangs, so that only a
-        restart helps; None if there is none.
+        """Return a description of a part of the service outside the worker that has died or hangs,
+        so that only a restart helps; None if there is none.
         """
         if self.engine.settlement.hangs_s >= HANGS_S:
             return (

@@ -70,7 +70,9 @@ class Settlement:
 
     @property
     def hangs_s(self) -> float:
-        """Return the time [s] since the current segment write began; 0 if no write is running."""
+        """Return the time [s] since the current writing of a segment (file of new rows) began; 0 if
+        none is being written.
+        """
         return self._log.hangs_s
 
     @property

@@ -137,7 +137,8 @@ def load_state(
     damaged: Callable[[Path, str], None] = skip_damaged,
     until: Cut | None = None,
 ) -> ServiceState:
-    """Load the state from the archive. If `until` is given, use only segments up to this position.
+    """Load the state from the archive. If `until` is given, use only segments (files of new rows)
+    up to this position.
 
     Raises:
         OSError: the archive cannot be read.

@@ -1,4 +1,6 @@
-"""Work that other threads ask the worker to do between two segments."""
+"""Work that other threads ask the worker to do between two segments (files of new rows), when all
+accepted rows are on disk.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +30,11 @@ class Tasks:
         return not self._queue.empty()
 
     def ask(self, work: Callable[[], T], stop: threading.Event) -> T | None:
-        """Queue work, wait, and return its result; None if `stop` is set meanwhile.
+        """Queue work, wait until the worker has done it, and return its result; None if `stop` is
+        set meanwhile.
 
         Raises:
-            OSError: no segment could be written for too long.
+            OSError: no segment (file of new rows) could be written for too long.
         """
         done: Future[T] = Future()
         self._queue.put((done, work))

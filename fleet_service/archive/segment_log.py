@@ -87,7 +87,7 @@ class SegmentLog(Generic[Batch]):
 
     @property
     def newest(self) -> Cut:
-        """Return the position of the last written segment."""
+        """Return the position of the last written segment (file of new rows)."""
         return self._writer.newest
 
     @property
@@ -157,5 +157,5 @@ class SegmentLog(Generic[Batch]):
         return self.end()
 
     def close(self) -> None:
-        """Stop the thread that writes segments, after its current write."""
+        """Stop the thread that writes segments (files of new rows), after its current write."""
         self._thread.shutdown()

@@ -183,8 +183,8 @@ def _make_record(alert: StretchAlert, name: str, now: int) -> ET.Element:
 
 
 def _make_location(alert: StretchAlert) -> ET.Element:
-    """Return the location element of a stretch: a line from end to end in driving direction; a
-    point if the stretch is one cell.
+    """Return the DATEX II location element of a stretch of road: a line from end to end in driving
+    direction, or a point if the stretch is one cell.
     """
     points = list(alert.points)
     line = len(alert.points) > 1
@@ -261,9 +261,9 @@ def _has_ended(record: ET.Element) -> bool:
 
 
 def _same_place(alert: StretchAlert, old: dict[str, ET.Element], written: set[str]) -> str | None:
-    """Return the id of an earlier situation that shares a cell with the stretch; None if there is
-    none. A client that was restarted gives the same stretch another name, so the name cannot be
-    compared.
+    """Return the id of an earlier situation that shares a cell with the stretch of road; None if
+    there is none. Cells are compared and not names, because a client that was restarted gives the
+    same stretch another name.
     """
     cells = {
         f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points

@@ -59,7 +59,7 @@ class DatexFile:
         """Write the publication if its content has changed, or if it is old.
 
         Args:
-            standing: every stretch with an active alert.
+            standing: every stretch of road with an active alert.
             is_heard: function that returns True if a service answers for a place (latitude,
                 longitude).
 
@@ -90,7 +90,7 @@ class StretchOutput(Protocol):
     def keep_up(
         self, standing: list[StretchAlert], is_heard: Callable[[float, float], bool]
     ) -> None:
-        """Publish the stretches with an active alert."""
+        """Publish the stretches of road that have an active alert."""
 
 
 class DatexFeed:

@@ -122,11 +122,13 @@ class Stretches:
 
     @property
     def standing(self) -> list[StretchAlert]:
-        """Return all stretches with an active alert, as of the last call of `take_changes`."""
+        """Return all stretches of road with an active alert, as of the last call of `take_changes`."""
         return list(self._known.values())
 
     def take_changes(self) -> list[StretchAlert]:
-        """Return the stretches that were raised, changed or cleared since the last call."""
+        """Return the stretches of road whose alert was raised, changed or cleared since the last
+        call.
+        """
         found = self._group_by_stretch()
         out = []
         for name, group in found.items():

@@ -299,9 +299,9 @@ class Fusion:
     def find_sources(
         self, slots: IntArray, side: int, since: IntArray | int
     ) -> tuple[IntArray, IntArray]:
-        """Return the vehicles that corroborate `side` (GRIP or ICE) in the slots, as two arrays (k,
-        SOURCES): index of the vehicle, and time of its report [ns]. The time is 0 if the vehicle
-        does not count (see `sources`).
+        """Return the vehicles that corroborate `side` (GRIP or ICE) in the slots (cells and
+        sectors), as two arrays (k, SOURCES): index of the vehicle, and time of its report [ns]. The
+        time is 0 if the vehicle does not count (see `sources`).
         """
         row = self.live.reporters[slots]
         reporters = self.store.state.live.reporters

@@ -58,8 +58,9 @@ LAYOUT: Final = hashlib.blake2b(
 
 
 def image_of(fusion: Fusion) -> Image:
-    """Return the complete state of a fusion as plain arrays. Windows, entries and pairs keep their
-    row numbers, because they refer to each other by row.
+    """Return the complete state of a fusion as plain arrays. Windows, entries (observations in a
+    window) and pairs (of vehicle and cell) keep their row numbers, because they refer to each other
+    by row.
     """
     store = fusion.store
     state = fusion.store.state

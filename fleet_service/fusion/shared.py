@@ -142,8 +142,8 @@ def base_kernel() -> FloatArray:
 
 
 def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
-    """Return the kernel K, (32, 32), for an error with two standard deviations per bin (32,): of
-    readings that are too low, and of readings that are too high.
+    """Return the kernel K, (32, 32), for an error with two standard deviations per bin (32,): one
+    for vehicles' readings of friction that are too low, and one for readings that are too high.
     """
     away = mugrid.CENTRES[None, :] - mugrid.CENTRES[:, None]
     kernel = np.exp(-0.5 * np.square(away / np.where(away < 0.0, below[:, None], above[:, None])))

@@ -53,8 +53,8 @@ def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> Stretch
 
 
 def witnesses_of(fusion: Fusion, slot: int, since: int) -> list[int]:
-    """Return the numbers of the vehicles that reported ice on the stretch around a slot (cell and
-    sector) after `since` [ns].
+    """Return the numbers of the vehicles that reported ice on the slippery stretch of road around a
+    slot (cell and sector) after `since` [ns].
     """
     who, when, _ = stretch_sources(fusion, np.array([slot]), np.array([since]))
     return [int(fusion.store.names["key"][index]) for index in who[0][when[0] > 0].tolist()]

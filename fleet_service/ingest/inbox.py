@@ -175,8 +175,8 @@ class BatchIntake:
         self.times: dict[str, int] = {}  # newest that each vehicle told in the last call [ns]
 
     def accept(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, AcceptedBatches]:
-        """Return the rows of valid, new batches, by kind; all other batches are refused or
-        counted.
+        """Return the rows of valid, new batches, by kind (observations or states); all other
+        batches are refused or counted.
         """
         self.times.clear()
         self._now = clock.now / NS
@@ -286,7 +286,7 @@ class BatchIntake:
 
     def _new(self, kind: Kind, heads: Heads, time: IntArray, good: BoolArray) -> dict[BatchId, int]:
         """Return the valid batches that were not accepted before, each once, with their positions
-        in `heads`.
+        in `heads` (fields of the batches other than records).
         """
         out: dict[BatchId, int] = {}
         numbers = (heads.boot, heads.region, time // DAY_NS, heads.seq, heads.first_held)

@@ -58,7 +58,8 @@ class ErrorModel(NamedTuple):
             share in a place.
         tails: degrees of freedom of a visit's noise (Student's t); infinite for normal noise.
         stated: ratio of the standard deviation that a vehicle states to its true one.
-        share: smallest and largest share of the grip that an excited visit uses.
+        share: smallest and largest share of the grip that an excited visit uses (one that measures
+            the friction).
         low: how much too low a value is, per share of the grip that was left unused.
         tyres: relative error common to all tyres of the fleet.
         half: relative error that every second vehicle has in addition.
@@ -188,8 +189,8 @@ def draw_reports(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
 def reading_likelihood(
     reading: FloatArray, relative: FloatArray, absolute: float = NOISE_ABSOLUTE
 ) -> FloatArray:
-    """Return ln p(z | μ) on the friction grid, (n, 32), up to a constant, for readings z (n,) with
-    relative noise (n,).
+    """Return ln p(z | μ) on the friction grid, (n, 32), up to a constant, for vehicles' readings z
+    (n,) of the friction μ with relative noise (n,).
     """
     std = np.hypot(absolute, relative[:, None] * mugrid.CENTRES)
     return -0.5 * np.square((reading[:, None] - mugrid.CENTRES) / std) - np.log(std)

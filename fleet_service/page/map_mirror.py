@@ -1,5 +1,5 @@
-"""Local copy ("mirror") of the live map: tiles as records, and alerts as stretches. This module
-does not use the network.
+"""Local copy ("mirror") of the live map: tiles as records of cells, and alerts by stretch of road.
+This module does not use the network.
 """
 
 from __future__ import annotations
@@ -109,7 +109,9 @@ class MapMirror:
         return place // grid.SECTORS, place % grid.SECTORS
 
     def changes(self) -> list[TileBlock]:
-        """Return one block per changed tile with its changes since the last call."""
+        """Return one block (encoded records of cells) per changed tile with its changes since the
+        last call.
+        """
         with self._lock:
             before = self._before
             self._before = {}
@@ -124,20 +126,22 @@ class MapMirror:
             return found
 
     def alerts_changed(self) -> bool:
-        """Return True if stretches with an alert have changed since the last call."""
+        """Return True if the stretches of road with an alert have changed since the last call."""
         with self._lock:
             found = bool(self._stretches.take_changes()) or self._alerts_changed
             self._alerts_changed = False
             return found
 
     def stretches(self) -> list[StretchAlert]:
-        """Return the stretches with an active alert, according to everything received until now."""
+        """Return the stretches of road with an active alert, according to everything received until
+        now.
+        """
         with self._lock:
             self._alerts_changed |= bool(self._stretches.take_changes())
             return self._stretches.standing
 
     def standing(self) -> list[dict[str, Any]]:
-        """Return the stretches with an active alert in a form for JSON, newest first."""
+        """Return the stretches of road with an active alert in a form for JSON, newest first."""
         with self._lock:
             return [
                 one.to_json_values()
@@ -170,8 +174,8 @@ class MapMirror:
                 self._tiles[tile].heard = now
 
     def encoded(self, tile: int, level: int) -> bytes:
-        """Return the cells of a tile, encoded as one block at a zoom level; empty bytes if the tile
-        is unknown.
+        """Return the cells of a tile at a zoom level, encoded as one block (bytes for the browser);
+        empty bytes if the tile is unknown.
         """
         with self._lock:
             held = self._tiles.get(tile)
@@ -193,7 +197,7 @@ class MapMirror:
 
 
 def block_at(level: int, tile: int, cells: Records, version: int, moment: float) -> bytes:
-    """Return the cells of a tile, encoded as one block at a zoom level."""
+    """Return the cells of a tile at a zoom level, encoded as one block (bytes for the browser)."""
     seen = cells if level == records.CELL_LEVEL else records.aggregate_worst(cells, level)
     return TileBlock(tile, level, version, 0, moment, seen).encoded()
 

@@ -71,8 +71,8 @@ class Moments:
         return list(self._at(moment))
 
     def encoded(self, moment: int, tile: int, level: int) -> bytes:
-        """Return the cells of a tile at a moment, encoded as one block; empty bytes if the tile had
-        no cells.
+        """Return the cells of a tile at a past moment, encoded as one block (bytes for the
+        browser); empty bytes if the tile had no cells.
         """
         cells = self._at(moment).get(tile)
         return b"" if cells is None else map_mirror.block_at(level, tile, cells, 1, float(moment))

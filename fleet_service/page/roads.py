@@ -120,7 +120,8 @@ def learned_lines(cell: IntArray, sector: IntArray) -> list[Line]:
 
 
 def _merge_side_by_side(cells: list[tuple[int, int]], heading: int) -> dict[int, list[float]]:
-    """Return, for each column of cells along the heading, the positions across the heading.
+    """Return the position or positions of the road across the heading, for each step along the
+    heading. The cells at one step form a column.
 
     The receiver's error spreads one lane over neighbouring cells. Therefore cells of one column
     that are at most AHEAD apart become one position, their mean.

@@ -67,7 +67,8 @@ class Begin(NamedTuple):
 
     Attributes:
         day: first day of measurement that is read; None for all days.
-        after: only segments after this position are read; None to read from the first.
+        after: only segments (files of new rows) after this position are read; None to read from the
+            first.
         until: only segments up to this position are read; None to read to the last.
     """
 

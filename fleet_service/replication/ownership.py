@@ -46,7 +46,9 @@ class Ownership:
 
     @property
     def smallest_epoch(self) -> int:
-        """Return the smallest number that may be used as the epoch in new segment names."""
+        """Return the smallest number that may be used as the epoch in the names of new segments
+        (files of new rows).
+        """
         return 0 if self.lease is None else self.lease.term.epoch
 
     @property

@@ -62,8 +62,8 @@ def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
 
 
 def cell_table(fusion: Fusion, slots: IntArray, now: int) -> pa.Table:
-    """Return the cells of `slots` as a table in the schema of the map, with beliefs for the time
-    `now` [ns].
+    """Return the cells of `slots` (cells and sectors) as a table in the schema of the map, with
+    beliefs for the time `now` [ns].
     """
     return pa.Table.from_batches([batch_of(view_cells(fusion, slots, now), now)])
 

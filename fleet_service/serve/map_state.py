@@ -73,8 +73,8 @@ class MapState:
         return sum(map(len, self._slots.get(tile, ())))
 
     def rebuild(self) -> None:
-        """Discard the index, so that it is built again. Call this after the fusion renumbered its
-        slots.
+        """Discard the index from tiles to cells, so that it is built again. Call this after the
+        fusion renumbered its slots (cells and sectors).
         """
         self._slots.clear()
         self._indexed = 0

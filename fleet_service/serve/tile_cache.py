@@ -115,7 +115,7 @@ class TileCache:
         return made
 
     def seen(self, slots: IntArray, now: int) -> CellView:
-        """Return the cells of public slots in the form that readers see."""
+        """Return the cells of public slots (cells and sectors) in the form that readers see."""
         return self.coarse(view_cells(self.source, slots, now))
 
     @property

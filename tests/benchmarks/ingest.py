@@ -1,5 +1,5 @@
 """Benchmark of ingest without the network: messages are decoded, admitted, fused, written to a
-synced Parquet segment, and acknowledged.
+synced Parquet file (segment), and acknowledged.
 
 Every round sends new batches of many vehicles to a new archive. The limit for comparison is a
 subscriber that only decodes the same messages with protobuf's own module into one array per column.

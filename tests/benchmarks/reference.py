@@ -22,7 +22,7 @@ def move(
     Args:
         points: states (P, 6).
         row: vehicle parameters (12,).
-        before, now: readings (11,) at both ends of the step.
+        before, now: sensor readings (11,) at the beginning and the end of the step.
         gone: length of the step [s].
     """
     mu = np.clip(points[:, 5], LOWER, UPPER)

@@ -57,7 +57,7 @@ class Batch(NamedTuple):
 
 
 def rows_of(batches: list[Batch]) -> Rows:
-    """Return the rows of batches of one kind as columns, as the log expects them."""
+    """Return the rows of batches of one kind as columns, in the form that the segment log takes."""
     kind = batches[0].kind
     n = ROWS * len(batches)
     rows: Rows = {

@@ -174,8 +174,8 @@ class ServiceHistory(Lives[Sent]):
             self.done[job] += 1
 
     def _write_checkpoint(self, engine: Engine, root: Path) -> None:
-        """Write a checkpoint: the background job requests it, and the worker writes it after a
-        segment.
+        """Write a checkpoint (saved state of the service): a background job requests it, and the
+        worker writes it when all accepted rows are on disk.
         """
         stop = threading.Event()
         with ThreadPoolExecutor(1) as upkeep:

@@ -70,8 +70,8 @@ def small_disk(folder: Path) -> Iterator[bool]:
 
 @contextmanager
 def fill_disk(folder: Path, mounted: bool) -> Iterator[None]:
-    """Fill the disk for the duration of the block. Without a mounted disk, let writing
-    calls fail.
+    """Fill the disk for the duration of the block. If no small disk is mounted, let all system
+    calls that write fail as on a full disk.
     """
     if mounted:
         ballast = folder / "ballast"

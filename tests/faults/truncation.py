@@ -64,8 +64,8 @@ def run(site: Site) -> list[Figure]:
 
 
 def _write_archive(root: Path) -> tuple[list[Batch], Path]:
-    """Write an archive. Return its batches in the order of their segments, and the newest segment's
-    path.
+    """Write an archive. Return its batches in the order of their segments (files of new rows), and
+    the path of the newest segment.
     """
     now = time.time_ns() - SECOND
     batches = [batch("sim-001", seq, now, [0.8, 0.7]) for seq in range(1, SEGMENTS * BATCHES + 1)]

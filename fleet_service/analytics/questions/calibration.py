@@ -55,5 +55,7 @@ def expression(t: Table, maps: Table) -> Table:
 
 
 def ask(engine: QueryEngine, _: Options) -> pa.Table:
-    """Return the rows of `expression` for the selected part of the archive."""
+    """Return the shares `held` and `compatible` for the selected part of the archive; `expression`
+    describes the rows.
+    """
     return engine.answer(expression(engine.observations(), engine.maps()))

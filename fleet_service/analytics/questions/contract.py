@@ -159,8 +159,9 @@ def longest_breach(
 
 
 def _find_runs(is_below: BoolArray, far: BoolArray | None = None) -> tuple[IntArray, IntArray]:
-    """Return two arrays: the first position of each run of true values, and the position after its
-    last value. If `far` is given, a run also ends before a slot that is far from the previous one.
+    """Return two arrays for the runs of true values in `is_below`: the first position of each run,
+    and the position after its last value. If `far` is given, a run also ends before each time slot
+    for which `far` is true.
     """
     number = np.cumsum(~is_below if far is None else ~is_below | far)
     at = np.flatnonzero(is_below)

@@ -68,5 +68,7 @@ def expression(t: Table, least_vehicles: int) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return the rows of `expression` for the selected part of the archive."""
+    """Return one row per slippery spell in the selected part of the archive; `expression` describes
+    the rows.
+    """
     return engine.answer(expression(engine.observations(), options.least_vehicles))

@@ -62,5 +62,7 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, _: Options) -> pa.Table:
-    """Return the rows of `expression` for the selected part of the archive."""
+    """Return one row per vehicle in the selected part of the archive; `expression` describes the
+    rows.
+    """
     return engine.answer(expression(engine.observations()))

@@ -74,7 +74,8 @@ def _join_stations(t: Table, stations: Table, readings: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return the rows of `expression` for the selected part of the archive.
+    """Return one row per temperature band for the selected part of the archive; `expression`
+    describes the rows.
 
     Raises:
         InputError: the table of stations is missing, or lacks a column.

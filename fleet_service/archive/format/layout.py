@@ -75,8 +75,8 @@ class Partition(NamedTuple):
     zone: int
 
     def folder(self, root: Path, table: str) -> Path:
-        """Return the partition's folder. A letter precedes the zone's digits in its name, so that
-        readers do not parse them as a number.
+        """Return the partition's folder. A letter precedes the digits of the zone (map square of
+        zoom 7) in the name, so that readers do not parse them as a number.
         """
         zone = f"zone=q{grid.quadkey(self.zone, grid.ZONE_ZOOM)}"
         return root / table / f"date={date_of(self.day)}" / zone
@@ -106,8 +106,8 @@ def require_archive(root: Path) -> None:
 
 
 def partitions_of(time: IntArray, cell: IntArray) -> tuple[IntArray, IntArray]:
-    """Return day (days since 1970) and zone of rows, two arrays (n,), from their times [ns] and
-    cells.
+    """Return two arrays (n,), computed from the times [ns] and cells of rows: the day (days since
+    1970) and the zone (map square of zoom 7) of each row.
     """
     return time // DAY_NS, grid.zone_of(cell)
 
@@ -123,7 +123,9 @@ def day_of(folder: Path) -> int:
 
 
 def partition_of(path: Path) -> Partition:
-    """Return the partition (day and zone) of a compacted file, from the folder in which it lies."""
+    """Return the partition of a compacted file, that is, its day and its zone (map square of zoom
+    7), read from the names of the folders in which the file lies.
+    """
     return Partition(
         day_of(path.parents[1]), grid.from_quadkey(path.parent.name.removeprefix("zone=q"))
     )
@@ -132,9 +134,9 @@ def partition_of(path: Path) -> Partition:
 def compacted_files(
     root: Path, kind: Kind, since_day: int | None = None, until_day: int | None = None
 ) -> Iterator[Path]:
-    """Yield the compacted files of a kind (observations or states), sorted by date, zone and age.
-    Only days (since 1970) from `since_day` to `until_day`, both included, are read; None means no
-    limit.
+    """Yield the compacted files of a kind (observations or states), sorted by date, zone (map
+    square of zoom 7) and age. Only days (since 1970) from `since_day` to `until_day`, both
+    included, are read; None means no limit.
     """
     for folder in day_folders(root, TABLES[kind], since_day, until_day):
         yield from sorted(folder.glob("zone=*/*.parquet"))

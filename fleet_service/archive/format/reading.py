@@ -43,8 +43,8 @@ class Wanted(NamedTuple):
         after: read only files that were written after this position in the sequence of segments. A
             compacted file is read as a whole, so it may contain older rows too.
         until: read no segment of the inbox that was written after this position.
-        box: read only compacted files of zones that touch this box (west, south, east, north
-            [deg]).
+        box: read only compacted files of zones (map squares of zoom 7) that touch this box (west,
+            south, east, north [deg]).
     """
 
     columns: Sequence[str] | None = None
@@ -152,7 +152,9 @@ class Listing:
 
 
 def files_near(files: Sequence[Path], box: tuple[float, float, float, float] | None) -> list[Path]:
-    """Return the compacted files of zones that touch a box [deg]; all files if the box is None."""
+    """Return the compacted files of zones (map squares of zoom 7) that touch a box [deg]; all files
+    if the box is None.
+    """
     if box is None or not files:
         return list(files)
     zone = np.array([layout.partition_of(path).zone for path in files])

@@ -37,13 +37,13 @@ Rows = dict[str, NDArray[Any]]
 
 
 def segment_folder(root: Path, kind: Kind) -> Path:
-    """Return the folder for segments of a kind (observations or states)."""
+    """Return the folder for segments (files of new rows) of a kind (observations or states)."""
     return root / _FOLDERS[kind]
 
 
 def list_segments(root: Path, kind: Kind) -> list[Path]:
-    """Return the segments of a kind (observations or states), sorted from old to new by epoch and
-    number.
+    """Return the segments (files of new rows) of a kind (observations or states), sorted from old
+    to new by epoch and number.
     """
     return sorted(
         segment_folder(root, kind).glob("*.parquet"), key=lambda path: layout.age_key(path.name)
@@ -89,7 +89,7 @@ class Writer:
 
     @property
     def newest(self) -> layout.Cut:
-        """Return the position of the last written segment."""
+        """Return the position of the last written segment (file of new rows)."""
         return layout.Cut(self._epoch, self._seq)
 
     def write(self, kind: Kind, rows: Rows) -> Path:
@@ -110,8 +110,8 @@ class Writer:
         return path
 
     def sync(self) -> None:
-        """Make the names of the written segments durable. If this fails, call it again; the
-        segments need not be written again.
+        """Make the names of the written segments (files of new rows) durable. If this fails, call
+        it again; the segments need not be written again.
 
         Raises:
             OSError: a folder cannot be synced.

@@ -1,5 +1,5 @@
-"""Compaction: rows of the inbox are sorted by cell and time and moved to one file per date and
-zone.
+"""Compaction: rows of the inbox are sorted by cell and time and moved to one file per date and zone
+(map square of zoom 7).
 
 A round takes the oldest segments. It adds files before it deletes segments:
 
@@ -155,7 +155,7 @@ def _compact_round(rest: _Rest, most: int) -> CompactionResult:
 
 
 def join_versions(tables: list[pa.Table], known: pa.Schema) -> pa.Table:
-    """Join tables from segments of several format versions.
+    """Join tables from segments (files of new rows) of several format versions.
 
     The result has the known columns, null where a segment does not have the column. Columns that
     only a newer version knows follow, so that a downgrade loses no data.
@@ -185,8 +185,8 @@ def _place_files(
 
 
 def consecutive_runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
-    """Return runs of consecutive segment numbers, as (SHARD-EPOCH, first, last), from segment names
-    in order of age.
+    """Return runs of consecutive segment numbers, each as (SHARD-EPOCH, first number, last number),
+    found in the names of segment files in order of age.
     """
     out: list[tuple[str, int, int]] = []
     for name in names:
@@ -200,7 +200,9 @@ def consecutive_runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
 
 
 def split_by_partition(table: pa.Table, kind: Kind) -> Iterator[tuple[layout.Partition, pa.Table]]:
-    """Yield the rows of each partition (date and zone), sorted by cell and time."""
+    """Yield the rows of each partition (date, and zone, a map square of zoom 7) as one table,
+    sorted by cell and time.
+    """
     if not table.num_rows:
         return
     table = table.combine_chunks()

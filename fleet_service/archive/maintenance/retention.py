@@ -338,8 +338,9 @@ def key_of(root: Path, month: str) -> Path:
 
 
 def _days_of_month(month: str) -> tuple[int, int]:
-    """Return the first day of a month, and the day after its last day. Rows of that day may belong
-    to the month too, because a batch has the pseudonym of its first record and may end a day later.
+    """Return two days between which all rows of a month lie: its first day, and the day after its
+    last day. The latter is included, because a batch has the pseudonym of its first record and may
+    end a day later.
     """
     begin, until = erasures.span_of(month)
     return begin // layout.DAY_NS, until // layout.DAY_NS

@@ -1,5 +1,5 @@
-"""Events of one originating station: the event number of each stretch with an active alert, and the
-messages that must be sent. Pure.
+"""Events of one originating station: the event number of each stretch of road with an active alert,
+and the messages that must be sent. Pure.
 
 A stretch is one event from its first to its last cell, even over restarts, because the events are
 saved to a file. An event is sent when it begins, when it changes, before its validity ends, and
@@ -32,7 +32,7 @@ class OpenEvent:
     """Event that has been sent to the interchange.
 
     Attributes:
-        name: id of the stretch.
+        name: id of the stretch of road.
         sequence: number of the event.
         detected, sent: time of the first detection, and of the last message [ns UTC].
         state: content of the last message, which is compared to detect changes.
@@ -94,7 +94,7 @@ class EventBook:
         not ended.
 
         Args:
-            standing: every stretch with an active alert.
+            standing: every stretch of road with an active alert.
             now: current time [ns UTC].
             is_heard: function that returns True if a service answers for a place (latitude,
                 longitude).

@@ -87,10 +87,10 @@ class DenmOutput:
     def keep_up(
         self, standing: Sequence[StretchAlert], is_heard: Callable[[float, float], bool]
     ) -> None:
-        """Send the messages that are due.
+        """Send the DENM (hazard messages) that are due.
 
         Args:
-            standing: every stretch with an active alert.
+            standing: every stretch of road with an active alert.
             is_heard: function that returns True if a service answers for a place (latitude,
                 longitude).
 

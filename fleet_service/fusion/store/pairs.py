@@ -1,5 +1,5 @@
-"""Earlier reports of one vehicle in one cell (a pair): linked entries in the lateness window, and a
-record of the older reports.
+"""Earlier reports of one vehicle in one cell (a pair): a linked list of its recent observations
+(entries of the lateness window), and a record of the older reports.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ _FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its
 
 @refcount_free_inlined
 def comes_before(entries: RecordArray, a: int, b: int) -> bool:
-    """Return True if window entry `a` comes before `b`: ordered by time, then by vehicle, start and
-    sequence number.
+    """Return True if entry `a` (an observation) of a lateness window comes before entry `b`:
+    ordered by time, then by vehicle, start and sequence number.
     """
     if entries[a].time != entries[b].time:
         return bool(entries[a].time < entries[b].time)
@@ -71,8 +71,8 @@ def link_pair(entries: RecordArray, pairs: RecordArray, pair: int, entry: int) -
 
 @refcount_free_inlined
 def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
-    """Move an entry's report into the record of its vehicle's older reports, and unlink the entry
-    from later entries of the vehicle.
+    """Move the report of an entry (an observation) into the record of its vehicle's older reports,
+    and unlink the entry from later entries of the vehicle.
     """
     pair = int(entries[entry].pair)
     kind = int(entries[entry].kind)
@@ -91,7 +91,7 @@ def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 @refcount_free_inlined
 def _must_stay(pairs: RecordArray, place: int, least: int) -> bool:
     """Return True if the record of a vehicle and cell must stay: the vehicle reported there at
-    `least` [s] or later, or has entries in the window.
+    `least` [s] or later, or has entries (observations) in the lateness window.
     """
     pair = pairs[place]
     return bool(pair.last != NONE or pair.time[0] >= least or pair.time[1] >= least)

@@ -149,7 +149,7 @@ class WindowRecord:
 
     Attributes:
         slot: the slot; NONE if the window is not in use.
-        head, tail: first and last entry.
+        head, tail: first and last entry (observation).
         stale: 1 if the live row must be computed again.
         first: time of the first entry [ns].
         values: number of entries that are values (not only lower bounds).
@@ -164,8 +164,9 @@ class WindowRecord:
 
 
 class PairRecord:
-    """Summary of the older reports of one vehicle in one cell (a pair): those that the checkpoint
-    has passed. A record is half a cache line long, so that no record crosses the border of a line.
+    """Summary of the older reports of one vehicle in one slot (cell and sector), called a pair: the
+    reports that the checkpoint has passed. A record is half a cache line long, so that no record
+    crosses the border of a line.
 
     Attributes:
         slot, vehicle: the pair; a free place of the table has slot NONE.

@@ -127,7 +127,7 @@ class Store:
 
     @property
     def table(self) -> IntArray:
-        """Hash table in which compiled code finds slots by key."""
+        """Hash table in which compiled code finds slots (cells and sectors) by key."""
         return self._slots
 
     def slots_for(self, keys: IntArray) -> IntArray:

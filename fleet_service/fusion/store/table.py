@@ -138,7 +138,7 @@ def assign_rows(
 
 @compiled
 def fill_table(table: IntArray, rows: RecordArray, used: int) -> None:
-    """Enter the first `used` rows into an empty hash table."""
+    """Enter the numbers of the first `used` rows into an empty hash table."""
     for row in range(used):
         table[locate_key(table, rows, rows[row].key)] = _place_content(
             _hash_key(rows[row].key), row
@@ -147,14 +147,17 @@ def fill_table(table: IntArray, rows: RecordArray, used: int) -> None:
 
 @refcount_free_inlined
 def first_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
-    """Return the place of the table at which the search for a pair of slot and vehicle begins."""
+    """Return the place of the table at which the search for a pair of slot (cell and sector) and
+    vehicle begins.
+    """
     return _first_place(_hash_key((np.int64(slot) << np.int64(32)) | np.int64(vehicle)), len(pairs))
 
 
 @refcount_free_inlined
 def pair_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
-    """Return the place of a pair of slot and vehicle in a table that contains the pair records
-    themselves. If the pair is unknown, return the free place (slot NONE) where it belongs.
+    """Return the place of a pair of slot (cell and sector) and vehicle in a table that contains the
+    pair records themselves. If the pair is unknown, return the free place (slot NONE) where it
+    belongs.
     """
     place = first_place(pairs, slot, vehicle)
     while pairs[place].slot != NONE and (
@@ -165,7 +168,9 @@ def pair_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
 
 
 def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
-    """Return a hash table with room for `entries` that contains the first `used` rows."""
+    """Return a hash table that has room for `entries` row numbers and contains the first `used`
+    rows.
+    """
     table = np.full(places_for(entries, ROWS_MOST), NONE, np.int64)
     fill_table(table, rows, used)
     return table
@@ -180,5 +185,5 @@ def places_for(entries: int, most: float) -> int:
 
 
 def is_full(entries: int, places: int, most: float) -> bool:
-    """Return True if the number of entries exceeds the share `most` of the number of places."""
+    """Return True if the number of row numbers in a table exceeds the share `most` of its places."""
     return entries > most * places

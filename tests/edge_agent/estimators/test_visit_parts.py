@@ -1,5 +1,5 @@
-"""Tests that a visit during which friction jumps is reported in two parts, and any other visit in
-one.
+"""Tests of the likelihood of a visit (pass through one cell): it is reported in two parts if the
+friction jumps during the visit, and in one part otherwise.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of live sources: their readings share one clock, losses are reported, and no error ends the
-program.
+"""Tests of live sources of signals: the values that they read share one clock, losses are reported,
+and no error ends the program.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Tests of the observation builder: one observation per visit and states in their time slots, for
-any division into blocks.
+any division of the drive into blocks of samples.
 """
 
 from __future__ import annotations

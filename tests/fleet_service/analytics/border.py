@@ -1,5 +1,5 @@
-"""Synthetic archive for tests of a rebuild by zone: its roads cross the border of two zones, and a
-third zone lies far away.
+"""Synthetic archive for tests of a rebuild by zone (map square of zoom 7): its roads cross the
+border of two zones, and a third zone lies far away.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ def fill(root: Path, world: SyntheticFleet) -> None:
 
 
 def rebuilt_map(out: Path) -> pa.Table:
-    """Return all zones of a rebuilt map as one table, in the row order of a map."""
+    """Read the map that was rebuilt zone by zone (in squares of zoom 7); return it as one table,
+    with rows in the order of a complete map.
+    """
     parts = [
         pq.read_table(path, partitioning=None)
         for path in sorted((out / "map").glob("*/*/*.parquet"))

@@ -62,7 +62,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def rows(archive: Path) -> pd.DataFrame:
     """Return all rows of the archive. `time` is in whole seconds, and `value` is True if mu was
-    measured as the contract defines it.
+    measured (at least 0.6 of mu was used).
     """
     frame = (
         pa.concat_tables(reading.read_tables(archive, Kind.OBSERVATION))

@@ -1,5 +1,5 @@
-"""Tests that an archive rebuilt zone by zone equals a replay of everything, and that its roll-ups
-equal the stored ones.
+"""Tests that a map rebuilt zone by zone (in squares of zoom 7) equals a replay of the whole
+archive, and that its roll-ups equal the stored ones.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Common tools that read an archive. Each is a function that returns the number of rows, the mean
-of mu, the number of rows with a likelihood, and the zones.
+of mu, the number of rows with a likelihood, and the zones (map squares of zoom 7).
 
 A tool that is not installed is left out. Spark has a separate test, because it needs Java and
 twenty seconds.

@@ -1,4 +1,6 @@
-"""Tests that roll-ups equal a direct sum over the rows, for every division into parts."""
+"""Tests that roll-ups (hourly statistics per cell) equal a direct sum over the rows, however the
+rows are divided into files.
+"""
 
 from __future__ import annotations
 

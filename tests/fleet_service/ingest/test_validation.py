@@ -219,8 +219,9 @@ def test_no_text_stops_the_intake(desk: Desk, payload: bytes) -> None:
 
 
 def test_unusable_records_are_rejected_if_the_head_can_be_read(desk: Desk) -> None:
-    """A batch with a readable head and unusable records must be rejected. Otherwise the vehicle
-    would send it for ever, and its stream would stop after 65 536 later batches.
+    """A batch with unusable records must be rejected if its head (the other fields) can be read.
+    Otherwise the vehicle would send it for ever, and its stream would stop after 65 536 later
+    batches.
     """
     pb = wire.parse(wire.encode(batch("sim-001", 7, NOW, [0.8, 0.8])), "", ObservationBatch, "")
     del pb.mu[1:]

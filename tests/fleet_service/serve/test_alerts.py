@@ -116,8 +116,8 @@ def report_in_turn(
     mu: float, vehicles: range, then: float, others: range, wait: float = 400.0
 ) -> tuple[Fusion, list[bool]]:
     """Let `vehicles` report the friction `mu` in a cell, and `wait` seconds later each of `others`
-    the friction `then`. Return the fusion, and whether the cell was under alert after each of
-    `others`.
+    the friction `then`. Return the fusion, and a list that is True for each of `others` after whose
+    report the cell was under alert.
     """
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)

@@ -1,5 +1,5 @@
-"""Tests of simulated fleets: results do not depend on the number of vehicles or on blocks, cars
-stay on the road, and they use grip where intended.
+"""Tests of simulated fleets: results do not depend on the number of vehicles or on the division
+into blocks of samples, cars stay on the road, and they use grip where intended.
 """
 
 from __future__ import annotations
