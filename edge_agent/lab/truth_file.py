@@ -1,5 +1,5 @@
-"""True friction of a simulated fleet's roads: one row per true visit of a cell, for comparison with
-the map.
+"""Writer of a file with the true friction of a simulated fleet's roads: one row per passage of a
+map cell (visit), for comparison with the map.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ class _Visit:
 
 @dataclass
 class TruthRecorder:
-    """Recorder of the true visits of the named vehicles, block by block."""
+    """Recorder of the true friction per visit (passage of a map cell) of the named vehicles, one
+    block of samples after the other."""
 
     names: tuple[str, ...]
     rows: list[tuple[str, _Visit]] = field(default_factory=list)
@@ -55,8 +56,8 @@ class TruthRecorder:
         mu: FloatArray,
         used: FloatArray,
     ) -> None:
-        """Add one block: time [ns UTC], position (latitude, longitude) [deg] and yaw [rad], (T, N)
-        each; friction and used share of it per wheel, (T, N, 4).
+        """Add one block of T samples: time [ns UTC], position (latitude, longitude) [deg] and yaw
+        [rad], (T, N) each; friction, and the used share of the friction, per wheel, (T, N, 4).
         """
         cells = grid.cell_of(*position)
         sectors = grid.sector_of(yaw)

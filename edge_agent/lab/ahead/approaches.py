@@ -1,9 +1,10 @@
 """Evaluation of warnings: are simulated cars that approach a slippery stretch warned in time, and
 other cars not?
 
-The drivers are simulated; the warning code is that of the agent. The connection works and the map
-is known, with errors of standard deviation SPREAD (see `known_town`). The test evaluates the
-warnings that a car computes from this map, with the position errors of its receiver.
+The drivers are simulated; the warning code is that of the agent. The simulated connection never
+fails, and the map contains all roads, with errors of standard deviation SPREAD (see `known_town`).
+The test evaluates the warnings that a car computes from this map, with the position errors of its
+receiver.
 
 An approach starts on road that is not slippery; a car that drives from snow onto ice is already on
 slippery road. A warning is in time if the car could stop before the stretch from the place of the
@@ -61,8 +62,8 @@ class Approaches:
 
 @dataclass
 class _Raised:
-    """One warning: the look ahead (second) at which it was raised, its distance and length [m], and
-    the look at which it ended.
+    """One warning: the second in which it was raised, the distance and length of the slippery
+    stretch [m], and the second in which the warning ended.
     """
 
     at: int
@@ -227,8 +228,8 @@ def _count_outcome(track: _Track, counts: Approaches) -> None:
 def _stopping_shortfall(
     metre: FloatArray, speed: FloatArray, mu: FloatArray, at: int, start: float
 ) -> float:
-    """Return the stopping distance at second `at` minus the distance to the stretch [m]. It is 0 or
-    less if the car can stop in time.
+    """Return the stopping distance of the car at second `at` minus its distance to the slippery
+    stretch [m]. The result is 0 or less if the car can stop in time.
     """
     v = float(speed[at])
     on_the_way = (metre >= metre[at]) & (metre <= start)

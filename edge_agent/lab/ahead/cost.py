@@ -1,9 +1,10 @@
 """Cost of the look ahead for one car and day: megabytes received in a busy city, and processor
 time.
 
-The city is a grid of streets 100 m apart. Every place is measured in both directions, and each tile
-has STANDING active alerts. The car drives DAY_KM through it at city speed. The counted bytes are
-those of the service's answers, with their keys and FRAME bytes of transport overhead each.
+The city is a grid of streets 100 m apart. Every map place is measured in both directions, and each
+map tile has STANDING active alerts. The car drives DAY_KM through it at city speed. The received
+bytes are counted as the service's answers with their keys, plus FRAME bytes of transport overhead
+per answer.
 """
 
 from __future__ import annotations
@@ -75,8 +76,8 @@ def draw_way(rng: np.random.Generator, metres: float) -> FloatArray:
 
 
 def cost_figures(seed: int, metres: float) -> list[Figure]:
-    """Return the megabytes received per day and the used share of a processor core, for a car that
-    knows its route and for one that does not.
+    """Return the megabytes received per day and the share of a processor core that is used, for a
+    car that knows its route and for one that does not.
     """
     known = street_places()
     out = []
@@ -98,7 +99,7 @@ def drive_way(
     rng: np.random.Generator, known: IntArray, metres: float, *, routed: bool
 ) -> tuple[float, float]:
     """Drive a random route of `metres` through the city; return (megabytes received, processor time
-    over driving time).
+    divided by driving time).
 
     `known` are the keys of all places that the service knows. With `routed`, the car knows its
     route.

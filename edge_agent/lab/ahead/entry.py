@@ -43,8 +43,9 @@ FAKE_M: Final = 22.0  # half of a fake stretch
 
 @dataclass
 class FilterTrace:
-    """Records of N filters at T blocks: place (T, N), filter belief `own` and visit likelihood
-    `visit` (T, N, 32), true friction (T, N).
+    """Records of N filters at T instants: place (map cell with heading sector) (T, N); friction
+    belief of the filter, `own`, and likelihood of the current visit (passage of the place),
+    `visit`, (T, N, 32); true friction (T, N).
     """
 
     place: IntArray
@@ -56,8 +57,8 @@ class FilterTrace:
 
 def entry_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
     """Return the figures over all towns: the error at the entry of a cell and the delay caused by a
-    wrong map, each as the ratio with the map to without it, and the largest change of a published
-    value.
+    wrong map, each as the value with the map divided by the value without it; and the largest
+    change of a published value.
     """
     errors: list[FloatArray] = []
     delays: dict[str, list[tuple[float, float]]] = {"dry": [], "ice": []}
@@ -143,8 +144,8 @@ def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
 def arrival_times(
     trace: FilterTrace, wrong: LocalMap, right: LocalMap, now: int
 ) -> list[tuple[float, float]]:
-    """Return pairs of times [s] with and without the map, one pair per stretch where the map is
-    wrong.
+    """Return pairs of times [s] until the estimate is right, with and without the map; one pair per
+    stretch where the map is wrong.
 
     A time is counted from the entry of the stretch until the estimate differs by at most ARRIVED
     from the true friction; if it never does, the time spent on the stretch counts.
@@ -190,7 +191,7 @@ def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) 
 
 
 def with_map(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
-    """Return the median friction (T, N) according to the filters' beliefs combined with a map."""
+    """Return the median friction (T, N) of the filters' recorded beliefs combined with a map."""
     prior = MapPrior(trace.place.shape[1])
     out = np.empty(trace.place.shape)
     for t, place in enumerate(trace.place):

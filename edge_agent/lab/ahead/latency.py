@@ -1,5 +1,5 @@
-"""Latency from the publication of an alert to the warning, for VEHICLES cars in one process, each
-with its own session on a real router.
+"""Latency from the publication of an alert to the warning, for VEHICLES simulated cars in one
+process, each with its own session on a real Zenoh router.
 
 Every car stands on its own road and looks ahead each second; a simulated service answers the cars'
 queries. Alerts are published one after the other on the roads of randomly chosen cars, and the time
@@ -65,7 +65,7 @@ def open_router() -> Iterator[ZenohSettings]:
 
 def latency_figures(seed: int, alerts: int, vehicles: int = VEHICLES) -> list[Figure]:
     """Return the quantiles of the time from the publication of an alert to the warning, and the
-    share of processor time that looking ahead takes, as figures.
+    share of processor time that looking ahead takes, as figures of the evaluation.
     """
     waited, share, lost = measure_alerts(np.random.default_rng(seed), alerts, vehicles)
     return [

@@ -67,8 +67,8 @@ class MadeUpService:
     """Simulated service with places of known friction (`mu` by cell·4 + sector) and active alerts;
     it records the queries.
 
-    The places were observed at the time `now`. With `kept`, the ages in its answers are those at
-    that time, as in a store of old messages.
+    The places were observed at the time `now`. With `kept`, its answers always contain the ages at
+    that time, as a store of old messages does.
     """
 
     settings: ZenohSettings

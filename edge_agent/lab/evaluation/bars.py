@@ -80,8 +80,8 @@ def false_per_hour(results: Results) -> float:
 
 
 def both_stops(results: Results) -> float:
-    """Return the mean coverage of the friction interval over two braking manoeuvres with ABS, on
-    dry road and on snow.
+    """Return how often the friction interval contains the true value (coverage): the mean over two
+    braking manoeuvres with ABS, on dry road and on snow.
     """
     return 0.5 * (
         mean_of("default.abs.dry", "coverage90")(results)
@@ -90,8 +90,8 @@ def both_stops(results: Results) -> float:
 
 
 def on_foreign_tyres(results: Results) -> float:
-    """Return the mean coverage of the default estimator's friction interval over all scenarios with
-    tyres that the filter does not model.
+    """Return how often the default estimator's friction interval contains the true value
+    (coverage): the mean over all scenarios with tyres that differ from the filter's tyre model.
     """
     return mean(np.concatenate(list(results.foreign.values()))) if results.foreign else math.nan
 
@@ -240,8 +240,8 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
 
 
 def _consistency_figures(results: Results) -> list[Figure]:
-    """Return the bounds of NEES and NIS, and for every estimator the share of true frictions below
-    each stated quantile, as figures.
+    """Return the bounds of NEES and NIS (normalised squared errors and innovations), and for every
+    estimator the share of true frictions below each stated quantile, as figures.
     """
     listed = []
     for measure in COMPONENTS if results.seeds else ():

@@ -27,8 +27,8 @@ FINE_HZ = 500.0
 
 @dataclass(frozen=True)
 class DriveSpec:
-    """A manoeuvre of a paper, or of the default estimator's evaluation: vehicle, speed [m/s],
-    friction, sampling rate, duration.
+    """A simulated manoeuvre, from a paper or for the default estimator's evaluation: vehicle, speed
+    [m/s], friction, sampling rate, duration.
 
     `road` is the relief by name, and `slope` a constant slope added to it. `torque` is False if
     wheel torque is not recorded.
@@ -48,8 +48,8 @@ class DriveSpec:
 
 @dataclass(frozen=True)
 class DriveSet:
-    """N drives of T samples: t (T, N) [s], signals (T, N, 18), true values by name (T, N), nominal
-    vehicles.
+    """N simulated drives of T samples: times t (T, N) [s], sensor readings `signals` (T, N, 18),
+    true values by name (T, N), nominal vehicles.
     """
 
     t: FloatArray
@@ -68,7 +68,7 @@ class DriveSet:
         return np.asarray(self.mu_wheel.mean(axis=-1))
 
     def last(self, seconds: float) -> slice:
-        """Return the slice of the samples in the last `seconds` of the drives."""
+        """Return the slice of sample indices that covers the last `seconds` of the drives."""
         return slice(int(np.searchsorted(self.t[:, 0], self.t[-1, 0] - seconds)), None)
 
 

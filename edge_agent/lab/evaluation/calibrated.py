@@ -61,7 +61,8 @@ def true_errors(seed: int, car: int) -> dict[str, float]:
 
 
 def _mass_radius_ratio(seed: int, car: int) -> float:
-    """Return the true mass times radius, divided by mass times radius of the vehicle file."""
+    """Return the true mass times the true wheel radius, divided by the same product of the vehicle
+    file."""
     rng = np.random.default_rng([seed, car, VEHICLE_STREAM])
     true = one_of_a_fleet(car, "car", rng)
     file = nominal(true, rng)
@@ -126,7 +127,7 @@ def _drive_fleet(fleet: SimulatedFleet, seconds: int) -> tuple[FloatArray, Float
 
 def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
     """Return the width of the friction interval with calibration, its ratio to the width without
-    calibration, and the coverage in both cases, as figures.
+    calibration, and the share of true values inside it in both cases, as figures.
     """
     groups = [
         learn_and_narrow(min(CARS_AT_ONCE, cars - k), seed + k, judged_s)

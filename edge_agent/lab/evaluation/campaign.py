@@ -144,8 +144,8 @@ def _all_measures(name: str, batch: DriveSet, reported: Estimates) -> dict[str, 
 
 
 def _foreign_tyres(seeds: Sequence[int], log_line: Callable[[str], None]) -> dict[str, FloatArray]:
-    """Return the coverage of the default estimator's friction interval in all scenarios, by kind of
-    tyre; the tyres differ from the filter's model.
+    """Return, by kind of tyre, how often the default estimator's friction interval contains the
+    true value, over all scenarios. The tyres differ from the filter's tyre model.
     """
     found: dict[str, list[float]] = {kind: [] for kind in FOREIGN}
     kinds = list(FOREIGN)

@@ -72,8 +72,8 @@ Stretches: TypeAlias = list[tuple[int, int]]
 
 @dataclass
 class DetectionTally:
-    """Sums of the detection evaluation for one or several towns: sums and counts of values by name
-    (for means), and lists of times [s] by name.
+    """Sums of the detection evaluation for one or several towns: sums and counts of values by name,
+    from which means are computed, and lists of detection times [s] by name.
     """
 
     total: dict[str, float] = field(default_factory=dict)
@@ -102,15 +102,16 @@ class DetectionTally:
         return self.total[name] / self.count[name] if self.count.get(name) else float("nan")
 
     def rate(self, over: str, under: str) -> float:
-        """Return the sum called `over` divided by the sum called `under`; NaN if the latter is zero
-        or missing.
+        """Return the sum with the name `over` divided by the sum with the name `under`; NaN if the
+        latter is zero or missing.
         """
         return (
             self.total.get(over, 0.0) / self.total[under] if self.total.get(under) else float("nan")
         )
 
     def quantile(self, name: str, share: float) -> float:
-        """Return the quantile `share` of the times called `name` [s]; NaN without times."""
+        """Return the quantile `share` of the times [s] with the name `name`; NaN if there are no
+        times."""
         return (
             float(np.quantile(self.seconds[name], share))
             if self.seconds.get(name)
@@ -144,7 +145,8 @@ def slides_of(theta: NDArray[np.floating], seconds: float = SLIDE_S) -> Stretche
 
 
 def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
-    """Return the cause of a slide (one of ACTIVITIES), from the larger acceleration and its sign."""
+    """Return the cause of a slide (one of ACTIVITIES): it follows from the larger of the
+    longitudinal and lateral accelerations, and its sign."""
     along = float(drive.ax[first:end, n].mean())
     across = float(drive.ay[first:end, n].mean())
     if abs(across) > abs(along):
@@ -153,8 +155,9 @@ def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
 
 
 def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTally:
-    """Evaluate the drives of one town, and return their tally. With `oracle`, an oracle also
-    evaluates the excited visits to ice.
+    """Evaluate the drives of one town, and return their tally (sums and counts). With `oracle`, the
+    oracle (an observer that knows motion and tyre forces) also evaluates the visits to ice with
+    high use of grip.
     """
     tally = DetectionTally()
     _judge_samples(tally, drive)
@@ -169,8 +172,8 @@ def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTall
 
 
 def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
-    """Add coverage, false ice, false grip and interval score over all samples of the town to the
-    tally.
+    """Add to the tally, over all samples of the town: coverage of the interval, false ice, false
+    grip (both as in the module's docstring) and interval score.
     """
     mu = drive.mu
     apart = ~drive.stood
@@ -245,16 +248,16 @@ def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
 
 
 def _add_seconds(tally: DetectionTally, key: str, activity: str, wait: float) -> None:
-    """Add a time until detection [s] to the list for all slides, and to the list for slides with
-    this cause (`activity`).
+    """Add a time until detection [s] to the tally's list for all slides, and to its list for slides
+    with this cause (`activity`).
     """
     tally.seconds.setdefault(key, []).append(wait)
     tally.seconds.setdefault(f"{key}.{activity}", []).append(wait)
 
 
 def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
-    """Count the slides of car n on slippery road that the estimator reports as slippery, at the
-    latest TOLD_AFTER_S after the slide.
+    """Count the slides of car n on slippery road during which, or at most TOLD_AFTER_S after which,
+    the estimator reports the road as slippery.
     """
     beyond = drive.theta[:, n] > SLIDING
     for first, end in slides_of(drive.theta[:, n], TOLD_SLIDE_S):
@@ -292,8 +295,8 @@ def _judge_contradictions(
 
 
 def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
-    """Count settled false events of the estimator, of its belief at each threshold, and of the slip
-    flag.
+    """Count false reports of slippery road at least SETTLED_S away from snow and ice: those of the
+    estimator, of its belief at each threshold, and of the slip flag (ordinary ABS logic).
     """
     grips = drive.mu[:, n] > SNOW_MU
     settled = grips & ~recent_maximum(~grips[:, None], SETTLED_S)[:, 0].astype(bool)
@@ -356,7 +359,8 @@ def _note_visit(
 
 
 class TownTally(NamedTuple):
-    """Tally of the detection evaluation for one town, with the town's season."""
+    """Sums and counts of the detection evaluation (`Tally`) for one town, with the town's
+    season."""
 
     winter: bool
     tally: DetectionTally
@@ -364,7 +368,8 @@ class TownTally(NamedTuple):
 
 @dataclass
 class DetectionResults:
-    """Tallies of towns by (length, kind): length "short" or "long", kind "rough" or "plain"."""
+    """Results (`Tally`) of towns by (length, kind): drives are "short" or "long", cars are "rough"
+    (inaccurate) or "plain" (accurate)."""
 
     towns: dict[tuple[str, str], list[TownTally]] = field(default_factory=dict)
 

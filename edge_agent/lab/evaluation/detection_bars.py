@@ -1,5 +1,5 @@
-"""Figures of the detection evaluation: how each one is read from a tally, its unit, and its targets
-("bars") for rough and plain cars.
+"""Figures of the detection evaluation: how each one is computed from a tally (sums and counts), its
+unit, and its targets ("bars") for rough and plain cars.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ SHARE: Final = "1"
 
 
 class DetectionBar(NamedTuple):
-    """A figure of the detection evaluation: its drives, the function that reads it from a tally,
-    its unit, and its targets for both KINDS.
+    """A figure of the detection evaluation: the drives that it covers, the function that computes
+    it from a tally (sums and counts), its unit, and its targets for both KINDS of cars.
 
     `length`: one of LENGTHS, or "" for both together.
     """
@@ -41,20 +41,20 @@ class DetectionBar(NamedTuple):
 
 
 def mean_of(name: str) -> Callable[[DetectionTally], float]:
-    """Return a function that reads the mean called `name` from a tally."""
+    """Return a function that reads the mean with the name `name` from a tally (sums and counts)."""
     return lambda tally: tally.mean(name)
 
 
 def seconds_of(name: str, share: float) -> Callable[[DetectionTally], float]:
-    """Return a function that reads the quantile `share` of the times called `name` [s] from a
-    tally.
+    """Return a function that reads from a tally the quantile `share` of the detection times [s]
+    with the name `name`.
     """
     return lambda tally: tally.quantile(name, share)
 
 
 def rate_of(over: str, under: str) -> Callable[[DetectionTally], float]:
-    """Return a function that reads a rate from a tally: 1000 times the sum called `over` divided by
-    the sum called `under`.
+    """Return a function that reads a rate from a tally (sums by name): 1000 times the sum `over`
+    divided by the sum `under`.
     """
     return lambda tally: 1e3 * tally.rate(over, under)
 
@@ -213,8 +213,8 @@ DETECTION: Final = (
 
 
 def detection_figures(results: DetectionResults) -> list[Figure]:
-    """Return the figure `NAME.KIND` for every entry of DETECTION, first those with a target, with
-    the standard error over towns.
+    """Return the figure `NAME.KIND` (KIND: rough or plain cars) for every entry of DETECTION, with
+    its standard error over towns. Figures with a target come first.
 
     `NAME.KIND.winter` and `NAME.KIND.other` are the same figure for the winter towns and the other
     towns, if there are both.

@@ -64,8 +64,8 @@ class DetectionTown(NamedTuple):
 
 
 def towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
-    """Return the towns of the campaign. Short and long towns have different seeds; both kinds of
-    cars have the same seeds.
+    """Return the towns of the campaign. Towns with short and with long drives have different seeds;
+    towns with accurate and with inaccurate cars have the same seeds.
 
     Towns with an odd seed are winter towns.
     """
@@ -101,8 +101,8 @@ def judge_towns(
     *,
     oracle: bool = True,
 ) -> DetectionResults:
-    """Simulate and evaluate towns. With `oracle`, also run the oracle in short towns. `log_line`
-    receives one line per town.
+    """Simulate and evaluate towns. With `oracle`, also run the oracle (an observer that knows
+    motion and tyre forces) in towns with short drives. `log_line` receives one line per town.
     """
     results = DetectionResults()
     for town in chosen:

@@ -1,5 +1,5 @@
-"""Drives through random towns for the detection evaluation: true values, estimates, visits with
-their evidence, and the slip flag.
+"""Drives through random towns for the detection evaluation: true values, estimates, visits
+(passages of a map cell) with their evidence, and the slip flag (ordinary ABS logic).
 
 The cars are those of `SimulatedFleet`; the agent's own pipeline (`observe`) computes visits and
 evidence. A drive is computed in chunks, so that fifteen minutes of sixteen cars fit in memory.
@@ -38,8 +38,8 @@ Samples: TypeAlias = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class DetectionVisits:
-    """Published visits: index of the vehicle (V,), first and last sample (V,), ln L on the friction
-    grid (V, 32).
+    """V published visits (passages of a map cell): index of the vehicle (V,), first and last sample
+    (V,), ln L on the friction grid (V, 32).
     """
 
     vehicle: IntArray
@@ -55,7 +55,7 @@ class DetectionDrive:
     Attributes:
         speed, ax, ay: true motion [m/s, m/s^2].
         mu: true mean friction of the four wheels.
-        mu_wheel, theta, used: friction, normalised slip and used share of the grip, per wheel.
+        mu_wheel, theta, used: true friction, normalised slip and used share of the grip, per wheel.
         lower, median, upper, slippery, health: estimates; `slippery` is P(mu < SLIPPERY_MU).
         favoured: ln of the largest belief below SLIPPERY_MU over the largest above; NaN where the
             estimator has no belief.
@@ -85,7 +85,8 @@ class DetectionDrive:
 
 
 def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> DetectionDrive:
-    """Simulate a fleet for `seconds` and estimate its signals with the bank."""
+    """Simulate a fleet for `seconds`, and estimate motion and friction from its signals with the
+    bank of estimators."""
     vehicles = fleet.vehicles
     config = AgentConfig()
     tracks = new_tracks(len(vehicles))
@@ -160,8 +161,8 @@ def stood_where_it_appeared(
 def _estimate_chunk(
     bank: EstimatorBank, t: FloatArray, signals: FloatArray, closes: BoolArray
 ) -> tuple[Estimates, FloatArray]:
-    """Return the estimates of a chunk of the drive with their evidence, and (T, N) by how much
-    [nat] the belief favours a slippery road.
+    """Return the estimates of one chunk of the drive, their evidence, and an array (T, N): by how
+    much [nat] the belief favours a slippery road.
     """
     if bank.beliefs() is None:
         return bank.advance(t, signals, closes), np.full(t.shape, np.nan)
@@ -181,7 +182,8 @@ def _estimate_chunk(
 
 
 def slippery_favoured(log_likelihood: FloatArray) -> FloatArray:
-    """Return max ln L(μ < SLIPPERY_MU) - max ln L(μ >= SLIPPERY_MU) for log-likelihoods (…, 32)."""
+    """Return max ln L(μ < SLIPPERY_MU) - max ln L(μ >= SLIPPERY_MU) for log-likelihoods (…, 32) on
+    the friction grid."""
     low = mugrid.CENTRES < SLIPPERY_MU
     return np.asarray(
         log_likelihood[..., low].max(axis=-1) - log_likelihood[..., ~low].max(axis=-1)

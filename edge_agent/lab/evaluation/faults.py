@@ -1,8 +1,8 @@
 """Evaluation with sensor faults: each fault, its expected effect, and the response of every
 estimator.
 
-The drives are ordinary ones; a fault begins at BEGINS. The measure `told` is the share of drives in
-which health reports the expected flag.
+The faults are added to the signals of ordinary simulated drives from BEGINS on. The measure `told`
+is the share of drives in which health reports the expected flag.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ CASES: Final = {
 
 
 def apply_fault(batch: DriveSet, case: Case) -> DriveSet:
-    """Return the drives with the fault applied to their signals and clock."""
+    """Return a copy of the drives in which their signals and time stamps have the fault."""
     each = [
         apply_faults(batch.t[:, n], batch.signals[:, n], case.faults)
         for n in range(batch.t.shape[1])
@@ -151,8 +151,8 @@ def apply_fault(batch: DriveSet, case: Case) -> DriveSet:
 
 
 def case_measures(batch: DriveSet, reported: Estimates, case: Case) -> dict[str, FloatArray]:
-    """Return the measures of a fault case, per drive: `finite` and `told` (1 or 0), and from BEGINS
-    on coverage and width of the friction interval, and RMSE of v_x and v_y.
+    """Return the measures of a fault case, per drive: `finite` and `told` (1 or 0), and, over the
+    time from BEGINS on: coverage and width of the friction interval, and RMSE of v_x and v_y.
     """
     after = batch.t[:, 0] >= BEGINS
     whole = np.isfinite(reported.values).all(axis=-1)

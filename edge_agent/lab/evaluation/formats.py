@@ -1,5 +1,5 @@
-"""Writers of one drive in every supported bus log format, with the libraries that usually write
-them.
+"""Writers of one drive in every supported bus log format, each with a library that is commonly used
+for the format.
 """
 
 from __future__ import annotations
@@ -88,7 +88,8 @@ def as_bag(folder: Path, messages: Sequence[Any], storage: str = "mcap") -> Path
 
 
 def as_csv(path: Path, log: Path, *, mark: str = ",") -> Path:
-    """Write a signal log as CSV with full precision; `mark` is the delimiter. Return the path."""
+    """Write a signal log as CSV with full precision; `mark` is the character between columns.
+    Return the path."""
     table = pq.read_table(log)
     names = table.column_names
     t = np.array(table["timestamp"].cast(pa.int64()))

@@ -90,8 +90,8 @@ def _compare_decoders(ours: Database, message: Any, frames: Sequence[bytes]) -> 
 
 
 def on_a_bus(drive: Recorded) -> list[Any]:
-    """Return a drive as CAN frames. Each frame has two channels of a sample; pairs with a missing
-    reading are left out.
+    """Encode a drive as CAN frames, and return the frames. Each frame contains two channels of a
+    sample; it is left out if one of the two readings is missing.
     """
     frames = []
     columns = drive.signals[:, [ALL.index(name) for name in CHANNELS]]
@@ -111,8 +111,8 @@ def _make_frame(t: float, identifier: int, data: bytes) -> Any:  # noqa: ANN401 
 
 
 def a_minute(path: Path) -> Path:
-    """Write a log of one minute with MINUTE_FRAMES frames: four wanted messages at 100 Hz, and
-    OTHERS unwanted messages. Return the path.
+    """Write a log of one minute with MINUTE_FRAMES frames: four messages that the import must
+    decode, at 100 Hz, and OTHERS messages that it must ignore. Return the path.
     """
     rng = np.random.default_rng(1)
     others = rng.choice(np.arange(512, 512 + OTHERS), MINUTE_FRAMES - 24_000)
@@ -153,8 +153,8 @@ def estimates_of(log: Path, drive: Recorded) -> FloatArray:
 
 
 def same_estimates(folder: Path, seed: int, seconds: int = DRIVE_S) -> tuple[float, int]:
-    """Return (largest difference between the estimates of one drive over its formats, number of
-    formats).
+    """Write one drive in every format, import and estimate it; return (largest difference between
+    these estimates, number of formats).
     """
     (drive,) = drives(1, seed, rough=True, seconds=seconds)
     frames = on_a_bus(drive)
@@ -177,7 +177,7 @@ def _largest_difference(one: FloatArray, other: FloatArray) -> float:
 
 
 def figures(folder: Path, seed: int, recorded: Path | None, seconds: int = DRIVE_S) -> list[Figure]:
-    """Return the figures of file import, with the numbers of values and formats on which they are
+    """Return the figures of file import, each with the number of values or formats on which it is
     based.
     """
     wrong, compared = decode_errors(recorded, seed)

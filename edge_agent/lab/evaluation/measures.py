@@ -96,8 +96,9 @@ def consistency(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Return two measures on a road with different friction on its sides, over the last LAST_S: the
-    error on the side with less friction, and the coverage on the other side.
+    """Return two measures over the last LAST_S of drives on a road with different friction left and
+    right: the friction error on the side with less friction, and the coverage of the interval on
+    the other side.
     """
     end = batch.last(LAST_S)
     truth = batch.mu_wheel
@@ -115,8 +116,8 @@ def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def arrival(batch: DriveSet, reported: Estimates) -> FloatArray:
-    """Return the time [s] from the change of friction until the estimate mu is within NEAR of the
-    new value; if this never happens, the time to the end.
+    """Return the time [s] from the change of friction until the friction estimate is within NEAR of
+    the new value; if this never happens, the time from the change to the end of the drive.
     """
     changed = batch.mu == batch.mu[-1]
     seconds = np.empty(batch.t.shape[1])

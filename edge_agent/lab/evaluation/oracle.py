@@ -56,8 +56,8 @@ LEAST: Final = 1e-3  # normalised slip below which a wheel rolls freely
 
 
 class OracleSignals(NamedTuple):
-    """A drive of scenario 002.sine: the values given to the oracle, and the roll and pitch terms of
-    the accelerometers, (T,) each.
+    """A drive of scenario 002.sine: the readings and true values that the oracle gets, and the
+    effects of roll and pitch on the accelerometers, (T,) each.
     """
 
     batch: DriveSet
@@ -81,8 +81,8 @@ def speed(seeds: Sequence[int]) -> FloatArray:
 def _speed(heard: OracleSignals, n: int, rho: float) -> float:
     """Return the RMSE of the oracle's speed for drive n [m/s].
 
-    Each second, ρ is estimated again from all earlier readings, and the wheel speeds are corrected
-    by it.
+    Each second, the error ρ of the wheel radius is estimated again from all earlier readings, and
+    the wheel speeds are corrected by it.
     """
     batch = heard.batch
     car = PAPERS["002.sine"].vehicle

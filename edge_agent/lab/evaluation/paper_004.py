@@ -1,11 +1,10 @@
 """The two experiments of paper 004 under its conditions: noise only on a_x, a_y and r, exact
 inputs, start at the true state.
 
-They show that the implementation is correct. They do not show that the filter can estimate
-friction, because friction is known at the start. Therefore the targets and the printed tables are
-for v_x, v_y and the yaw rate. The simulated tyre curve is a Magic Formula, and the variable noise
-is on all three channels; `papers.reproduction_004` has Dugoff tyres, and the paper's noise on a_y
-alone.
+The experiments check the implementation. They do not test whether the filter can estimate friction,
+because friction is known at the start. Therefore the targets and the printed tables are for v_x,
+v_y and the yaw rate. The simulated tyre curve is a Magic Formula, and the variable noise is on all
+three channels; `papers.reproduction_004` has Dugoff tyres, and the paper's noise on a_y alone.
 """
 
 from __future__ import annotations

@@ -120,14 +120,14 @@ def turn_yaw_clockwise(drive: Recorded) -> Recorded:
 
 
 def other_tyre(drive: Recorded) -> Recorded:
-    """Return the drive with a vehicle file whose wheel radius is 10 % too small."""
+    """Return the drive with another vehicle file, whose wheel radius is 10 % too small."""
     radius = 0.9 * drive.vehicle.wheel_radius
     return drive._replace(vehicle=drive.vehicle.model_copy(update={"wheel_radius": radius}))
 
 
 def rim_speed_factor(unit: str) -> Callable[[float], float]:
-    """Return a function of the wheel radius: the factor from wheel speed [rad/s] to speed at the
-    rim in `unit`.
+    """Return a function of the wheel radius. It returns the factor that converts a wheel speed
+    [rad/s] to a speed at the rim in `unit`.
     """
     return lambda radius: radius / SPEED[unit]
 
@@ -204,8 +204,8 @@ def drives(
 
 
 def winter_drives(count: int, seed: int, *, seconds: int = DRIVE_S) -> list[Recorded]:
-    """Return simulated drives through the hilly town in winter: wet road in general, snow where the
-    town is usually wet, ice where it usually has snow.
+    """Return simulated drives through the hilly demonstration town in winter: roads that are
+    usually dry are wet, usually wet roads have snow, and usually snowy roads have ice.
     """
     usual = scenario_named("hills")
     worse = {WET: SNOW, SNOW: ICE}
@@ -218,8 +218,8 @@ def winter_drives(count: int, seed: int, *, seconds: int = DRIVE_S) -> list[Reco
 
 
 def doctor_verdict(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
-    """Return two booleans: True if the doctor names the fault, and True if the doctor passes the
-    drive.
+    """Return two booleans: whether the signal doctor names the fault, and whether it finds the
+    drive free of faults.
     """
     diagnosis = diagnose(*planted.spoil(drive))
     found = {(finding.channel, finding.kind) for finding in diagnosis.findings}

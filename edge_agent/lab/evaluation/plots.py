@@ -275,7 +275,8 @@ def _triangles(axis: Axes, peaks: tuple[float, ...], title: str, name: str) -> N
 
 
 def _reliability(figures: Sequence[Figure], path: Path) -> Path:
-    """Plot the share of true frictions below each stated quantile, over all scenarios."""
+    """Plot, over all scenarios, the share of true frictions that lie below each quantile of the
+    estimate."""
     from matplotlib import pyplot as plt
 
     found: dict[str, dict[float, float]] = {}
@@ -302,8 +303,9 @@ def _reliability(figures: Sequence[Figure], path: Path) -> Path:
 
 
 def draw_detection(figures: Sequence[Figure], path: Path) -> Path:
-    """Write the ROC plot: share of slippery passes found against the number of settled false
-    events, for estimator, slip flag and oracle.
+    """Write the ROC plot: share of passes over slippery road that are found, against the number of
+    false reports (away from snow and ice), for estimator, slip flag (ordinary ABS logic) and oracle
+    (knows motion and forces).
     """
     import matplotlib as mpl
 

@@ -8,8 +8,8 @@ from typing import Final, NamedTuple
 
 
 class Printed(NamedTuple):
-    """A number that a paper prints: paper, quantity, printed value, and the names of our figures
-    for comparison.
+    """A number that a paper prints: paper, quantity, printed value, and the names of the
+    evaluation's figures that are compared with it.
     """
 
     paper: str
@@ -39,8 +39,8 @@ PRINTED_002: Final = {"sine": (".1008", ".0779"), "jturn": (".0825", ".0117")}
 def printed_row(
     paper: str, scenario: str, estimator: str, measure: str, what: str, value: str
 ) -> Printed:
-    """Return a paper's printed number together with our figure, which is measured with error-free
-    sensors.
+    """Return a number printed in a paper together with the figure that this evaluation measures
+    with error-free sensors.
     """
     same = f"ideal.{scenario}.{estimator}.{measure}"
     real = f"real.{scenario}.ESTIMATOR.{measure}"
@@ -133,8 +133,8 @@ DEFAULT: Final = "aco-fckf"
 
 
 def names() -> list[str]:
-    """Return the names of our figures that are compared with the papers, and of their standard
-    deviations.
+    """Return the names of the evaluation's figures that are compared with printed numbers, and the
+    names of their standard deviations.
     """
     found = [
         name.replace("ESTIMATOR", estimator)

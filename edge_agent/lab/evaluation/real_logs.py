@@ -1,4 +1,5 @@
-"""Evaluation of the estimator on recorded drives of real cars, for owners of such logs.
+"""Evaluation of the estimator on recorded drives of real cars; owners of such logs run it on their
+own files.
 
 A folder contains LOG.parquet with its vehicle file LOG.json. Optional files are LOG.truth.parquet
 (columns t, vx, vy, mu, as far as they were measured) and LOG.meta.json (`mu_known`: known friction
@@ -171,7 +172,8 @@ def judge_estimates(
     known: float | None,
     urgent: int | None,
 ) -> LogFigures:
-    """Return the evaluation figures of one log from its estimates (T, columns) and the true values."""
+    """Return the evaluation figures of one log, computed from its estimates (T, columns) and the
+    measured true values."""
     t = adopted.log.t
     signals = adopted.log.signals
     wheels = np.where(
@@ -250,8 +252,8 @@ def root_mean_square(error: FloatArray, among: BoolArray) -> float:
 
 
 def summarise(found: Sequence[LogFigures]) -> list[Figure]:
-    """Return the evaluation figures over all logs: means weighted by time, and the worst log where
-    even one bad log matters.
+    """Return the evaluation figures over all logs: means weighted by the time of each log; where
+    even one bad log matters, the value of the worst log.
     """
     seconds = np.array([log.seconds for log in found])
 

@@ -68,8 +68,8 @@ STANDING_SLOPES: Final = (0.05, 0.08)
 
 @dataclass
 class Tally:
-    """Sums and counts of measures over samples, by name: `add` adds values, `means` returns their
-    means.
+    """Accumulator of means over samples, by name of the measure: `add` adds values, `means` returns
+    their means.
     """
 
     total: dict[str, float] = field(default_factory=dict)
@@ -140,7 +140,7 @@ def in_use(batch: DriveSet) -> FloatArray:
 
 
 def recent_maximum(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDOW_S) -> FloatArray:
-    """Return, for each sample, the largest value of `used` within the last `seconds`, (T, N)."""
+    """Return, for each sample, the largest grip `used` (T, N) within the last `seconds`, (T, N)."""
     samples = round(seconds * RATE_HZ)
     padded = np.concatenate([np.zeros((samples - 1, used.shape[1])), used])
     return np.asarray(
@@ -149,8 +149,9 @@ def recent_maximum(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDO
 
 
 def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
-    """Return the interval score: width of the interval plus MISS times its distance from the true
-    value. The score rewards narrow intervals that contain the true value.
+    """Return the interval score: width of the interval plus, if the true value lies outside, MISS
+    times its distance from the interval. The score rewards narrow intervals that contain the true
+    value.
     """
     return np.asarray(
         upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0))
@@ -199,8 +200,8 @@ def tally_town(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatAr
 
 
 def baseline(tally: Tally, batch: DriveSet) -> None:
-    """Add two baselines to the tally: the interval score of the prior, and the v_x error of the
-    mean speed of the four wheels.
+    """Add two baselines to the sums: the interval score of the prior interval of friction, and the
+    error of the mean speed of the four wheels as an estimate of v_x.
     """
     radius = np.array([vehicle.wheel_radius for vehicle in batch.vehicles])
     off = (

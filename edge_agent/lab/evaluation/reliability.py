@@ -27,8 +27,8 @@ EDGES: Final = np.linspace(LOWER, UPPER, BINS + 1)
 
 
 def estimate_with_ranks(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates, FloatArray]:
-    """Return the bank's estimates of the drives, and every EVERY_S the share of the posterior that
-    lies below the true friction (its rank), (K, N).
+    """Return the bank's estimates of the drives, and an array (K, N): for each drive, every
+    EVERY_S, the posterior probability of a friction below the true one (its rank).
     """
     samples = len(batch.t)
     step = max(1, round(EVERY_S / float(batch.t[1, 0] - batch.t[0, 0])))
@@ -42,15 +42,16 @@ def estimate_with_ranks(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates
 
 
 def join_estimates(parts: list[Estimates]) -> Estimates:
-    """Return the estimates of successive parts of one drive as one; the evidence is left out."""
+    """Join the estimates of successive parts of one drive and return them as one object, without
+    the evidence."""
     return Estimates(np.concatenate([part.values for part in parts]))
 
 
 def _rank_of_truth(
     bank: EstimatorBank, batch: DriveSet, now: int, reported: Estimates
 ) -> FloatArray:
-    """Return the share of the posterior that lies below the true friction of the sample before
-    `now`, (N,).
+    """Return the posterior probability, (N,), of a friction below the true one at the sample before
+    `now`.
     """
     truth = batch.mu[now - 1]
     closes = np.ones((1, len(truth)), np.bool_)

@@ -215,8 +215,8 @@ def world(values: dict[str, float]) -> str:
 
 
 def estimators(values: dict[str, float], prefix: str, suffix: str) -> list[str]:
-    """Return the estimators that occur in the figures' names between `prefix` and `suffix`, each
-    once, in order.
+    """Return the names of estimators, each once and in order. They are the parts between `prefix`
+    and `suffix` in the names of the figures.
     """
     found = [
         name[len(prefix) : -len(suffix)]

@@ -1,5 +1,5 @@
 """The scenarios of the evaluation: the papers' manoeuvres with the papers' vehicles, those for the
-default estimator's targets, and other vehicles.
+default estimator's targets, and manoeuvres of other vehicles.
 
 Data that a paper does not give (tyres, wheel inertia, the vehicle of paper 003) are those of the
 simulator's sedan or of an ordinary car. All four wheels are driven, as in the papers.

@@ -1,5 +1,5 @@
-"""Oracle for visits: the evidence of an observer that knows the motion and the force of every tyre,
-except for noise.
+"""Oracle for visits (passages of a map cell): the evidence of an ideal observer that knows the
+motion and the force of every tyre, except for noise.
 
 The oracle does not know the stiffness of the tyre and the shape of its force curve. Its evidence is
 an upper limit of the information that any estimator can gain from a visit.
@@ -55,7 +55,8 @@ def tyres_drawn() -> FloatArray:
 def visit_evidence(
     force: FloatArray, slip: FloatArray, speed: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return ln L (BINS,) of a visit on the friction grid, with maximum 0.
+    """Return the log-likelihood ln L (BINS,) of a visit (passage of a map cell) on the friction
+    grid, with maximum 0.
 
     Args:
         force: true f (T, 4) [1].
@@ -79,7 +80,8 @@ def visit_evidence(
 def _evidence(
     force: FloatArray, slip: FloatArray, noise: FloatArray, tyres: FloatArray
 ) -> FloatArray:
-    """Return ln L on the friction grid for each tyre of the sample, (TYRES, BINS).
+    """Return the log-likelihood ln L on the friction grid for each of the random tyres, (TYRES,
+    BINS).
 
     force and slip are f and q with noise, (T, 4); noise (T,) is the standard deviation of q; tyres
     (TYRES, 3) is the result of `tyres_drawn`.

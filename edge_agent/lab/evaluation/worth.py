@@ -95,8 +95,8 @@ def campaign(
 
 
 def ways() -> dict[str, list[MixtureDesign]]:
-    """Return the filters that represent each filter variant; a variant with several searches has
-    several filters.
+    """Return the filters of each variant by its name; a variant whose vertices come from several
+    searches has one filter per search.
     """
     untuned = Memberships()
     found = {
@@ -111,8 +111,8 @@ def ways() -> dict[str, list[MixtureDesign]]:
 
 
 def without_sets() -> MixtureDesign:
-    """Return the tables of the default filter for the variant without fuzzy sets, but with strain
-    and the consistency test.
+    """Return the tables (`design`) of the default filter for the variant without fuzzy sets. This
+    variant has strain (deviation of states from their prior) and the consistency test.
     """
     design = design_of(Memberships(), adaptive=True)
     c = design.constants
@@ -172,8 +172,8 @@ def ratio(scores: Scores, name: str) -> float:
 
 
 def figures(scores: Scores) -> list[Figure]:
-    """Return the figures of the comparison: standard deviations of the ratios, paired differences
-    of the scores, ratios per surface, and every interval score.
+    """Return the figures of the comparison that have no target: standard deviations of the ratios,
+    paired differences of the scores, ratios per surface, and every interval score.
     """
     listed = []
     for name, (over, under) in RATIOS.items():

@@ -21,7 +21,8 @@ LONGEST_BUFFER = 1000
 
 
 class Databroker:
-    """gRPC server at the address host:port with the given paths, at first without values."""
+    """gRPC server at the address host:port with the given paths, which have no values at the
+    start."""
 
     def __init__(self, address: str, paths: Sequence[str]) -> None:
         self._grpc = import_optional("grpc")
@@ -69,7 +70,8 @@ class Databroker:
         return len(self._subscribers)
 
     def value(self, path: str) -> Any:  # noqa: ANN401
-        """Return the data point (value and time stamp) that the broker has for a path."""
+        """Return the data point (value and time stamp) that this simulated broker has stored for a
+        path."""
         with self._changed:
             return self._values[path]
 

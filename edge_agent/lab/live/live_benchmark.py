@@ -92,7 +92,8 @@ def run_peer(kind: str, address: str, samples: int, rate: float = RATE_HZ) -> It
 
 
 def peer_addresses(kind: str) -> tuple[str, str]:
-    """Return (address of the sender, source name under which the agent listens to it)."""
+    """Return (address of the sender, command-line argument with which the agent opens it as a
+    source)."""
     (port,) = free_ports(1)
     if kind == "can":
         return f"udp_multicast/{MULTICAST}/{port}", f"can:udp_multicast/{MULTICAST}?port={port}"
@@ -115,7 +116,8 @@ def write_profile(kind: str, folder: Path) -> tuple[str, Path | None]:
 
 
 def count_lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
-    """Return (number of samples lost between a source and the rows, number of samples sent).
+    """Return (number of samples lost between a source and the rows that the agent builds, number of
+    samples sent).
 
     A sample is lost if its message was not received, or if its reading arrived after its row had
     been built.

@@ -79,7 +79,7 @@ def profile_of(kind: str) -> Profile:
 
 
 def pace_samples(samples: int, rate: float) -> Iterator[float]:
-    """Yield the time of each sample [s] when the sample is due."""
+    """Yield the time of each sample [s] at the moment when the sample must be sent."""
     began = time.monotonic()
     for k in range(samples):
         time.sleep(max(0.0, began + k / rate - time.monotonic()))
@@ -103,8 +103,8 @@ def send_can(address: str, samples: int, rate: float) -> int:
 
 
 def send_ros2(address: str, samples: int, rate: float) -> int:
-    """Send an Imu and a JointState message per sample in the form of rmw_zenoh; a Zenoh router is
-    opened at the address. Return the number of messages.
+    """Send an Imu and a JointState message per sample in the form of rmw_zenoh; the function opens
+    a Zenoh router at the address. Return the number of messages.
     """
     session = open_session(
         ZenohSettings(connect=[], config={"mode": "router", "listen/endpoints": [address]})
@@ -183,8 +183,8 @@ def send_vss(address: str, samples: int, rate: float) -> int:
 
 
 def send_gpsd(address: str, samples: int, rate: float) -> int:
-    """Send position fixes of a car that drives east, as gpsd does; the address is host:port. Return
-    the number of fixes.
+    """Act as a gpsd server: send position fixes of a simulated car that drives east; the address is
+    host:port. Return the number of fixes.
     """
     import socket
 

@@ -1,4 +1,5 @@
-"""A simulated fleet as an endless source of blocks; a recorder receives the true values."""
+"""A simulated fleet as an endless source of blocks (samples of a short time); a recorder receives
+the true values."""
 
 from __future__ import annotations
 

@@ -90,7 +90,8 @@ def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt:
 
 @compiled
 def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int, dt: float) -> None:
-    """Advance the brake torque limit of ABS at wheel `i` by `dt` [s]."""
+    """Update the limit that ABS sets to the brake torque of wheel `i`, over a time step `dt`
+    [s]."""
     asked = u[Control.BRAKE, i] + x[Motion.HELD + i]
     limit = slip_limit(p, i)
     slip = w[Wheel.SLIP, i]

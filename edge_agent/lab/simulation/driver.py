@@ -115,7 +115,7 @@ def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
     """Advance the route state `g` to the vehicle's position. At the end of a lane, choose the next
     lane at random.
 
-    Return the distance to the next point [m], at most the distance between points.
+    Return the distance to the next point of the lane [m], at most the distance between two points.
     """
     points, first, size, spacing, ways = lanes
     while True:
@@ -140,7 +140,8 @@ def place_ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tu
     """Return the position `distance` [m] further along the route, as (row of a point, metres beyond
     that point).
 
-    After the next lane, the route takes the first continuation of each lane.
+    The route is decided only to the end of the next lane; beyond that, the function assumes the
+    first continuation of each lane.
     """
     _, first, size, spacing, ways = lanes
     lane = g[Route.LANE]
@@ -169,8 +170,8 @@ def budget(d: FloatArray) -> float:
 
 @compiled
 def cruise(d: FloatArray) -> float:
-    """Return the driver's speed on an open road [m/s]; it is lower where the driver believes that
-    the road is slippery.
+    """Return the speed that the driver chooses on an open road [m/s]; it is lower where the driver
+    believes that the road is slippery.
     """
     return float(d[Driver.CRUISE] * math.sqrt(min(1.0, 0.25 + 1.1 * d[Driver.BELIEF])))
 
@@ -191,7 +192,8 @@ def update_belief(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None
 
 @compiled
 def advance_warning(d: FloatArray, vx: float, dt: float) -> None:
-    """Advance the stretch of which the driver was warned: its distance decreases by `vx` * `dt`."""
+    """Update the stored distance to the stretch of which the driver was warned: it decreases by
+    `vx` * `dt`."""
     if d[Driver.WARNED_END] > 0.0:
         d[Driver.WARNED_IN] -= dt
         d[Driver.WARNED_START] -= vx * dt
@@ -219,7 +221,7 @@ def traffic_braking(t: float, key: Key) -> float:
 def is_stopping(t: float, share: float, key: Key) -> bool:
     """Return True if the driver is stopping or waiting now.
 
-    The driver stops in the given share of the time windows of length ALERT_S.
+    The driver stops in a share of all time windows of length ALERT_S; an argument gives this share.
     """
     window = int(t / ALERT_S)
     return bool(

@@ -100,7 +100,8 @@ def run(
     steps: int,
     timing: tuple[float, int],
 ) -> FloatArray:
-    """Return records (T, N, RECORD) of the next `steps` samples; the states are advanced in place.
+    """Simulate the next `steps` samples; return records with the true values (T, N, RECORD). The
+    states are advanced in place.
 
     states: vehicles (N, STATES), drivers (N, len(Driver)), routes (N, 4), wheels (N, 8, 4); ground:
     lanes, tables of friction and of relief; keys: random keys of routes and of traffic (N,);
@@ -287,8 +288,8 @@ class SimulatedFleet:
 
 
 def rough_ones(vehicles: int, share: float) -> BoolArray:
-    """Return an array (N,) that is True for rough (inaccurate) vehicles, evenly distributed. The
-    value for vehicle k does not depend on the number of vehicles.
+    """Return an array (N,) that is True for rough (inaccurate) vehicles, which are evenly
+    distributed. The value for vehicle k does not depend on the number of vehicles.
     """
     number = np.arange(vehicles)
     return np.asarray(np.floor((number + 1) * share) > np.floor(number * share))

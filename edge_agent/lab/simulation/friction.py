@@ -1,5 +1,5 @@
-"""Friction of the road as a function of position and time: a background value with oriented
-rectangles on top.
+"""Friction of the road as a function of position and time: a background value, and rotated
+rectangles (patches) that replace it.
 
 If patches overlap, the last one in the list counts. Each patch has its true friction (`mu`) and the
 friction that a driver expects from its appearance (`looks`). Black ice looks like the road around

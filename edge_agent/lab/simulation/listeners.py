@@ -59,7 +59,7 @@ class WarnedDrivers:
         return bool(self.warned[k])
 
     def route_of(self, k: int) -> GivenRoute | None:
-        """Return the route ahead of vehicle k; None before its first update."""
+        """Return the route ahead of vehicle k; None before the first block of samples."""
         return self._routes.get(k)
 
     def hear(self, name: str, warning: GripWarning) -> None:
@@ -73,8 +73,8 @@ class WarnedDrivers:
     def heeding(
         self, blocks: Iterator[Block], hear: Callable[[], None] = lambda: None
     ) -> Iterator[Block]:
-        """Yield the blocks. After each block, call `hear` and pass the stored warnings to the
-        drivers.
+        """Yield the blocks of samples of a source unchanged. After each block, call `hear` and pass
+        the stored warnings to the drivers.
         """
         for number, block in enumerate(blocks):
             if number % EVERY == 0:

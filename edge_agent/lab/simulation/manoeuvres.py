@@ -162,8 +162,8 @@ def braking(now: Moment) -> tuple[float, float]:
 
 
 def split_braking(now: Moment) -> tuple[float, float]:
-    """Brake as in `braking`; the driver keeps the car straight on a road with different friction on
-    both sides.
+    """Brake as in `braking`, on a road with different friction left and right; the driver steers so
+    that the car stays straight.
     """
     return steer_to(now, now.x + preview(now), 0.0), braking(now)[1]
 
@@ -243,8 +243,8 @@ def moderate_braking(now: Moment) -> tuple[float, float]:
 
 
 def pulses(now: Moment) -> tuple[float, float]:
-    """Alternate two seconds of throttle and two seconds of braking while weaving slightly, as in
-    town traffic.
+    """Alternate two seconds of acceleration and two seconds of braking while weaving slightly, as
+    in town traffic.
     """
     wanted = 2.5 if now.t % 4.0 < 2.0 else -2.5
     return 0.03 * math.sin(

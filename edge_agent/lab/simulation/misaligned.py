@@ -11,7 +11,7 @@ Legend
              error that depends on the angle
     ε        of each wheel: ω' = ω (1 + ε), as of a radius smaller by ε
     Δω       step width of wheel speeds; a wheel that stands reads zero, because teeth are counted
-    τ        each device reports the state of τ ago
+    τ delay of a device: it reports the state of τ ago
 
 The sizes are those found in eleven public logs of real cars: offsets of a_x .22 to .96 and of a_y
 .07 to .54 m/s^2, steering offsets of 1 to 17 mrad, steering gain errors of 3 % at speed and 5 to 15

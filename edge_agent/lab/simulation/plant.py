@@ -24,8 +24,8 @@ An accelerometer measures all forces except gravity: (dv_x/dt − r v_y − g_x)
 the vehicle stands. The load transfer follows the measured acceleration, and the sum of the loads is
 the part of the weight normal to the road.
 
-K does not depend on μ, unless the tyre softens: friction acts by similarity (Pacejka, Tyre and
-Vehicle Dynamics, 3rd ed., §4.2), and |F| ≤ μ F_z.
+The slip stiffness K does not depend on μ, except for tyres with the option that it does: friction
+acts by similarity (Pacejka, Tyre and Vehicle Dynamics, 3rd ed., §4.2), and |F| ≤ μ F_z.
 
 A vehicle may have tyres with a relaxation length (RELAXATION: four fifths of the slip build up over
 that length), and controllers that work in cycles and report their activity (ABS_HZ:
@@ -83,7 +83,8 @@ def gravity(u: FloatArray) -> tuple[float, float, float]:
 
 @compiled
 def stiffness_per_load(slope: float, degression: float, load: float, at_rest: float) -> float:
-    """Return the stiffness K/F_z of a wheel under `load` [N] whose static load is `at_rest` [N]."""
+    """Return the slip stiffness over load, K/F_z [1], of a wheel under `load` [N] whose static load
+    is `at_rest` [N]."""
     return slope * max(1.0 - degression * (load / at_rest - 1.0), SOFTEST)
 
 
@@ -362,8 +363,8 @@ def regenerate(x: FloatArray, p: FloatArray, u: FloatArray) -> None:
 
 @compiled
 def start_at(x: FloatArray, p: FloatArray, place: tuple[float, float, float], speed: float) -> None:
-    """Set the state `x` to straight rolling at `speed` [m/s], starting at `place` (x [m], y [m],
-    yaw [rad]).
+    """Set the state `x` to straight rolling at `speed` [m/s], starting at the pose `place` (x [m],
+    y [m], yaw [rad]).
     """
     x[:] = 0.0
     x[Motion.VX] = speed

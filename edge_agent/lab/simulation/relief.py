@@ -55,7 +55,7 @@ class Wave:
 @dataclass(frozen=True)
 class Relief:
     """Shape of the ground: the sum of `waves`, the `crossfall` of every lane [1], and the `banking`
-    per curvature [m].
+    (sideways slope of a bend) per curvature [m].
     """
 
     waves: tuple[Wave, ...] = ()
@@ -98,7 +98,8 @@ def cross_slope(table: FloatArray, curvature: float) -> float:
     """Return the cross slope [1] of a lane with this `curvature` [1/m], positive if the road rises
     to the left.
 
-    It is the crossfall minus the banking, so it is smaller in a bend to the left.
+    The cross slope is the crossfall minus the banking; in a bend to the left it is therefore
+    smaller.
     """
     return float(table[0, 0] - table[0, 1] * curvature)
 

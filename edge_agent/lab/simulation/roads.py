@@ -254,7 +254,8 @@ def _plan_speeds(
     """Compute the speed profiles of all lanes, backwards from their ends, repeatedly until nothing
     changes.
 
-    The braking that a point requires is at most the part of the budget that cornering leaves there.
+    At each point, the profile brakes at most with the part of the driver's grip budget that
+    cornering leaves.
     """
     while True:
         before = [table[0, LanePoint.PROFILE :].copy() for table in tables]

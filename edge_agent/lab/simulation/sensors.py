@@ -225,8 +225,8 @@ def read_late(
     rate_hz: float,
     signals: FloatArray,
 ) -> None:
-    """Fill `signals` (18,) with the delayed readings of each device. In the records (T, 32), row
-    `lead` is the present sample.
+    """Fill `signals` (18,) with the delayed readings of each device. `records` (T, 32) are true
+    values; row `lead` is the present sample, and the rows before it are past samples.
     """
     record = np.empty(records.shape[1])
     readings = np.empty(signals.size)
@@ -255,7 +255,7 @@ def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int
 @compiled
 def drop_out(share: float, key: np.uint64, window: int, row: FloatArray) -> None:
     """Replace the readings of each device in `row` (18,) with NaN with probability `share`. The
-    same devices are silent in all samples of a time window.
+    random choice is made once per time window, so a device is silent in all samples of that window.
     """
     for c in range(len(CHANNELS)):
         if uniform(key, window * len(GROUPS) + GROUP_OF[c]) < share:
@@ -271,8 +271,8 @@ def sense(
     keys: tuple[KeyArray, KeyArray],
     clock: tuple[int, float, int],
 ) -> FloatArray:
-    """Return signals (T, N, 18) for the records (lead + T, N, 32). The first `lead` records only
-    serve delayed readings.
+    """Return the sensor readings (T, N, 18) for the records with true values (lead + T, N, 32). The
+    first `lead` records only serve delayed readings.
 
     `wander` (N, 3) is advanced. `keys` are two uint64 arrays (N,), for the noise and for the
     dropouts; `clock` is (number of the first sample, rate [Hz], `lead`).

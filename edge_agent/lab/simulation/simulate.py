@@ -183,8 +183,8 @@ def _drive_manoeuvre(
     rate_hz: float,
     samples: int,
 ) -> FloatArray:
-    """Return the true records (T, RECORD) of the drive. The driver adds the force that a slope
-    requires.
+    """Simulate the drive and return the records of its true values (T, RECORD). The driver adds the
+    force that a slope requires.
     """
     p = truth.row()
     x = np.zeros(STATES)
@@ -239,7 +239,8 @@ def _moment_of(t: float, x: FloatArray, speed: float) -> Moment:
 def _sense_records(
     records: FloatArray, sensors: Sensors, origin: Origin, seed: int, rate_hz: float
 ) -> FloatArray:
-    """Return the sensor readings (T, 18) for the true records (T, RECORD) of one vehicle."""
+    """Simulate the sensors: return readings (T, 18) for the records of true values (T, RECORD) of
+    one vehicle."""
     errors = error_row(sensors, origin, seed, 0)[None]
     place = np.array([origin.latitude, origin.longitude, *origin.per_metre])
     keys = tuple(np.array([key]) for key in noise_keys(seed, 0))

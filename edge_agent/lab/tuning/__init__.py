@@ -1,3 +1,3 @@
-"""Tuning of the fuzzy memberships: ant colony, random search for comparison, objectives, and tuned
-files with their origin.
+"""Tuning of the fuzzy memberships: ant colony optimisation, random search for comparison,
+objectives, and files of tuned memberships that state how they were found.
 """

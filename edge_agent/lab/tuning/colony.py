@@ -74,8 +74,9 @@ def transition_probabilities(
     alpha: float,
     theta: float,
 ) -> FloatArray:
-    """Return the probabilities of equation (31) for all vertices, (V, K). They are zero outside A,
-    and each row sums to one.
+    """Return the probabilities of equation (31) for all vertices (variables), (V, K): row v has the
+    probability of each position (possible value). It is zero where no position exists, and each row
+    sums to one.
     """
     attraction = np.where(reachable, pheromone**alpha * visibility**theta, 0.0)
     probabilities: FloatArray = attraction / attraction.sum(axis=1, keepdims=True)
@@ -83,11 +84,11 @@ def transition_probabilities(
 
 
 def lowest_pheromone(reachable: BoolArray, retrace: float) -> FloatArray:
-    """Return the lower pheromone bound τ_min (V, 1) with which a converged colony repeats its best
-    path with probability `retrace`.
+    """Return the lower bound of the pheromone, τ_min (V, 1) for V vertices (variables), with which
+    a converged colony repeats its best path with probability `retrace`.
 
-    The best position of each vertex then has p = retrace^(1/V) = τ_max / (τ_max + (K − 1)·τ_min);
-    this is solved for τ_min.
+    The best position (value) of each vertex then has the probability p = retrace^(1/V) = τ_max /
+    (τ_max + (K − 1)·τ_min); this is solved for τ_min.
     """
     vertices = len(reachable)
     p = retrace ** (1.0 / vertices)
@@ -97,8 +98,9 @@ def lowest_pheromone(reachable: BoolArray, retrace: float) -> FloatArray:
 
 
 def deposit(paths: IntArray, weights: FloatArray, reachable: BoolArray) -> FloatArray:
-    """Return the deposited pheromone Δτ (V, K) of paths (P, V) with weights (P,). Each vertex
-    receives the sum of the weights.
+    """Return the pheromone Δτ (V, K) that P paths (P, V) with weights (P,) deposit on V vertices
+    (variables) with K positions (values) each. Each path adds its weight at its position of every
+    vertex.
     """
     laid = np.zeros(reachable.shape)
     vertices = np.arange(reachable.shape[0])
@@ -115,16 +117,16 @@ def renew(
     evaporation: float,
     retrace: float,
 ) -> FloatArray:
-    """Return the pheromone after equation (32), limited to [τ_min, 1]; zero where no position
-    exists.
+    """Return the pheromone after equation (32), limited to [τ_min, 1]; zero where a vertex
+    (variable) has no such position (possible value).
     """
     renewed = (1.0 - evaporation) * pheromone + laid
     return np.where(reachable, np.clip(renewed, lowest_pheromone(reachable, retrace), HIGHEST), 0.0)
 
 
 def _walk_ant(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
-    """Return the path of one ant (V,): at each vertex a position drawn with the probabilities of
-    (31).
+    """Return the path of one ant, (V,): at each vertex (variable), the index of a position
+    (possible value) drawn with the probabilities of (31).
     """
     reached = np.cumsum(probabilities, axis=1)
     drawn = rng.random((len(probabilities), 1)) * reached[:, -1:]
@@ -134,7 +136,7 @@ def _walk_ant(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
 
 def _rank_weights(ants: int, habits: Habits) -> FloatArray:
     """Return the deposits (P,) of the best ants of an iteration, by rank. Together with the deposit
-    of the best path so far they sum to ρ.
+    of the best path so far they sum to ρ (evaporation per iteration).
     """
     count = max(1, round(habits.elite * ants))
     ranks = np.arange(count, 0, -1, dtype=np.float64)
@@ -154,11 +156,12 @@ def optimise(
 ) -> Result:
     """Search for the vector with the largest objective.
 
-    `visibility` is, per vertex, the preference η > 0 of each position; without it all positions are
-    equal. The objective is called at most ants·iterations times, once per vector.
+    Each vertex (variable) has a list of positions (possible values). `visibility` is, per vertex,
+    the preference η > 0 of each position; without it all positions are equally preferred. The
+    objective is called at most ants·iterations times, once per vector.
 
     Raises:
-        InputError: there are empty choices, no ants or no iterations.
+        InputError: a vertex has no position, or there are no ants or no iterations.
     """
     habits = habits or Habits()
     graph = Graph.from_choices(problem.choices)

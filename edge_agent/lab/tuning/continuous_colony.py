@@ -1,10 +1,10 @@
 """Ant colony for continuous variables, ACO_R (Socha and Dorigo, European J. of Operational Research
 2008). The module is pure.
 
-The graph of `colony` gives each vertex a short list of positions. The vertices of fuzzy sets are
-continuous, so here an archive of the k best vectors takes the place of the pheromone. An ant
-chooses vector l of the archive with a weight that decreases with its rank. It then draws each
-variable from a normal distribution around that vector.
+In `colony`, each vertex (variable) has a short list of positions (possible values). The corners of
+fuzzy sets are continuous quantities. Therefore this colony stores the k best vectors (archive) in
+place of pheromone. An ant chooses vector l of the archive with a weight that decreases with its
+rank. It then draws each variable from a normal distribution around that vector.
 
 Legend
     l           rank in the archive, 1 is best
@@ -53,10 +53,11 @@ class ArchiveHabits:
 
 
 class SearchTally:
-    """Tally of a search over continuous variables: number of evaluations, best vector, and history."""
+    """Record of a search over continuous variables: number of evaluations, best vector, and history
+    of the objective."""
 
     def __init__(self, problem: Problem) -> None:
-        """Create the tally before the first evaluation.
+        """Create the record of a search before the first evaluation.
 
         Raises:
             InputError: a variable has no choices.
@@ -90,7 +91,8 @@ class SearchTally:
         return np.asarray(np.clip(vector, self.lower, self.upper))
 
     def uniform(self, rng: np.random.Generator) -> FloatArray:
-        """Return an admissible random vector from the whole range.
+        """Return a random vector, uniform over the whole range of the variables, that the problem
+        admits.
 
         Raises:
             InputError: no vector out of REDRAWS draws is admissible.
@@ -136,7 +138,7 @@ def optimise(
     """Search for the vector with the largest objective, with ants·iterations evaluations.
 
     The archive is filled first, with the start vector and random vectors from the whole range. The
-    range of a variable is that of its choices.
+    range of a variable extends from its smallest to its largest choice.
     """
     habits = habits or ArchiveHabits()
     tally = SearchTally(problem)

@@ -10,10 +10,10 @@ Legend
 IS and l_v are proper scores: in expectation, stating the true distribution gives the best score.
 Inflating R does not improve them, in contrast to paper 004's equation 33 (variance mismatch) and
 errors against the truth. IS is the score of Gneiting and Raftery (JASA 2007). The innovations need
-no true friction. However, they look only one update ahead and do not show persistent errors: R
-shrinks to white noise, and friction intervals become too narrow. Therefore the objective
-`predictive` adds a cost for the deviation of NIS from its expectation. README.md, section
-"Choices", explains the default objective.
+no true friction. However, they look only one update ahead and do not show persistent errors: a
+tuning on l_v alone reduces R to white noise, and friction intervals become too narrow. Therefore
+the objective `predictive` adds a cost for the deviation of NIS from its expectation. README.md,
+section "Choices", explains the default objective.
 
 The simulated cars are inaccurate: misaligned sensors, slopes, clock delays, and in towns half of
 the cars have no torque. The drives of a search and the held-out drives share no seed, no vehicle
@@ -131,8 +131,8 @@ class TuningScores:
 
 
 def detection_cost(scores: TuningScores) -> float:
-    """Return the interval score plus costs for false and for missed ice, so that one cannot be
-    improved at the expense of the other.
+    """Return the interval score plus costs for false and for missed ice. With both costs, a search
+    gains nothing from reducing one at the expense of the other.
     """
     false_ice = max(scores.false_ice - MOST_FALSE_ICE, 0.0)
     return scores.surface_score + FALSE_ICE_PRICE * false_ice + MISSED_ICE_PRICE * scores.missed_ice
@@ -295,8 +295,8 @@ def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
 
 
 def choices(positions: int) -> tuple[FloatArray, ...]:
-    """Return the candidate values of every vertex and noise scale: evenly spaced within the bounds,
-    and including the default.
+    """Return the candidate values of every vertex (corner of a fuzzy set) and every noise scale:
+    evenly spaced within the bounds, and the default value.
     """
     default = Memberships().to_vector()
     found = []

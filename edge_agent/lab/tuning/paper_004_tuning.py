@@ -1,5 +1,5 @@
-"""The tuning of paper 004 as in the paper: sixteen lower vertices, three noise levels, and a choice
-of objectives.
+"""The tuning of paper 004 as in the paper: sixteen lower vertices (feet of the fuzzy sets), three
+noise levels, and a choice of objectives.
 
 The drive is the double lane change at 80 km/h on the printed tyre, with P_0 = .2*I, Q = .1*T^2.
 Noise variance and R are .1, .05 and .01 in turn (section IV.A). Objectives, larger is better:
@@ -120,8 +120,8 @@ def _run_filter(sets: Sets, drive: LevelDrive) -> Estimates:
 
 
 def visibility() -> list[FloatArray]:
-    """Return the visibility eta of every position at every vertex, for equation (31). It is larger
-    for positions near the untuned position.
+    """Return the visibility eta (prior preference) of every position (value) of every vertex
+    (variable), for equation (31). It is larger for positions near the untuned value.
     """
     preferred = np.exp(-0.5 * ((POSITIONS - 1.0) / PREFERENCE) ** 2)
     return [preferred] * len(LowerVertices().to_vector())
@@ -130,7 +130,7 @@ def visibility() -> list[FloatArray]:
 @dataclass(frozen=True)
 class PaperTuning:
     """Result of the tuning: the tuned fuzzy sets, the history of the search, and the final
-    pheromone (16, 7).
+    pheromone of the ant colony (16 vertices, 7 positions).
     """
 
     sets: LowerVertices
@@ -147,7 +147,8 @@ def tune(
     seed: int,
     habits: Habits | None = None,
 ) -> PaperTuning:
-    """Tune the lower vertices with the ant colony; the objective is averaged over all noise levels."""
+    """Tune the lower vertices (feet of the fuzzy sets) with the ant colony; the objective is
+    averaged over all noise levels."""
     score = OBJECTIVES[objective]
     laid: list[FloatArray] = []
 

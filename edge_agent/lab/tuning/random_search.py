@@ -1,5 +1,5 @@
-"""Random search, for comparison with the ant colony: uniform draws from the same positions with the
-same budget.
+"""Random search, for comparison with the ant colony: uniform draws from the same possible values
+with the same number of evaluations.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Parts that the searches share: a graph of positions, a result, a history.
+"""Parts that the searches share: a graph of possible values, a result, a history.
 
 A search looks for the best vector, with one value per vertex (variable). Each vertex has its own
 short list of possible values, its positions. A search does not depend on filters: the objective is
@@ -44,9 +44,10 @@ Progress = Callable[[Iteration], None]
 class Problem:
     """The objective to maximise, and the vectors to search.
 
-    objective: value of a vector (V,). choices: per vertex its positions, in ascending order. start
-    (V,): the vector that is evaluated first, so that the result is never worse than it. admissible:
-    returns True for vectors that may be evaluated; others are replaced by new draws.
+    objective: function that returns the value of a vector (V,), one number per vertex (variable).
+    choices: per vertex its positions (possible values), in ascending order. start (V,): the vector
+    that is evaluated first, so that the result is never worse than it. admissible: returns True for
+    vectors that may be evaluated; others are replaced by new draws.
     """
 
     objective: Objective
@@ -71,8 +72,8 @@ class Result:
 
 @dataclass(frozen=True)
 class Graph:
-    """V vertices with up to K positions each, as arrays: `positions` (V, K), and `reachable` (V,
-    K), which is True where a position exists.
+    """V vertices (variables) with up to K positions (possible values) each, as arrays: `positions`
+    (V, K), and `reachable` (V, K), which is True where a position exists.
     """
 
     positions: FloatArray
@@ -80,7 +81,8 @@ class Graph:
 
     @classmethod
     def from_choices(cls, choices: Sequence[FloatArray]) -> "Graph":
-        """Return the graph for one array of positions per vertex.
+        """Return the graph for a list with one array per vertex (variable): its positions (possible
+        values).
 
         Raises:
             InputError: a vertex has no position.
@@ -96,13 +98,15 @@ class Graph:
         return cls(positions, np.isfinite(positions))
 
     def vector(self, path: IntArray) -> FloatArray:
-        """Return the values (V,) that belong to a path, which is an array of position indices (V,)."""
+        """Return the vector of values (V,) for a path (V,), which has, per vertex (variable), the
+        index of its position (possible value)."""
         return self.positions[np.arange(len(path)), path]
 
 
 @dataclass
 class Ledger:
-    """Ledger of all evaluated paths, so that no path is evaluated twice and the best one is kept."""
+    """Record of all evaluated paths (one index of a value per variable): no path is evaluated
+    twice, and the best one is stored."""
 
     objective: Objective
     graph: Graph
@@ -113,8 +117,8 @@ class Ledger:
     history: list[Iteration] = field(default_factory=list)
 
     def draw(self, sample: Callable[[], IntArray]) -> IntArray:
-        """Return an admissible path drawn by `sample`, if possible one that was not evaluated
-        before.
+        """Return a path (one index of a value per variable) that `sample` draws and the problem
+        admits, if possible one that was not evaluated before.
 
         Raises:
             InputError: no drawn path is admissible.
@@ -133,8 +137,8 @@ class Ledger:
         return fallback
 
     def evaluate(self, path: IntArray) -> float:
-        """Return the objective at a path, which is computed once per path. A value that is not
-        finite counts as the worst.
+        """Return the objective at a path (one index of a value per variable); it is computed only
+        once per path. A value that is not finite counts as the worst.
         """
         key = path.tobytes()
         if key not in self.values:
@@ -169,7 +173,8 @@ class Ledger:
 
 
 def nearest(graph: Graph, vector: FloatArray) -> IntArray:
-    """Return the indices (V,) of the positions nearest to a vector (V,)."""
+    """Return, per vertex (variable), the index of the position (possible value) nearest to the
+    value in a vector (V,); shape (V,)."""
     distance = np.abs(graph.positions - np.asarray(vector)[:, None])
     indices: IntArray = np.argmin(np.where(graph.reachable, distance, np.inf), axis=1)
     return indices

@@ -9,8 +9,8 @@
 The objective is the mean log-likelihood of the innovations over four conditions of R [nat/s]
 (`study`), on four drives. Each seed gives one search of each kind, and one set of held-out drives
 with its own noise. The results of all searches are scored on these drives, together with the
-untuned sets and a constant R for comparison. Differences are paired by seed; `.se` is the standard
-error over seeds.
+untuned sets and a filter with constant R (measurement noise) for comparison. Differences are paired
+by seed; `.se` is the standard error over seeds.
 """
 
 from __future__ import annotations

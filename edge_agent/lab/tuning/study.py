@@ -43,8 +43,8 @@ WAYS: Final[dict[str, Callable[..., Result]]] = {
 
 
 class Condition(NamedTuple):
-    """Condition of R: the filter's R divided by VARIANCE, and True if the noise follows the paper's
-    schedule.
+    """Condition of a study: the measurement noise R of the filter divided by VARIANCE, and True if
+    the simulated noise follows the paper's schedule.
     """
 
     scale: float
@@ -86,8 +86,8 @@ HELD_OUT: Final = (
 
 @dataclass(frozen=True)
 class StudySet:
-    """N drives of equal length: t (T, N) [s], signals (T, N, 18) by condition, true v_x, v_y and
-    yaw rate (T, N, 3).
+    """N drives of equal length: t (T, N) [s], noisy readings `signals` (T, N, 18) by condition,
+    true v_x, v_y and yaw rate (T, N, 3).
     """
 
     vehicles: tuple[Vehicle, ...]
@@ -194,15 +194,15 @@ def overall(memberships: Memberships, drives: StudySet) -> float:
 
 
 def memberships_of(vector: FloatArray) -> Memberships:
-    """Return the memberships with the ten vertices in `vector`. This filter has no noise scales to
-    tune, because its R is given.
+    """Return the memberships (fuzzy sets) with the ten vertices (corners) in `vector`. Only
+    vertices are tuned, because the measurement noise R of this filter is given.
     """
     return Memberships.from_vector(np.append(vector, np.zeros(CHANNELS)))
 
 
 def objective_on(drives: StudySet) -> Objective:
     """Return the objective of the search on the given drives, as a function of a vector of ten
-    vertices.
+    vertices (corners of fuzzy sets).
     """
     return lambda vector: overall(memberships_of(vector), drives)
 
@@ -217,8 +217,8 @@ def search(
     seed: int,
     progress: Progress | None = None,
 ) -> Result:
-    """Search for the best vertices by a method of WAYS. Every search starts at the untuned
-    vertices.
+    """Search for the best vertices (corners of the fuzzy sets) by a method of WAYS. Every search
+    starts at the untuned vertices.
     """
     return WAYS[way](
         Problem(

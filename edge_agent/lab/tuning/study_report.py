@@ -50,23 +50,25 @@ SHOWN: Final = (*GIVEN, *WAYS)
 
 @dataclass
 class Study:
-    """Results of all searches of each kind, and the drives used for search and scoring."""
+    """Results of all searches of each kind (ant colony, random search), and the drives used for
+    search and scoring."""
 
     train: StudySet
     held_out: StudySet
     found: dict[str, list[Result]] = field(default_factory=dict)
 
     def memberships(self, way: str) -> list[Memberships]:
-        """Return the memberships found by each search of the kind `way`. For a kind of GIVEN, which
-        is not searched, return its only memberships.
+        """Return the memberships (fuzzy sets) found by each search of the kind `way`. If `way` is
+        in GIVEN (sets that are given, not searched), return its only memberships.
         """
         if way in GIVEN:
             return [GIVEN[way]]
         return [memberships_of(result.best) for result in self.found[way]]
 
     def best(self, way: str) -> Memberships:
-        """Return the memberships of that search of the kind `way` which has the best objective on
-        the drives of the search. For a kind of GIVEN, return its only memberships.
+        """Return the best memberships (fuzzy sets) found by the searches of the kind `way`, judged
+        by the objective on the drives of the search. If `way` is in GIVEN, return its only
+        memberships.
         """
         if way in GIVEN:
             return GIVEN[way]
@@ -82,8 +84,8 @@ def run(
     duration_s: float,
     reporter: Callable[[str], Progress],
 ) -> Study:
-    """Run every search with every seed and return the study. `reporter` returns the progress
-    function of a search, given its name.
+    """Run every search with every seed and return the study. `reporter` is called with the name of
+    a search and returns the function that reports its progress.
     """
     done = Study(study.record(study.TRAIN, duration_s), study.record(study.HELD_OUT, duration_s))
     for seed in seeds:

@@ -1,5 +1,5 @@
-"""Columns of the papers' tables, for the same drive: under the paper's conditions ("matched"), with
-the simulator's own vehicle model ("own plant"), and with realistic sensors.
+"""Columns of the papers' tables: results of the same drive under the paper's conditions
+("matched"), with the simulator's own vehicle model ("own plant"), and with realistic sensors.
 """
 
 from __future__ import annotations

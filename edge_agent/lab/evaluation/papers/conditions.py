@@ -1,8 +1,8 @@
 """The papers' conditions: vehicle models with the papers' tyres and without drag, and their drives.
 
-"Matched" is a simulated vehicle ("plant") that equals the filter's model. Drives at constant speed
-keep drag and rolling resistance, which are known to the filter: without a longitudinal force the
-tyres give no information on friction.
+"Matched" is a simulated vehicle ("plant") that equals the filter's model. Only drives at constant
+speed have drag and rolling resistance, which the filter knows. They need them because without a
+longitudinal force the tyres give no information on friction.
 """
 
 from __future__ import annotations
@@ -106,8 +106,8 @@ MATCHED: Final[dict[str, DriveSpec]] = {
 
 
 def given_motion(batch: DriveSet, vehicle: TrueVehicle) -> GivenMotion:
-    """Return the first drive of the batch with its true motion, in the form that the literal
-    filters require.
+    """Return the first drive of the batch with its true motion, as input of the literal filters
+    (the papers' filters as printed, which do not estimate motion).
     """
     truth = batch.truth
     return GivenMotion(

@@ -46,7 +46,7 @@ def draw_plot(plot: PaperPlot) -> Figure:
 
 
 def write_plots(plots: Sequence[PaperPlot], folder: Path) -> list[Path]:
-    """Write every plot as PNG and SVG into the folder; return the paths."""
+    """Write every plot as a PNG and an SVG file into the folder; return the paths of the files."""
     import matplotlib as mpl
 
     written = []

@@ -1,5 +1,5 @@
-"""Plots for paper 004: path, motor torques, states estimated by both filters, fuzzy sets, search
-and pheromone.
+"""Plots for paper 004: path, motor torques, states estimated by both filters, fuzzy sets, progress
+of the search, and pheromone of the ant colony.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FILTERS: Final = {"FCKF": "comparator", "ACOFCKF": "improved"}
 def plots(
     constant: NoisyRun, variable: NoisyRun, tuned: Memberships, tuning: PaperTuning
 ) -> list[PaperPlot]:
-    """Return all plots, drawn from the drive of the first noise seed."""
+    """Return all plots. Curves over time show the drive with the first noise seed."""
     return [
         _path_plot(constant),
         _torque_plot(constant),
@@ -148,8 +148,8 @@ def _lower_vertices(tuned: LowerVertices) -> PaperPlot:
 
 
 def _shoulder_values(k: int) -> FloatArray:
-    """Return the memberships at the left foot, peak and right foot of the first (k = 0) or last
-    fuzzy set.
+    """Return the fuzzy membership (degree, 0 to 1) at the left foot, peak and right foot of the
+    first (k = 0) or last fuzzy set.
     """
     return np.array([1.0, 1.0, 0.0]) if k == 0 else np.array([0.0, 1.0, 1.0])
 
@@ -166,7 +166,8 @@ def _search_plot(tuning: PaperTuning) -> PaperPlot:
 
 
 def pheromone_plot(tuning: PaperTuning) -> PaperPlot:
-    """Return the plot of the pheromone as a colour map: vertices by positions."""
+    """Return the plot of the pheromone as a colour map: one axis shows the vertices (variables of
+    the fuzzy sets), the other their positions (possible values)."""
     count = len(tuning.pheromone)
     ticks = tuple(f"{'e' if k < count // 2 else 'n'} {k % (count // 2) + 1}" for k in range(count))
     label = "position of the vertex: " + ", ".join(f"{value:g}" for value in POSITIONS)

@@ -24,11 +24,12 @@ class PaperRow(NamedTuple):
         what: the number in words, with its unit in brackets.
         printed: the printed number, or NaN if the paper prints none.
         matched: result of the paper's filter under the paper's conditions.
-        own: result of the same filter with the simulator's own vehicle model.
+        own: result of the same filter on drives that the simulator's own vehicle model gives.
         realistic: result of the paper's estimator with ordinary sensors and a vehicle file with
             errors of a few per cent.
         default: result of the default estimator on the same drives.
-        bar: target for `matched`. None: the printed number, if there is one. NaN: no target.
+        bar: target for `matched`. None: the printed number is the target, if there is one. NaN:
+            there is no target.
         better: "less" or "more": the side of the target on which `matched` must lie.
         shown: text for the printed number, if it is more than a number.
     """
@@ -46,7 +47,8 @@ class PaperRow(NamedTuple):
 
     @property
     def limit(self) -> float | None:
-        """Return the target for the matched number; None if there is no target."""
+        """Return the target for the number under the paper's conditions (`matched`); None if there
+        is no target."""
         bar = self.printed if self.bar is None else self.bar
         return None if math.isnan(bar) else bar
 
@@ -58,7 +60,8 @@ class PaperRow(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Return True if the matched number meets its target, or has no target."""
+        """Return True if the number under the paper's conditions (`matched`) meets its target, or
+        has no target."""
         return self.limit is None or self.figure("papers").holds
 
     def figure(self, prefix: str) -> Figure:
@@ -133,7 +136,8 @@ class Reproduction:
 
     @property
     def missed_rows(self) -> list[str]:
-        """Return the names of the rows whose matched number misses its target."""
+        """Return the names of the rows whose number under the paper's conditions (`matched`) misses
+        its target."""
         return [row.name for row in self.rows if not row.holds]
 
     def all_figures(self) -> list[Figure]:

@@ -45,7 +45,8 @@ def cells(row: PaperRow) -> list[str]:
 
 
 def limit_text(row: PaperRow) -> str:
-    """Return the target of the matched number as text, for example "≤ 0.02"; "" without a target."""
+    """Return the target of the number under the paper's conditions as text, for example "≤ 0.02";
+    "" without a target."""
     if row.limit is None:
         return ""
     return f"{'≤' if row.better == 'less' else '≥'} {row.limit:g}"

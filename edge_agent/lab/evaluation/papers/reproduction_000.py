@@ -34,8 +34,8 @@ NEAR: Final = 0.1
 
 
 def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
-    """Return two times [s] until the mean friction (T,) is within NEAR of the true value: from the
-    start, and from the change of friction.
+    """Return two durations [s] until the estimated mean friction (T,) is within NEAR of the true
+    value: one from the start, and one from the change of friction.
     """
     t = batch.t[:, 0]
     truth = batch.mu[:, 0]
@@ -50,8 +50,8 @@ def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
 
 
 def _run_friction(spec: DriveSpec, setting: FederatedSetting) -> tuple[DriveSet, FloatArray]:
-    """Return the drive, and the friction of the wheels (T, 4) estimated by the printed filter with
-    given motion.
+    """Return a simulated drive, and the friction of the wheels (T, 4) that the printed filter
+    estimates from it; the filter gets the true motion.
     """
     batch = ideal(spec)
     return batch, estimate(given_motion(batch, spec.vehicle), setting).mu

@@ -59,7 +59,7 @@ class MotionRun:
 
 
 def run_drive(spec: DriveSpec, settings: dict[str, AdaptiveSetting]) -> MotionRun:
-    """Simulate a drive and run the filters with the true friction at the start."""
+    """Simulate a drive, and run the filters on it with the true friction as initial value."""
     batch = ideal(spec)
     friction = float(batch.mu[0, 0])
     reported = {

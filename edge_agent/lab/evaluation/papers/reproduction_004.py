@@ -1,5 +1,5 @@
-"""Reproduction of paper 004: the fuzzy cubature filter before and after tuning by the ant colony,
-with constant and variable noise.
+"""Reproduction of paper 004: the fuzzy cubature filter before and after tuning by ant colony
+optimisation, with constant and variable noise.
 """
 
 from __future__ import annotations
@@ -247,7 +247,7 @@ def _option_rows(seeds: Sequence[int]) -> tuple[PaperRow, ...]:
 
 def _tuning_rows(seeds: Sequence[int]) -> tuple[PaperTuning, tuple[PaperRow, ...]]:
     """Tune the fuzzy sets on the three noise levels, and evaluate them on noise with other seeds.
-    Return the tuning with the objective "likelihood", and the rows of the table.
+    Return the tuning with the objective "likelihood", and the rows of the report's table.
     """
     setting = AS_PRINTED._replace(tyre=PROPORTIONAL)
     spec = MATCHED["004.dlc.proportional"]

@@ -1,4 +1,5 @@
-"""The reproduction functions by paper, and the output of `edge-agent evaluate --paper`."""
+"""The functions that reproduce the papers, by paper, and the writer of the files of `edge-agent
+evaluate --paper`."""
 
 from __future__ import annotations
 
