@@ -2,7 +2,7 @@
 
 They test the promise that unknown road is never shown as dry. If only lower bounds of a cell's μ
 are known, or a report used little grip, the median of μ is mostly the prior. The prior's median has
-the colour of wet asphalt.
+the colour of wet asphalt, so it must not be shown as a colour.
 """
 
 from __future__ import annotations

@@ -133,8 +133,9 @@ class QueryEngine:
     def _read(
         self, name: str, paths: Sequence[Path], moment: str, seconds: str, columns: str = "*"
     ) -> Table:
-        """Return a table of the given files, with an additional column `seconds`: the time column
-        `moment` in whole seconds since 1970. The engines convert times differently.
+        """Return a table of the given files, with an additional column named `seconds`: the time
+        column `moment` in whole seconds since 1970. Queries use this column instead of `moment`,
+        because DuckDB and Spark convert times differently.
         """
         texts = [str(path) for path in paths]
         if self._spark is None:

@@ -45,7 +45,9 @@ from schemas.errors import InputError
 def handle_requests(
     engine: Engine, config: ServiceConfig, root: Path, stop: threading.Event
 ) -> str | None:
-    """Handle the waiting erasure requests; return a line for the operator, or None."""
+    """Handle the waiting erasure requests. Return a line about them for the operator, or None if no
+    request was carried out.
+    """
     rows = answered = 0
     for question in erasure_requests.open_requests(root):
         try:

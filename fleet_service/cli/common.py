@@ -190,8 +190,8 @@ def on_archive(
 
 
 def compact_first(root: Path) -> None:
-    """Compact the waiting segments of an archive, so that their rows are included in the answer. If
-    that is impossible, print how many segments are left out.
+    """Compact the waiting segments (files of new rows) of an archive, so that their rows are
+    included in the answer. If that is impossible, print how many segments are left out.
 
     Raises:
         InputError: the folder is not an archive.

@@ -1,5 +1,5 @@
-"""`fleet-service compact`: move new rows of an archive from segments to files by date and zone. The
-service may be running.
+"""`fleet-service compact`: move new rows of an archive from segments (files of new rows) to files
+by date and zone (map square of zoom 7). The service may be running.
 """
 
 from __future__ import annotations

@@ -102,9 +102,10 @@ def _bound_rows(steps: ByteArray, used: FloatArray, bounds: ByteArray) -> None:
 def level_above_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     """Return likelihoods (n, 32) that claim no more grip than the grip used (n,) supports.
 
-    A bound is made flat from the bin that contains `used` minus half its standard deviation. A
-    hundred such bounds together then raise the lower end to at most .95·used + .04. A value is not
-    changed, nor is a row where `used` is NaN.
+    A likelihood that is only a lower bound is made flat from the bin that contains `used` minus
+    half its standard deviation. A hundred such bounds together then raise the lower end of the
+    interval to at most .95·used + .04. The likelihood of a value is not changed, nor is a row where
+    `used` is NaN.
     """
     out = steps.copy()
     _level_rows(out, np.asarray(used, np.float64))

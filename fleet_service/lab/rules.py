@@ -123,8 +123,8 @@ def fuse_by_rules(
 
 
 def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
-    """Return the median of the vehicles' last readings within MEDIAN_MIN minutes, and its standard
-    deviation, (cells,) each.
+    """Return the median of the last friction values that the vehicles reported within MEDIAN_MIN
+    minutes, and its standard deviation, (cells,) each.
     """
     recent = (v.seconds < 60.0 * minute) & (v.seconds >= 60.0 * (minute - MEDIAN_MIN))
     rows = np.flatnonzero(np.isfinite(v.reports.reading) & recent)

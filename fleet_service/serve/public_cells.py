@@ -83,8 +83,8 @@ class PublicCells:
 
     @property
     def live(self) -> Cells:
-        """Return the cells as they were copied. Rows of cells that are not public must not be shown
-        to readers.
+        """Return the cells in the state in which they were last copied for readers. Rows of cells
+        that are not public must not be shown to readers.
         """
         self._add_slots()
         return cells_of(self._rows)

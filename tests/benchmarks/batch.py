@@ -1,5 +1,6 @@
-"""`make batch-bench`: batch work on an archive and on drives, compared with the same work done
-directly. It writes .batch/figures.json.
+"""`make batch-bench`: work on many files at once. Estimation of drives and rebuilding of a map on
+Spark are compared with the same work in one process, and Iceberg tables with the archive's files.
+It writes .batch/figures.json.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ FOLDER: Final = ROOT / ".batch"
 
 
 def measure_all(folder: Path) -> list[Figure]:
-    """Measure the batch work, and return all figures. Temporary files go into `folder`."""
+    """Measure the work on Spark and in Iceberg tables, and return all figures. Temporary files go
+    into `folder`.
+    """
     logs = spread.simulate_drives(folder / "drives")
     return [
         Figure(

@@ -3,8 +3,8 @@ second.
 
 A message has ten observations, and each vehicle sends one message per second, so a higher rate
 means more vehicles. The engine ingests one second of messages in turns, and then does the other
-work of a second: segment, acknowledgements, tiles. The clock is simulated, so that rates above the
-machine's capacity can be measured. There is no network.
+work of a second: segment (file of new rows), acknowledgements, tiles. The clock is simulated, so
+that rates above the machine's capacity can be measured. There is no network.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ def growth() -> list[Figure]:
 
 def second_s(rate: int, seconds: int) -> float:
     """Return the mean processor time [s] for one second of messages at `rate`, measured over
-    `seconds` after a warm-up. An epoch (minute of the fusion) ends half way.
+    `seconds` after a warm-up. In the middle of the measurement an epoch (minute of the fusion)
+    ends, so the work at its end is included.
     """
     vehicles = rate // ROWS
     spent = 0.0

@@ -1,5 +1,5 @@
-"""Tests of the documentation pages: their examples run, and their tables agree with the
-contract.
+"""Tests of the documentation pages: their examples run, and their tables agree with the contract
+(the tables in `schemas`).
 """
 
 from __future__ import annotations

@@ -52,8 +52,8 @@ class Told(NamedTuple):
     settled: dict[Name, float]
 
     def longest_wait(self, since: float) -> float:
-        """Return the time [s] from `since` until the last batch stored before it was settled. The
-        result is infinite if such a batch was never settled.
+        """Return the time [s] from `since` until all batches that were stored before `since` are
+        settled. The result is infinite if one of these batches was never settled.
         """
         waits = [
             self.settled.get(name, float("inf")) - since

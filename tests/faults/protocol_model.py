@@ -293,8 +293,9 @@ def _stand_by(world: World, me: int, rules: Rules, most_number: int) -> Iterator
 
 
 def _advance_clocks(world: World, slow: int, rules: Rules) -> World:
-    """Return the state after a tick: all clocks in use advance (of a lease, of a wait for it, of a
-    wait before listing), except that of the service `slow`.
+    """Return the state after a tick: the clocks of all running services advance, except that of the
+    service `slow`. A clock is used for the age of a lease, for the wait for a lease, or for the
+    wait before listing.
     """
     out = []
     for me, one in enumerate(world.services):

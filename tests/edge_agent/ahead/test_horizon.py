@@ -1,5 +1,5 @@
-"""Tests of the horizon: conversion of metres to cells, unknown cells that stay unknown, ageing, the
-cache, and the safe speed.
+"""Tests of the horizon (friction of the road ahead of a car): conversion of metres to cells,
+unknown cells that stay unknown, ageing, the cache, and the safe speed.
 """
 
 from __future__ import annotations

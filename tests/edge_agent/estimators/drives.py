@@ -20,7 +20,7 @@ def drive(
     name: str, mu: float | None, seed: int = 1, seconds: float | None = None
 ) -> tuple[FloatArray, FloatArray, Vehicle]:
     """Return times t (T,) [s], signals (T, 18) and nominal vehicle of a manoeuvre with ordinary
-    sensors. With `mu` None the manoeuvre has its own friction.
+    sensors. If `mu` is None, the road has the friction that the manoeuvre defines.
     """
     log, vehicle = simulate_manoeuvre(name, mu=mu, seed=seed, duration_s=seconds, sensors="mems")
     return (

@@ -47,7 +47,9 @@ def speed_error(mu: float, missing: slice, *, engine_only: bool = False) -> floa
 
 
 def drive_without_torque(name: str, mu: float) -> tuple[FloatArray, Estimates]:
-    """Return signals (T, 18) without torque, and the estimates from them, of a manoeuvre."""
+    """Simulate a manoeuvre and delete its torque signals. Return the remaining signals (T, 18) and
+    the estimates from them.
+    """
     t, signals, vehicle = drive(name, mu)
     signals = signals.copy()
     signals[:, TORQUE] = np.nan

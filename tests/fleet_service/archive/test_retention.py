@@ -160,8 +160,8 @@ ERASED = "time: the data of this month or vehicle were erased; delete the batch"
 
 
 def acknowledge_batch(engine: Engine, sent: Batch, now: int) -> list[str]:
-    """Ingest a batch, write a segment, and return the kinds of acknowledgement that the batch
-    received.
+    """Ingest a batch, write a segment (file of new rows), and return the kinds of acknowledgement
+    that the batch received.
     """
     engine.intake.ingest([Message(sent.kind, key(sent.vehicle), wire.encode(sent), "")], now)
     streams = [

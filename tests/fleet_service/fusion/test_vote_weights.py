@@ -23,8 +23,8 @@ VEHICLES = 30
 def make_acquainted(
     slope: float = 0.0, gain_std: float = 0.06, *, gain_in_use: bool = False
 ) -> Fusion:
-    """Return a fusion after forty minutes of a fleet with gain errors in ten cells. A value is too
-    low by `slope` times the unused part of μ.
+    """Return a fusion that has received forty minutes of reports about ten cells, from a fleet with
+    gain errors (relative errors). A value is too low by `slope` times the unused part of μ.
     """
     rng = np.random.default_rng(5)
     fusion = Fusion(120.0)

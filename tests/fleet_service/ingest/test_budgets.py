@@ -45,8 +45,8 @@ def engine(tmp_path: Path) -> Iterator[Engine]:
 
 
 def months(now: int) -> tuple[int, int]:
-    """Return the last second of a month and the first of the next [ns], at the month's border
-    before `now`.
+    """Return two times [ns] around the last border of a month before `now`: one second before the
+    border, and two seconds after it.
     """
     first = datetime.fromtimestamp(now / SECOND, UTC).replace(
         day=1, hour=0, minute=0, second=0, microsecond=0

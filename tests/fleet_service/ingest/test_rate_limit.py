@@ -1,4 +1,6 @@
-"""Tests of rate limits: token buckets over time, invented names, long acknowledgements."""
+"""Tests of rate limits: token buckets over time, senders with invented names, and the size of
+acknowledgements.
+"""
 
 from __future__ import annotations
 

@@ -21,8 +21,8 @@ ROUTE = EAST * grid.SECTORS
 
 
 def borrow_beliefs(visited: dict[int, float], route: IntArray | None = ROUTE) -> CellView:
-    """Return the beliefs that a row of thirty cells borrows from cells in which three vehicles
-    measured friction.
+    """Return the beliefs about unvisited cells in a row of thirty cells, estimated ("borrowed")
+    from cells of this row in which three vehicles measured friction.
 
     Args:
         visited: measured friction by index of the cell in the row.

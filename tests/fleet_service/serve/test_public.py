@@ -73,7 +73,7 @@ def hear(engine: Engine, *names: str, now: int | None = None) -> None:
 
 
 def later() -> int:
-    """Return a time [ns] at which the visits of now are published."""
+    """Return a time [ns] that is late enough for visits made now to be published."""
     return time.time_ns() + PERIOD_NS
 
 

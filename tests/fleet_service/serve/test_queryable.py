@@ -145,8 +145,8 @@ COSTS = {2: MOST, 3: 2 * LIGHT, 4: LIGHT}  # by what is asked for; a question of
 
 
 class Half:
-    """Queryable that answers with two tiles. The most expensive answers wait for `go` after the
-    first tile.
+    """Queryable that answers with two tiles. A query of the most expensive kind gets further
+    replies until `go` is set.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
@@ -170,13 +170,15 @@ class Half:
         yield TILE, b"last"
 
     def ask(self, kind: int) -> list[str]:
-        """Return all replies to a query. Zenoh returns only the last reply of a key."""
+        """Send a query and return its replies as texts. All replies have the same key, and Zenoh
+        passes on only the last reply with a key, so the list usually has one item.
+        """
         return texts(self.session, f"{self.key}?min_vehicles={kind}")
 
 
 @pytest.fixture
 def half(session: zenoh.Session) -> Iterator[Half]:
-    """Yield a declared queryable of this kind."""
+    """Yield a queryable of the class `Half` that a client's queries reach."""
     made = Half(session)
     declared = session.declare_queryable(made.key, made.queryable, complete=True)
     querier = session.declare_querier(made.key)
