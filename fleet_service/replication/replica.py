@@ -231,7 +231,8 @@ class BucketReplica:
         return {name: size for name, size in there.items() if fence.counts_object(name)}
 
     def upload_segments(self, segments: Iterable[Path]) -> None:
-        """Upload written segments and the keys; all of them are in the bucket when this returns.
+        """Upload written segments (files of new rows) and the keys; all of them are in the bucket
+        when this returns.
 
         Raises:
             CopyError: some files are not in the bucket; the next call continues and uploads no file

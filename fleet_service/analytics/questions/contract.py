@@ -133,9 +133,9 @@ def longest_breach(
     level: float,
     span: tuple[int, int],
 ) -> tuple[int, int, int, int]:
-    """Return four numbers [s] for one link: the duration of the longest breach according to the
+    """Return four numbers [s] for one link: the durations of the longest breach according to the
     means, of the longest certain breach and of the longest possible breach, and the begin of the
-    first of these three (0 if there is none).
+    longest breach according to the means (0 if there is none).
 
     Args:
         slot: (n,) numbers of time slots, ascending.

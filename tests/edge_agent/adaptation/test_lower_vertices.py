@@ -1,4 +1,4 @@
-"""Tests of fuzzy sets whose lower corners are free parameters."""
+"""Tests of fuzzy sets whose lower vertices (corners of the set) are free parameters."""
 
 from __future__ import annotations
 
