@@ -102,7 +102,8 @@ class LowerVertices:
         return at, np.array([self.step(float(value)) for value in at])
 
     def to_vector(self) -> FloatArray:
-        """Return the free parameters, (16,): shares of the input sets, then of the output sets."""
+        """Return the free parameters, (16,): the shares `feet` of the input sets, then the shares
+        `out_feet` of the output sets."""
         return np.array([*self.feet, *self.out_feet])
 
     @classmethod
@@ -135,8 +136,8 @@ def _triangle_sets(peaks: tuple[float, ...], feet: tuple[float, ...]) -> FloatAr
 
 
 def _membership_weights(sets: FloatArray, mismatch: float) -> FloatArray:
-    """Return the memberships (5,) of a mismatch in the five sets. Beyond the outer peaks the
-    membership in the outer set is 1.
+    """Return the memberships (5,), degrees from 0 to 1, of a mismatch in the five fuzzy sets.
+    Beyond the outer peaks the membership in the outer set is 1.
     """
     weight = np.zeros(SETS)
     for k, (left, peak, right) in enumerate(sets):

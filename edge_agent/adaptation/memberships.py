@@ -61,7 +61,8 @@ CLOSEST = 0.01  # peaks of neighbouring sets stay apart
 
 @dataclass(frozen=True)
 class Memberships:
-    """Vertices of the fuzzy sets, and the noise scales tuned with them.
+    """Vertices (corners) of the fuzzy sets, and the scales of measurement noise that are tuned with
+    them.
 
     Raises:
         InputError: a vertex is not finite, out of order or out of range; the error names the field.
@@ -149,7 +150,8 @@ class Memberships:
 
     @classmethod
     def from_vector(cls, vector: FloatArray) -> Memberships:
-        """Return the memberships for an optimiser's vector (30,), which lies within `bounds`.
+        """Convert the vector (30,) of an optimiser to memberships (fuzzy sets). The vector must lie
+        within `bounds`.
 
         Inputs and outputs are sorted, so that every such vector is valid. A vector (12,) contains
         only the fields up to `ln_scales`; the other fields keep their untuned values.
@@ -190,8 +192,8 @@ class Memberships:
 
     @classmethod
     def from_json(cls, document: object) -> Memberships:
-        """Return the memberships in a parsed JSON document. If the document has no rules, the
-        untuned rules are used.
+        """Read the memberships (fuzzy sets) from a parsed JSON document, and return them. If the
+        document has no rules, the untuned rules are used.
 
         Raises:
             InputError: a field is missing or is not a list of numbers.

@@ -81,7 +81,8 @@ def plain_rules(half: float, power: float, steady: float) -> RuleBase:
 
 @compiled
 def is_high(value: float, ramp: FloatArray) -> float:
-    """Return the membership of `value` in a fuzzy set that rises from 0 at ramp[0] to 1 at ramp[1]."""
+    """Return the membership (degree, 0 to 1) of `value` in a fuzzy set that rises from 0 at ramp[0]
+    to 1 at ramp[1]."""
     return float(min(max((value - ramp[0]) / (ramp[1] - ramp[0]), 0.0), 1.0))
 
 
@@ -105,7 +106,8 @@ def wide_noise(rules: RuleBase, angle: float) -> float:
 
 @compiled
 def plain_share(plain: FloatArray, demand: float, new: float) -> float:
-    """Return ln of the share of a block's evidence that is used without fuzzy rules.
+    """Return ln of the share of evidence from a block (0.05 s) that is used if there are no fuzzy
+    rules.
 
     The share is (steady + (1 - steady)*new)/(1 + (half/demand)^power), with `plain` = (half, power,
     steady).
@@ -120,16 +122,18 @@ def plain_share(plain: FloatArray, demand: float, new: float) -> float:
 def evidence_share(
     rules: RuleBase, slides: float, demand: float, new: float, strain: float
 ) -> float:
-    """Return ln of the share of a block's evidence on friction that the filter uses, at most 0.
+    """Return ln of the share of the evidence on friction from a block (0.05 s) that the filter
+    uses, at most 0.
 
     Zero-order Takagi-Sugeno rules with product inference; the memberships of each input sum to one.
 
     Args:
         rules: the consequents, `shares` (12,) and `strained` (2,) [nat].
-        slides: membership in "a wheel slides" [1].
-        demand: force over load of the axle that uses more [1].
-        new: membership of the forces in "new" [1].
-        strain: chi-square over degrees of freedom of the beliefs about the car [1].
+        slides: fuzzy degree of "a wheel slides", 0 to 1.
+        demand: the larger force over load of the two axles [1].
+        new: fuzzy degree of "the forces are new", 0 to 1.
+        strain: deviation of the estimated states of car and sensors from their prior, as chi-square
+            over degrees of freedom [1].
     """
     if not rules.by_sets:
         return plain_share(rules.plain, demand, new)

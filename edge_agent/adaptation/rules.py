@@ -40,7 +40,8 @@ RATE: Final = np.array([-8.0, -2.0, 0.0, 2.0, 8.0])  # [1/s]
 
 
 def rule_table(printed: tuple[str, ...] = PRINTED) -> FloatArray:
-    """Return the levels (5, 7) [nat] of a rule table, whose entries are names of output sets.
+    """Convert a rule table, whose entries are names of output sets, to levels (ln of the factor on
+    R), (5, 7) [nat].
 
     Raises:
         InputError: a name is unknown, the shape is wrong, or the level at zero mismatch and zero

@@ -70,8 +70,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:
-    """Replay a drive with a vehicle; return the score of the estimator's predictions of the
-    measurements.
+    """Estimate a recorded drive with a vehicle; return a score of how well the estimator predicts
+    the measurements.
     """
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.calibration.held_out import Prediction
@@ -91,8 +91,8 @@ def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:
 
 
 def report_lines(found: HeldOut) -> list[str]:
-    """Return the lines of the report: learned values with units, groups that were left out, and the
-    scores on held-out drives.
+    """Return the lines of the report: learned values with units, groups of quantities that were
+    left out, and the scores on held-out drives.
     """
     lines = []
     for name, estimate in found.calibration.model_dump(exclude_none=True).items():

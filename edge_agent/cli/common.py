@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def checked_name(name: str) -> str:
-    """Return the name if it is a valid vehicle name, which may be part of a key.
+    """Return the name if it is a valid vehicle name, that is, if it may be part of a Zenoh key.
 
     Raises:
         InputError: the name is invalid.

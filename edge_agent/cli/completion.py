@@ -1,4 +1,5 @@
-"""`edge-agent completion`: print the script that completes commands and options in a shell."""
+"""`edge-agent completion`: print a script for a shell, by which the shell completes commands and
+options."""
 
 from __future__ import annotations
 

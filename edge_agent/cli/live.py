@@ -45,7 +45,8 @@ class LookoutPart:
         self._lookout.start()
 
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:  # noqa: ARG002 warnings need no admission
-        """Pass the vehicles' positions and the friction beliefs of their filters to the lookout."""
+        """Pass the vehicles' positions and the friction beliefs of their filters to the lookout
+        (the thread that looks ahead in the map)."""
         if pipeline.seen is None:
             return
         columns = (column.tolist() for column in pipeline.seen)
@@ -59,8 +60,8 @@ class LookoutPart:
 
 
 class VssPart:
-    """Agent part that reports the friction at the vehicles as VSS signals, while their records may
-    be published.
+    """Agent part that reports the friction at the vehicles as VSS signals (vehicle signal
+    specification). It does so only while records of the vehicles may be published.
     """
 
     def __init__(self, output: RoadFrictionOutput) -> None:

@@ -83,8 +83,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay logs. Return 0 if all records were written and acknowledged, 1 if records were
-    rejected or not settled, 3 if the estimates of a log are implausible.
+    """Replay logs (estimate recorded drives). Return 0 if all records were written and
+    acknowledged, 1 if the service rejected records or did not answer, 3 if the estimates of a log
+    are implausible.
     """
     from edge_agent.app.backfill import (
         backfill_on_spark,

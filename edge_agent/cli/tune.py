@@ -1,5 +1,5 @@
-"""`edge-agent tune`: search the memberships by ant colony and by a random search of equal budget;
-write the best result.
+"""`edge-agent tune`: search for the best memberships (fuzzy sets) by ant colony optimisation and by
+random search with equal budget; write the best result.
 
 With --study: run paper 004's own filter with correct and wrong R, several searches each; write
 figures, a table and a plot.
@@ -107,7 +107,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Search the memberships, print the comparison on held-out drives, and write the best set.
+    """Search for the best memberships (fuzzy sets), print the comparison on held-out drives, and
+    write the best ones to a file.
 
     Raises:
         InputError: an option is out of range.
@@ -212,7 +213,8 @@ def _tuning_drives(
 def _search_worth(score: Score, objective: str) -> float:
     """Return the value by which search results are compared; larger is better.
 
-    It is minus the cost of false and missed ice if the true friction is known, else the objective.
+    If the true friction is known, the value is minus the cost of false and missed ice; otherwise it
+    is the objective of the search.
     """
     known = {name: value for name, value in score.model_dump().items() if value is not None}
     unknown = {"interval_score": math.nan, "coverage": math.nan}

@@ -65,8 +65,7 @@ def advance_velocity(
     """Return (v_x, v_y) [m/s] after `step` [s] with constant a_x, a_y and r. The solution is exact:
     a rotation by -r*step.
 
-    Heun's rule is its second-order approximation. Euler's rule makes the error of v_y four times
-    larger (errata).
+    The solution replaces Euler's rule, with which the error of v_y is four times larger (errata).
     """
     angle = yaw_rate * step
     cos = math.cos(angle)

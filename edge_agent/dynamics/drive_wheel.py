@@ -41,8 +41,9 @@ class WheelState(NamedTuple):
 def drive_wheel(
     state: WheelState, settled: float, inertia: float, radius: float, step: float
 ) -> WheelState:
-    """Return the state of a driven wheel after `step` [s] by Euler's rule, as printed in equation
-    (32) of paper 002. `settled` is tau_u, the stationary motor torque [N m].
+    """Return the state of a driven wheel (motor torque, speed, force, derivative of the force)
+    after `step` [s] by Euler's rule, as printed in equation (32) of paper 002. `settled` is tau_u,
+    the stationary motor torque [N m].
     """
     torque, omega, force, slope = state
     pull = SLIDING_GAIN * math.tanh(slope / SOFT_N_S) + SLIDING_RATE * slope

@@ -7,9 +7,10 @@ J_w inertia of a wheel, R radius.
     J_w*omega_i' = T_di - F_xi*R                    (4)
     2*J_w*omega_c' = T_m*i_t*eta_t - F_x*R          (5), (6)
 
-The paper uses the larger of the two wheel speeds as midpoint speed. That is the outer wheel's
-speed, so the mean is used here. The signals are torques at the wheels, so T_m*i_t*eta_t is the sum
-of an axle's two torques. The paper does not give i_t and eta_t.
+The paper uses the larger of the two wheel speeds as midpoint speed. In a turn that is the speed of
+the outer wheel, not of the midpoint; therefore the mean is used here. The signals are torques at
+the wheels, so T_m*i_t*eta_t is the sum of an axle's two torques. The paper does not give i_t and
+eta_t.
 """
 
 from __future__ import annotations

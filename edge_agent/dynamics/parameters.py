@@ -42,8 +42,8 @@ def parameter_row(vehicle: Vehicle) -> FloatArray:
 
     The stiffnesses in the vehicle file are means over the four wheels at static load. The row has
     stiffness per newton of load, which is valid for lightly and heavily loaded wheels. If the file
-    gives a separate rear stiffness, the rear one is used for all wheels. The difference of the
-    front axle from it is compliance, a state of the default estimator.
+    gives a separate rear stiffness, the rear one is used for all wheels. The remaining difference
+    of the front axle is explained by compliance, a state of the default estimator.
     """
     static_load = vehicle.mass * GRAVITY / 4.0
     rear = vehicle.cornering_stiffness_rear
@@ -82,8 +82,8 @@ def parameter_table(vehicles: Sequence[Vehicle]) -> FloatArray:
 
 
 class Body(NamedTuple):
-    """Parameters of the vehicle that body and tyres use. They are scalars instead of an array; see
-    `inlined` for the reason.
+    """Parameters of the vehicle that the equations of body and tyres use. They are scalars instead
+    of an array, because compiled code is then faster; see `inlined`.
     """
 
     mass: float

@@ -17,9 +17,9 @@ class Block:
     """Samples of N vehicles at T times.
 
     `t` (T, N) is the time in seconds [s], `time` (T, N) the same instants in [ns UTC], `signals`
-    (T, N, channels) the readings. `context` (T, N, len(CONTEXT)) has the flags of controllers (ABS,
-    ESC, traction control), the air temperature and the wiper; it is None if the source has no such
-    signals.
+    (T, N, channels) the readings of the sensors. `context` (T, N, len(CONTEXT)) has the flags of
+    controllers (ABS, ESC, traction control), the air temperature and the wiper; it is None if the
+    source has no such signals.
     """
 
     t: FloatArray

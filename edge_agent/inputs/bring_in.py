@@ -1,5 +1,5 @@
 """Import of recordings into a signal log: choose the reader of each file, apply the profile, and
-write Parquet with a record of its origin.
+write a Parquet file whose metadata records its origin.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def read_source(path: Path, profile: Profile | None, database: Database | None) 
 
     Raises:
         InputError: the file is missing, of an unknown kind, broken or too large for the memory, or
-            it needs a database or a library that is not there.
+            it needs a CAN database or a library that is missing.
     """
     with bounded_memory(path):
         return _read_source(path, profile, database)
@@ -135,7 +135,7 @@ def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Da
 
 def profile_of(log: Path) -> Profile:
     """Return the profile with which a log was imported. For a log that was not imported, return a
-    profile that uses its columns unchanged.
+    profile (assignment of signals to channels) that uses the columns unchanged.
 
     Raises:
         InputError: the file cannot be read.

@@ -1,9 +1,9 @@
 """Context signals: flags of controllers and state of the surroundings, converted from readings of a
 source to rows of a log.
 
-A flag or a temperature is not interpolated. A row has the last reading at or before its time, if
-that reading is at most HELD_S old. A channel that the profile marks as `lasting` is sent only when
-it changes; its last reading is valid until the next one.
+A flag or a temperature is not interpolated. A row of the log contains the last reading at or before
+its time, if that reading is at most HELD_S old. A channel that the profile marks as `lasting` is
+sent only when it changes; its last reading is valid until the next one.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ def context_values(name: str, values: FloatArray, active: Sequence[float] | None
         active: recorded values at which a flag is on; None: all except 0.
 
     Returns:
-        Flags as 0 or 1, wiper limited to 0 to 1, temperatures as they are. Impossible temperatures
-        become NaN; NaN stays NaN.
+        Flags as 0 or 1, wiper limited to the range 0 to 1, temperatures unchanged. Impossible
+        temperatures become NaN; NaN stays NaN.
     """
     if name in FLAGS:
         on = values != 0.0 if active is None else np.isin(values, active)
@@ -89,8 +89,8 @@ def context_signals(profile: Profile) -> set[str]:
 def context_block(
     samples: int, vehicles: int, values: Mapping[str, FloatArray | BoolArray | float]
 ) -> FloatArray:
-    """Return the context signals (T, N, len(CONTEXT)) of a block, from the values that a source
-    gives.
+    """Return the context signals (controller flags, temperature, wiper) of a block, (T, N,
+    len(CONTEXT)), from the values that a source gives.
 
     Signals without a value are NaN (unknown). For sources without a profile, for example a
     simulation:

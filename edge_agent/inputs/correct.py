@@ -1,10 +1,11 @@
 """Correction of signals by a vehicle's calibration: sensor offsets, wheel radii, steering angle and
 delays between devices.
 
-A quantity that was not learned is assumed to be free of error. A learned quantity is a posterior
-mean, so it lies between the measured value and no error. The rear steering angle is not corrected.
-The lateral acceleration a_y is not corrected either: its offset on a straight contains the
-crossfall of the road, for which the tyres provide a real force, and drives cannot separate the two.
+A quantity that was not learned is assumed to be free of error. A learned quantity is the mean of a
+posterior whose prior assumes no error. Therefore the correction is smaller than the measured error.
+The rear steering angle is not corrected. The lateral acceleration a_y is not corrected either: its
+measured offset on a straight is partly a sensor error and partly the crossfall of the road. The
+tyres provide a real force for the crossfall, and drives cannot separate the two.
 """
 
 from __future__ import annotations
@@ -103,8 +104,9 @@ def free_rear_wheels(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
     """Return signals (T, 18) with the rear wheel speeds that freely rolling wheels would have at
     the measured yaw rate. The mean of both rear wheels does not change.
 
-    Wheels of a locked axle turn at the same speed, so in a turn each wheel slips by half the track
-    times the yaw rate. That slip contains no information on the total force of the axle.
+    The function is for a locked axle, whose wheels turn at the same speed, so that in a turn each
+    wheel slips by half the track times the yaw rate. This slip is removed, because it contains no
+    information on the total force of the axle.
     """
     signals = signals.copy()
     half = 0.5 * vehicle.track_rear * signals[..., S.YAW_RATE] / vehicle.wheel_radius

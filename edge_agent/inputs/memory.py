@@ -20,7 +20,8 @@ _PAGES: Final = Path("/proc/self/statm")  # address space of this process, in pa
 
 @contextmanager
 def bounded_memory(path: Path, most: int = MOST_BYTES) -> Iterator[None]:
-    """Limit the memory that this process allocates within the block to `most` more bytes.
+    """Limit the memory that this process allocates within the `with` block to `most` bytes in
+    addition to the memory already used.
 
     On a system that does not report the used memory, nothing is limited.
 
@@ -42,8 +43,8 @@ def bounded_memory(path: Path, most: int = MOST_BYTES) -> Iterator[None]:
 
 
 def limit_memory(most: int) -> None:
-    """Limit the memory of this process to `most` bytes more than now. A lower existing limit stays
-    in force.
+    """Limit the memory of this process to `most` bytes more than now. If the process already has a
+    lower limit, that limit remains.
     """
     with suppress(FileNotFoundError):
         held = int(_PAGES.read_text().split()[0]) * resource.getpagesize()

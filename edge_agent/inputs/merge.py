@@ -1,13 +1,13 @@
 """Merging of recordings, each with its own clock, into one signal log by a profile.
 
-Clocks: the log's time is that of the source with the wheel speeds. A source with a date is placed
+Clocks: the log's time is that of the source with the wheel speeds. A source with a date is aligned
 by its date; a source without a date begins when the first source does. Some loggers write local
 time without stating it. Therefore, if dates do not overlap, other time zones are tried, in steps of
 a quarter of an hour.
 
 Rows: if all signals come from one table, its rows are used. Otherwise rows have a fixed rate, with
-linear interpolation between readings that are near enough. A position is written only into the row
-nearest to its fix.
+linear interpolation between readings that are near enough in time. A position is written only into
+the row nearest to its fix.
 """
 
 from __future__ import annotations
@@ -136,8 +136,8 @@ def merge_recordings(
 
 
 def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tuple[int, Channel]]:
-    """Return, for each channel, the index of the recording that has its signals, and its
-    conversion.
+    """Return, for each channel of the signal log, the index of the recording that contains its
+    signals, and the conversion of the signals to the channel.
 
     A recording of a position receiver provides those position channels for which the profile names
     no signal.
@@ -283,8 +283,8 @@ def make_channel(
 
 
 def _hold_last(series: Series, t: FloatArray) -> FloatArray:
-    """Return the last reading at or before each time; before the first reading, return the first
-    one.
+    """Return, for each time, the last reading at or before it; for times before the first reading,
+    the first reading.
     """
     return series.values[
         np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, len(series.t) - 1)
@@ -372,7 +372,8 @@ def _row_rate(dense: Mapping[str, Series]) -> float:
 
 
 def sample_at_rows(series: Series, t: FloatArray, *, sparse: bool) -> FloatArray:
-    """Return a series sampled at the times of the rows; NaN in rows without a reading near enough."""
+    """Return a series sampled at the times of the log's rows; NaN in rows that have no reading near
+    enough in time."""
     good = np.isfinite(series.values)
     known = series.t[good]
     values = series.values[good]

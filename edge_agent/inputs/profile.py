@@ -100,8 +100,8 @@ class Channel(Part):
         return {self.full_name(name): values for name, values in self.valid.items()}
 
     def full_name(self, name: str) -> str:
-        """Return the name of a signal as readers use it: MESSAGE.SIGNAL if the channel has a CAN
-        message.
+        """Return the full name of a signal, as the readers of recordings use it: MESSAGE.SIGNAL if
+        the channel has a CAN message.
         """
         return name if self.message is None else f"{self.message}.{name}"
 

@@ -3,9 +3,10 @@
 Required columns: `t` [s] or `timestamp`; ax, ay, yaw_rate; the four omega; delta_fl or delta_fr.
 Each of them must have at least one reading. The other channels may be missing, and NaN or null is a
 missing reading in any column. A front wheel without a steering column gets the angle of the other
-front wheel; rear wheels without a column do not steer. Context signals (`schemas.signals.CONTEXT`)
-are optional. `timestamp` is an Arrow timestamp, or a number: integer [ns] or float [s] since 1970
-UTC. Time may repeat (the estimator reports this in `health`) but not go backwards.
+front wheel; for rear wheels without a column the angle is zero. Context signals
+(`schemas.signals.CONTEXT`) are optional. `timestamp` is an Arrow timestamp, or a number: integer
+[ns] or float [s] since 1970 UTC. Time may repeat (the estimator reports this in `health`) but not
+go backwards.
 """
 
 from __future__ import annotations
@@ -155,8 +156,8 @@ def _read_time(table: pa.Table) -> tuple[FloatArray, int | None]:
 
 
 def _seconds_from_first(column: Any) -> tuple[FloatArray, int | None]:  # noqa: ANN401 pyarrow's column types are not generic
-    """Return the seconds since the first sample, and the [ns UTC] of that sample (None if its time
-    is not finite).
+    """Return the seconds since the first sample, and the [ns UTC] of that sample (None if the time
+    of that sample is not finite).
     """
     if column.null_count:
         row = int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])

@@ -1,11 +1,12 @@
 """Begin and end of visits: computes the cell and heading sector of a vehicle from position fixes
 and yaw, sample by sample.
 
-A visit begins with a fix in a new cell or heading sector. Fixes are noisy, and a road may run along
-a border. Therefore a visit ends only when a fix lies clearly outside: CELL_MARGIN beyond the cell,
-or SECTOR_KEEP beyond the sector. After FIX_HELD_S without a fix the vehicle is in no cell (cell
--1). Without yaw the course over ground is used. The module is pure: the state between blocks is a
-`CellTrack` per vehicle. Any division of the samples into blocks gives the same result.
+A visit (passage of one map cell) begins with a position fix in a new cell or heading sector. Fixes
+are noisy, and a road may run along a border. Therefore a visit ends only when a fix lies clearly
+outside: CELL_MARGIN beyond the cell, or SECTOR_KEEP beyond the sector. After FIX_HELD_S without a
+fix the vehicle is in no cell (cell -1). Without yaw the course over ground is used. The module is
+pure: the state between blocks is a `CellTrack` per vehicle. Any division of the samples into blocks
+gives the same result.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ NOWHERE: Final = -1  # cell of a vehicle without position
 
 
 class CellTrack:
-    """State of one vehicle between blocks, as a record; NaN where nothing has been received yet."""
+    """State of the tracking of one vehicle that is kept between blocks of samples, as a record; NaN
+    where nothing has been received yet."""
 
     fix_time: float  # of the last fix [s]
     latitude: float  # of it [deg]
@@ -85,7 +87,8 @@ class Located(NamedTuple):
 
 
 def new_tracks(vehicles: int) -> RecordArray:
-    """Return the initial tracks (N,) of vehicles that have not received a position."""
+    """Return the initial tracks (N,) (states of the cell tracking) of vehicles that have not
+    received a position."""
     tracks = records(CellTrack, vehicles)
     for name in tracks.dtype.names or ():
         tracks[name] = NOWHERE if name in ("cell", "sector") else np.nan
@@ -125,7 +128,8 @@ def locate_vehicles(
 
 
 def _receiver_samples(signals: FloatArray) -> RecordArray:
-    """Return the receiver's part of signals (T, N, channels), as an array of records (T, N)."""
+    """Return the samples of the position receiver, as an array of records (T, N), taken from the
+    signals (T, N, channels)."""
     fixes = records(ReceiverSample, *signals.shape[:-1])
     latitude = signals[..., S.LATITUDE]
     longitude = signals[..., S.LONGITUDE]
@@ -153,8 +157,8 @@ def _update_course(track: CellTrack, latitude: float, longitude: float) -> None:
 
 @compiled
 def _stays_in_cell(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
-    """Return True if a position fix still belongs to the visit, also within the margins beyond cell
-    and sector.
+    """Return True if a position fix still belongs to the visit (passage of a map cell). This
+    includes fixes within a margin around the cell and the heading sector.
     """
     wide = CELL_MARGIN * (track.east - track.west)
     high = CELL_MARGIN * (track.north - track.south)
@@ -194,8 +198,8 @@ def _begin_visit(track: CellTrack, fix: ReceiverSample, heading: float) -> None:
 def _advance_tracks(
     t: FloatArray, fixes: Records[ReceiverSample], tracks: Records[CellTrack], located: Located
 ) -> None:
-    """Advance the tracks sample by sample and fill `located`; this is the compiled part of
-    `locate_vehicles`.
+    """Advance the tracks (states of the cell tracking) sample by sample, and write the cells to
+    `located`; this is the compiled part of `locate_vehicles`.
     """
     for k in range(t.shape[0]):
         for n in range(t.shape[1]):

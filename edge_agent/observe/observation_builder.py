@@ -1,10 +1,10 @@
 """Construction of the records for publication from estimates: one observation per visit of a cell,
 and states at a given rate.
 
-For each block of samples: `located` marks where visits end (`cell_tracker`), the estimator bank is
-advanced with these `closes`, and `build_records` constructs the records. The state between blocks
-is an `OpenVisits`. Any division of the samples into blocks gives the same records in the same
-order. The module is pure.
+For each block of samples: `located` marks the samples at which visits (passages of a map cell) end
+(`cell_tracker`), the estimator bank is advanced with these `closes`, and `build_records` constructs
+the records. The state between blocks is an `OpenVisits`. Any division of the samples into blocks
+gives the same records in the same order. The module is pure.
 """
 
 from __future__ import annotations
@@ -99,7 +99,8 @@ class Visit:
 
 
 class Sample:
-    """Output of an estimator at one sample, with the measured accelerations, as a record."""
+    """Output of the estimator for one vehicle at one sample, with the measured accelerations, as a
+    record."""
 
     health: int
     speed: float  # [m/s]
@@ -113,8 +114,8 @@ class Sample:
 
 @dataclass(frozen=True)
 class OpenVisits:
-    """Open visits of all vehicles as records (N,), and the time slot of each vehicle's last state
-    (N,).
+    """Open visits (passages of a map cell) of all vehicles as records (N,), and the number of the
+    time slot (reporting interval) of each vehicle's last published state (N,).
     """
 
     visits: RecordArray
@@ -165,7 +166,7 @@ def build_records(
 
 
 class SampleNotes(NamedTuple):
-    """Additional data per sample for the visits.
+    """Additional data per sample for the visits (passages of a map cell).
 
     `row` (T, N): index of a row of `told` at a sample where friction changed within a visit, else
     -1. `told` (k, 32): evidence of the part of the visit before that change. `context` (T, N,
@@ -188,8 +189,8 @@ def _sample_notes(estimates: Estimates, context: FloatArray | None) -> SampleNot
 
 
 def _visit_samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
-    """Return the samples from which visits are computed, from estimates and accelerometers, as
-    records (T, N).
+    """Join estimates and accelerometer readings to records (T, N), one per sample, from which
+    visits (passages of a map cell) are computed.
     """
     samples = records(Sample, *estimates.mu.shape)
     samples["speed"] = np.hypot(estimates.vx, estimates.vy)
@@ -210,8 +211,8 @@ def _advance_visits(
     ended: Records[Visit],
     position_std: float,
 ) -> int:
-    """Add each sample to its visit, and write a visit to `ended` when the next one begins; return
-    the number of ended visits.
+    """Add each sample to its visit (passage of a map cell), and write a visit to `ended` when the
+    next one begins; return the number of ended visits.
     """
     count = 0
     for k in range(time.shape[0]):
@@ -270,10 +271,11 @@ def _begin_visit(visit: Visit, time: int, cell: int, sector: int) -> None:
 
 @compiled
 def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
-    """Begin a new part of a visit after a change of friction.
+    """Begin a new part of a visit (passage of a map cell) after a change of friction within the
+    cell.
 
-    The grip used before counts only up to the largest friction that the evidence `told` of the
-    ended part does not exclude.
+    The recorded grip used in the visit is limited to the largest friction that `told`, the evidence
+    of the ended part, does not exclude.
     """
     most = mugrid.UPPER
     for i in range(mugrid.BINS - 1, -1, -1):
@@ -311,7 +313,8 @@ def _add_sample(visit: Visit, time: int, sample: Sample, position_std: float) ->
 
 @compiled
 def _add_context(visit: Visit, context: FloatArray) -> None:
-    """Add one sample of the context signals (len(CONTEXT),) to a visit; NaN are skipped."""
+    """Add one sample of the context signals (controllers, surroundings; (len(CONTEXT),)) to a
+    visit; NaN are skipped."""
     for i in range(len(context)):
         if np.isfinite(context[i]):
             visit.known[i] += 1.0
@@ -445,8 +448,8 @@ def _likelihood_bytes(ended: RecordArray, evidence: FloatArray | None) -> NDArra
 def _build_states(
     after: OpenVisits, time: IntArray, located: Located, estimates: Estimates, config: AgentConfig
 ) -> RecordBlock:
-    """Return the states to publish: the first sample with a known position in each time slot.
-    `after.slot` is advanced.
+    """Return the states to publish: the first sample with a known position in each time slot
+    (reporting interval). The function updates `after.slot`, the number of the last slot.
     """
     slot = np.floor_divide(time, round(NS / config.state_rate_hz))
     earlier = np.vstack([after.slot[None], slot[:-1]])

@@ -51,8 +51,8 @@ class Grip(NamedTuple):
 
 
 class Pipeline:
-    """A bank of N vehicles with its open visits. Call `step` for each block in order, then `finish`
-    once.
+    """A bank of estimators for N vehicles, with the open visits (passages of a map cell) of the
+    vehicles. Call `step` for each block in order, then `finish` once.
     """
 
     def __init__(self, bank: EstimatorBank, vehicles: int, config: AgentConfig) -> None:
@@ -70,7 +70,7 @@ class Pipeline:
     def step(self, block: Block) -> tuple[Estimates, RecordBlock, RecordBlock]:
         """Process a block of at least one sample; return (estimates, observations, states).
 
-        The records near the beginning and end of a trip are left out.
+        For privacy, records near the beginning and end of a trip are left out.
         """
         self._tracks, located = locate_vehicles(self._tracks, block.t, block.signals)
         estimates = self._bank.advance(block.t, block.signals, located.closes)
@@ -106,8 +106,8 @@ class Pipeline:
         )
 
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return the current friction beliefs of the estimators, and the evidence of the visits so
-        far; see `EstimatorBank.beliefs`.
+        """Return the current friction beliefs of the estimators, and the evidence of the current
+        visits (passages of a map cell) so far; see `EstimatorBank.beliefs`.
         """
         return self._bank.beliefs()
 
@@ -120,8 +120,8 @@ class Pipeline:
     def finish(self) -> RecordBlock | None:
         """Close the open visits and return their observations; None if no sample was processed.
 
-        The evidence of a visit is available only at the next sample. Therefore one sample without
-        readings and without a position is added.
+        The evidence of a visit becomes available only at the sample after its end. Therefore the
+        method first adds one sample without readings and without a position.
         """
         if self._last is None:
             return None

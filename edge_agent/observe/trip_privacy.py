@@ -72,8 +72,8 @@ class TripEnds:
         return _select_rows(both, begun & passed)
 
     def _drop_old_track(self) -> None:
-        """Drop the part of the vehicles' stored tracks that is older than the oldest waiting
-        record.
+        """Delete those stored distances and times of the vehicles that are older than the oldest
+        waiting record.
         """
         waiting = [
             r.columns[_TIME[kind]].min() for kind, r in self._waiting.items() if len(r.vehicle)

@@ -1,5 +1,5 @@
-"""Processing of acknowledgements from fleet services: they settle batches in the outbox, and show
-how far the vehicle's clock is behind.
+"""Processing of acknowledgements from fleet services: they settle (finish) batches in the outbox,
+the store on disk, and show how far the vehicle's clock is behind.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Counts:
-    """Numbers of records by kind and by result (published, acknowledged, rejected, dropped), and of
-    late or resent batches.
+    """Numbers of records by kind and by result (published, acknowledged, rejected, dropped), and
+    numbers of late and of resent batches.
     """
 
     offered: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
@@ -41,7 +41,8 @@ class Counts:
 
 
 class AckSettlement:
-    """Queue of received acknowledgements, applied to an outbox by the sending thread.
+    """Queue of received acknowledgements; the sending thread applies them to the outbox (store of
+    unsent and unanswered batches).
 
     Attributes:
         clock_behind_s: delay of the vehicle's clock relative to the last service that answered [s].
@@ -101,7 +102,7 @@ class AckSettlement:
         """Compare the vehicle's clock with the time [ns UTC] that a service reported; 0 means
         unknown.
 
-        An acknowledgement is about a second old on arrival.
+        The comparison assumes that an acknowledgement is about a second old on arrival.
         """
         if not reported:
             return

@@ -51,8 +51,8 @@ class _Group:
 
 
 class Batcher:
-    """Collector of the records of the named vehicles. A batch has at most `rows` records and waits
-    at most `flush_s` seconds.
+    """Collector that makes batches from the records of the named vehicles. A batch has at most
+    `rows` records and waits at most `flush_s` seconds.
     """
 
     def __init__(
@@ -95,7 +95,8 @@ class Batcher:
             group.urgent |= bool(records.urgent[chosen].any())
 
     def take_due(self, now: float, *, everything: bool = False) -> list[Draft]:
-        """Remove the batches that are due (or all batches, with `everything`), and return them."""
+        """Remove from the collector the batches that are due (or all batches, with `everything`),
+        and return them."""
         drafts: list[Draft] = []
         for place, group in list(self._groups.items()):
             whole = everything or group.urgent or now - group.since >= self._flush_s
@@ -145,5 +146,6 @@ def _slice_columns(columns: Columns, first: int, last: int) -> Columns:
 
 
 def _encode_batch(batch: Batch, seq: int, first_held: int) -> bytes:
-    """Return the payload of a batch with the sequence number that the outbox assigned."""
+    """Encode a batch with the sequence number that the outbox (store on disk) assigned, and return
+    the payload."""
     return encode(replace(batch, seq=seq, first_held=first_held))

@@ -46,8 +46,8 @@ EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)  # an old state is worth least, 
 
 
 class Stream(NamedTuple):
-    """Scope of the sequence numbers: one vehicle, one start, one kind of record, one region (z10
-    quadint).
+    """Stream of batches with its own sequence numbers, which count from 1: the batches of one
+    vehicle, one start, one kind of record and one region (z10 quadint).
     """
 
     vehicle: str
@@ -58,8 +58,8 @@ class Stream(NamedTuple):
 
 @dataclass(frozen=True)
 class StoredBatch:
-    """Unsettled batch on disk. Send a `fresh` one immediately, any other when `due_batches` returns
-    it.
+    """Batch on disk that no service has settled (finally answered). A `fresh` batch is sent
+    immediately, any other when `due_batches` returns it.
     """
 
     key: int
@@ -99,8 +99,8 @@ class _Entry:
 
 @dataclass
 class _Sequence:
-    """Sequence numbers of one stream: the next free number, and the numbers of batches in the
-    outbox.
+    """Sequence numbers of one stream (vehicle, start, kind, region): the next free number, and the
+    numbers of its batches in the outbox.
     """
 
     stream: Stream
@@ -120,7 +120,8 @@ class _Sequence:
 
 
 class Outbox:
-    """Store of the unsettled batches of one agent process.
+    """Store on disk of the batches of one agent process that no service has settled (finally
+    answered).
 
     Raises:
         InputError: the file belongs to another agent or is not an outbox.
@@ -167,8 +168,8 @@ class Outbox:
         self._evict_oldest()
 
     def recover_file(self) -> None:
-        """Continue in a new file with the readable content of the damaged file. After an error the
-        call may be repeated.
+        """Replace a damaged file: continue in a new file that has the readable content of the old
+        one. After an error the call may be repeated.
 
         Raises:
             sqlite3.Error, OSError: the disk does not accept the write.
@@ -262,8 +263,8 @@ class Outbox:
         return max((now - one for one in since if one is not None), default=0.0)
 
     def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
-        """Assign sequence numbers to the drafts, and commit the drafts in one transaction; if the
-        commit fails, nothing changes.
+        """Assign sequence numbers to new batches (drafts), and commit them to disk in one
+        transaction; if the commit fails, nothing changes.
 
         Return the stored batches.
 
@@ -350,7 +351,8 @@ class Outbox:
         )
 
     def delete_settled(self) -> None:
-        """Delete settled batches from the disk now, instead of with the next `store`.
+        """Delete settled (finally answered) batches from the disk now, instead of with the next
+        `store`.
 
         Raises:
             sqlite3.Error: the disk does not accept the change.
@@ -364,9 +366,9 @@ class Outbox:
         """Remove the batches in inclusive ranges of seq; return the number of their records.
         Unknown numbers are ignored.
 
-        The rows are deleted with the next `store` or `delete_settled`, so that an acknowledgement
-        requires no sync. A batch that a crash restores is sent again, and the service recognises
-        it.
+        The batches are deleted from the disk only with the next `store` or `delete_settled`, so
+        that an acknowledgement requires no sync of the disk. If a crash happens before that, the
+        batches are sent again, and the service recognises them as already processed.
         """
         sequence = self._streams.get(stream)
         if sequence is None:
@@ -414,7 +416,7 @@ class Outbox:
 
     def _is_passed_over(self, entry: _Entry) -> bool:
         """Return True if this batch is the oldest of its stream in the outbox, and PASSED_OVER
-        later batches of the stream were settled.
+        later batches of the stream (same vehicle, start, kind, region) were settled.
         """
         sequence = self._streams[entry.stream]
         later = sequence.next - entry.seq - len(sequence.held)
@@ -459,8 +461,8 @@ class Outbox:
 
 
 def _keys_within(held: dict[int, int], first: int, last: int) -> list[int]:
-    """Return the keys of the batches in the outbox with a sequence number in [first, last]. A very
-    large (hostile) range is not iterated.
+    """Return the keys of the batches in the outbox with a sequence number in [first, last]. The
+    work does not grow with the range, because a hostile service may send a very large one.
     """
     if last - first < len(held):
         return [held[seq] for seq in range(first, last + 1) if seq in held]

@@ -76,8 +76,8 @@ class Pacer:
 
     @property
     def unanswered_since(self) -> float | None:
-        """Return the time since which sent batches are unanswered; None if no batch waits for an
-        answer.
+        """Return the time [s] since which sent batches have been unanswered; None if no batch waits
+        for an answer.
         """
         return self._unanswered_since
 

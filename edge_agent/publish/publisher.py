@@ -1,5 +1,5 @@
-"""Publisher: a thread between the estimation loop and the network that batches, stores, sends,
-settles and resends records.
+"""Publisher: a thread between the estimation loop and the network. It collects records into
+batches, stores and sends them, and sends them again until a service has answered.
 
 The loop only calls `offer`, which never blocks. Only the sender thread uses disk and network. Every
 batch is on disk before it is sent, and stays there until the service has settled it. A second
@@ -114,7 +114,7 @@ class Publisher:
         """Send the remaining records, wait at most `within_s` seconds for acknowledgements, and
         stop.
 
-        Return False if a thread did not stop in time and was abandoned.
+        Return False if a thread did not stop in time; it then continues to run.
         """
         self._deadline = self._clock() + within_s
         self._closing.set()

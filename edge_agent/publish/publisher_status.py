@@ -59,8 +59,8 @@ class PublisherStatus:
 
     @property
     def stranded_records(self) -> int:
-        """Return the number of records in the outbox under other vehicle names, for example after a
-        change of name.
+        """Return the number of records in the outbox that are not sent, because they belong to
+        other vehicle names than those of this agent, for example after a change of name.
         """
         return self._outbox.count_stranded(self._names)
 
@@ -71,8 +71,8 @@ class PublisherStatus:
 
     @property
     def unanswered_records(self) -> int:
-        """Return the number of records in batches that were given up, because the service answered
-        only later batches.
+        """Return the number of records in batches that are no longer sent, because the service
+        answered later batches but not these.
         """
         return self._outbox.counts.unanswered
 
@@ -89,8 +89,8 @@ class PublisherStatus:
         return sum(self.counts.dropped.values()) + sum(self._outbox.counts.evicted.values())
 
     def count_unsettled(self, kind: Kind | None = None) -> int:
-        """Return the number of unsettled records: those in the outbox, also of an earlier start,
-        and those not yet stored.
+        """Return the number of records that no service has settled (finally answered): those in the
+        outbox, also of an earlier start, and those not yet stored.
         """
         counts = self.counts
         kinds = Kind if kind is None else (kind,)

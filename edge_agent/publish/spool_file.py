@@ -1,8 +1,8 @@
 """SQLite file of an outbox: opened exclusively. A damaged file is renamed, and its readable batches
 are copied to a new file.
 
-Each batch has a checksum of its identifier and payload, because SQLite does not detect changed bits
-in them.
+Each batch has a checksum of its identifier and payload, because SQLite itself does not detect
+changed bits in its data.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def batch_checksum(name: Row, payload: bytes) -> int:
 
 
 def is_damage(error: sqlite3.Error) -> bool:
-    """Return True if an error indicates a damaged file. A full or slow disk is no damage."""
+    """Return True if an error indicates a damaged file. For a full or slow disk, return False."""
     return getattr(error, "sqlite_errorcode", 0) & 0xFF in _CORRUPT
 
 

@@ -31,7 +31,7 @@ _TOPIC: Final = keys.TOPICS["vss"]
 def road_friction(
     mu: float, mu_lower: float, mu_upper: float, mu_utilised: float
 ) -> dict[str, float]:
-    """Return the known signals [%]; {} if no signal is known.
+    """Return the known friction signals by VSS path [%]; an empty dictionary if none is known.
 
     Args:
         mu, mu_lower, mu_upper: 50 %, 5 % and 95 % quantiles; NaN where unknown.

@@ -3,8 +3,8 @@ locked axles.
 
 The doctor reports a delay between devices that is too large for the filter. If the drive shows the
 size of the delay, the log is corrected before the estimator reads it. A delay of unknown size
-remains a finding, and the log is not published. Smaller delays are estimated by the filter's own
-states, so that the replay of a log without faults remains causal.
+remains a finding (reported fault), and the records of the log are not published. Smaller delays are
+estimated by the filter's own states, so that the replay of a log without faults remains causal.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
 
 
 def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
-    """Examine a log, correct the faults whose size the drive shows, and examine the corrected log."""
+    """Examine a log, correct the faults whose size the drive shows, and examine the corrected log.
+    Return the corrected log with the result of the examination."""
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
     delays = {
         finding.channel: finding.delay_s
@@ -90,8 +91,8 @@ def align_import(
     """Correct the delays of devices in merged recordings; return the merged recordings and a
     profile that contains the delays.
 
-    The doctor measures the delays. `merge_with` merges the same recordings with a given profile. If
-    no device is delayed, both arguments are returned unchanged.
+    The signal doctor measures the delays. `merge_with` is a function that merges the same
+    recordings with a given profile. If no device is delayed, both arguments are returned unchanged.
     """
     signals = np.full((len(merged.t), len(CHANNELS)), np.nan)
     for index, name in enumerate(CHANNELS):

@@ -19,8 +19,8 @@ LARGEST_LAG_S: Final = 0.085  # devices of sound cars lie within .06 s
 
 
 def wheels_speak_late(axle: Fit, seconds: float) -> bool:
-    """Return True if the yaw rate from the wheels confirms the measured wheel lag `seconds`: its
-    own lag has the same sign and is larger than half of it.
+    """Return True if the yaw rate computed from the wheels confirms the measured lag `seconds` of
+    the wheels: the lag of this yaw rate has the same sign and is larger than half of `seconds`.
     """
     return (
         axle.is_known
@@ -47,8 +47,9 @@ def measure_clocks(
 def late_devices(diagnosis: Diagnosis) -> dict[str, float]:
     """Return the delay [s] of each device, from the lags measured in the turns of a drive.
 
-    If wheels and steering lead the yaw rate by about the same time, the inertial unit is late. If
-    in that case the accelerometer is not late compared with the wheels, only the gyroscope is late.
+    If wheels and steering lead the yaw rate by about the same time, the inertial unit has the
+    delay; but if its accelerometer is not late compared with the wheels, only the gyroscope has the
+    delay.
     """
     wheel, steer = (diagnosis.lags.get(name, 0.0) for name in ("wheel_lag", "steer_lag"))
     if not (abs(wheel) > LARGEST_LAG_S and abs(wheel - steer) < 0.5 * abs(wheel)):

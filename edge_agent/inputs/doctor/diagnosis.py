@@ -22,7 +22,7 @@ class Finding:
         scale: factor that corrects the channel.
         offset: correction that is added after the factor.
         delay_s: delay of the channel's time stamps [s].
-        confidence: log odds of this explanation against the next best one, where there is one.
+        confidence: log odds of this explanation against the next best one, if there is another one.
     """
 
     channel: str
@@ -36,8 +36,8 @@ class Finding:
 
 @dataclass
 class Diagnosis:
-    """Result of an examination: faults, channels without fault, channels that the drive says
-    nothing about, and the fits of the physical relations.
+    """Result of an examination: faults, channels without fault, channels about which the drive says
+    nothing, and the fits of the physical relations.
     """
 
     findings: list[Finding] = field(default_factory=list)

@@ -99,8 +99,8 @@ def interpolate_near(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray
 def over_ground(
     t: FloatArray, latitude: FloatArray, longitude: FloatArray, at: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return speed [m/s] and course [rad] at the times `at`, from the positions FIX_S / 2 before
-    and after.
+    """Return speed [m/s] and course [rad] at the times `at`, computed from the positions FIX_S / 2
+    before and FIX_S / 2 after each time.
     """
     north = interpolate_near(t, np.radians(latitude) * EARTH_RADIUS_M, at)
     east = interpolate_near(t, np.radians(longitude) * EARTH_RADIUS_M, at) * np.cos(
@@ -191,12 +191,12 @@ def prepare_drive(
 
 
 def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
-    """Return an array (n,) that is True where a wheel spins or locks, by comparison of the wheel
-    speeds (n, 4) in any unit.
+    """Return an array (n,) that is True where a wheel spins or locks. The function compares the
+    wheel speeds (n, 4) with each other, so their unit does not matter.
 
-    Front and rear wheel of a side roll nearly alike, in turns too; a constant difference is caused
-    by different tyres. A wheel that differs all the time is left out: it is a separate fault and
-    would make the rest of the drive unusable.
+    The front and rear wheel of a side roll nearly alike, in turns too. A constant difference
+    between them is attributed to different tyres. A wheel that differs all the time is not
+    compared, because the whole drive would then count as slip; it is reported as a separate fault.
     """
     speed = np.nanmedian(np.where(np.isfinite(wheels), wheels, 0.0), axis=1)
     size = np.maximum(np.abs(speed), CREEP * max(fast, 1e-9))
@@ -218,8 +218,9 @@ def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
 
 
 def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
-    """Return an array (n,) that is True where the wheel speed differs from the speed over ground,
-    in any unit: all wheels spin or lock together.
+    """Return an array (n,) that is True where all wheels spin or lock together: their speed,
+    compared with the speed over ground, is not in its usual ratio. The unit of the wheel speed does
+    not matter.
     """
     known = np.isfinite(v) & np.isfinite(v_ground) & (np.abs(v) > 0.3 * fast)
     if known.sum() < 5 * RATE_HZ:
@@ -235,8 +236,8 @@ def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
 
 
 def _nearest_yaw(t: FloatArray, yaw: FloatArray, at: FloatArray) -> FloatArray:
-    """Return at each time the nearest reading of the yaw angle, which is recorded rarely. Averages
-    across ±π would be wrong.
+    """Return at each time the nearest reading of the yaw angle, which is recorded rarely. Readings
+    are not averaged, because averages of angles near ±π would be wrong.
     """
     good = np.flatnonzero(np.isfinite(yaw))
     if len(good) < 2:

@@ -1,5 +1,5 @@
-"""Findings of the signal doctor: one per fault, with its evidence, and the list of channels without
-fault.
+"""Findings (reported faults) of the signal doctor: one per fault, with its evidence, and the list
+of channels without fault.
 
 A channel is free of faults if a physical relation with enough excitation confirms it, and no fault
 explains the drive nearly as well. A channel is unknown if it is neither confirmed nor faulty. A log
@@ -266,8 +266,9 @@ def _find_scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) 
 def _holds_throughout(
     quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenDrive | None
 ) -> bool:
-    """Return True if an identity has the gain that the fault predicts in all parts of the drive.
-    During slides the gain is not constant.
+    """Return True if an identity (two quantities that are equal by physics) has the gain that the
+    fault predicts in all parts of the drive. A slide, during which the gain is not constant, is
+    thus not taken for a fault.
     """
     fault = verdict.faults[quantity]
     if (
@@ -307,8 +308,8 @@ def _holds_throughout(
 
 
 def _turns_as_steered(verdict: Verdict, found: dict[str, Fit]) -> bool:
-    """Return True if the car turns as its steering or its course predicts. In a spin, v·r is not
-    the lateral acceleration.
+    """Return True if the car turns as its steering or its course predicts. Otherwise the car spins,
+    and v·r (speed times yaw rate) must not be compared with the lateral acceleration.
     """
     for name in ("steering", "turning"):
         gain = 1.0

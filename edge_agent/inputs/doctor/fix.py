@@ -33,14 +33,16 @@ EXCHANGED: Final = {
 
 
 def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
-    """Return the lags [s] by device that are too small for a finding, but too large for the filter."""
+    """Return, by device, the lags [s] that are too small to be reported as faults, but too large
+    for the filter."""
     if any(finding.kind == "clock" for finding in diagnosis.findings):
         return {}
     return {name: lag for name, lag in late_devices(diagnosis).items() if abs(lag) > FILTER_BEARS_S}
 
 
 def list_corrections(diagnosis: Diagnosis) -> list[Finding]:
-    """Return all corrections for a profile: the findings, and the small lags in the same form."""
+    """Return all corrections to write into a profile (assignment of signals to channels): the
+    findings (faults), and the small lags in the same form."""
     lags = small_lags(diagnosis)
     return [
         *diagnosis.findings,
@@ -51,8 +53,8 @@ def list_corrections(diagnosis: Diagnosis) -> list[Finding]:
 def apply_findings(
     findings: Sequence[Finding], profile: Profile, vehicle: Vehicle
 ) -> tuple[Profile, Vehicle, list[Finding]]:
-    """Return profile and vehicle file corrected by the findings, and the findings that cannot be
-    corrected there.
+    """Return profile and vehicle file corrected by the findings, and those findings that cannot be
+    corrected in a profile or vehicle file.
     """
     channels = dict(profile.channels)
     left = list[Finding]()

@@ -43,7 +43,8 @@ CORRELATED_S: Final = 1.0  # that far apart two moments tell different things
 
 @dataclass(frozen=True)
 class Fit:
-    """Result of the fit left = gain · right + offset (+ further terms).
+    """Result of the fit left = gain · right + offset (+ further terms), where left and right are
+    equal by physics.
 
     `error` is the standard deviation of ln |gain|. `lag_s` is the delay of `left` relative to
     `right` [s]. `excited_s` is the time with enough excitation [s].
@@ -64,8 +65,8 @@ class Fit:
 
     @property
     def is_known(self) -> bool:
-        """Return True if the drive determines the gain: enough excited time, a small error and a
-        clear correlation.
+        """Return True if the drive determines the gain of left over right: enough time with
+        excitation, a small error and a clear correlation.
         """
         return self.excited_s >= FEWEST_S and self.error < 0.3 and abs(self.correlation) > 0.45
 
@@ -160,8 +161,9 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
     Args:
         sides: the two sides of the identity.
         moving: (n,) 1 where the car moves.
-        grips: (n,) 0 where wheels slip; these samples count for the lag, but not for the fit.
-        level: fit without offset, and use every moving sample as excited.
+        grips: (n,) 0 where wheels slip; these samples are used for the lag, but not for the fit.
+        level: True to fit without an offset, and to use every sample in motion as one with
+            excitation.
     """
     left = sides.left
     right = sides.right
@@ -246,8 +248,8 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
 def _bend_of(
     x: FloatArray, y: FloatArray, constant: FloatArray, bend: FloatArray, count: float
 ) -> tuple[float, float]:
-    """Return (share of `bend` in the right side, standard deviation of ln gain that follows from
-    the uncertainty of this share).
+    """Return (share of `bend` (the understeer term) in the right side, standard deviation of ln
+    gain that follows from the uncertainty of this share).
 
     The share is the posterior mean over BENDS. Its cost is the residual of the left side over
     `count` independent moments plus the squared deviation from usual cars.
@@ -269,8 +271,8 @@ def _bend_of(
 def _fit_with_priors(
     table: FloatArray, y: FloatArray, loose: tuple[float, ...], count: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the gains of an identity's terms by robust least squares, and their standard
-    deviations.
+    """Return the gains of the terms of an identity (left = Σ gain · term), fitted by robust least
+    squares, and their standard deviations.
 
     The gains of the last columns have a prior with mean 0 and the standard deviations `loose`.
     """
@@ -291,8 +293,8 @@ def _fit_with_priors(
 
 
 def _gains_of_parts(x: FloatArray, y: FloatArray, excited: BoolArray) -> tuple[float, ...]:
-    """Return the gain of an identity in each of PARTS consecutive parts of the excited time. Parts
-    that are too short are left out.
+    """Return the gain of an identity (left over right side) in each of PARTS consecutive parts of
+    the time with excitation. Parts that are too short are left out.
     """
     rows = np.flatnonzero(excited)
     found = []

@@ -93,8 +93,8 @@ class _Peak(NamedTuple):
 def _find_delay(
     left: FloatArray, right: FloatArray, among: BoolArray, least: float
 ) -> _Peak | None:
-    """Return the delay of `left` relative to `right` with its correlation; None if the drive does
-    not determine it.
+    """Return the delay [s] of the signal `left` relative to `right`, with the correlation at that
+    delay; None if the drive does not determine it.
     """
     most = round(LONGEST_S * RATE_HZ)
     among = among.copy()

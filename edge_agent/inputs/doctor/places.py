@@ -52,7 +52,8 @@ def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
 
 
 def _total_turn(angle: FloatArray) -> float:
-    """Return the range of an angle (n,) [rad] after unwrapping, from its 5 % to its 95 % quantile."""
+    """Return how much an angle (n,) [rad] varies after unwrapping: its 95 % quantile minus its 5 %
+    quantile."""
     unwrapped = np.unwrap(angle)
     return float(np.percentile(unwrapped, 95) - np.percentile(unwrapped, 5))
 
@@ -65,8 +66,8 @@ def _course_agreement(yaw: FloatArray, course: FloatArray) -> float:
 
 
 def has_exchanged_position(t: FloatArray, signals: FloatArray, drive: EvenDrive) -> bool:
-    """Return True if the positions agree with the wheels only after latitude and longitude are
-    exchanged.
+    """Return True if the motion of the positions agrees with the wheel speeds only after latitude
+    and longitude are exchanged.
     """
     latitude = signals[:, S.LATITUDE]
     longitude = signals[:, S.LONGITUDE]

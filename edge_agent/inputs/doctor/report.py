@@ -87,7 +87,8 @@ def _finite_or_none(value: object) -> object:
 
 
 def publishing_advice(diagnosis: Diagnosis) -> str:
-    """Return one line: the log may be published, or what to do before it may be published."""
+    """Return one line with the verdict: either the log may be published, or it states the steps
+    that are necessary before."""
     if diagnosis.is_passed:
         return "passed: units, signs, clocks and offsets agree with each other"
     if diagnosis.findings:
@@ -99,7 +100,8 @@ def publishing_advice(diagnosis: Diagnosis) -> str:
 
 
 def report_page(diagnosis: Diagnosis, title: str) -> str:
-    """Return an HTML page with the verdict, the findings, and a plot of each identity."""
+    """Return an HTML page with the verdict, the findings, and a plot of each identity (two
+    quantities that are equal by physics)."""
     rows = [
         f"<tr class='bad'><td>{escape(f.channel)}<td>{escape(f.kind)}<td>{escape(f.words)}"
         for f in diagnosis.findings
@@ -133,8 +135,8 @@ def _identity_table(fits: dict[str, Fit]) -> str:
 
 
 def _scatter_plot(name: str, fit: Fit) -> str:
-    """Return an SVG scatter plot of both sides of an identity, with the ideal relation (grey) and
-    the measured relation (red).
+    """Return an SVG scatter plot of both sides of an identity (two quantities that are equal by
+    physics), with the ideal relation (grey) and the measured relation (red).
     """
     step = max(1, len(fit.right) // POINTS)
     x = fit.right[::step]

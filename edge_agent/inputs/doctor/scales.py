@@ -41,15 +41,16 @@ class Mistake(NamedTuple):
 
 
 class Member(NamedTuple):
-    """A quantity in an identity, and the power of its factor in the gain."""
+    """A quantity in an identity (equation between two sides), and the power with which its factor
+    enters the gain."""
 
     quantity: str
     power: int
 
 
 class Law(NamedTuple):
-    """Properties of an identity without faults: expected gain, standard deviation of the gain's
-    logarithm between cars, and its quantities.
+    """Properties of an identity (equation between two sides) on a car without faults: expected
+    gain, standard deviation of the gain's logarithm between cars, and its quantities.
     """
 
     centre: float
@@ -152,7 +153,8 @@ class Verdict:
 
 
 def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
-    """Return the smallest set of unit and sign faults that explains the fitted identities."""
+    """Return the smallest set of unit and sign faults that explains the fitted identities (pairs of
+    quantities that are equal by physics)."""
     choices = faults_of(vehicle, found["ground"])
     known = {name: fit for name, fit in found.items() if fit.is_known}
     costs: list[tuple[float, dict[str, Mistake]]] = []
@@ -173,8 +175,8 @@ def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
 
 
 def _are_equivalent(one: Mistake | None, other: Mistake | None) -> bool:
-    """Return True if two faults have the same effect on the signal. For example, km/h equals a
-    radius of .28 m, and no drive can distinguish it from a wrong radius.
+    """Return True if two faults have the same effect on the signal. For example, a wheel speed in
+    km/h instead of rad/s looks like a wheel radius of .28 m; no drive can distinguish the two.
     """
     if one is None or other is None:
         return one is other

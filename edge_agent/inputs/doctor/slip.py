@@ -37,7 +37,7 @@ TURNS_LIKE: Final = 0.8
 
 def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:
     """Return True if a wheel speed differs from the others by sudden steps of a few fixed sizes, at
-    least FEWEST_STEPS times.
+    least FEWEST_STEPS times. Such steps indicate a sensor fault, not slip.
 
     `above` (n,) is the difference from the other wheels, `off` (n,) is True where it is large.
     """
@@ -58,7 +58,8 @@ def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float
     """Return True if a wheel disagrees with the other three wheels (n, 3) most of the time while
     they agree with each other.
 
-    No wheel spins for that long, so the signal is not a speed of this wheel.
+    No wheel spins for that long, so the caller reports that the signal is not the speed of this
+    wheel.
     """
     agree = np.ptp(rest, axis=1) < 0.1 * np.abs(others) + 0.02 * fast
     moves = np.abs(others) > 0.3 * fast
@@ -132,8 +133,8 @@ def find_locked_axles(drive: EvenDrive) -> list[str]:
 
 
 def find_followed(drive: EvenDrive) -> BoolArray:
-    """Return an array (n,) that is True where the car follows its steering, so that it does not
-    slide on any road.
+    """Return an array (n,) that is True where the car turns as its steering predicts, that is,
+    where it does not slide.
     """
     fast = np.maximum(np.abs(drive.v), 1.0)
     wanted = drive.wheelbase * drive.r / fast
@@ -161,8 +162,8 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
 
 
 def spread_of_parts(beside: FloatArray) -> float:
-    """Return the standard deviation of a quantity between parts of a drive. A tilt of the sensor
-    gives the same value in all parts, a slide does not.
+    """Return the standard deviation of a quantity between parts of a drive. The result
+    distinguishes a tilt of the sensor, which gives the same value in all parts, from a slide.
     """
     parts = [
         float(np.nanmedian(part))
@@ -173,13 +174,14 @@ def spread_of_parts(beside: FloatArray) -> float:
 
 
 def is_steady(fit: Fit) -> bool:
-    """Return True if the gain in most parts of the drive equals the gain over the whole drive."""
+    """Return True if the gain of an identity (left over right side) in most parts of the drive
+    equals the gain over the complete drive."""
     return share_of_parts(fit, fit.gain) >= STEADY_SHARE
 
 
 def share_of_parts(fit: Fit, gain: float, within: float = STEADY) -> float:
-    """Return the share of a drive's parts whose gain has the sign of `gain` and differs by less
-    than `within` in the logarithm.
+    """Return the share of a drive's parts whose gain has the same sign as `gain`, and whose
+    logarithm differs from that of `gain` by less than `within`.
     """
     if not fit.parts:
         return 0.0
@@ -190,8 +192,8 @@ def share_of_parts(fit: Fit, gain: float, within: float = STEADY) -> float:
 def measure_lags_twice(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, found: dict[str, Fit]
 ) -> dict[str, float]:
-    """Return the lags [s] on which both halves of a drive agree, for devices whose identity holds
-    throughout the drive.
+    """Return the lags [s] on which both halves of a drive agree, for devices whose identity
+    (relation to other signals) is valid throughout the drive.
 
     In a slide, a car responds to its steering later or sooner than the model, and by a different
     time in each slide. Such a lag is therefore left out.

@@ -1,11 +1,11 @@
 """Base of a live source: a thread that listens, reopens a lost connection, and stores the received
 messages.
 
-Times are the host's: seconds since its start, by a monotonic clock. A source whose time stamps are
-at most BELIEVED_S old on arrival has the same date as the host, and its stamps are used unchanged.
-For any other source, the difference between the two clocks is estimated: the message with the
-smallest delay within the last WHILE_S to 2 WHILE_S is assumed to have arrived without delay
-(Cristian, Distrib. Comput. 3 (1989): the minimum of the delays).
+Times are the host's: seconds since its start, by a monotonic clock. If the time stamps of a source
+are at most BELIEVED_S old on arrival, source and host have the same date, and the stamps are used
+unchanged. For any other source, the difference between the two clocks is estimated: the message
+with the smallest delay within the last WHILE_S to 2 WHILE_S is assumed to have arrived without
+delay (Cristian, Distrib. Comput. 3 (1989): the minimum of the delays).
 """
 
 from __future__ import annotations

@@ -96,7 +96,8 @@ class Ros2Feed(Feed):
         self._after: dict[bytes, int] = {}  # publisher -> the sequence number that is next
 
     def listen(self) -> None:
-        """Receive messages until the source is stopped. Zenoh itself reconnects to a lost router."""
+        """Receive messages until the source is stopped. The method does not handle a lost router,
+        because Zenoh itself reconnects."""
         session = open_session(self._settings, self.stopping)
         if session is None:
             return

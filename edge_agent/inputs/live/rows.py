@@ -47,10 +47,10 @@ class LiveRows:
     """Generator of blocks with one vehicle's samples from its live sources.
 
     Args:
-        feeds: the sources; `blocks` starts them.
+        feeds: the live sources; the method `blocks` starts them.
         profile: maps signals to channels.
         vehicle: its wheel radius and steering ratio take precedence over the profile's.
-        clock: clock of the host, the same as that of the feeds.
+        clock: clock of the host; the feeds must have the same one.
         wait: function that sleeps for a number of seconds.
 
     Raises:
@@ -193,8 +193,9 @@ class LiveRows:
         return Recording(feed.name, dict(kept))
 
     def _place_fixes(self, fixes: dict[str, Series], t: FloatArray, signals: FloatArray) -> None:
-        """Write each position fix into the row nearest to its time. If that row has already been
-        sent, move the fix to the first row of the block.
+        """Write each position fix into the row (sample) nearest to its time. If that row has
+        already been sent to the estimator, move the fix along its course to the first row of the
+        block.
         """
         half = 0.5 / self.rate_hz
         speed = fixes.get(GROUND)
@@ -231,8 +232,9 @@ class LiveRows:
                 signals[rows, CHANNELS.index(name)] = values
 
     def _fill_steering(self, signals: FloatArray) -> None:
-        """Fill missing steering angles as in a log. A front wheel without a channel in the profile
-        gets the angle of the other front wheel, and rear wheels get zero.
+        """Fill missing steering angles in the same way as the importer of recorded logs. A front
+        wheel without a channel in the profile gets the angle of the other front wheel, and rear
+        wheels get zero.
         """
         fill_steering(signals, [name not in self._profile.channels for name in STEERING])
 

@@ -3,8 +3,8 @@ to series.
 
 Times are those of arrival, counted from the log's first frame in whole microseconds, so that a
 drive has the same times in every format. Buses are numbered as python-can does. If several buses
-carry a message, the bus named in the profile is used; otherwise the bus with the most frames of the
-wanted messages.
+carry a message, the frames of the bus named in the profile are used; otherwise those of the bus
+with the most frames of the wanted messages.
 """
 
 from __future__ import annotations

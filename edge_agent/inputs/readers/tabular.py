@@ -1,8 +1,8 @@
 """Reader of tables (CSV and Parquet) with one row per sample; every numeric column becomes a
 series.
 
-The time column is `t` [s], `timestamp`, or a column with a name such as `time`. A name may contain
-its unit: `speed [km/h]`.
+The time column is `t` [s], `timestamp`, or a column with a name such as `time`. The name of a
+column may contain its unit: `speed [km/h]`.
 """
 
 from __future__ import annotations
