@@ -187,7 +187,7 @@ class Memberships:
         return np.array(lower), np.array(upper)
 
     def to_json(self) -> dict[str, list[float]]:
-        """Return the memberships as a dictionary for a JSON file."""
+        """Return the memberships (fuzzy sets) as a dictionary for a JSON file."""
         return {name: list(getattr(self, name)) for name in LENGTHS}
 
     @classmethod

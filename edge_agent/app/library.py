@@ -67,8 +67,8 @@ def make_bank(
     and signals (T, N, 18).
 
     Raises:
-        InputError: the estimator is unknown, no vehicle is given, or memberships are given for an
-            estimator that has none.
+        InputError: the estimator is unknown, no vehicle is given, or memberships (fuzzy sets) are
+            given for an estimator that has none.
     """
     return bank_of(estimator, vehicles, memberships)
 

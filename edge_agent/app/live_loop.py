@@ -31,8 +31,8 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Progress:
-    """Progress of the live loop: duration of the signals [s], number of blocks, number of late
-    blocks, the longest and the last delay [s].
+    """Progress of the live loop: duration of the signals [s], number of blocks (of samples), number
+    of late blocks, the longest and the last delay [s].
 
     `held` counts records that were not published, because their signals were not verified.
     """
@@ -134,8 +134,8 @@ def _offer_if_admitted(
 
 
 def final_counts(progress: Progress, publisher: Publisher) -> dict[str, float]:
-    """Return the agent's final counts: all records, the observations among them, and blocks and
-    delays of the loop.
+    """Return the agent's final counts: all records, the observations among them, and the number of
+    blocks of samples with the delays of the loop.
     """
     counts = publisher.counts
     seen = Kind.OBSERVATION

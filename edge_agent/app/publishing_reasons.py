@@ -48,8 +48,8 @@ class PublisherState(Protocol):
 
 
 class SignalWatch:
-    """Observer of a signal source: it records when the source's blocks last contained a position, a
-    wheel speed and a turning wheel.
+    """Observer of a signal source: it records when the source's blocks of samples last contained a
+    position, a wheel speed and a turning wheel.
 
     Args:
         clock: monotonic clock [s].
@@ -61,13 +61,14 @@ class SignalWatch:
         self._seen: dict[str, float] = {}
 
     def watch_blocks(self, source: Iterator[Block]) -> Iterator[Block]:
-        """Yield the blocks of a source unchanged, and record which signals they contain."""
+        """Yield the blocks of samples of a source unchanged, and record which signals they
+        contain."""
         for block in source:
             self.add(block)
             yield block
 
     def add(self, block: Block) -> None:
-        """Record which signals a block contains."""
+        """Record which signals a block of samples contains."""
         signals = block.signals
         now = self._clock()
         if not self._seen:

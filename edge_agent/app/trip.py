@@ -100,8 +100,8 @@ class Trip:
     def corrected_blocks(
         self, source: Generator[Block], ground: Callable[[], FloatArray]
     ) -> Generator[Block]:
-        """Yield the blocks of a source with known sensor errors corrected. The uncorrected blocks
-        are stored for the doctor.
+        """Yield the blocks of samples of a source, in which known sensor errors are corrected. The
+        uncorrected blocks are stored for the doctor.
 
         `ground` returns the speed over ground (T,) [m/s] of the last block.
         """

@@ -59,7 +59,8 @@ class Score(Record):
 
 
 class SplitScores(Record):
-    """Scores of the memberships on the drives used in the search, and on held-out drives."""
+    """Scores of memberships (fuzzy sets) on the drives that the search used, and on held-out
+    drives."""
 
     train: Score
     held_out: Score
@@ -137,7 +138,7 @@ def parse_tuned(text: str | bytes, where: str) -> Tuned:
 
 
 def load_tuned(path: Path | str) -> Tuned:
-    """Read a file of tuned memberships.
+    """Read a file of tuned memberships (fuzzy sets).
 
     Raises:
         InputError: a field is invalid, or the file cannot be read; the error names the field or the
@@ -155,7 +156,7 @@ def load_tuned(path: Path | str) -> Tuned:
 
 
 def shipped_memberships(estimator: str) -> Memberships:
-    """Return the memberships that the package contains for an estimator.
+    """Return the memberships (fuzzy sets) that this package contains for an estimator.
 
     Raises:
         InputError: the package has no memberships for that estimator.
@@ -164,8 +165,8 @@ def shipped_memberships(estimator: str) -> Memberships:
 
 
 def search_results(estimator: str) -> dict[str, list[Memberships]]:
-    """Return the results of all searches that led to the shipped file of memberships, by kind of
-    search; empty if the file does not contain them.
+    """Return the results of all searches that led to the file of memberships (fuzzy sets) in this
+    package, by kind of search; empty if the file does not contain them.
     """
     document = load_tuned(FOLDER / f"{estimator}.json").document
     return {
@@ -175,8 +176,8 @@ def search_results(estimator: str) -> dict[str, list[Memberships]]:
 
 
 def save_tuned(path: Path, document: Document) -> None:
-    """Write a document with tuned memberships. It is parsed first, so that `load_tuned` accepts
-    every file that is written.
+    """Write a document with tuned memberships (fuzzy sets) to a file. It is parsed first, so that
+    `load_tuned` accepts every file that is written.
     """
     text = json.dumps(document.model_dump(), indent=1, ensure_ascii=False) + "\n"
     parse_tuned(text, f"tuned file {path}")

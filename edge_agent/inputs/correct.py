@@ -23,8 +23,8 @@ TURNING = (S.OMEGA, S.OMEGA + 4)
 
 
 class Corrector:
-    """Correction of one vehicle's signals by its calibration; the input may be split into blocks
-    anywhere.
+    """Correction of one vehicle's signals by its calibration; the samples may be passed in blocks
+    of any length.
 
     Devices that send early are delayed to match the latest device. For each early device the
     reading nearest to the time of the latest device's reading is used, without interpolation. A row

@@ -104,7 +104,8 @@ def locate_vehicles(
         tracks: (N,) tracks after the previous block.
         t: (T, N) [s].
         signals: (T, N, channels).
-        lost: if True, the last fixes are dropped, which ends every visit.
+        lost: if True, the last position fixes are dropped, which ends every visit (passage of a
+            cell).
 
     Returns:
         the tracks for the next block, and the cells per sample.
@@ -185,7 +186,8 @@ def _store_readings(track: CellTrack, fix: ReceiverSample, now: float) -> None:
 
 @compiled
 def _begin_visit(track: CellTrack, fix: ReceiverSample, heading: float) -> None:
-    """Begin a visit to the cell of the fix, in the sector of `heading` [rad]."""
+    """Begin a visit (passage) of the map cell that contains the fix, in the sector of `heading`
+    [rad]."""
     track.cell = fix.cell
     track.sector = int(np.floor((heading + np.pi / 4) / (np.pi / 2))) % grid.SECTORS
     track.west = fix.west

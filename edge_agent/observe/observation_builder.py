@@ -59,7 +59,7 @@ class RecordBlock(NamedTuple):
 
 
 class Visit:
-    """One visit of a cell, open or ended, as a record."""
+    """One visit (passage of a map cell), open or ended, as a record."""
 
     sample: int  # of the block, and
     vehicle: int  # at which it ended
@@ -123,7 +123,8 @@ class OpenVisits:
 
     @staticmethod
     def before_any(vehicles: int) -> OpenVisits:
-        """Return the open visits of vehicles that have not begun a visit."""
+        """Return the initial records of vehicles that have not begun a visit (passage of a map
+        cell)."""
         visits = records(Visit, vehicles)
         visits["cell"] = NOWHERE
         return OpenVisits(visits, np.full(vehicles, np.iinfo(np.int64).min))
@@ -138,8 +139,8 @@ def build_records(
     signals: FloatArray | None = None,
     context: FloatArray | None = None,
 ) -> tuple[OpenVisits, RecordBlock, RecordBlock]:
-    """Build the records of a block with times (T, N) [ns UTC]; return (open visits, observations,
-    states).
+    """Build the records of a block of samples with times (T, N) [ns UTC]; return (open visits,
+    observations, states).
 
     Without `signals` (T, N, channels) observations do not contain the direction in which grip was
     used. Without `context` (T, N, len(CONTEXT)) they contain no data of controllers and
@@ -244,7 +245,7 @@ def _advance_visits(
 
 @compiled
 def _begin_visit(visit: Visit, time: int, cell: int, sector: int) -> None:
-    """Start a new visit, still without samples, in the record."""
+    """Start a new visit (passage of a map cell) in the record, still without samples."""
     visit.enter_time = time
     visit.cell = cell
     visit.sector = sector
@@ -293,7 +294,7 @@ def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
 
 @compiled
 def _add_sample(visit: Visit, time: int, sample: Sample, position_std: float) -> None:
-    """Add one sample at `time` [ns UTC] to a visit."""
+    """Add one sample at `time` [ns UTC] to a visit (passage of a map cell)."""
     _update_felt_grip(visit, (time - visit.leave_time) / NS, sample, position_std)
     visit.leave_time = time
     visit.samples += 1
@@ -313,8 +314,8 @@ def _add_sample(visit: Visit, time: int, sample: Sample, position_std: float) ->
 
 @compiled
 def _add_context(visit: Visit, context: FloatArray) -> None:
-    """Add one sample of the context signals (controllers, surroundings; (len(CONTEXT),)) to a
-    visit; NaN are skipped."""
+    """Add one sample of the context signals (controllers, surroundings; (len(CONTEXT),)) to a visit
+    (passage of a map cell); NaN are skipped."""
     for i in range(len(context)):
         if np.isfinite(context[i]):
             visit.known[i] += 1.0
@@ -323,8 +324,9 @@ def _add_context(visit: Visit, context: FloatArray) -> None:
 
 @compiled
 def _update_felt_grip(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
-    """Update a visit's grip according to the accelerometers, `dt` [s] after the previous sample.
-    Without accelerometer readings this grip stays infinite and excludes no friction.
+    """Update the grip of a visit (passage of a map cell) that the accelerometers show, `dt` [s]
+    after the previous sample. Without accelerometer readings this grip stays infinite and excludes
+    no friction.
     """
     if np.isfinite(sample.ax + sample.ay):
         share = 1.0 - np.exp(-dt / FELT_S)
@@ -349,8 +351,8 @@ def _grip_directions(ended: RecordArray) -> dict[str, FloatArray]:
     """Return the grip used in longitudinal and lateral direction of the vehicle, (n,): the total,
     divided in proportion to squared accelerations. NaN without acceleration.
 
-    The sign is that of the stronger direction: a visit with braking and driving counts as one of
-    them.
+    The sign is that of the stronger direction: a visit (passage of a map cell) with braking and
+    driving counts as one of them.
     """
     along = ended["driving"] + ended["braking"]
     across = ended["left"] + ended["right"]
@@ -367,7 +369,7 @@ def _grip_directions(ended: RecordArray) -> dict[str, FloatArray]:
 
 
 def _grip_used(ended: RecordArray) -> FloatArray:
-    """Return the grip used in visits (n,) [1].
+    """Return the grip used (force over load) in n visits (passages of a map cell), (n,) [1].
 
     It is limited by the accelerometers in this cell, because the time window of `mu_utilised` may
     reach into the previous cell. If friction changed within the visit, the smallest value of all
@@ -413,7 +415,8 @@ def _build_observations(
 
 
 def _context_columns(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
-    """Return the observation columns about controllers and surroundings for n visits, (n,) each.
+    """Return the observation columns about controllers and surroundings for n visits (passages of a
+    map cell), (n,) each.
 
     A flag is 1 if it was on at any sample. It is 0 if it was never on and was known at KNOWN_SHARE
     of the samples. Otherwise it is unknown.
@@ -431,7 +434,8 @@ def _context_columns(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
 
 
 def _likelihood_bytes(ended: RecordArray, evidence: FloatArray | None) -> NDArray[np.uint8]:
-    """Return the encoded likelihoods (n, 32) of visits; (n, 0) for a bank without evidence.
+    """Return the likelihoods of n visits (passages of a map cell) in the encoding of the message,
+    (n, 32); (n, 0) for a bank without evidence.
 
     The likelihood is flat for a visit that the bank did not process from its start. If friction
     changed within the cell, either value may be right, so the larger likelihood counts.

@@ -27,8 +27,8 @@ FINAL_STEP_S = 1e-3  # after the last sample; short, so that the estimate is not
 
 
 class Seen(NamedTuple):
-    """Position and motion of the vehicles at the end of a block, (N,) each: latitude and longitude
-    [deg], yaw [rad from east], speed [m/s], time [ns UTC]; NaN where unknown.
+    """Position and motion of the vehicles at the end of a block of samples, (N,) each: latitude and
+    longitude [deg], yaw [rad from east], speed [m/s], time [ns UTC]; NaN where unknown.
     """
 
     latitude: FloatArray
@@ -39,8 +39,8 @@ class Seen(NamedTuple):
 
 
 class Grip(NamedTuple):
-    """Friction of the vehicles at the end of a block, (N,) each: quantiles of mu, grip used, time
-    [ns UTC]; NaN where unknown.
+    """Friction of the vehicles at the end of a block of samples, (N,) each: quantiles of mu, grip
+    used, time [ns UTC]; NaN where unknown.
     """
 
     mu: FloatArray
@@ -118,7 +118,8 @@ class Pipeline:
         return doubted_flags(self._flags)
 
     def finish(self) -> RecordBlock | None:
-        """Close the open visits and return their observations; None if no sample was processed.
+        """Close the open visits (passages of a map cell) and return their observations; None if no
+        sample was processed.
 
         The evidence of a visit becomes available only at the sample after its end. Therefore the
         method first adds one sample without readings and without a position.

@@ -47,8 +47,9 @@ LIKELY = 2.0  # and of what is unknown of the radii
 
 @compiled
 def block_features(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> int:
-    """Compute the inputs of the measurement equations from the sums of the block, and write them to
-    `features`; return the health flags. The caller has already set duration and speed.
+    """Compute the inputs of the measurement equations from the sums of the block (the samples
+    within 0.05 s), and write them to `features`; return the health flags. The caller has already
+    set duration and speed.
     """
     row = memory.row
     last = memory.last

@@ -140,8 +140,8 @@ def _segment_mass(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> f
 def visit_evidence(
     mu: FloatArray, prior: FloatArray, w: FloatArray, centres: FloatArray, out: FloatArray
 ) -> None:
-    """Compute out = log(w/prior) at the bin centres (32,), interpolated between nodes, with maximum
-    0.
+    """Compute out = log(w/prior) at the bin centres (32,), interpolated between nodes (grid values
+    of friction), with maximum 0.
     """
     count = mu.shape[0]
     top = -math.inf

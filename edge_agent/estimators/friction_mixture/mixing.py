@@ -143,8 +143,8 @@ def match_moments(
     overall_mean: FloatArray,
     overall_covariance: FloatArray,
 ) -> None:
-    """Compute mean (n,) and covariance (n, n) of the mixture of the first K nodes with weights
-    (K,).
+    """Compute mean (n,) and covariance (n, n) of the mixture of the first K nodes (filters of one
+    friction hypothesis each) with weights (K,).
     """
     count = weight.shape[0]
     n = mean.shape[1]

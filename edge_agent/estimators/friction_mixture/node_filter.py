@@ -52,8 +52,8 @@ DOUBTED = 0.05  # of distrust_noise, at the brink of it
 
 
 class NodeUpdate(NamedTuple):
-    """Result of the measurement update of one node: its log-likelihood, the number of measurement
-    rows used, and similar values.
+    """Result of the measurement update of one node (friction hypothesis): its log-likelihood, the
+    number of measurement rows used, and similar values.
     """
 
     log_likelihood: float  # with the inflated R and the price of sliding [nat]
@@ -67,13 +67,12 @@ class NodeUpdate(NamedTuple):
 def update_node(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int, inflation: float
 ) -> NodeUpdate:
-    """Run the cubature update of node j with R times `inflation`. The update changes the node's
-    mean and scratch.root[j].
+    """Run the cubature update of node j (friction hypothesis) with the measurement noise R times
+    `inflation`. The update changes the node's mean and scratch.root[j].
 
-    R (measurement noise) of the axles' rows is increased further if these rows contradict the
-    model, and while the inputs are steady. With steady inputs, errors of the tyre curve and of
-    offsets repeat from block to block; if they were treated as noise, the filter would average them
-    into stiffness and shape.
+    R of the axles' rows is increased further if these rows contradict the model, and while the
+    inputs are steady. With steady inputs, errors of the tyre curve and of offsets repeat from block
+    to block; if they were treated as noise, the filter would average them into stiffness and shape.
 
     The function also writes the innovation and the variance expected for it without `inflation`.
     """
@@ -120,8 +119,8 @@ def update_node(
 
 @compiled
 def linearize_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
-    """Compute node.derivative and, at the node's mean state, node.force of node j; return the
-    penalty [nat] for sliding wheels.
+    """Compute node.derivative and, at the node's mean state, node.force of node j (friction
+    hypothesis); return the penalty [nat] for sliding wheels.
 
     The leak (gravity in a_y when the body rolls) and the offset of a_y change the same forces.
     Therefore the derivative by the one is computed from the derivative by the other.
@@ -180,8 +179,8 @@ def linearize_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratc
 def _by_wheel_speeds(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int
 ) -> None:
-    """Compute the derivatives of the rows by the four wheel radii, and by the time lag of the wheel
-    speed signals.
+    """Compute the derivatives of the measurement rows by the four wheel radii, and by the time lag
+    of the wheel speed signals.
 
     Each wheel's row depends on the speed of this wheel. One evaluation with all four radii changed
     gives all derivatives, because the radii hardly change the rows of the axles. node.force must
@@ -262,7 +261,8 @@ def slip_noise_correction(slope: float) -> float:
 
 @compiled
 def spread_points(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> None:
-    """Evaluate the measurement rows at the cubature points of node j.
+    """Compute the predicted measurements (rows) at the cubature points of node j (friction
+    hypothesis).
 
     Fill node.deviation (A), node.residual with the predicted rows, and node.nonlinearity with the
     variance caused by nonlinearity. scratch.root[j] is lower triangular.
@@ -322,7 +322,8 @@ def rear_noise(memory: MixtureMemory, constants: Constants) -> float:
 @compiled
 def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
     """Return the penalty [nat] for deviations of a node's vehicle and sensor states from their
-    prior: half the sum of the squared deviations in standard deviations. `mean` has shape (n,).
+    prior (a node is the filter of one friction hypothesis): half the sum of the squared deviations
+    in standard deviations. `mean` has shape (n,).
     """
     total = 0.0
     for i in range(NodeState.LN_KX, mean.shape[0]):
@@ -334,7 +335,8 @@ def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
 def take_rows(
     mean: FloatArray, root: FloatArray, node: NodeWorkspace, axle_penalty: float
 ) -> tuple[float, int]:
-    """Update a node with the innovations node.residual (6,), one row after the other.
+    """Update a node (friction hypothesis) with the innovations node.residual (6,), one measurement
+    row after the other.
 
     Return (negative log-likelihood [nat] without constants, number of rows applied): the first is
     half of the normalised squared innovations plus the ln det S terms. `axle_penalty` scales the ln
@@ -381,8 +383,9 @@ def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> Non
 def predict_node(
     memory: MixtureMemory, scratch: Scratch, j: int, turn_cos: float, turn_sin: float
 ) -> None:
-    """Predict the state of node j to the end of the block (0.05 s): rotate the velocity by the yaw
-    angle, add the gained velocity, and add the process variances scratch.process.
+    """Predict the state of node j (friction hypothesis) to the end of the block (0.05 s): rotate
+    the velocity by the yaw angle, add the gained velocity, and add the process variances
+    scratch.process.
 
     The prediction is affine, so cubature is exact: covariance <- F*L*(F*L)' + diag(noise). Vehicle
     and sensor states return to their prior by the factors scratch.keep. The function changes

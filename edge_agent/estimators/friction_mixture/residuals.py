@@ -98,8 +98,8 @@ def find_slips(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Fill node.slip with the slips of wheels and axles at node.point, a state at the beginning of
-    the block (0.05 s).
+    """Compute node.slip, the slips of wheels and axles, at node.point: a state of this node
+    (friction hypothesis) at the beginning of the block (0.05 s).
 
     `mean` (n,) is the node's mean. Where the force is too small to distinguish stiffness from slip
     noise, the logarithm of stiffness in node.point is moved towards that of `mean`.

@@ -45,7 +45,7 @@ FARTHEST_FOLLOWED = 0.8  # a_y over g to which the rear axle is then taken to fo
 
 @compiled
 def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
-    """Update memory.rolling with the wheel speeds of the block."""
+    """Update memory.rolling with the wheel speeds of the block (the samples within 0.05 s)."""
     rolling = memory.rolling
     row = memory.row
     time = memory.last.time
@@ -140,8 +140,8 @@ def _compute_velocities(
 
 @compiled
 def take_rolling(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
-    """Update node j with the velocity derived from the wheels; return the penalty [nat] for the
-    difference from the node's own velocity.
+    """Update node j (friction hypothesis) with the velocity derived from the wheels; return the
+    penalty [nat] for the difference from the node's own velocity.
     """
     rolling = memory.rolling
     constants = design.constants
@@ -183,8 +183,8 @@ def _take_velocity(
     direction: tuple[float, float],
     reading: tuple[float, float, float],
 ) -> float:
-    """Update node j with a velocity reading (innovation, variance, Huber threshold) along
-    `direction` (x, y).
+    """Update node j (friction hypothesis) with a velocity reading (innovation, variance, Huber
+    threshold) along `direction` (x, y).
 
     Return half of its normalised squared innovation [nat].
     """

@@ -39,8 +39,8 @@ LEAST_DEMAND = 1e-3  # [1] below it no evidence is left
 
 @compiled
 def apply_measurement(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Apply the measurements of the block (0.05 s): update all nodes, recompute their weights, and
-    adapt the measurement noise R.
+    """Apply the measurements of the block (0.05 s): update all nodes (friction hypotheses),
+    recompute their weights, and adapt the measurement noise R.
     """
     update_all(memory, design, scratch)
     temper_evidence(memory, design, scratch)
@@ -95,11 +95,13 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
 
 @compiled
 def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Replace scratch.log_likelihood by the tempered evidence of the block for each node [nat].
+    """Replace scratch.log_likelihood [nat] of each node by the evidence of the block (0.05 s) that
+    counts: rules weaken (temper) the likelihood.
 
     A node (friction hypothesis) below the grip in use gets its penalty however small the tyre
-    forces are. At full distrust no evidence is used. Without accelerations, yaw rate or steering,
-    sliding cannot be distinguished from rolling, so no evidence on friction is used either.
+    forces are. Once the filter accepts that measurements contradict the model, no evidence is used.
+    Without accelerations, yaw rate or steering, sliding cannot be distinguished from rolling, so no
+    evidence on friction is used either.
     """
     constants = design.constants
     features = scratch.features

@@ -73,7 +73,7 @@ class NodeSlip:
 
 
 class NodeWorkspace:
-    """Scratch arrays for the update of one node."""
+    """Scratch arrays for the update of one node (friction hypothesis)."""
 
     gained: PlanarVector  # mean velocity gained in the block, by the node's mean [m/s]
     point: Annotated[FloatArray, STATES]
@@ -102,7 +102,7 @@ class NodeWorkspace:
 
 
 class Scratch:
-    """Scratch arrays for one block."""
+    """Scratch arrays for one block (the samples within 0.05 s)."""
 
     features: BlockFeatures
     node: NodeWorkspace

@@ -75,7 +75,8 @@ NOTHING: Final = Fit(np.nan, np.nan, 0.0, np.inf, 0.0, 0.0, np.inf, np.zeros(0),
 
 
 class Relation(NamedTuple):
-    """Terms of an identity: left = gain · right + offset + Σ k · term, each an array (n,).
+    """Terms of an identity (two sides that are equal by physics): left = gain · right + offset + Σ
+    k · term, each an array (n,).
 
     If `per` is given, the offset is multiplied by it and therefore not constant. If `bend` (n,) is
     given, the left side also contains an unknown share of right · bend, because at one speed
@@ -144,7 +145,8 @@ IDENTITIES: Final[dict[str, Callable[[EvenDrive], Relation]]] = {
 
 
 def fit_identities(drive: EvenDrive) -> dict[str, Fit]:
-    """Fit every identity to a drive; return the fits by name."""
+    """Fit every identity (two quantities that are equal by physics) to a drive; return the fits by
+    name."""
     return {
         name: fit_identity(sides(drive), drive.moving, drive.grips, level=name == "ground")
         for name, sides in IDENTITIES.items()

@@ -74,8 +74,8 @@ def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
     """Return the axles with exchanged left and right wheels, if the other axle is correct: name and
     wheel indices.
 
-    If both axles are exchanged, they agree with each other, and the identity of the yaw rates shows
-    the fault.
+    If both axles are exchanged, they agree with each other, and the comparison of the wheels' yaw
+    rate with the gyroscope shows the fault.
     """
 
     def yaw_likeness(yaw: FloatArray) -> float:

@@ -165,7 +165,8 @@ class LiveRows:
         )
 
     def _recent_recording(self, place: int, feed: Feed, oldest: float) -> Recording:
-        """Return the recent readings of a source, including those from before the block."""
+        """Return the recent readings of a source, including those from before the current block of
+        rows."""
         kept = self._readings[place]
         fresh_ones = feed.take()
         if "course" not in fresh_ones:

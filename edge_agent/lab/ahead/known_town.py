@@ -44,7 +44,7 @@ def places_of(scenario: Scenario, t: float) -> KnownPlaces:
 def map_of_places(
     places: KnownPlaces, now: int, rng: np.random.Generator | None = None
 ) -> LocalMap:
-    """Return the local map of a car that has received all places.
+    """Return the local map of a car that has received all places (map cells with heading sector).
 
     The friction in the map is the true one; with `rng`, random errors of standard deviation SPREAD
     are added.

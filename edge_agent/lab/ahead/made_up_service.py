@@ -102,7 +102,8 @@ class MadeUpService:
         )
 
     def tile_answer(self, key: IntArray, mu: FloatArray) -> bytes:
-        """Return the answer to a query for places of a tile with friction `mu`."""
+        """Return the answer to a query for map places (cell·4 + sector) of a tile, with friction
+        `mu`."""
         age = 1.0 if self.kept else 1.0 + (time.time_ns() - self.now) / NS
         return tile_payload(key, mu, self.now, age_s=np.full(len(key), age))
 

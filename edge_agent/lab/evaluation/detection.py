@@ -156,8 +156,8 @@ def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
 
 def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTally:
     """Evaluate the drives of one town, and return their tally (sums and counts). With `oracle`, the
-    oracle (an observer that knows motion and tyre forces) also evaluates the visits to ice with
-    high use of grip.
+    oracle (an observer that knows motion and tyre forces) also evaluates the visits (passages of a
+    map cell) on ice with high use of grip.
     """
     tally = DetectionTally()
     _judge_samples(tally, drive)

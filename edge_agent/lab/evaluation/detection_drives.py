@@ -62,7 +62,7 @@ class DetectionDrive:
         flagged: friction that the slip flag reports, infinite without a flag.
         controlled: True while ABS, traction control or ESC acts, for cars with winter equipment.
         stood: True where ice or snow appeared under the standing car, until the car leaves it.
-        visits: the published visits.
+        visits: the published visits (passages of a map cell).
     """
 
     speed: Samples
@@ -213,8 +213,8 @@ def _samples_of(
 
 
 def _bytes_of(column: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Return the encoded likelihoods of visits, (V, 32) bytes; flat likelihoods if the estimator
-    has no evidence.
+    """Return the encoded likelihoods of V visits (passages of a map cell), (V, 32) bytes; flat
+    likelihoods if the estimator has no evidence.
     """
     found = np.asarray(column, dtype=np.uint8)
     return found if found.shape[1] else np.zeros((len(found), mugrid.BINS), np.uint8)

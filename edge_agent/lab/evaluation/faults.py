@@ -171,8 +171,8 @@ def case_measures(batch: DriveSet, reported: Estimates, case: Case) -> dict[str,
 def campaign(
     seeds: Sequence[int], estimators: Sequence[str], drives: Sequence[str] = tuple(DRIVES)
 ) -> dict[tuple[str, str], dict[str, FloatArray]]:
-    """Run every case for every estimator over all drives and seeds; return the measures by (case,
-    estimator).
+    """Run every fault case for every estimator on all drives with all seeds; return the measures by
+    (case, estimator).
     """
     batches = [realistic(DRIVES[name], seeds) for name in drives]
     found = {}

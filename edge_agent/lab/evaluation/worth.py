@@ -95,8 +95,8 @@ def campaign(
 
 
 def ways() -> dict[str, list[MixtureDesign]]:
-    """Return the filters of each variant by its name; a variant whose vertices come from several
-    searches has one filter per search.
+    """Return the filters of each variant by its name; a variant whose vertices (corners of fuzzy
+    sets) come from several searches has one filter per search.
     """
     untuned = Memberships()
     found = {

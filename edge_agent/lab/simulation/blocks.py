@@ -16,8 +16,8 @@ BLOCK_S = 0.1  # of a live loop: short beside the second that a batch waits
 def blocks(
     fleet: SimulatedFleet, rate_hz: float, recorder: TruthRecorder | None = None
 ) -> Iterator[Block]:
-    """Yield blocks of simulated signals, BLOCK_S [s] long, without end. Simulated time starts when
-    the first block is requested.
+    """Yield blocks of simulated samples, each BLOCK_S [s] long, without end. Simulated time starts
+    when the first block is requested.
     """
     steps = max(1, round(BLOCK_S * rate_hz))
     start_ns = 0

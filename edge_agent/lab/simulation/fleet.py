@@ -63,7 +63,7 @@ GOLDEN = (
 
 @dataclass(frozen=True)
 class Truth:
-    """True values of a block, shapes (T, N) or (T, N, 4).
+    """True values of a block of T samples, shapes (T, N) or (T, N, 4).
 
     x, y, yaw: pose [m, m, rad]; vx, vy: velocity [m/s]; mu_wheel: friction; utilisation: |F|/(μ
     F_z); yaw_rate [rad/s]; ax, ay: acceleration that an accelerometer measures [m/s^2]; slope: rise

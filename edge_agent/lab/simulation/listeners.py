@@ -64,7 +64,7 @@ class WarnedDrivers:
 
     def hear(self, name: str, warning: GripWarning) -> None:
         """Store a warning for a driver. The driver responds after the reaction time, which starts
-        with the next block.
+        with the next block of samples.
 
         The method may be called from any thread.
         """

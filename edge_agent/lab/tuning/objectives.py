@@ -113,7 +113,8 @@ class TuningSet:
 
 @dataclass(frozen=True)
 class TuningScores:
-    """Scores of memberships on drives; the first two are NaN if the true friction is unknown."""
+    """Scores of memberships (fuzzy sets) on simulated drives; the first two are NaN if the true
+    friction is unknown."""
 
     interval_score: float  # less is better [1]
     coverage: float  # share of samples whose truth lies in the 90 % interval [1]
@@ -273,8 +274,8 @@ def _share(of: BoolArray, among: BoolArray) -> float:
 
 
 def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
-    """Return an objective as a function of a membership vector. An invalid vector has the worst
-    value.
+    """Return an objective as a function of a vector of memberships (parameters of the fuzzy sets).
+    An invalid vector has the worst value.
 
     Raises:
         InputError: there is no objective with that name.

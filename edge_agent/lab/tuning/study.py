@@ -97,7 +97,7 @@ class StudySet:
 
 
 class StudyScores(NamedTuple):
-    """Scores of memberships under one condition, averaged over the drives."""
+    """Scores of memberships (fuzzy sets) under one condition of R, averaged over the drives."""
 
     log_likelihood: float  # of the innovations, more is better [nat/s]
     nis: float  # per row; near 1 where the stated covariance is right [1]
@@ -155,7 +155,8 @@ def setting(condition: Condition) -> Setting:
 
 
 def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudyScores:
-    """Return the scores of memberships on the drives under the condition of R called `name`."""
+    """Return the scores of memberships (fuzzy sets) on the drives under the condition of R called
+    `name`."""
     filters = make_bank(drives.vehicles, memberships, setting(CONDITIONS[name]))
     reported = filters.advance(drives.t, drives.signals[name])
     log_likelihoods = np.nan_to_num(
