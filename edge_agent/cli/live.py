@@ -75,7 +75,8 @@ class VssPart:
         """Do nothing: the output starts with the first report of friction."""
 
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:
-        """Report the friction after a block, if its records may be published."""
+        """Report the friction after a block of samples, if the records of the block may be
+        published."""
         if admitted:
             self._output.report_grip(pipeline.grip)
 

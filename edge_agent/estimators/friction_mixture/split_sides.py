@@ -46,7 +46,8 @@ class Triangle(NamedTuple):
 
 
 def triangular_cells(edges: tuple[float, ...]) -> list[Triangle]:
-    """Return one triangle per cell with its maximum at the middle of the cell.
+    """Return one triangular density per cell (range of friction), with its maximum at the middle of
+    the cell.
 
     Each triangle extends to the middles of the neighbouring cells; the first and last extend to the
     outer edges.

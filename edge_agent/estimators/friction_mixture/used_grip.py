@@ -4,9 +4,9 @@ The report takes the largest value of the last second. It is smoothed because th
 noisy blocks would show the sensor noise more than the tyres. The value that weights the evidence on
 friction is not smoothed.
 
-Where torque is missing, the brakes are assumed to load both axles in proportion to their load. ABS
-and brake-force distribution do so near the limit. A fixed share would demand more of an unloaded
-rear axle than any tyre can give.
+Where torque is missing, the brakes are assumed to load both axles in proportion to their load. This
+is how ABS and brake-force distribution act near the limit. With a fixed share instead, the force of
+an unloaded rear axle would exceed the grip of any tyre.
 """
 
 from __future__ import annotations

@@ -47,7 +47,8 @@ def begin_part(memory: MixtureMemory, design: MixtureDesign) -> None:
 @compiled
 def end_part(memory: MixtureMemory, design: MixtureDesign, evidence: FloatArray) -> None:
     """Update the most informative belief of the visit (passage of one map cell). If friction has
-    jumped, write the evidence (32,) of the part that ends, and begin the next part.
+    jumped, write the evidence (32,) of the part (stretch on one surface) that ends, and begin the
+    next part.
     """
     if memory.split:
         return

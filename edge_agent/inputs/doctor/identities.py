@@ -254,7 +254,8 @@ def _bend_of(
     gain that follows from the uncertainty of this share).
 
     The share is the posterior mean over BENDS. Its cost is the residual of the left side over
-    `count` independent moments plus the squared deviation from usual cars.
+    `count` independent moments plus the squared deviation of the share from its value on usual
+    cars.
     """
     costs = np.zeros(len(BENDS))
     gains = np.zeros(len(BENDS))

@@ -57,8 +57,8 @@ def open_bag(path: Path) -> Iterator[Any]:
 
 
 def _close_files(part: Any) -> None:  # noqa: ANN401
-    """Close the files that a reader has opened. The library itself leaves a bag's file open if the
-    bag cannot be opened.
+    """Close the files that a reader has opened. This is necessary because the library rosbags
+    leaves a file open if it cannot read it as a bag.
     """
     for held in (part, *getattr(part, "storages", ()), getattr(part, "storage", None)):
         if (file := getattr(held, "bio", None)) is not None:

@@ -150,7 +150,8 @@ def town_named(text: str) -> DetectionTown:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Evaluate the detection in the towns given on the command line, and print a table."""
+    """Evaluate the detection of slippery road in the towns given on the command line, and print a
+    table."""
     parse = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

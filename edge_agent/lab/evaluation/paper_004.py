@@ -58,8 +58,8 @@ def experiments(
 
     "sedan" and "van" are the experiment "constant" with the simulator's own vehicles; with the
     suffix ".variable" they are the experiment "variable". The filters are the paper's, and two for
-    comparison: untuned (paper-fckf) and without adaptation (paper-ckf). Only a_x, a_y and r are
-    noisy, in the channel order of S.
+    comparison: untuned (paper-fckf) and without adaptation (paper-ckf). Only a_x, a_y and r have
+    noise.
     """
     found = {}
     drives = {}

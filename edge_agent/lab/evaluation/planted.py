@@ -228,8 +228,8 @@ def doctor_verdict(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
 
 
 def figures(count: int, seed: int) -> list[Figure]:
-    """Return two shares for accurate and inaccurate cars: faults that the doctor finds, and drives
-    that it passes.
+    """Return two shares for accurate and inaccurate cars: added faults that the signal doctor
+    finds, and drives that it declares free of faults.
 
     Drives without a fault show the false alarms. The same shares are measured in a winter town.
     """

@@ -76,8 +76,8 @@ class Tally:
     count: dict[str, int] = field(default_factory=dict)
 
     def add(self, name: str, value: FloatArray | BoolArray, among: BoolArray | None = None) -> None:
-        """Add values (T, N) to the mean called `name`, only those where `among` is True if it is
-        given; NaN are left out.
+        """Add values (T, N) to the mean with the name `name`. If `among` (T, N) is given, only
+        values where it is True are added; NaN are left out.
         """
         taken = np.asarray(value, dtype=np.float64)[slice(None) if among is None else among]
         taken = taken[np.isfinite(taken)]

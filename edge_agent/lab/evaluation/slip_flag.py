@@ -45,7 +45,8 @@ FLAGGED_MU: Final = 0.35  # below it the flag calls the road slippery
 
 
 def friction_flagged(t: FloatArray, signals: FloatArray, vehicles: list[Vehicle]) -> FloatArray:
-    """Return the friction that the flag reports, (T, N); infinite where no flag is set.
+    """Return the friction that ABS-like logic reports from slip and yaw rate (slip flag), (T, N);
+    infinite where no flag is set.
 
     Args:
         t: (T, N) [s].
@@ -73,7 +74,8 @@ def _median(values: FloatArray, count: int) -> float:
 
 @compiled
 def _follow(signals: FloatArray, car: FloatArray, period: float) -> FloatArray:
-    """Return the friction (T,) that the flags of one car report; infinite where no flag is set.
+    """Return the friction (T,) that the slip flag and the yaw flag of one car report; infinite
+    where no flag is set.
 
     Args:
         signals: (T, channels).

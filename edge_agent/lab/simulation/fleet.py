@@ -226,7 +226,7 @@ class SimulatedFleet:
 
     def step(self, steps: int) -> tuple[FloatArray, FloatArray]:
         """Simulate the next `steps` samples; return t (T, N) [s] from 0 and signals (T, N, 18).
-        Afterwards `truth` has the true values of this block.
+        Afterwards the attribute `truth` has the true values of these samples.
         """
         if steps < 1:
             raise InputError(

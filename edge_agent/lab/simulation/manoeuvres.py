@@ -74,15 +74,15 @@ class Manoeuvre:
 
 
 def jump(before: float, after: float, at: float) -> Callable[[float, float], float]:
-    """Return a function of the friction along the track: `before` up to the position `at` [m], and
-    `after` beyond.
+    """Return a function that gives the friction along the track: `before` up to the position `at`
+    [m], and `after` beyond.
     """
     return lambda x, _y: before if x < at else after
 
 
 def split(left: float, right: float) -> Callable[[float, float], float]:
-    """Return a function of the friction across the track: `left` on its left side and `right` on
-    its right side.
+    """Return a function that gives the friction across the track: `left` on its left side and
+    `right` on its right side.
     """
     return lambda _x, y: left if y > 0.0 else right
 

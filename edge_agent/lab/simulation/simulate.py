@@ -183,8 +183,8 @@ def _drive_manoeuvre(
     rate_hz: float,
     samples: int,
 ) -> FloatArray:
-    """Simulate the drive and return the records of its true values (T, RECORD). The driver adds the
-    force that a slope requires.
+    """Simulate the drive and return the records of its true values (T, RECORD). On a slope, the
+    simulated driver adds the force that the slope requires.
     """
     p = truth.row()
     x = np.zeros(STATES)

@@ -168,7 +168,7 @@ def _next_vector(
     habits: ArchiveHabits,
 ) -> FloatArray:
     """Return the next vector to evaluate: first the start vector, then random vectors until the
-    archive is full, then vectors near one of the archive.
+    archive is full, then vectors drawn near a vector of the archive (the best vectors so far).
     """
     if tally.count == 0 and tally.problem.start is not None:
         return tally.fit(np.asarray(tally.problem.start, float))
