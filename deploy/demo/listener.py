@@ -52,7 +52,7 @@ class Listener:
 
     def progress(self) -> str:
         """Return one line of text: the number of known cells, how many of them are measured, how
-        many several vehicles visited, and the number of active alerts.
+        many cells more than one vehicle visited, and the number of active alerts.
         """
         with self._lock:
             cells = pa.concat_tables(self.tiles.values()) if self.tiles else None

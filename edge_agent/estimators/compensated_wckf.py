@@ -192,8 +192,8 @@ def _compensated_forces(
 
 @compiled
 def _step_wheel_filter(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
-    """Run a step of WCKF-A. Its lateral forces come from the tyre model at the last motion of
-    WCKF-B.
+    """Run a step of the filter of the wheels, WCKF-A. Its lateral forces come from the tyre model
+    at the last motion that the filter of the vehicle, WCKF-B, estimated.
     """
     row = memory.row
     mean = memory.mean

@@ -190,8 +190,8 @@ def _sample_notes(estimates: Estimates, context: FloatArray | None) -> SampleNot
 
 
 def _visit_samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
-    """Join estimates and accelerometer readings to records (T, N), one per sample, from which
-    visits (passages of a map cell) are computed.
+    """Return one record with the estimates and the accelerometer readings for each of T samples of
+    N vehicles, (T, N). Visits (passages of a map cell) are computed from these records.
     """
     samples = records(Sample, *estimates.mu.shape)
     samples["speed"] = np.hypot(estimates.vx, estimates.vy)

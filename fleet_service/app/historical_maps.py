@@ -48,7 +48,7 @@ class PastQuery(NamedTuple):
     Attributes:
         query: parameters of the query.
         at: the moment [ns].
-        lateness_s: allowed lateness of the service [s].
+        lateness_s: time by which a report may be late and still be fused in order [s].
         only: the only selected tile; None for any.
         public: smallest number of recent vehicles with which readers may see a cell.
     """

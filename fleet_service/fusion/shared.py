@@ -151,8 +151,9 @@ def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
 
 
 def _kernel_table(slope: float) -> Float32Array:
-    """Return the table of all kernels for a slope, (…, 32, 32); `kernel_of` gives the index. Each
-    kernel is transposed, so that the bins of a road are contiguous in memory.
+    """Return all kernels (distributions of the error that the reports of a cell share) for one
+    learned slope (see `shared_kernel`), (kernels, 32, 32); `kernel_of` gives the index. Each kernel
+    is transposed, so that the 32 bins of one belief are contiguous in memory.
     """
     rows = [
         shared_kernel((row + 0.5) * USED_STEP, kinds, stated, slope).T

@@ -141,7 +141,8 @@ class SimulatedReports:
 
 def used_shares(rng: Generator, excited: BoolArray, model: ErrorModel = CLEAN) -> FloatArray:
     """Return the share s of the grip used in each visit, (n,). In an excited visit (one that
-    measures the friction) it is within the model's range, else as in ordinary driving.
+    measures the friction) it is drawn from `model.share`, else from .05 to .5, which is ordinary
+    driving.
     """
     ordinary = rng.uniform(0.05, min(0.5, model.share[1]), excited.shape)
     return np.where(excited, rng.uniform(*model.share, excited.shape), ordinary)

@@ -24,8 +24,8 @@ WORLD: Final = SyntheticFleet(500_000, days=1, seed=SEED)
 
 
 def contract() -> list[Figure]:
-    """Measure time and size of an observation in a message with ten observations, and
-    in Parquet.
+    """Measure the time to encode and to decode one observation in a message with ten
+    observations, and its size in the message and in Parquet.
     """
     rows = 10
     columns = make_visits(10, 1, 10)

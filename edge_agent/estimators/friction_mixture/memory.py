@@ -32,7 +32,9 @@ class VelocityGain:
 
 
 class BlockSums:
-    """Sums over the samples of the current block."""
+    """Sums of the inputs and of the motion over the samples of the current block (.05 s), from which
+    the block's means are computed when it ends.
+    """
 
     time: float  # at which it began [s]
     samples: int

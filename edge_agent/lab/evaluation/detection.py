@@ -368,8 +368,10 @@ class TownTally(NamedTuple):
 
 @dataclass
 class DetectionResults:
-    """Results (`Tally`) of towns by (length, kind): drives are "short" or "long", cars are "rough"
-    (inaccurate) or "plain" (accurate)."""
+    """Counts (`DetectionTally`) of the detection evaluation for each simulated town, by the length
+    of its drives ("short" or "long") and the kind of its cars ("rough": inaccurate, "plain":
+    accurate).
+    """
 
     towns: dict[tuple[str, str], list[TownTally]] = field(default_factory=dict)
 

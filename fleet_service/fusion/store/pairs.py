@@ -1,5 +1,6 @@
-"""Earlier reports of one vehicle in one cell (a pair): a linked list of its recent observations
-(entries of the lateness window), and a record of the older reports.
+"""Store of the earlier reports of a pair, which is one vehicle in one cell: a linked list of the
+reports that may still be reordered by a late one (entries of the lateness window), and one record
+that sums up the older reports.
 """
 
 from __future__ import annotations

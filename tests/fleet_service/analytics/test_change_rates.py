@@ -1,5 +1,6 @@
-"""Tests of the question `change-rates`: the fit finds the rates of a known process, its interval is
-calibrated, and pairs are counted correctly.
+"""Tests of the question `change-rates`, which fits how often and how fast the friction of roads
+changes: the fit finds the rates of a known process, its interval is calibrated, and pairs of
+successive values of a cell are counted correctly.
 """
 
 from __future__ import annotations
