@@ -172,9 +172,26 @@ def test_a_simulated_source_hands_its_context_to_the_observations(
         assert np.array_equal(one, other, equal_nan=one.dtype.kind == "f"), name
 
 
+class WaitingClock(threading.Event):
+    """Clock that only waiting advances, as on a machine of unlimited speed, and the event on which
+    the loop waits.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = 0.0
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Advance the clock by the timeout [s] and return at once."""
+        self.now += timeout or 0.0
+        return self.is_set()
+
+
 def test_a_loop_that_keeps_up_is_not_behind_and_takes_its_time() -> None:
     fleet, parts = fleet_blocks(8)
-    progress, basket, _ = run(iter(parts), fleet, threading.Event())
+    stop = WaitingClock()
+    progress, basket, _ = run(iter(parts), fleet, stop, clock=lambda: stop.now)
+    assert stop.now == pytest.approx(progress.signals_s)
     assert (progress.blocks, progress.behind) == (8, 0)
     assert progress.signals_s == pytest.approx(8 * 0.1 - 1 / RATE)
     assert len(basket.column(Kind.STATE, "time"))
@@ -203,7 +220,8 @@ def test_the_loop_ends_when_told_and_closes_the_open_visits() -> None:
 
 def test_the_loop_ends_after_its_duration() -> None:
     fleet = SimulatedFleet("demo", VEHICLES, 1, RATE)
-    progress, _, _ = run(blocks(fleet, RATE), fleet, threading.Event(), duration_s=0.3)
+    stop = WaitingClock()
+    progress, _, _ = run(blocks(fleet, RATE), fleet, stop, duration_s=0.3, clock=lambda: stop.now)
     assert 2 <= progress.blocks <= 6
 
 
