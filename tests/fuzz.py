@@ -201,7 +201,8 @@ class Fuzzer:
             self._corpus.append(data)
             self._keep("corpus", data)
 
-    def _trace_call(self, frame: FrameType, event: str, _: Any) -> Any:  # noqa: ANN401 the type of sys.settrace
+    # the type that `sys.settrace` requires
+    def _trace_call(self, frame: FrameType, event: str, _: Any) -> Any:  # noqa: ANN401
         if not frame.f_code.co_filename.startswith(CODE):
             return None
         before = 0

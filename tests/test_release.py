@@ -1,4 +1,6 @@
-"""Tests that a release needs a changelog section, and sets the version exactly once in each file."""
+"""Tests that a release needs a changelog section, and sets the version exactly once in
+each file.
+"""
 
 from __future__ import annotations
 

@@ -15,7 +15,9 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def push_innovation(window: FloatArray, innovation: float) -> None:
-    """Insert the newest innovation at the front of the window (N,), and drop the oldest innovation."""
+    """Insert the newest innovation at the front of the window (N,), and drop the oldest
+    innovation.
+    """
     for j in range(window.shape[0] - 1, 0, -1):
         window[j] = window[j - 1]
     window[0] = innovation

@@ -41,7 +41,9 @@ CORRIDOR_WIDENS: Final = 0.05  # per metre: a bend of a kilometre's radius
 
 
 class Pose(NamedTuple):
-    """Pose of a car: latitude and longitude [deg], yaw [rad from east], speed [m/s], time [ns UTC]."""
+    """Pose of a car: latitude and longitude [deg], yaw [rad from east], speed [m/s], time
+    [ns UTC].
+    """
 
     latitude: float
     longitude: float

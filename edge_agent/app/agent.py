@@ -229,7 +229,8 @@ def stop_on_signal() -> Iterator[threading.Event]:
     stop = threading.Event()
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 
-    def on_signal(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 the signal interface hands it over
+    # `signal.signal` passes both arguments
+    def on_signal(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
         stop.set()
         signal.signal(number, signal.SIG_DFL)
 

@@ -226,7 +226,8 @@ def _least_known(values: FloatArray) -> float:
     return float(known.min()) if len(known) else math.nan
 
 
-def figure_of(drive: RecordedDrive) -> Any:  # noqa: ANN401 a figure of matplotlib, which is optional
+# return type: a figure of matplotlib, which is optional
+def figure_of(drive: RecordedDrive) -> Any:  # noqa: ANN401
     """Return the report of a recorded drive as a figure of matplotlib.
 
     Raises:

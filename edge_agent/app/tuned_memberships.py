@@ -23,7 +23,9 @@ Count = Annotated[int, Field(ge=1)]
 
 
 class Record(BaseModel):
-    """Base class of the records in a file of tuned memberships; unknown field names are rejected."""
+    """Base class of the records in a file of tuned memberships; unknown field names are
+    rejected.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

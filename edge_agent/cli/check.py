@@ -36,7 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check the signals of a log; return 0 if the log passes, 1 if a channel is faulty or unknown."""
+    """Check the signals of a log; return 0 if the log passes, 1 if a channel is faulty or
+    unknown.
+    """
     from edge_agent.app.backfill import vehicle_file_of
     from edge_agent.app.estimates_file import prepare_path
     from edge_agent.inputs.bring_in import profile_of

@@ -44,7 +44,8 @@ class LookoutPart:
         """Start the thread that looks ahead."""
         self._lookout.start()
 
-    def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:  # noqa: ARG002 warnings need no admission
+    # `admitted` is unused: warnings need no admission
+    def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:  # noqa: ARG002
         """Pass the vehicles' positions and the friction beliefs of their filters to the lookout
         (the thread that looks ahead in the map)."""
         if pipeline.seen is None:

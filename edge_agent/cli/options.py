@@ -1,4 +1,6 @@
-"""Options that several commands share. The module imports little, because every help text needs it."""
+"""Options that several commands share. The module imports little, because every help text
+needs it.
+"""
 
 from __future__ import annotations
 

@@ -212,7 +212,9 @@ def _check_engine(engine: str, jobs: int, *, several: bool) -> None:
 
 
 def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
-    """Print the progress of the estimation on stderr; return 2 if a log could not be read, else 0."""
+    """Print the progress of the estimation on stderr; return 2 if a log could not be
+    read, else 0.
+    """
     bad = 0
     samples = 0
     began = time.monotonic()

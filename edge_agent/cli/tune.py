@@ -356,7 +356,9 @@ def _format_number(value: float | None, digits: int) -> str:
 
 
 def comparison_table(scores: dict[str, SplitScores]) -> str:
-    """Return the scores of each search as a plain-text table, one row per search and set of drives."""
+    """Return the scores of each search as a plain-text table, one row per search and set
+    of drives.
+    """
     lines = [
         (
             f"{'':<8} {'drives':<9} {'interval score':>15} {'coverage':>9} "

@@ -110,7 +110,8 @@ def make_bank(
 
 
 @compiled
-def _begin_filter(memory: AdaptiveMemory, design: AdaptiveDesign) -> None:  # noqa: ARG001 the design is the step's
+# `design` is unused: all filters have this signature
+def _begin_filter(memory: AdaptiveMemory, design: AdaptiveDesign) -> None:  # noqa: ARG001
     begin_motion(memory)
     memory.actual[:], memory.expected[:], memory.alpha[:] = 0.0, 0.0, 0.0
 

@@ -120,7 +120,8 @@ def make_bank(
 
 
 @compiled
-def _begin_filter(memory: CompensatedMemory, context: FrictionSet) -> None:  # noqa: ARG001 the context is the step's
+# `context` is unused: all filters have this signature
+def _begin_filter(memory: CompensatedMemory, context: FrictionSet) -> None:  # noqa: ARG001
     row = memory.row
     mean = memory.mean
     root = memory.root

@@ -31,7 +31,9 @@ class Element(NamedTuple):
 
 
 def elements_without_reason(elements: tuple[Element, ...]) -> list[str]:
-    """Return the `place` of each element that lacks a required reason or a required code location."""
+    """Return the `place` of each element that lacks a required reason or a required code
+    location.
+    """
     found = []
     for element in elements:
         lacks_reason = element.verdict != "as printed" and not element.why

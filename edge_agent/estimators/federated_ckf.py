@@ -102,7 +102,8 @@ def make_bank(
 
 
 @compiled
-def _begin_filter(memory: JointMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001 as of all filters
+# an argument is unused: all filters have this signature
+def _begin_filter(memory: JointMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001
     begin_motion(memory)
     memory.mean[:], memory.root[:], memory.beta = PRIOR_MU, PRIOR_ROOT, 0.5
 

@@ -128,7 +128,8 @@ def make_bank(vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> Es
 
 
 @compiled
-def _begin_filter(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001 as of all filters
+# an argument is unused: all filters have this signature
+def _begin_filter(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001
     mean = memory.mean
     root = memory.root
     X = WheelFrictionState

@@ -1,4 +1,6 @@
-"""Rank-one downdate of a covariance factor. It is refused if the result would not be a covariance."""
+"""Rank-one downdate of a covariance factor. It is refused if the result would not be a
+covariance.
+"""
 
 from __future__ import annotations
 

@@ -88,7 +88,9 @@ class Channel(Part):
 
     @property
     def signals(self) -> list[str]:
-        """Return the full names of the signals whose values are added to give the channel's value."""
+        """Return the full names of the signals whose values are added to give the
+        channel's value.
+        """
         names = [self.signal] if isinstance(self.signal, str) else self.signal
         return [self.full_name(name) for name in names]
 

@@ -1,4 +1,6 @@
-"""Result of a reader: named series with a common clock, and helpers for readers of foreign files."""
+"""Result of a reader: named series with a common clock, and helpers for readers of
+foreign files.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,8 @@ def foreign_errors(path: Path, kind: str) -> Iterator[None]:
         ) from error
 
 
-def import_optional(name: str, extra: str = "inputs") -> Any:  # noqa: ANN401 modules of optional libraries have no common type
+# modules of optional libraries have no common type
+def import_optional(name: str, extra: str = "inputs") -> Any:  # noqa: ANN401
     """Import an optional library and return it.
 
     Raises:

@@ -155,7 +155,8 @@ def _read_time(table: pa.Table) -> tuple[FloatArray, int | None]:
     return t, start_ns
 
 
-def _seconds_from_first(column: Any) -> tuple[FloatArray, int | None]:  # noqa: ANN401 pyarrow's column types are not generic
+# pyarrow's column types are not generic
+def _seconds_from_first(column: Any) -> tuple[FloatArray, int | None]:  # noqa: ANN401
     """Return the seconds since the first sample, and the [ns UTC] of that sample (None if the time
     of that sample is not finite).
     """

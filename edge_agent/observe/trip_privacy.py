@@ -58,7 +58,9 @@ class TripEnds:
         self._drop_old_track()
 
     def release_records(self, records: RecordBlock) -> RecordBlock:
-        """Return the records that may be published now, from `records` and from those that waited."""
+        """Return the records that may be published now, from `records` and from those
+        that waited.
+        """
         if self._is_off or self._began is None:
             return records
         waiting = self._waiting.get(records.kind)

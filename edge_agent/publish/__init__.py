@@ -1,1 +1,3 @@
-"""Publication of observations: batches, an outbox on disk, sending by Zenoh, and acknowledgements."""
+"""Publication of observations: batches, an outbox on disk, sending by Zenoh, and
+acknowledgements.
+"""

@@ -143,7 +143,9 @@ class _Process:
         self.out = self._child.stdout
 
     def ask(self, question: PastQuery) -> bytes:
-        """Send a query to the process; return the head (tile number and length) of the first reply."""
+        """Send a query to the process; return the head (tile number and length) of the
+        first reply.
+        """
         self._in.write(encode_question(question))
         self._in.flush()
         return self.head()

@@ -122,7 +122,9 @@ class Stretches:
 
     @property
     def standing(self) -> list[StretchAlert]:
-        """Return all stretches of road with an active alert, as of the last call of `take_changes`."""
+        """Return all stretches of road with an active alert, as of the last call of
+        `take_changes`.
+        """
         return list(self._known.values())
 
     def take_changes(self) -> list[StretchAlert]:

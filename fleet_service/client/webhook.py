@@ -219,7 +219,8 @@ class Webhook:
             if failure is None:
                 self._record_answer(number, status)
                 return ""
-        except Exception as error:  # noqa: BLE001 any answer may come, and the thread must outlive it
+        # any answer may come, and the thread must outlive it
+        except Exception as error:  # noqa: BLE001
             failure = f"{type(error).__name__} {error}".strip()
         self.counts["failures"] += 1
         if not self._failure:

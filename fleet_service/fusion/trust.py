@@ -84,7 +84,8 @@ def compare_reports(
             place = k
     for k in range(c.REPORTERS):
         other = int(reporter[k])
-        if other == NOBODY or other == vehicle or now - reported[k] > c.PEER_S:  # noqa: SIM109 not known to the compiler
+        # Numba does not compile `other in (...)`
+        if other == NOBODY or other == vehicle or now - reported[k] > c.PEER_S:  # noqa: SIM109
             continue
         spread = math.hypot(max(std, c.NOVELTY_STD), max(float(here.std[k]), c.NOVELTY_STD))
         if spread > c.PEER_STD:

@@ -151,7 +151,8 @@ class MapQueryable:
         """Answer one query at once, or queue or refuse it."""
         self._counts["queries"] += 1
         try:
-            pairs: Iterable[tuple[str, str]] = request.parameters  # type: ignore[assignment] # stub: no iterable
+            # the stub does not declare it as iterable
+            pairs: Iterable[tuple[str, str]] = request.parameters  # type: ignore[assignment]
             wanted = query.parse(
                 {name: value for name, value in pairs if not name.startswith("_")}
             )  # Zenoh's own

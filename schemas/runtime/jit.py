@@ -87,7 +87,8 @@ def refcount_free_inlined(function: Callable[P, R]) -> Callable[P, R]:
     return _compile(function, nogil=True, forceinline=True, references=False)
 
 
-def _prefetch(context: Any, array: Any, row: Any, line: Any) -> Any:  # noqa: ANN401, ARG001 numba's own types
+# the types are Numba's own
+def _prefetch(context: Any, array: Any, row: Any, line: Any) -> Any:  # noqa: ANN401, ARG001
     def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ANN401
         kind = signature.args[0]
         long = ir.IntType(64)

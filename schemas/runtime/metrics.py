@@ -112,7 +112,8 @@ def _exposition(read: Read) -> Callable[[], tuple[str, bytes]]:
 
 
 class _MetricsServer(ThreadingHTTPServer):
-    def finish_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 the type of its base
+    # the base class has these types
+    def finish_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
         deadline = Timer(READ_S, _stop_reading, (request,))
         deadline.daemon = True
         deadline.start()

@@ -90,7 +90,8 @@ class _Without(MetaPathFinder):
     def __init__(self, names: set[str]) -> None:
         self._names = names
 
-    def find_spec(self, fullname: str, path: object, target: object = None) -> None:  # noqa: ARG002 as finders have it
+    # the interface of import finders
+    def find_spec(self, fullname: str, path: object, target: object = None) -> None:  # noqa: ARG002
         if fullname in self._names:
             raise ModuleNotFoundError(
                 f"{fullname} must not be imported in this process", name=fullname

@@ -46,7 +46,8 @@ KINDS: dict[Any, Any] = {
     FloatArray: "f8",
     IntArray: "i8",
     **{number: number for number in _NUMBERS},
-    **{NDArray[number]: number for number in _NUMBERS},  # type: ignore[valid-type] # a value, not an annotation
+    # a value, not an annotation
+    **{NDArray[number]: number for number in _NUMBERS},  # type: ignore[valid-type]
 }
 
 

@@ -123,7 +123,8 @@ class PresentColumns(NamedTuple):
         return np.repeat(self.columns[name], self.sizes)
 
 
-def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN401 protobuf messages are untyped
+# protobuf messages are untyped
+def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN401
     """Parse a batch with the protobuf library and check that its columns have equal lengths.
 
     Raises:

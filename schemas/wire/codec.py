@@ -153,7 +153,8 @@ def encode(batch: Batch) -> bytes:
     return data
 
 
-def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> Any:  # noqa: ANN401 protobuf messages are untyped
+# protobuf messages are untyped
+def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> Any:  # noqa: ANN401
     """Parse a message of type `message` from its bytes. They are protobuf if `encoding` is
     `expected` or names no message type, and JSON if it is the JSON encoding.
 

@@ -98,7 +98,9 @@ def turn_of(sent: list[Message]) -> int:
 
 
 def _decode_messages(sent: list[Message]) -> list[NDArray[Any]]:
-    """Return the columns of the observations in messages, decoded by protobuf's generated module."""
+    """Return the columns of the observations in messages, decoded by protobuf's generated
+    module.
+    """
     read = [MESSAGE.FromString(message.payload) for message in sent]
     out: list[NDArray[Any]] = []
     for name, dtype in wire.column_types(Kind.OBSERVATION).items():

@@ -380,7 +380,9 @@ def _time_part(what: str, measure: Callable[[], T]) -> T:
 
 
 def main() -> int:
-    """Measure the page and write the figures. Return 1 if a figure misses its target, otherwise 0."""
+    """Measure the page and write the figures. Return 1 if a figure misses its target,
+    otherwise 0.
+    """
     began = time.time_ns()
     rows = measure_all()
     OUT.mkdir(exist_ok=True)

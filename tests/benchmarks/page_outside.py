@@ -70,7 +70,9 @@ def list_records(document: bytes) -> list[ET.Element]:
 
 
 def is_over(record: ET.Element) -> bool:
-    """Return True if a situation record of a DATEX II publication states the end of the situation."""
+    """Return True if a situation record of a DATEX II publication states the end of the
+    situation.
+    """
     return record.find(".//com:overallEndTime", _SPACES) is not None
 
 
@@ -252,7 +254,9 @@ def can_open(reader: str, address: str) -> bool:
 
 
 def ogrinfo_opens(address: str) -> bool:
-    """Return True if GDAL's program ogrinfo lists all features (map cells) of the page's OGC API."""
+    """Return True if GDAL's program ogrinfo lists all features (map cells) of the page's
+    OGC API.
+    """
     words = ["ogrinfo", "-ro", "-al", "-q", f"OAPIF:{address}", "grip"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
     held = done.stdout.count("OGRFeature(grip)") == street.count_known("ice", "passed", "wet")

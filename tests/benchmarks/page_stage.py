@@ -159,7 +159,9 @@ def tiles_of(address: str) -> int:
 
 
 def seen_town(address: str, town: Town) -> str:
-    """Return the address of the page with the whole town in view, zoomed in enough to show cells."""
+    """Return the address of the page with the whole town in view, zoomed in enough to
+    show cells.
+    """
     x, y = town.corner
     return f"{address}#x={x / 2**14:.8f}&y={y / 2**14:.8f}&zoom={ZOOM}"
 

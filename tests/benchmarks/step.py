@@ -75,7 +75,9 @@ Kind = TypeVar("Kind", Limit, VectorLimit)
 
 
 def make_limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> Kind:
-    """Return a bank of filters in C for N vehicles, each in the state of the drive's first sample."""
+    """Return a bank of filters in C for N vehicles, each in the state of the drive's
+    first sample.
+    """
     rows = parameter_table([drive.vehicle] * vehicles)
     return kind(
         rows, np.repeat(drive.readings[:1], vehicles, 0), speed, shipped_memberships(TUNED[NAME])
@@ -158,7 +160,8 @@ def bank() -> list[Figure]:
         t, signals, readings = drive.repeat_samples(samples, vehicles)
         fleet = [drive.vehicle] * vehicles
         ours, threaded = time_in_turn(
-            lambda: bank_of(NAME, fleet).advance(t, signals, threads=THREADS),  # noqa: B023 called at once
+            # called before the loop goes on
+            lambda: bank_of(NAME, fleet).advance(t, signals, threads=THREADS),  # noqa: B023
             lambda: make_limit(Limit, drive, vehicles, speed).drive(readings, drive.gone),  # noqa: B023
         )
         cost[vehicles] = ours / (vehicles * samples)

@@ -73,7 +73,9 @@ class SerializedReader:
         return self._data[self._at - size : self._at]
 
     def read_text(self) -> str:
-        """Read a text, stored as its length in bytes and then its bytes in UTF-8; return the text."""
+        """Read a text, stored as its length in bytes and then its bytes in UTF-8; return
+        the text.
+        """
         return self.read_bytes().decode()
 
     def read_encoding(self) -> zenoh.Encoding:

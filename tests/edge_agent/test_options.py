@@ -460,7 +460,9 @@ def test_waiting_time_and_rows_of_a_batch_change_the_batches(flush_s: float, row
 def test_every_number_of_the_vehicle_file_changes_what_is_estimated(
     estimator: str, name: str
 ) -> None:
-    """The estimates must change if the number `name` of the vehicle file is increased by a fifth."""
+    """The estimates must change if the number `name` of the vehicle file is increased by
+    a fifth.
+    """
     t, signals, vehicle = drive("pulses", 0.6, seconds=3.0)
     broken = signals.copy()
     broken[150:, 11:15] = np.nan  # without torque, the drive's split matters

@@ -73,7 +73,8 @@ def run(site: Site) -> list[Figure]:
                     kind != "key"
                 ):  # without its key an archive is another one: only a person can decide
                     loops.append(f"{kind}: {path.name} bit {bit}")
-            except Exception as error:  # noqa: BLE001 whatever ends a service at its start ends it at each
+            # whatever ends a service at its start ends it at each
+            except Exception as error:  # noqa: BLE001
                 loops.append(f"{kind}: {path.name} bit {bit}: {error!r}")
             else:
                 if not found["counted"] and not _is_same(found, right):

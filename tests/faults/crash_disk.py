@@ -193,7 +193,8 @@ class CrashDisk:
         disk = self
 
         class Raw(io.FileIO):
-            def write(self, data: bytes) -> int:  # type: ignore[override]  # nobody hands it anything else
+            # only bytes are written
+            def write(self, data: bytes) -> int:  # type: ignore[override]
                 disk._count_operation(needs_room=True)
                 return super().write(data)
 

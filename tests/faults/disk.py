@@ -157,7 +157,9 @@ def run(site: Site) -> list[Figure]:
 
 
 def _drive(engine: Engine, since: int, steps: int) -> int:
-    """Run load on the service for `steps` seconds, and return the number of acknowledged batches."""
+    """Run load on the service for `steps` seconds, and return the number of acknowledged
+    batches.
+    """
     got = 0
     for seq in range(since + 1, since + steps + 1):
         now = time.time_ns()

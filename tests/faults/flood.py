@@ -105,7 +105,9 @@ class Honest:
         self._put_batch(one)
 
     def resend(self) -> None:
-        """Send again this vehicle's batches that wait for longer than RESEND_S, as an outbox does."""
+        """Send again this vehicle's batches that wait for longer than RESEND_S, as an
+        outbox does.
+        """
         now = time.monotonic()
         for seq in [seq for seq in self._last if seq in self.delays]:
             del self._last[seq]
@@ -117,7 +119,9 @@ class Honest:
 
 
 def run(site: Site) -> list[Figure]:
-    """Flood the service for half a minute (in a quick run, three seconds), and return the figures."""
+    """Flood the service for half a minute (in a quick run, three seconds), and return the
+    figures.
+    """
     seconds = site.choose_amount(30, 3)
     fleet = make_enrolment(vehicles=[*HONEST, FLOODER])
     with open_network(site.folder / "certificates", fleet=fleet) as running:

@@ -127,7 +127,8 @@ class Mutants:
             return message.SerializeToString(), wire.ENCODING[kind]
         return changed_bytes(r, message.SerializeToString()), wire.ENCODING[kind]
 
-    def _make_valid(self, kind: Kind, name: str) -> Any:  # noqa: ANN401 protobuf messages are untyped
+    # protobuf messages are untyped
+    def _make_valid(self, kind: Kind, name: str) -> Any:  # noqa: ANN401
         self._seq += 1
         message = _MESSAGE[kind]()
         message.CopyFrom(self._random.choice(_VALID[kind]))

@@ -1,4 +1,6 @@
-"""Tables that the kernels read, computed once from the constants; they do not change while driving."""
+"""Tables that the kernels read, computed once from the constants; they do not change
+while driving.
+"""
 
 from __future__ import annotations
 

@@ -31,7 +31,9 @@ LEAST_MU = 0.02  # of a tyre that is not proportional: its slip over friction ne
 
 @dataclass(frozen=True)
 class WheelForces:
-    """Slips, loads and steering angles at each sample of a drive, with the kind of tyre stiffness."""
+    """Slips, loads and steering angles at each sample of a drive, with the kind of tyre
+    stiffness.
+    """
 
     free: FloatArray  # (T, 4, 2) k*s of the wheels
     loads: FloatArray  # (T, 4) [N]

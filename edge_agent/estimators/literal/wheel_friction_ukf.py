@@ -90,7 +90,9 @@ def estimate(given: GivenMotion, setting: UnscentedSetting) -> FrictionRun:
 
 
 class _Model:
-    """Measurements of a drive, and the function that predicts them, in the precision of the filter."""
+    """Measurements of a drive, and the function that predicts them, in the precision of
+    the filter.
+    """
 
     def __init__(self, given: GivenMotion, setting: UnscentedSetting) -> None:
         self.setting = setting

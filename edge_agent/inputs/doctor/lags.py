@@ -84,7 +84,9 @@ def find_lags(
 
 
 class _Peak(NamedTuple):
-    """Shift [s] of one series against another with the largest correlation, and that correlation."""
+    """Shift [s] of one series against another with the largest correlation, and that
+    correlation.
+    """
 
     seconds: float
     likeness: float

@@ -168,7 +168,8 @@ class Feed(ABC):
             reason = "the source ended"
             try:
                 self.listen()
-            except Exception as error:  # noqa: BLE001 a driver or a peer may raise anything; a lost source is no crash
+            # a driver or a peer may raise anything; a lost source is no crash
+            except Exception as error:  # noqa: BLE001
                 reason = (str(error) or type(error).__name__).splitlines()[0][:200]
             if not self.stopping.is_set():
                 self.losses += 1
@@ -176,7 +177,9 @@ class Feed(ABC):
             self.stopping.wait(RETRY_S)
 
     def say(self, reason: str) -> None:
-        """Log the reason of a problem with the source; each different reason is logged only once."""
+        """Log the reason of a problem with the source; each different reason is logged
+        only once.
+        """
         if reason not in self._reasons and len(self._reasons) < 50:
             self._reasons.add(reason)
             log.warning("%s: %s", self.name, reason)

@@ -129,10 +129,12 @@ class Ros2Feed(Feed):
         }
 
     def _make_listener(self, topic: str) -> Any:  # noqa: ANN401
-        def receive_sample(sample: Any) -> None:  # noqa: ANN401 the session's type is its library's own
+        # Zenoh's sample type is not exported
+        def receive_sample(sample: Any) -> None:  # noqa: ANN401
             try:
                 self._take_sample(topic, sample)
-            except Exception as error:  # noqa: BLE001 hostile bytes may raise anything, and Zenoh would swallow it
+            # hostile bytes may raise anything, and Zenoh would swallow it
+            except Exception as error:  # noqa: BLE001
                 self.unreadable(f"{topic}: a message that cannot be read ({type(error).__name__})")
 
         return receive_sample

@@ -256,7 +256,9 @@ class LiveRows:
 
 
 def _readings_at(series: Series | None, times: FloatArray) -> FloatArray:
-    """Return the readings of a signal at exactly the given times; NaN at times without a reading."""
+    """Return the readings of a signal at exactly the given times; NaN at times without a
+    reading.
+    """
     found = np.full(len(times), np.nan)
     if series is not None and len(series.t):
         place = np.clip(np.searchsorted(series.t, times), 0, len(series.t) - 1)

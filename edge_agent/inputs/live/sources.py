@@ -166,7 +166,9 @@ def _open_ros2(
 
 
 def _parse_option(text: str) -> int | float | bool | str:
-    """Return the value of an option in the type that python-can expects: bool, int, float or str."""
+    """Return the value of an option in the type that python-can expects: bool, int, float
+    or str.
+    """
     if text in ("true", "false"):
         return text == "true"
     for kind in (int, float):

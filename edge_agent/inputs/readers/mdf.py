@@ -148,7 +148,9 @@ def has_frames(mdf: Any) -> bool:  # noqa: ANN401
 
 
 def mdf_frames(mdf: Any, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
-    """Return the frames with the wanted identifiers, and the start of the log [s since 1970 UTC]."""
+    """Return the frames with the wanted identifiers, and the start of the log [s since
+    1970 UTC].
+    """
     log: Log = {}
     first = np.inf
     start = float(mdf.header.start_time.timestamp())

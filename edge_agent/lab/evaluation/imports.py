@@ -103,7 +103,8 @@ def on_a_bus(drive: Recorded) -> list[Any]:
     return frames
 
 
-def _make_frame(t: float, identifier: int, data: bytes) -> Any:  # noqa: ANN401 python-can has no types
+# python-can has no types
+def _make_frame(t: float, identifier: int, data: bytes) -> Any:  # noqa: ANN401
     stamp = round(START_S + t, 6)
     return import_optional("can").Message(
         timestamp=stamp, arbitration_id=identifier, is_extended_id=False, data=data, channel=1

@@ -38,7 +38,9 @@ STILL = Memberships(outputs=(0.0,) * 5)  # fuzzy sets that leave R as it is
 
 
 def noisy(batch: DriveSet, variance: FloatArray, seeds: Sequence[int]) -> DriveSet:
-    """Return one copy of the drive per seed, with white noise of variance (T,) on a_x, a_y and r."""
+    """Return one copy of the drive per seed, with white noise of variance (T,) on a_x,
+    a_y and r.
+    """
     copies = repeat_drive(batch, len(seeds))
     for n, seed in enumerate(seeds):
         add_white(copies.signals[:, n], variance, np.random.default_rng([seed, 4]))
@@ -46,7 +48,9 @@ def noisy(batch: DriveSet, variance: FloatArray, seeds: Sequence[int]) -> DriveS
 
 
 def variances(t: FloatArray, experiment: str) -> FloatArray:
-    """Return the noise variance at the times t (T,) [s] of the experiment "constant" or "variable"."""
+    """Return the noise variance at the times t (T,) [s] of the experiment "constant" or
+    "variable".
+    """
     return np.full(len(t), CONSTANT) if experiment == "constant" else scheduled_variance(t)
 
 

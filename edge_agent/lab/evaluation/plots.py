@@ -102,7 +102,9 @@ def _scenario(scenario: str, drives: dict[str, PlottedDrive], seed: int, path: P
 
 
 def title(scenario: str, drive: PlottedDrive, seed: int) -> str:
-    """Return the title of a drive's plot: scenario, manoeuvre, speed, friction, vehicle and seed."""
+    """Return the title of a drive's plot: scenario, manoeuvre, speed, friction, vehicle
+    and seed.
+    """
     spec = SCENARIOS.get(scenario)
     batch = drive.batch
     mu = batch.mu[:, 0]

@@ -132,7 +132,9 @@ def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
 
 
 def in_use(batch: DriveSet) -> FloatArray:
-    """Return the grip that the car as a whole uses, smoothed and reduced by the noise, (T, N) [1]."""
+    """Return the grip that the car as a whole uses, smoothed and reduced by the noise,
+    (T, N) [1].
+    """
     used = np.hypot(batch.truth["true_ax"], batch.truth["true_ay"]) / GRAVITY
     width = max(1, round(SMOOTH_S * RATE_HZ))
     summed = np.cumsum(np.concatenate([np.zeros((width, used.shape[1])), used]), axis=0)

@@ -130,7 +130,9 @@ def report(figures: Sequence[Figure], *, seeds: int) -> str:
 
 
 def table(values: dict[str, float]) -> str:
-    """Return a Markdown table of the figures printed in the papers with the figures measured here."""
+    """Return a Markdown table of the figures printed in the papers with the figures
+    measured here.
+    """
     rows = []
     for row in PRINTED:
         cells = (

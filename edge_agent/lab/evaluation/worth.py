@@ -202,7 +202,9 @@ def figures(scores: Scores) -> list[Figure]:
 
 
 def barred_figures(scores: Scores) -> list[Figure]:
-    """Return the figures of the comparison: first the ratios, which have targets, then all others."""
+    """Return the figures of the comparison: first the ratios, which have targets, then
+    all others.
+    """
     barred = [Figure(name, ratio(scores, name), "1", bar, "less") for name, bar in BARS.items()]
     plain = [
         Figure(name, ratio(scores, name), "1")

@@ -256,7 +256,9 @@ def _shows_silence(
 
 
 def _health_problems(port: int) -> list[str]:
-    """Return the problems in an agent's `/healthz`; an empty list while the agent does not answer."""
+    """Return the problems in an agent's `/healthz`; an empty list while the agent does
+    not answer.
+    """
     try:
         with urllib.request.urlopen(
             f"http://127.0.0.1:{port}/healthz", timeout=PATIENCE_S

@@ -58,7 +58,9 @@ def mix_bits(key: np.uint64, counter: np.uint64) -> np.uint64:
 
 @compiled
 def uniform(key: np.uint64, counter: int) -> float:
-    """Return a uniform random number strictly between 0 and 1, for `counter` in the stream `key`."""
+    """Return a uniform random number strictly between 0 and 1, for `counter` in the
+    stream `key`.
+    """
     return (float(mix_bits(key, np.uint64(counter)) >> DROP) + 0.5) * UNIT
 
 

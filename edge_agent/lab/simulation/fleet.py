@@ -1,4 +1,6 @@
-"""Simulation of a fleet of vehicles that drive endlessly on a road network, in one compiled kernel."""
+"""Simulation of a fleet of vehicles that drive endlessly on a road network, in one
+compiled kernel.
+"""
 
 from __future__ import annotations
 

@@ -373,7 +373,9 @@ def start_at(x: FloatArray, p: FloatArray, place: tuple[float, float, float], sp
 
 
 def substeps_of(rate_hz: float) -> int:
-    """Return the number of equal integration steps, of at most LONGEST_SUBSTEP each, in one sample."""
+    """Return the number of equal integration steps, of at most LONGEST_SUBSTEP each, in
+    one sample.
+    """
     return max(1, math.ceil(round(1.0 / (rate_hz * LONGEST_SUBSTEP), 9)))
 
 

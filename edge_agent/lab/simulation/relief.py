@@ -130,7 +130,9 @@ def gradient(
 
 @compiled
 def slope_in_body(east: float, north: float, yaw: float) -> tuple[float, float]:
-    """Return the rise per metre ahead of a vehicle with the heading `yaw` [rad], and to its left."""
+    """Return the rise per metre ahead of a vehicle with the heading `yaw` [rad], and to
+    its left.
+    """
     c = math.cos(yaw)
     s = math.sin(yaw)
     return c * east + s * north, c * north - s * east

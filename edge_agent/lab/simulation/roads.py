@@ -197,7 +197,9 @@ def _distance_along(line: FloatArray) -> FloatArray:
 
 
 def _inner_points(line: FloatArray, setback: float) -> IntArray:
-    """Return the indices of those points of a line that are at least `setback` [m] from both ends."""
+    """Return the indices of those points of a line that are at least `setback` [m] from
+    both ends.
+    """
     run = _distance_along(line)
     return np.flatnonzero((run >= setback) & (run <= run[-1] - setback))
 

@@ -1,4 +1,6 @@
-"""Scenarios as a table: each has a road network, its friction over time, and its position on earth."""
+"""Scenarios as a table: each has a road network, its friction over time, and its position
+on earth.
+"""
 
 from __future__ import annotations
 

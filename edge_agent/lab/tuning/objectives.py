@@ -185,7 +185,9 @@ def record(drives: Sequence[TuningDrive], duration_s: float) -> TuningSet:
 
 
 def record_all(name: str, duration_s: float) -> TuningSet:
-    """Return the drives and towns of "train" or "held_out" as one set, each `duration_s` [s] long."""
+    """Return the drives and towns of "train" or "held_out" as one set, each `duration_s`
+    [s] long.
+    """
     sets = [record(TRAIN if name == "train" else HELD_OUT, duration_s)]
     seeds, cars = TOWNS[name]
     sets += [record_town(seed, cars, duration_s) for seed in seeds]
@@ -226,7 +228,9 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
 
 
 def scores_of(memberships: Memberships, drives: TuningSet, estimator: str) -> TuningScores:
-    """Run the estimator on the drives, and return the scores of its output after the first second."""
+    """Run the estimator on the drives, and return the scores of its output after the
+    first second.
+    """
     estimates = create(estimator, drives.vehicles, memberships=memberships).advance(
         drives.t, drives.signals, threads=2
     )

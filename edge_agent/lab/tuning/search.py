@@ -18,7 +18,9 @@ Admissible = Callable[[FloatArray], bool]
 
 
 def is_always_allowed(_vector: FloatArray) -> bool:
-    """Return True for any vector: the default for `Problem.admissible`, which excludes no vector."""
+    """Return True for any vector: the default for `Problem.admissible`, which excludes no
+    vector.
+    """
     return True
 
 

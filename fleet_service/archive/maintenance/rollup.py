@@ -149,7 +149,8 @@ def _cell_statistics(rows: segments.Rows, starts: IntArray) -> dict[str, Any]:
     }
 
 
-def _make_array(values: Any, kind: pa.DataType) -> pa.Array[Any]:  # noqa: ANN401 columns of many types
+# the values are columns of many types
+def _make_array(values: Any, kind: pa.DataType) -> pa.Array[Any]:  # noqa: ANN401
     if pa.types.is_list(kind):
         offsets = np.arange(len(values) + 1, dtype=np.int32) * mugrid.BINS
         buffers = [None, pa.py_buffer(offsets.tobytes())]

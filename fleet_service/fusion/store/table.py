@@ -185,5 +185,7 @@ def places_for(entries: int, most: float) -> int:
 
 
 def is_full(entries: int, places: int, most: float) -> bool:
-    """Return True if the number of row numbers in a table exceeds the share `most` of its places."""
+    """Return True if the number of row numbers in a table exceeds the share `most` of its
+    places.
+    """
     return entries > most * places

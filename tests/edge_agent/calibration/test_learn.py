@@ -34,7 +34,9 @@ OFF = {"ax": 0.5, "yaw_rate": 0.012, "steer_offset": 0.012, "radius_fl": 0.012}
 
 @pytest.fixture(scope="module")
 def smooth() -> Recorded:
-    """Return a simulated drive of three minutes on level ground in a car with well mounted sensors."""
+    """Return a simulated drive of three minutes on level ground in a car with well
+    mounted sensors.
+    """
     return drives(1, 31, rough=False, seconds=180)[0]
 
 

@@ -25,7 +25,9 @@ ICE = 0.18
 
 
 class Bend:
-    """Car in a left bend with constant speed and curvature. The test sets how much the axles slip."""
+    """Car in a left bend with constant speed and curvature. The test sets how much the
+    axles slip.
+    """
 
     def __init__(self) -> None:
         """Create a car that has driven on a road with grip until its slip is the usual value."""

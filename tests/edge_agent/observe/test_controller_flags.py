@@ -23,7 +23,9 @@ RATE = 100
 def drive(
     on: FloatArray, omega: FloatArray | float = 50.0
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return times (T, 1) [s], signals and context signals of one car whose ABS flag is `on` (T,)."""
+    """Return times (T, 1) [s], signals and context signals of one car whose ABS flag is
+    `on` (T,).
+    """
     t = np.arange(len(on))[:, None] / RATE
     signals = np.full((len(on), 1, len(CHANNELS)), np.nan)
     signals[..., S.OMEGA : S.OMEGA + 4] = np.broadcast_to(omega, len(on))[:, None, None]

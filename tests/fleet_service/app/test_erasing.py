@@ -147,7 +147,9 @@ def fill_engine(root: Path, *names: str) -> Engine:
 
 
 def answer_requests(engine: Engine, root: Path) -> None:
-    """Carry out the requests to erase a vehicle in a thread, while the service's worker continues."""
+    """Carry out the requests to erase a vehicle in a thread, while the service's worker
+    continues.
+    """
     thread = threading.Thread(
         target=erasing.handle_requests, args=(engine, ServiceConfig(), root, threading.Event())
     )

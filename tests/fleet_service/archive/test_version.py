@@ -142,7 +142,9 @@ def _identities(root: Path, kind: Kind) -> list[tuple[str, int, int]]:
 def rewrite_file(
     path: Path, change: Callable[[pa.Table], pa.Table], said: str, encoding: Encoding = SEGMENT
 ) -> None:
-    """Rewrite an archive file as one of another format version, with its table changed by `change`."""
+    """Rewrite an archive file as one of another format version, with its table changed by
+    `change`.
+    """
     found = read_content(path)
     assert found is not None
     write_table(change(found.table), path, encoding, {**found.entries, version.KEY: said})

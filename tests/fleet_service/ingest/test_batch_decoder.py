@@ -28,7 +28,8 @@ _FLOAT = st.floats(width=32)
 
 
 @st.composite
-def draw_message(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401 protobuf messages are untyped
+# protobuf messages are untyped
+def draw_message(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401
     """Return a random message: records with some of the columns and arbitrary values."""
     rows = draw(st.integers(1, 4))
     message = MESSAGES[kind](

@@ -89,7 +89,8 @@ def test_a_sound_is_heard_of_a_new_alert_only_where_it_was_asked_for(
         silent.wait_for_selector("body[data-ready]", state="attached")
         for one in (seen.page, silent):
             one.evaluate(_HEARD)
-            until(lambda: one.evaluate("gripmap.heardAlerts"))  # noqa: B023 it is used up within the loop
+            # called before the loop goes on
+            until(lambda: one.evaluate("gripmap.heardAlerts"))  # noqa: B023
         seen.page.locator("#tab-alerts").click()
         assert not seen.page.locator("#sound").is_checked()
         seen.page.locator("#sound").check()

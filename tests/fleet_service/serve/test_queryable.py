@@ -36,7 +36,9 @@ FAILURES = (
 
 
 def texts(session: zenoh.Session, selector: str) -> list[str]:
-    """Return all replies and errors to a query as texts, sorted because Zenoh does not order them."""
+    """Return all replies and errors to a query as texts, sorted because Zenoh does not
+    order them.
+    """
     return sorted(
         part.payload.to_string()
         for reply in session.get(selector)

@@ -91,7 +91,9 @@ class ForceRun:
     second: dict[str, FloatArray]  # forces compensated (TFC), motion of WCKF-B
 
     def erms(self, stage: str) -> Values:
-        """Return the root mean square error of each quantity (equation 38), for stage "A" or "B"."""
+        """Return the root mean square error of each quantity (equation 38), for stage "A"
+        or "B".
+        """
         found = self.first if stage == "A" else self.second
         return {
             name: float(np.sqrt(np.mean((found[name] - true) ** 2)))

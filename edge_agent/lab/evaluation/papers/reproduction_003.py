@@ -116,7 +116,9 @@ def run_case(spec: DriveSpec, filters: dict[str, UnscentedSetting]) -> CaseRuns:
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
-    """Run all experiments of paper 003. `seeds` are the seeds of the drives with ordinary sensors."""
+    """Run all experiments of paper 003. `seeds` are the seeds of the drives with ordinary
+    sensors.
+    """
     done = Reproduction(
         "003", "Square-root unscented filter for the friction of four wheels", sr_ukf.ELEMENTS
     )
