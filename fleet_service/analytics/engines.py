@@ -69,8 +69,8 @@ class QueryEngine:
             self.connection.raw_sql(f"SET enable_progress_bar = {str(self.progress).lower()}")
 
     def files(self, table: str) -> list[Path]:
-        """Return the files of a table that may contain rows of the selected part. A snapshot of the
-        map is included if its day, or the day after it, is selected.
+        """Return the archive files of a table that may contain rows of the selected part. A
+        snapshot of the map is included if its day, or the day after it, is selected.
         """
         before = 1 if table == "map" else 0
         first = self.part.since // layout.DAY_NS - before

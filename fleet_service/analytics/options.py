@@ -13,7 +13,7 @@ class Options:
 
     Attributes:
         at: time of a road treatment, or of a replayed map [ns].
-        stations: table of weather station readings, CSV or Parquet.
+        stations: path of a table of weather station readings, CSV or Parquet.
         least_vehicles: minimum number of vehicles that report a slippery stretch or spell.
         step_s: time between the frames of an animated replay [s]; None for one map.
         lateness_s: allowed lateness of the service whose map is replayed [s].

@@ -1,5 +1,5 @@
-"""Map of cells as one HTML file that needs no network, with panels, an animation of frames, and a
-colour scale.
+"""Map of cells as one HTML file that needs no network. It can show several maps next to each other
+(panels), an animation of frames, and a colour scale.
 
 It can be used with mouse, touch and keyboard. Unmeasured cells are hatched and have no colour.
 """
@@ -51,9 +51,9 @@ class DrawnCells:
 
     Attributes:
         boxes: west, south, east, north [deg] of each square.
-        part: row number of each square; None if row k has the single square k.
+        part: row number of each square; None if every row has one square.
         sector: heading sector of each row, 0 east to 3 south.
-        panels: for each panel, its name and one value per row; None means 'not measured'.
+        panels: for each panel (map), its name and one value per row; None means 'not measured'.
         names, rows: names of the texts shown for a row, and the texts.
         frames, frame: names of the frames, and the frame number of each row.
         lasting: for each row, True if its value will still grow, such as the duration of a spell

@@ -4,8 +4,8 @@ makes the service lose or refuse data.
 A wall clock may jump: a time server corrects it, a machine wakes up, or a person sets it. The
 service therefore runs on a monotonic clock from its start. It follows a jump of more than JUMP_NS
 only if the reports of most current vehicles agree with the wall clock. Until then, a report whose
-time is right by the other clock is not refused. It is not acknowledged either, so its sender keeps
-it.
+time agrees with only one of the two clocks is not refused. It is not acknowledged either, so its
+sender keeps it and sends it again.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class TimeNow(NamedTuple):
         now: the time.
         slack: how far the time of a report may lie beyond `now`, because the archive already
             contains reports with such times.
-        doubt: how much further beyond `now` it may lie so that the report is only kept waiting, and
-            not refused for good.
+        doubt: how much further beyond `now` it may lie so that the report is only ignored for now
+            (its sender repeats it), and not rejected for good.
         least: lower bound of the true time.
         sure: True if active alerts may end only because time has passed; False while the clock may
             be wrong.
@@ -100,8 +100,8 @@ class SteadyClock:
         return TimeNow(now, slack, ANY, min(now, wall, seen) if self._seen else 0, self._sure)
 
     def record_reports(self, times: Mapping[str, int]) -> None:
-        """Record the time [ns] that each vehicle just reported. The clock compares these times with
-        the wall clock.
+        """Record the newest time [ns] that each vehicle just reported (`times`, by vehicle). The
+        clock compares these times with the wall clock.
         """
         now = self.now()
         wall = self._wall()

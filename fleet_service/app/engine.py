@@ -1,8 +1,9 @@
-"""Core of the service without its network. Inputs are messages; outputs are alerts, tiles,
-acknowledgements and answers.
+"""Core of the service without its network. Inputs are messages; outputs are alerts, map tiles,
+acknowledgements, and answers to queries.
 
 The parts share one state (`app.state`). One worker thread uses `intake`, `settlement` and `alerts`.
-Other threads use `queries` and `run_between_segments`.
+Other threads read the map with `queries`, or let the worker do something with
+`run_between_segments`.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class Engine:
         intake: admission and fusion of messages.
         queries: access to the map for readers.
         seen: latest time in a report that was in the archive at the start [ns].
-        settlement: writing of segments, and acknowledgements.
+        settlement: writing of segments (files of new rows), and acknowledgements.
     """
 
     def __init__(self, config: ServiceConfig, root: Path, holding: Ownership | None = None) -> None:
@@ -95,8 +96,8 @@ class Engine:
         return self._shared.state
 
     def reload_state(self, before: Callable[[], None]) -> None:
-        """Call `before`, then replace the state with the state of the archive. Use this only inside
-        `run_between_segments`.
+        """Call `before`, then replace the state with the state of the archive. Use this only in a
+        function that `run_between_segments` calls.
 
         Raises:
             OSError: the archive cannot be read; the state stays unchanged.
@@ -111,17 +112,18 @@ class Engine:
 
     def drop_old(self) -> int:
         """Drop old cells whose belief has returned to the prior (the belief before any
-        measurement); return their number. Use this only inside `run_between_segments`.
+        measurement); return their number. Use this only in a function that `run_between_segments`
+        calls.
         """
         with self._shared.guard:
             return self.state.drop_old()
 
     def checkpoint(self, stop: threading.Event) -> Taken | None:
-        """Return the content of a checkpoint: a copy of the state, and the last segment that it
-        includes. Return None if `stop` is set meanwhile.
+        """Return the content of a checkpoint (for a fast restart): a copy of the state, and the
+        name of the last segment that it includes. Return None if `stop` is set meanwhile.
 
-        Another thread calls this. The worker makes the copy directly after a segment (a file of new
-        rows) was written, when all rows in the state are on disk.
+        Another thread calls this. The worker thread makes the copy directly after a segment (a file
+        of new rows) was written, when all rows in the state are on disk.
         """
         return self.settlement.run_between_segments(self._image, stop)
 

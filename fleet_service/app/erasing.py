@@ -68,8 +68,8 @@ def handle_requests(
 
 
 def _erase_in_copy(copy: BucketReplica) -> str | None:
-    """Erase the data in the archive's bucket copy too. Return None, or the reason why the erasure
-    there is incomplete; a background job then completes it later.
+    """Remove the erased data from the archive's bucket copy too. Return None, or the reason why the
+    erasure there is incomplete; a background job then completes it later.
     """
     try:
         copy.sync()

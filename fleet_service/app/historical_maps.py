@@ -107,8 +107,8 @@ class HistoricalMaps:
             process.end()
 
     def _ask_process(self, question: PastQuery) -> tuple[_Process, bytes]:
-        """Return a process that is answering the query, and the head (tile number and length) of
-        its first reply.
+        """Send the query to an idle or new process. Return this process, and the head (tile number
+        and length) of its first reply.
         """
         if process := self._keep_process(None):
             with suppress(BrokenPipeError, ChildProcessError):  # it has just left
@@ -122,8 +122,8 @@ class HistoricalMaps:
             raise
 
     def _keep_process(self, process: _Process | None) -> _Process | None:
-        """Store an idle process (or None) for the next query; return the previously stored
-        process.
+        """Store an idle process (or None) for the next query; return the process that was stored
+        before.
         """
         self._idle, before = process, self._idle
         return before
@@ -233,7 +233,9 @@ def answer_line(root: Path, line: bytes, out: BinaryIO) -> None:
 
 
 def answer_all(root: Path, asked: BinaryIO, out: BinaryIO) -> None:
-    """Answer queries until none arrives for IDLE_S, or until ANSWERS queries have been answered."""
+    """Answer queries about past maps until none arrives for IDLE_S [s], or until ANSWERS queries
+    have been answered.
+    """
     pa.set_cpu_count(1)
     pa.set_io_thread_count(1)  # each thread that reads keeps memory of its own: 20 MB
     for _ in range(ANSWERS):

@@ -1,5 +1,5 @@
-"""Intake of a running service: it takes messages and weather, passes fused rows to the segment log,
-and returns alerts.
+"""Intake of a running service: it takes messages and weather, passes fused rows to the segment log
+(queue for the disk), and returns alerts.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ class Intake:
             )
 
     def reset(self) -> None:
-        """Continue with a replaced state of the service. The paths of vehicles and their budgets of
-        new cells belong to the old state and are discarded.
+        """Continue with a replaced state of the service. The recorded paths of vehicles and their
+        limits on new cells belong to the old state and are discarded.
         """
         self._paths = VehiclePaths()
         self._places = NewCells()
@@ -104,7 +104,7 @@ class Intake:
 
     @property
     def times(self) -> dict[str, int]:
-        """Return the newest time [ns] that each vehicle reported in the last `ingest`."""
+        """Return, by vehicle, the newest time [ns] that it reported in the last `ingest`."""
         return self.batches.times
 
     def _fuse(self, accepted: AcceptedBatches) -> list[Alert]:

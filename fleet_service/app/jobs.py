@@ -106,8 +106,8 @@ def archive_jobs(
     def with_disk_space(
         work: Callable[[threading.Event], str | None],
     ) -> Callable[[threading.Event], str | None]:
-        """Return the job `work` with a second attempt: if the disk is full, release the reserved
-        space and run the job again.
+        """Return a function that runs `work`. If the disk is full, it releases the reserved disk
+        space and runs `work` again.
         """
 
         def run_job(stop: threading.Event) -> str | None:

@@ -45,10 +45,10 @@ _SINGLE: Final = {
 
 
 class Pulse(NamedTuple):
-    """Values that only the running service knows.
+    """Values for metrics and health checks that only the running service knows.
 
     Attributes:
-        turn_age_s: time since the worker's loop last began [s].
+        turn_age_s: time since the worker thread last began a pass of its loop [s].
         queued: number of messages that wait.
         routers: number of connected routers.
         clock_lag_s: how far the wall clock is behind the service's time [s].

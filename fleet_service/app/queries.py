@@ -43,7 +43,7 @@ class Queries:
 
     def take_changed(self, now: int) -> list[int]:
         """Return the numbers of the tiles that changed since the last call. If cells are hidden for
-        privacy, these are the tiles with newly published changes.
+        privacy, a change counts only when it becomes visible to readers.
         """
         state = self._shared.state
         if state.public is not None:
@@ -95,7 +95,9 @@ class Queries:
     def measure_answer(
         self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None
     ) -> AnswerSize:
-        """Return the upper bound of an answer's size; errors as for `answer`."""
+        """Return an upper bound of an answer's size, as number of cells and number of tiles; errors
+        as for `answer`.
+        """
         return size_asked(self._shared.tiles, query, wanted, only)
 
     def close(self) -> None:

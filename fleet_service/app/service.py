@@ -162,8 +162,8 @@ class Service:
 
     def _has_lost_archive(self, came: Callable[[], bool]) -> bool:
         """Return True if another service has taken over the archive. The lease in the bucket shows
-        this. While the bucket does not answer, the liveliness tokens with which another service
-        announces the regions show it.
+        this. While the bucket does not answer, the Zenoh liveliness tokens of another service for
+        the same regions show it.
         """
         holding = self.engine.holding
         if not holding.may_acknowledge and came():
@@ -257,8 +257,8 @@ class Service:
         )
 
     def _standing(self, asked: zenoh.Query) -> None:
-        """Answer a query for the active ("standing") alerts. Clients that start late ask for
-        them.
+        """Answer a query for the active ("standing") alerts. Clients send it when they start,
+        because earlier messages do not reach them.
         """
         expression = asked.key_expr
         with asked:
@@ -305,8 +305,8 @@ class Service:
             self.engine.mark_survived()
 
     def _shut_down(self, session: zenoh.Session, stop: threading.Event) -> None:
-        """Process and acknowledge the waiting messages within LEAVE_S. Senders keep messages that
-        were not acknowledged.
+        """Process and acknowledge the waiting messages within LEAVE_S [s]. Nothing is lost
+        afterwards, because senders keep messages that were not acknowledged.
         """
         if self.engine.holding.is_lost:
             self._followed = True

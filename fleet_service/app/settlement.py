@@ -106,7 +106,7 @@ class Settlement:
         """Begin to write the waiting rows; messages may be processed meanwhile. `end_flush` returns
         the acknowledgements.
 
-        If work waits for `run_between_segments`, do a complete `flush` and return its
+        If a function waits in `run_between_segments`, do a complete `flush` and return its
         acknowledgements.
         """
         if self._tasks:
@@ -115,7 +115,9 @@ class Settlement:
         return []
 
     def end_flush(self) -> list[tuple[str, bytes]]:
-        """Return the acknowledgements of a flush that has ended; empty if no flush has ended."""
+        """Return the acknowledgements of a flush (writing to disk) that has ended; empty if no
+        flush has ended.
+        """
         return self._acknowledge(self._log.end) if self._log.ended else []
 
     def _acknowledge(self, durable: Callable[[], list[BatchId]]) -> list[tuple[str, bytes]]:

@@ -1,5 +1,5 @@
-"""Active ("standing") alerts of a service for publication: by tile, repeated in turn for clients
-that start late, and end messages.
+"""Active ("standing") alerts of a service for publication: by tile, repeated one after the other
+for clients that start late, and messages that an alert has ended.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class StandingAlerts:
         return self._shared.state.alerts.standing_alerts
 
     def encode_tiles(self, is_wanted: Callable[[int], bool]) -> list[tuple[int, bytes]]:
-        """Return the tile number and the payload of the active alerts, for each selected tile."""
+        """Return (tile number, payload) for each tile with active alerts that `is_wanted` accepts."""
         tiles: dict[int, list[Alert]] = {}
         with self._shared.guard:
             for alert in self.all:
@@ -60,8 +60,8 @@ class StandingAlerts:
         ]
 
     def next_to_repeat(self, most: int) -> list[Alert]:
-        """Return the next active alerts to publish again, at most `most`, in turn. In this way
-        clients that were offline receive them too.
+        """Return at most `most` active alerts to publish again. Successive calls go through all
+        alerts, so clients that were offline receive them too.
         """
         with self._shared.guard:
             standing = self.all
@@ -71,8 +71,8 @@ class StandingAlerts:
         return out
 
     def end_erased(self, before: Iterable[Alert]) -> None:
-        """End the alerts that were active before an erasure (`before`) and no longer are. Call this
-        with the lock held.
+        """End the alerts that were active before an erasure (`before`) and no longer are. The
+        caller must hold the lock of the shared state.
         """
         still = {(alert.cell, alert.sector) for alert in self.all}
         ended = [alert for alert in before if (alert.cell, alert.sector) not in still]

@@ -85,8 +85,8 @@ class ServiceState(NamedTuple):
         return 0
 
     def image(self, cut: Cut, weather: Iterable[Path]) -> Taken:
-        """Return the content of a checkpoint that includes everything up to the segment `cut`, and
-        the given weather files.
+        """Return the content of a checkpoint that includes all rows up to the segment (file of new
+        rows) `cut`, and the given weather files.
         """
         tables = image_of(self.fusion, self.alerts.standing_alerts, self.streams)
         if self.public is not None:
@@ -119,8 +119,8 @@ class SharedState:
 
 
 def public_tables(public: PublicCells) -> dict[str, pa.Table]:
-    """Return the cells that readers may see as tables for a checkpoint. All columns of a table have
-    the same length.
+    """Return the public copy of the map (cells that readers may see) as tables for a checkpoint.
+    All columns of a table have the same length.
     """
     columns = public.visitors.columns()
     part = np.full(len(columns["bits"]), columns["part"][0])
@@ -138,7 +138,7 @@ def load_state(
     until: Cut | None = None,
 ) -> ServiceState:
     """Load the state from the archive. If `until` is given, use only segments (files of new rows)
-    up to this position.
+    up to this position in their sequence.
 
     Raises:
         OSError: the archive cannot be read.

@@ -1,5 +1,5 @@
 """Work in a separate process. Its memory is freed when it ends, and it does not compete with the
-worker for the interpreter lock.
+service's worker thread for the interpreter lock.
 """
 
 from __future__ import annotations

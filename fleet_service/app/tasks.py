@@ -1,5 +1,5 @@
-"""Work that other threads ask the worker to do between two segments (files of new rows), when all
-accepted rows are on disk.
+"""Functions that other threads ask the worker thread to run between two segments (files of new
+rows), when all accepted rows are on disk.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ T = TypeVar("T")
 
 
 class Tasks:
-    """Queue of work that other threads ask the worker to do; `bool()` of it is True if it is not
-    empty.
+    """Queue of functions that other threads ask the worker thread to run; `bool()` of it is True if
+    it is not empty.
     """
 
     def __init__(self) -> None:
@@ -30,8 +30,8 @@ class Tasks:
         return not self._queue.empty()
 
     def ask(self, work: Callable[[], T], stop: threading.Event) -> T | None:
-        """Queue work, wait until the worker has done it, and return its result; None if `stop` is
-        set meanwhile.
+        """Queue the function `work`, wait until the worker thread has run it, and return its
+        result; None if `stop` is set meanwhile.
 
         Raises:
             OSError: no segment (file of new rows) could be written for too long.

@@ -24,8 +24,8 @@ Upload = Callable[[Sequence[Path]], None]
 
 
 class _Load(Generic[Batch]):
-    """Rows that are written together, by kind (observations or states), and the batches to which
-    they belong.
+    """Rows that are written to disk together, by kind (observations or states), and the batches
+    (messages) to which they belong.
     """
 
     def __init__(self) -> None:
@@ -39,8 +39,8 @@ class _Load(Generic[Batch]):
         return sum(len(part["row"]) for waiting in list(self.waiting.values()) for part in waiting)
 
     def take(self, other: _Load[Batch]) -> None:
-        """Append to this load (rows that are written together) the content of another load: rows
-        that wait for the disk, their batches, and segments that are already written.
+        """Append the content of another load to this one. A load consists of rows that wait for the
+        disk, their batches (messages), and segments that are already written.
         """
         for kind, waiting in other.waiting.items():
             self.waiting[kind] = self.waiting[kind] + waiting
@@ -71,7 +71,8 @@ class SegmentLog(Generic[Batch]):
         shard: name of the service.
         upload: function that makes segments durable in a second place; if given, a batch is durable
             only when it is in both places.
-        epoch: smallest number that may be used as the epoch in segment names, from the lease.
+        epoch: smallest number that may be used as the epoch (number of the start) in segment names;
+            the lease determines it.
     """
 
     def __init__(
@@ -87,7 +88,9 @@ class SegmentLog(Generic[Batch]):
 
     @property
     def newest(self) -> Cut:
-        """Return the position of the last written segment (file of new rows)."""
+        """Return the position of the last written segment (file of new rows) in the sequence of all
+        segments.
+        """
         return self._writer.newest
 
     @property
@@ -128,8 +131,8 @@ class SegmentLog(Generic[Batch]):
             self._written = self._thread.submit(self._load.write, self._writer, self._upload)
 
     def end(self) -> list[Batch]:
-        """Wait for the current write; return the batches that it made durable. Each batch is
-        returned once.
+        """Wait for the current write; return the batches (messages) that it made durable. Each
+        batch is returned once.
 
         Raises:
             OSError: the disk is full or broken, or the second place cannot be reached; rows that

@@ -149,8 +149,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _report_covered_box(arguments: argparse.Namespace, bbox: tuple[float, ...]) -> None:
-    """After a query found no observation in its box, print the box that contains all observations.
-    The user may have swapped latitude and longitude.
+    """If a query found no observation in its box, print the box that contains all observations. It
+    helps a user who has swapped latitude and longitude.
     """
     from fleet_service.analytics import engines
     from fleet_service.archive.export.extract import Extract
@@ -174,8 +174,8 @@ def _within_seconds(text: str | None) -> float | None:
 
 
 def _checked_question(arguments: argparse.Namespace) -> Question:
-    """Return the question, after all checks of the options that are possible before any
-    computation.
+    """Check the command's options as far as this is possible before any computation; return the
+    question.
     """
     question = question_of(arguments.question)
     if arguments.out is not None:

@@ -73,7 +73,7 @@ def supplier_of(arguments: argparse.Namespace) -> Supplier:
 
 
 def add_part(parser: argparse.ArgumentParser) -> None:
-    """Declare the options that select a part of the archive."""
+    """Declare the command-line options that select a part of the archive (times and box)."""
     parser.add_argument(
         "--from",
         dest="since",
@@ -104,7 +104,9 @@ def add_archive(parser: argparse.ArgumentParser, *, required: bool = True) -> No
 
 
 def add_dry_run(parser: argparse.ArgumentParser) -> None:
-    """Declare the safety options of a command that deletes data."""
+    """Declare the options of a command that deletes data: one to show only what it would delete,
+    and one to skip the confirmation.
+    """
     parser.add_argument("--dry-run", action="store_true", help="only print the planned changes")
     parser.add_argument("--yes", action="store_true", help="do not ask for confirmation")
 
@@ -167,7 +169,8 @@ class ArchiveReport(NamedTuple):
 def on_archive(
     arguments: argparse.Namespace, command: Callable[[argparse.Namespace], ArchiveReport]
 ) -> int:
-    """Run a command on its archive and print its report; return the exit code.
+    """Run the function `command` on the archive that the arguments name, and print its report;
+    return the exit code.
 
     Raises:
         InputError: there is no such archive, or it cannot be read or written.

@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _say_what_is_covered(arguments: argparse.Namespace) -> None:
-    """After a query found no cell in its box, print the box of the whole map. The user may have
+    """If a query found no cell in its box, print the box of the whole map. It helps a user who has
     swapped latitude and longitude.
     """
     from fleet_service.client import map_client

@@ -64,7 +64,7 @@ class AlertQueue:
             ).rowcount
 
     def read_first(self) -> tuple[int, str] | None:
-        """Return the number and the text of the oldest message; None if the queue is empty."""
+        """Return (number, text) of the oldest message; None if the queue is empty."""
         with self._guard:
             row = self._file.execute(
                 "SELECT number, text FROM waiting ORDER BY number LIMIT 1"

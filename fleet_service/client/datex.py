@@ -222,8 +222,8 @@ def _make_location(alert: StretchAlert) -> ET.Element:
 
 
 def _next_version(record: ET.Element, old: ET.Element) -> ET.Element:
-    """Return `record` as the next version of an old record. If only times differ, return the old
-    record.
+    """Return the DATEX II `record` with the version number after that of the record `old`. If only
+    times differ, return `old`.
     """
     for tag in (
         "sit:situationRecordCreationTime",
@@ -243,7 +243,9 @@ def _next_version(record: ET.Element, old: ET.Element) -> ET.Element:
 
 
 def _end_record(record: ET.Element, now: int) -> ET.Element | None:
-    """Return a record with its end time; None if the end has been published long enough."""
+    """Return a DATEX II record with `now` [ns] as its end time, unless it has one; None if the end
+    has been published long enough.
+    """
     period = _find_element(record, "sit:validity/com:validityTimeSpecification")
     end = period.find("com:overallEndTime", _SPACES)
     if end is not None:
@@ -261,9 +263,9 @@ def _has_ended(record: ET.Element) -> bool:
 
 
 def _same_place(alert: StretchAlert, old: dict[str, ET.Element], written: set[str]) -> str | None:
-    """Return the id of an earlier situation that shares a cell with the stretch of road; None if
-    there is none. Cells are compared and not names, because a client that was restarted gives the
-    same stretch another name.
+    """Return the id of a situation in the previous publication that shares a cell with the stretch
+    of road; None if there is none. Cells are compared and not names, because a client that was
+    restarted gives the same stretch another name.
     """
     cells = {
         f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points

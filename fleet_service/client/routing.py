@@ -149,7 +149,7 @@ def _has_evidence(table: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
 
 
 def _sorted_factors(table: pa.Table) -> tuple[IntArray, FloatArray]:
-    """Return the keys (cell and sector as one number) of the map's cells in ascending order, and
+    """Return two arrays: the keys (cell · 4 + sector) of the map's cells in ascending order, and
     the cost factor of each.
     """
     counts = _has_evidence(table)

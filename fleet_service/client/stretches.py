@@ -310,8 +310,8 @@ def _walk_tree(tree: list[list[tuple[int, float]]], start: int) -> tuple[FloatAr
 def _measure_shape(
     cell: IntArray,
 ) -> tuple[float, str, tuple[float, float], tuple[float, float, float, float]]:
-    """Return length [m], direction, centre [deg] and box [deg] of a set of cells. The direction is
-    that in which the cells spread the most.
+    """Return length [m], direction, centre [deg] and box [deg] of a set of cells. The direction
+    (e.g. north-south) is the axis along which the cells spread the most.
     """
     west, south, east, north = grid.bounds(cell)
     scale = METRES_PER_DEGREE * math.cos(math.radians(float(south.mean())))

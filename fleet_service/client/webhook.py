@@ -206,8 +206,8 @@ class Webhook:
             runner.run(client.aclose())
 
     def _send_first(self, runner: asyncio.Runner, client: httpx.AsyncClient) -> str | None:
-        """Send the oldest message. Return None if there is none, "" if the message was delivered or
-        refused for good, else the reason of the failure.
+        """Send the oldest message of the queue. Return None if the queue is empty, "" if the
+        message was delivered or refused for good, else the reason of the failure.
         """
         try:
             first = self._queue.read_first()

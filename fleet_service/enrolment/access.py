@@ -227,8 +227,8 @@ def _allow_rule(
 
 
 def _no_larger() -> Section:
-    """Return a rule that stops batches of measurements that are larger than the service accepts, at
-    the first router.
+    """Return a router rule that stops batches of measurements that are larger than the service
+    accepts. It applies at the router to which the sender connects.
     """
     return {
         "id": "batches",
@@ -240,8 +240,8 @@ def _no_larger() -> Section:
 
 
 def _no_larger_private() -> Section:
-    """Return a rule that stops private messages of a vehicle that are larger than any agent writes,
-    at the first router.
+    """Return a router rule that stops private messages of a vehicle (keys ahead/NAME and vss/NAME)
+    that are larger than any agent writes. It applies at the router to which the sender connects.
     """
     return {
         "id": "private",
@@ -253,8 +253,8 @@ def _no_larger_private() -> Section:
 
 
 def _no_payload() -> Section:
-    """Return a rule that stops queries with a payload at the first router: a query consists of its
-    key and parameters only.
+    """Return a router rule that stops queries with a payload, because a query of this project
+    consists of its key and parameters only. It applies at the router to which the sender connects.
     """
     return {
         "id": "questions",
@@ -266,8 +266,8 @@ def _no_payload() -> Section:
 
 
 def _topic_priority(topic: keys.Topic) -> Section:
-    """Return a rule that gives each message the priority of its topic, in place of the priority
-    that its sender chose.
+    """Return a router rule that gives each message the priority of its topic, in place of the
+    priority that its sender chose.
     """
     return {
         "id": f"priority-{topic.name}",

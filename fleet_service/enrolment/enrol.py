@@ -188,8 +188,8 @@ class Registry:
         ]
 
     def _leaves(self, path: Path, fleet: Enrolment, signers: list[x509.Certificate]) -> bool:
-        """Return True if a file is a certificate of this authority for a name that is not in the
-        enrolment file.
+        """Return True if the file at `path` is a certificate of one of the authorities `signers`
+        for a name that is not in the enrolment file.
         """
         if path.stem in {*fleet.names, "trust"}:
             return False

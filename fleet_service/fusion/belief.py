@@ -3,11 +3,11 @@ A vote is the effect of one visit (one pass of a vehicle through the cell). All 
 compiled.
 
 Legend
-    p    belief about the fleet's common reading of the road: probability per bin (32,)
+    p    belief about the friction that the whole fleet reads: probability per bin (32,)
     q    a belief in packed form: bins of 16 bits, the largest is 65 535          (32,)
     L    likelihood of one visit, from its bytes                                (32,)
     B    bias kernel: B[i, j] = P(the vehicle reads μ_j on a road of μ_i)  (32, 32), rows sum to 1
-    L̃    B·L divided by its mean: the vote of a vehicle with its own bias        (32,)
+    L̃    B·L divided by its mean: L averaged over the vehicle's bias            (32,)
     s    strength of a vote: share of new information × trust × P(the visit was in this cell) [-]
     h    P(the road changed within Δt), 1 - exp(-Δt / CHANGE_S)                 [-]
 
@@ -59,8 +59,9 @@ PADDED: Final = _BINS + 2 * REACH
 
 
 def bias_kernel() -> FloatArray:
-    """Return the bias kernel B (32, 32) of one vehicle: a normal distribution with the standard
-    deviation hypot(BIAS_RELATIVE·μ, BIAS_ABSOLUTE), set to zero more than REACH bins from its
+    """Return the bias kernel B (32, 32): row i holds the probabilities that one vehicle reads
+    friction bin j on a road of friction bin i. Each row is a normal distribution around μ_i with
+    the standard deviation hypot(BIAS_RELATIVE·μ, BIAS_ABSOLUTE), cut off REACH bins from its
     centre.
     """
     spread = np.hypot(c.BIAS_RELATIVE * _CENTRES, c.BIAS_ABSOLUTE)[:, None]
@@ -70,8 +71,8 @@ def bias_kernel() -> FloatArray:
 
 
 def _kernel_diagonals() -> Float32Array:
-    """Return the diagonals of the bias kernel B, (2·REACH + 1, 32). In this form the bins that one
-    step reads are contiguous in memory.
+    """Return the diagonals of the bias kernel B (see `bias_kernel`), (2·REACH + 1, 32). In this
+    form the numbers that one step of a convolution reads are contiguous in memory.
     """
     kernel = bias_kernel()
     taps = np.zeros((2 * REACH + 1, _BINS), np.float32)
@@ -193,8 +194,9 @@ def mix_prior(p: Bins, change: float, prior: Float32Array) -> None:
 
 @refcount_free_inlined
 def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded: Bins) -> None:
-    """Age a belief in place: diffusion over `drift_s` [s] with reflecting ends, then a possible
-    sudden change of the road over `change_s` [s].
+    """Age a belief `p` (32) in place: slow drift of μ over `drift_s` [s], as diffusion with
+    reflecting ends, then a possible sudden change of the road over `change_s` [s], which mixes in
+    the `prior`.
 
     A uniform belief stays uniform and a non-decreasing one non-decreasing. Therefore the passage of
     time alone never lowers the upper end of the belief's interval below that of the prior. `padded`
@@ -218,7 +220,7 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
 def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
     """Mix the prior into a belief `p` in place, so that the total probability of a sudden road
     change is at least CHANGE_LEAST·`power`. `forget` has already applied the change over `change_s`
-    [s]. `power` is the share of the vote that is new information.
+    [s]. `power` is the share of the coming vote (effect of one visit) that is new information.
     """
     lacking = c.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / c.CHANGE_S)
     if lacking > 0.0:
@@ -227,8 +229,9 @@ def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -
 
 @refcount_free_inlined
 def kind_of(evidence: ByteArray) -> int:
-    """Return the kind of a likelihood: VALUE if it falls by at least VALUE_DROP_STEPS towards the
-    highest friction, so that it limits μ from above; BOUND if it is only a lower bound of μ.
+    """Return the kind of a visit's likelihood (32,): VALUE if it falls by at least VALUE_DROP_STEPS
+    from its maximum to the highest friction, so that it limits μ from above; else BOUND, because it
+    is only a lower bound of μ.
     """
     least = np.uint8(255)
     for i in range(_BINS):
@@ -238,13 +241,13 @@ def kind_of(evidence: ByteArray) -> int:
 
 @refcount_free_inlined
 def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
-    """Fill `out` (32) with the likelihood L̃ of a visit, with mean 1, after integrating out the
-    vehicle's bias.
+    """Fill `out` (32) with the likelihood L̃ of a visit, scaled to mean 1, after averaging over the
+    vehicle's unknown bias. `evidence` (32) is the reported log-likelihood in steps.
 
-    The bias is applied only to a VALUE. A BOUND (lower bound of μ) is made flat above its maximum,
-    because a fall there is noise. It is not smoothed: otherwise many bounds together could exceed
-    the grip that any vehicle used. `padded` (PADDED) must hold zeros in its first and last REACH
-    places.
+    The average is taken only for the kind VALUE (a measurement of μ). A BOUND (only a lower bound
+    of μ) is made flat above its maximum, because a fall there is noise. It is not smoothed:
+    otherwise many bounds together could exceed the grip that any vehicle used. `padded` (PADDED) is
+    scratch memory; its first and last REACH numbers must be zero.
     """
     if kind == VALUE:
         for j in range(_BINS):
@@ -266,8 +269,8 @@ def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> No
 
 @refcount_free_inlined
 def apply_vote(p: Bins, likelihood: Bins, strength: float) -> None:
-    """Multiply a belief `p` in place by a vote of strength s: p ← p·(s·L̃ + 1 - s), where L̃ is the
-    likelihood. The result is not normalised.
+    """Multiply a belief `p` (32) in place by the likelihood L̃ (32) of one visit with strength s in
+    [0, 1]: p ← p·(s·L̃ + 1 - s). The result is not normalised.
     """
     s = np.float32(strength)
     rest = np.float32(1.0 - strength)

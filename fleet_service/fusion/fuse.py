@@ -1,10 +1,10 @@
-"""The fusion of one service: observations in, beliefs out. The module is pure: time comes with the
-observations.
+"""The fusion of one service: observations in, beliefs out. The module is pure: it reads no clock,
+because time comes with the observations.
 
 T is the latest observation time, in whole epochs (minutes). The checkpoint is at T - L, where L is
-the allowed lateness. Trust in vehicles is updated when the checkpoint advances, and applies to
-observations of the epoch that begins at T. Therefore the weight of a vote depends on the time of
-the visit and not on its time of arrival.
+the allowed lateness (delay of an observation); older observations are final. Trust in vehicles is
+updated when the checkpoint advances, and applies to observations of the epoch that begins at T.
+Therefore the weight of a vote depends on the time of the visit and not on its time of arrival.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Updated(NamedTuple):
 
     Attributes:
         late: True for an observation that is older than the checkpoint, or that was not fused
-            because too many visits of its vehicle to the cell were in the window.
+            because too many recent visits of its vehicle to the cell were stored.
         late_by: delay between the time of a late observation and the time at which it is fused
             [ns]; 0 if it is in time or not fused.
         weight: weight that was used; 0 if the observation was not fused.
@@ -81,7 +81,7 @@ class Fusion:
 
     Attributes:
         enrolled: the argument of that name.
-        store: cells, windows, pairs and vehicles.
+        store: cells, recent observations per cell, records per vehicle and cell, and vehicles.
         vote_weights: weights of the vehicles' votes, one record per epoch, the oldest first.
         reports: weather reports that a later update may still need.
     """
@@ -143,8 +143,8 @@ class Fusion:
 
     @property
     def checkpoint(self) -> int | None:
-        """Time of the checkpoint [ns]: older observations are final. None before the first
-        observation.
+        """Time of the checkpoint [ns]: older observations are final. A later one is fused as if it
+        came from the checkpoint. None before the first observation.
         """
         return None if self._epoch is None else self._epoch * c.EPOCH_NS - self._lateness_ns
 
@@ -163,7 +163,8 @@ class Fusion:
 
         Args:
             o: the observations.
-            before: recorded outcome of the first fusion, when an archive is replayed.
+            before: outcome that was recorded when these observations were fused first; given only
+                when an archive is replayed.
         """
         n = len(o.time)
         used = np.zeros(n, np.float32)
@@ -236,16 +237,16 @@ class Fusion:
         self._weather = weather_of(self.reports)
 
     def beliefs(self, slots: IntArray, now: int, rows: Rows | None = None) -> FloatArray:
-        """Return the belief about the road for each slot (cell and sector), (k, 32), predicted to
-        `now` [ns], including the evidence of slippery neighbours. If `rows` is given, read this
-        copy of the state instead of the live one.
+        """Return the belief about the road (32 probabilities of μ) for each slot (cell and sector),
+        (k, 32), predicted to `now` [ns]. It includes the evidence of slippery neighbouring cells.
+        If `rows` is given, read this copy of the state instead of the live one.
         """
         kernels = KERNELS[shape_class(self._shape.reader)]
         return self._read(kernels, slots, np.full(len(slots), now), rows)
 
     def beliefs_at_last_report(self, slots: IntArray) -> FloatArray:
-        """Return the belief about the road for each slot (cell and sector), (k, 32), at the time of
-        the slot's last observation.
+        """Return the belief about the road (32 probabilities of μ) for each slot (cell and sector),
+        (k, 32), at the time of the slot's last observation.
         """
         return self._read(KERNELS[shape_class(self._shape.reader)], slots, self.live.time[slots])
 
@@ -279,7 +280,9 @@ class Fusion:
         return self.store.slots_of(cell * grid.SECTORS + sector)
 
     def trust(self, vehicle: int) -> float:
-        """Return the weight that the next vote of a vehicle will have."""
+        """Return the weight that the next report of a vehicle will have in the fusion; it depends
+        on the vehicle's agreement with others, and 0 means no trust.
+        """
         return float(self.vote_weights[-1].weights(self._index(vehicle))[0])
 
     def _index(self, vehicle: int) -> IntArray:
@@ -291,7 +294,7 @@ class Fusion:
         (cell and sector), (k, SOURCES), newest first.
 
         Only vehicles count that are still trusted and reported `side` (GRIP or ICE) after `since`
-        [ns]. At most SOURCES are remembered; time 0 means no vehicle.
+        [ns]. At most SOURCES vehicles per slot are remembered; time 0 means no vehicle.
         """
         _, when = self.find_sources(slots, side, since)
         return -np.sort(-when, axis=1)
@@ -386,15 +389,16 @@ def _make_arrivals(
 
 
 def voted_keys(o: Observations) -> IntArray:
-    """Return the keys (cell · 4 + sector) of all cells and sectors that observations affect, with
-    repetitions.
+    """Return the keys (cell · 4 + sector) of all cells and sectors that the observations affect. A
+    key occurs once for each observation that affects it.
     """
     return _spread_votes(o, np.arange(len(o.time)))[1]
 
 
 def _spread_votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
-    """Return the votes of the selected observations, sorted by time, as three arrays: row of the
-    observation, key (cell and sector), and share of the vote.
+    """Return the votes of the selected observations, sorted by time. A vote is the effect of one
+    observation on one cell and sector. The three arrays contain the row of the observation, the key
+    (cell · 4 + sector), and P(the vehicle was in this cell).
 
     Besides its own cell and sector, an observation may affect a second sector and neighbouring
     cells.

@@ -58,9 +58,8 @@ LAYOUT: Final = hashlib.blake2b(
 
 
 def image_of(fusion: Fusion) -> Image:
-    """Return the complete state of a fusion as plain arrays. Windows, entries (observations in a
-    window) and pairs (of vehicle and cell) keep their row numbers, because they refer to each other
-    by row.
+    """Return the complete state of a fusion as plain arrays. Rows keep their numbers, because the
+    tables refer to each other by row.
     """
     store = fusion.store
     state = fusion.store.state

@@ -1,5 +1,6 @@
-"""Observations that arrive after the checkpoint. Each is fused at the checkpoint, with its
-likelihood aged from the time of the visit to the checkpoint. Pure.
+"""Fusion of observations that arrive after the checkpoint (the time before which observations are
+final). Each is fused at the checkpoint, with its likelihood aged from the time of the visit to the
+checkpoint. Pure.
 
 The model of a changing road is a Markov chain: a diffusion with reflecting ends, and sudden changes
 to any friction. The chain is reversible and leaves the uniform belief uniform. So the likelihood of
@@ -9,7 +10,7 @@ the road at the checkpoint C, given a measurement at an earlier time t, is
 
 If no other vehicle visited the cell between t and C, the result equals that of an observation in
 time. Otherwise the late visit counts in addition to the others, as an old report about the present
-road. Late visits enter the window like all others, the newest first. So the newest visit of each
+road. Late visits are sorted in like all others, the newest first. So the newest visit of each
 vehicle counts, and the order of arrival between two checkpoints does not matter.
 """
 
@@ -36,15 +37,15 @@ _FLOOR: Final = mugrid.FLOOR_STEPS
 
 def fused_at(time: IntArray, checkpoint: int) -> IntArray:
     """Return the times [ns] at which late visits are fused, given their end times `time` (n,):
-    within one second after the checkpoint, the newest first, in whole µs.
+    within one second after the checkpoint, in whole µs. The newest visit gets the earliest time.
     """
     age = np.clip(checkpoint - time, 0, LATE_MOST_NS)
     return np.asarray(checkpoint + age // (LATE_MOST_NS // _PLACES_NS) // 1000 * 1000)
 
 
 def delay_observations(o: Observations, late_by: IntArray, weather: Weather) -> Observations:
-    """Return the observations with their times moved forward by `late_by` (n,) [ns], and with their
-    likelihoods aged accordingly.
+    """Return the observations with their times moved forward by `late_by` (n,) [ns]. Their
+    likelihoods are aged by the same time, because the road may have changed since.
     """
     rows = np.flatnonzero(late_by)
     evidence = o.evidence.copy()

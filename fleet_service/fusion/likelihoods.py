@@ -64,12 +64,12 @@ def make_evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArra
 
 
 def bound_by_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
-    """Return likelihoods (n, 32) that are at least as informative as the grip used (n,): in each
-    bin the more informative of the reported likelihood and the lower bound.
+    """Return log-likelihoods (n, 32) that contain the lower bound from the grip used (n,): in each
+    bin the smaller of the reported likelihood and the likelihood of this bound.
 
-    An estimator reports an uninformative likelihood when its model is contradicted. The grip that
-    its accelerometers measured is a lower bound all the same. Both come from one visit, so they are
-    not multiplied.
+    An estimator reports a flat likelihood when no friction explains its measurements. The grip that
+    its accelerometers measured is still a lower bound. Likelihood and bound come from one visit, so
+    they are not multiplied.
     """
     out = steps.copy()
     _bound_rows(out, np.asarray(used, np.float64), _levelled_bounds())
@@ -78,8 +78,9 @@ def bound_by_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
 
 @cache
 def _levelled_bounds() -> ByteArray:
-    """Return the table of log-likelihoods of lower bounds, (m, 32), in steps of 1/16 nat, after
-    `level_above_used`. Rows are the grip used from 0 to UTILISED_MOST in steps of _USED_STEP.
+    """Return a table of log-likelihoods for visits that give only a lower bound, (m, 32), in steps
+    of 1/16 nat. Row k is for the grip used k·_USED_STEP, up to UTILISED_MOST. `level_above_used`
+    has been applied.
     """
     used = np.arange(0.0, c.UTILISED_MOST + 0.5 * _USED_STEP, _USED_STEP)
     return level_above_used(mugrid.encode_log_likelihood(at_least(used)), used)
@@ -104,8 +105,8 @@ def level_above_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
 
     A likelihood that is only a lower bound is made flat from the bin that contains `used` minus
     half its standard deviation. A hundred such bounds together then raise the lower end of the
-    interval to at most .95·used + .04. The likelihood of a value is not changed, nor is a row where
-    `used` is NaN.
+    interval to at most .95·used + .04. A likelihood that also limits μ from above is not changed,
+    nor is a row where `used` is NaN.
     """
     out = steps.copy()
     _level_rows(out, np.asarray(used, np.float64))

@@ -1,5 +1,6 @@
-"""Beliefs for readers of the map: aged to the time of reading, combined with messages of slippery
-neighbours, and widened by the error that all reports share. Compiled.
+"""Beliefs for readers of the map: aged to the time of reading, combined with messages from slippery
+neighbouring cells, and widened by the error that all reports share. A message is a factor on the
+probabilities of a belief. Compiled.
 
 A surface rarely ends at the border of a cell: snow and ice cover stretches. So a cell with slippery
 neighbours is more probably slippery than a cell without any information. Each side of a cell
@@ -16,10 +17,10 @@ belief depends on another's. The common error also applies to the neighbours' va
 applied once, at the end.
 
 Only slippery neighbours send messages. A message of grip would call an untested cell dry because
-others are dry, and cells without information send no message (s < s₀). The least value of m is 1 -
-w, which is .1 next to ice. So a cell in which its own visitors found grip stays a cell with grip. A
-neighbour with grip stops the messages of cells beyond it, because the stretch has ended there. A
-cell without a certain visit (see `space`) receives no message.
+others are dry. Cells without information send no message, because their s is below s₀. The least
+value of m is 1 - w, which is .1 next to ice. So a cell in which its own visitors found grip stays a
+cell with grip. A neighbour with grip stops the messages of cells beyond it, because the stretch has
+ended there. A cell that no vehicle has certainly visited (see `space`) receives no message.
 
 Source of the method: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4; here
 messages travel one step only.
@@ -87,8 +88,9 @@ def road_beliefs(
     slots: IntArray,
     now: IntArray,
 ) -> FloatArray:
-    """Return the belief about the road for each slot (cell and sector), (k, 32), at one time [ns]
-    per slot. `table` is the hash table that finds slots by key.
+    """Return the belief about the road for each slot (cell and sector), (k, 32), at the times `now`
+    (k,) [ns]. `kernels` are distributions of the error that all reports share (see `shared`);
+    `table` is the hash table that finds slots by key.
     """
     out = np.empty((len(slots), _BINS))
     scratch = np.empty((3, SCRATCH))
@@ -154,7 +156,8 @@ def road_beliefs(
 @compiled
 def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
     """Return each slot (cell and sector), and the slots before and behind it that may belong to the
-    same slippery stretch of road, (k, 1 + 2·NEIGHBOURS). Positions without such a slot are NONE.
+    same slippery stretch of road: slot numbers (k, 1 + 2·NEIGHBOURS). Positions without such a slot
+    are NONE.
 
     A stretch ends at a cell whose own reports make slippery road unlikely.
     """

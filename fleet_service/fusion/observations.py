@@ -35,8 +35,8 @@ class Observations:
         time: end of the visit [ns].
         cell, sector, second: place and direction; `second` is a sector whose edge is near, or -1.
         vehicle, boot, region, sequence: identity; `vehicle` is a number that stands for the
-            vehicle, `boot` for its start; `sequence` counts the rows of one vehicle, start and
-            region.
+            vehicle, `boot` for its start; `sequence` counts the rows of one vehicle since its start
+            in one region.
         evidence: (n, 32) log-likelihood in steps, see `likelihoods.make_evidence`.
         reported: (n, 3) mean, standard deviation and P(slippery) of a value as it was reported; NaN
             for a lower bound.

@@ -23,7 +23,7 @@ _LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT)
 
 
 class Evidence(NamedTuple):
-    """Likelihoods for the fusion, and the values that vehicles reported.
+    """Likelihoods of visits for the fusion, and the friction values that the vehicles reported.
 
     Attributes:
         steps: (n, 32) log-likelihood in steps below its maximum.

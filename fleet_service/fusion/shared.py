@@ -4,8 +4,9 @@ integrated out. Pure.
 Vehicles that do the same manoeuvre in the same place make the same error. One cause is the shape of
 the tyre's force curve, which each vehicle assumes: this error grows as the share of grip used
 falls. Other causes depend on the manoeuvre. More vehicles do not average this error out; other
-manoeuvres and a larger share of grip do. So the stored belief p is about the *fleet's* common
-reading of a road, and a reader of the map gets a belief about the road itself:
+manoeuvres and a larger share of grip do. So the stored belief p is about μ as the whole *fleet*
+measures it. A reader of the map gets a belief about μ of the road itself, which the kernel K
+computes from p:
 
     road_i = Σ_j K_ij·p_j,    K_ij ∝ exp(-½·((μ_j - μ_i)/(μ_i·σ±))²),    rows sum to 1
     σ₋² = σ_c² + (COMMON_ABSOLUTE/μ_i)² + clip(slope·(SHARED_SHARE - ū/μ_i), 0, SHARED_MOST)²
@@ -14,14 +15,14 @@ reading of a road, and a reader of the map gets a belief about the road itself:
     σ_c² = COMMON_ALWAYS² + COMMON_MANOEUVRE²/n_eff + σ_s²·(a + (1 - a)/n_eff)
     n_eff = (Σ w_k)²/Σ w_k²
 
-The shape error is one-sided: only readings that are too low are treated as values, because their
-likelihood falls towards the upper end. Its slope is the estimate of `trust.shape_of` plus
-SHAPE_DOUBT. An alarm uses the upper end of the slope's confidence range. This extra doubt
-disappears once the fleet's slope is known.
+The shape error is one-sided. A reading that is too low limits μ from above and so counts as a
+measurement; one that is too high counts only as a lower bound. The slope (error per unit of unused
+grip) is the estimate of `trust.shape_of` plus SHAPE_DOUBT. An alarm uses the upper end of the
+slope's confidence range, which narrows as the service compares more visits.
 
-A sender states its whole error. A part of it is common to all senders of the same manoeuvre, so it
-cannot be seen by comparing them: σ_s² = SHARED_PART·stated² (relative, weighted mean of the cell's
-values).
+The standard deviation that a sender states covers its whole error. A part of this error is common
+to all senders of the same manoeuvre, so a comparison of senders cannot show it: σ_s² =
+SHARED_PART·stated² (relative, weighted mean of the cell's values).
 
 Legend
     ū     mean grip used by the vehicles that gave values, weighted
@@ -72,8 +73,9 @@ def manoeuvre_of(longitudinal: FloatArray, lateral: FloatArray) -> NDArray[np.in
 
 
 def shared_parts(reported: Float32Array) -> ByteArray:
-    """Return the relative error σ_s that each value (n, 3) shares with others, in units of
-    1/SHARED; 0 for lower bounds.
+    """Return the relative error σ_s that the vehicles in a cell have in common, for each reported
+    value (n, 3: mean, standard deviation, P(slippery)). The result (n,) is in units of 1/SHARED; 0
+    for lower bounds.
     """
     mean = np.nan_to_num(reported[:, 0], nan=1.0)
     std = np.nan_to_num(reported[:, 1])
@@ -83,8 +85,8 @@ def shared_parts(reported: Float32Array) -> ByteArray:
 
 
 class Shape(NamedTuple):
-    """Effect of the tyre's shape: how far the fleet's values are too low per unit of grip left
-    unused (slope), and the standard deviation of this slope.
+    """Error from the shape of the tyre's force curve: how far the fleet's friction values are too
+    low per unit of grip left unused (the slope), and the standard deviation of this slope.
     """
 
     slope: float
@@ -92,19 +94,19 @@ class Shape(NamedTuple):
 
     @property
     def reader(self) -> float:
-        """Slope (error per unit of unused grip) that the intervals for readers of the map allow
-        for.
+        """Slope (error of a friction value per unit of unused grip) by which intervals are widened
+        for readers of the map.
         """
         return self.slope + c.SHAPE_DOUBT
 
     @property
     def alarm(self) -> float:
-        """Slope (error per unit of unused grip) that an alarm allows for: the upper end of its
-        one-sided 95 % interval.
+        """Slope (error of a friction value per unit of unused grip) that an alarm assumes: the
+        upper end of its one-sided 95 % interval.
 
-        A new service assumes .5. A service that knows its fleet assumes little more than a reader.
-        Missed ice on tuning seeds: with .5 for all, .044 of the icy cell-minutes of a clean fleet
-        had no alert; with this rule .010.
+        A new service assumes .5, and a service that has compared many visits little more than
+        `reader`. Missed ice on tuning seeds: with .5 for all services, .044 of the icy cell-minutes
+        of a clean fleet had no alert; with this rule .010.
         """
         return self.reader + Z_95 * self.std
 
@@ -116,10 +118,11 @@ UNKNOWN_SHAPE: Final = Shape(c.SHAPE_PRIOR, c.SHAPE_STD)
 def shared_kernel(
     used: float, kinds: float, stated: float, slope: float = UNKNOWN_SHAPE.reader
 ) -> FloatArray:
-    """Return the kernel K, (32, 32), which maps the fleet's common reading to the road.
+    """Return the kernel K, (32, 32), which maps a belief about the friction that the fleet measures
+    to a belief about the friction of the road.
 
     Args:
-        used: mean grip used by the vehicles that gave values.
+        used: mean grip used by the vehicles that measured friction in the cell.
         kinds: effective number of kinds of manoeuvre.
         stated: shared part of the error that the vehicles state, relative.
         slope: error per unit of unused grip.
@@ -134,16 +137,18 @@ def shared_kernel(
 
 
 def base_kernel() -> FloatArray:
-    """Return the kernel K, (32, 32), for cells that have only lower bounds and no values of
-    friction.
+    """Return the kernel K, (32, 32), for cells where vehicles reported only lower bounds of
+    friction and no values. K maps a belief about the friction that the fleet measures to a belief
+    about the road.
     """
     relative = c.COMMON_RELATIVE * mugrid.CENTRES
     return _two_sided(np.hypot(relative, c.COMMON_ABSOLUTE), np.hypot(relative, c.COMMON_HIGH))
 
 
 def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
-    """Return the kernel K, (32, 32), for an error with two standard deviations per bin (32,): one
-    for vehicles' readings of friction that are too low, and one for readings that are too high.
+    """Return the kernel K, (32, 32): row i is the distribution of the vehicles' reading on a road
+    of friction bin i. Its standard deviation is `below` (32,) [μ] for readings that are too low,
+    and `above` (32,) [μ] for readings that are too high.
     """
     away = mugrid.CENTRES[None, :] - mugrid.CENTRES[:, None]
     kernel = np.exp(-0.5 * np.square(away / np.where(away < 0.0, below[:, None], above[:, None])))
@@ -169,7 +174,9 @@ KERNELS: Final = tuple(_kernel_table(slope) for slope in SHAPES)
 
 
 def shape_class(slope: float) -> int:
-    """Return the index of the value in SHAPES that is nearest to a slope."""
+    """Return the index of the number in SHAPES (the slopes for which kernels are stored) that is
+    nearest to a given slope.
+    """
     away = [abs(shape - slope) for shape in SHAPES]
     return away.index(min(away))
 
@@ -224,10 +231,11 @@ def read_road(
 def note_value(
     cells: RecordArray, row: int, entries: RecordArray, entry: int, strength: float
 ) -> None:
-    """Add the value of an entry (an observation in one cell) to the running means of its cell: kind
-    of manoeuvre, grip used, and the part of its error that it shares with other vehicles.
+    """Add a friction value to the running means of its cell: grip used, the error that it shares
+    with other vehicles, and the weight of its kind of manoeuvre. Row `entry` of `entries` is the
+    observation; `strength` in [0, 1] is its weight in the belief.
 
-    The entry's weight is smaller if the vehicle used less grip or stated a wider interval.
+    The weight in the means is smaller if the vehicle used less grip or stated a wider interval.
     """
     used = entries[entry].used / USED
     shared = entries[entry].shared / SHARED

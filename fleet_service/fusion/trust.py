@@ -7,11 +7,10 @@ not matter. So a colluding group counts only by the number of its members, not b
 cells in which it drives alone. Once the majority distrusts the group, the group's reports about
 others have no weight.
 
-The module does not learn a vehicle's error from its differences to others. Such differences show
-only relative errors. In addition, an error that affects both the value and the grip used looks like
-a slope between them. This error cancels in the difference between two visits of one vehicle to one
-cell. Such differences therefore show how values fall with the grip that was left unused
-(`shape_of`).
+The module does not learn a vehicle's error from its differences to others, because they show only
+relative errors. It learns one thing about the whole fleet: by how much a friction value is too low
+if the vehicle used little of the grip (`shape_of`). It learns this from two visits of one vehicle
+to one cell, because a constant error of the vehicle cancels in their difference.
 
 Legend
     q    agreement of two values: 1 within PEERS_AGREE standard deviations, 0 from PEERS_DISAGREE on
@@ -145,8 +144,9 @@ def judge_flag(
 def _note_shape(
     peers: RecordArray, vehicle: int, used: float, difference: float, variance: float
 ) -> None:
-    """Record how a vehicle's values in one cell change with the grip that it used. The differences
-    between its values are recorded, because its gain error is the same in all of them and therefore
+    """Record how a vehicle's friction values in one cell change with the grip that it used:
+    `difference` and `used` are the differences of two values and of the grip used, both relative to
+    friction, and `variance` is that of `difference`. A constant relative error of the vehicle
     cancels.
     """
     this = peers[vehicle]
@@ -170,9 +170,10 @@ def _pair_rank(vehicle: int, other: int) -> int:
     """Return a fixed pseudo-random number of a pair of vehicles. It depends on the two vehicle
     numbers and not on their order of arrival.
 
-    A vehicle's table of others has few places. If two others compete for a place, the pair with the
-    lower number keeps it. So a vehicle that was met rarely is as likely to be kept as one that was
-    met often; otherwise the vehicles that report most would displace the others.
+    A vehicle's table of other vehicles has only PEERS places. If two others compete for a place,
+    the pair with the lower number keeps it. So a vehicle that was met rarely is as likely to be
+    kept as one that was met often; otherwise the vehicles that report most would displace the
+    others.
     """
     mixed = np.uint64(vehicle) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(other) * np.uint64(
         0xBF58476D1CE4E5B9
@@ -257,10 +258,10 @@ def heeded_flags(peers: RecordArray) -> BoolArray:
     """Return a mask of vehicles (V,): True if interventions of the vehicle's slip controllers
     (flags) may support an alert.
 
-    The flags of each vehicle have a record. It starts with TRUST_PRIOR_PEERS imagined cells, in a
-    share TRUST_PRIOR of which the flag was confirmed. If the share of confirmations is below
-    TRUST_NONE, the flags support no alert. So a vehicle whose flag is always on is excluded after
-    two dry cells.
+    For each vehicle the service counts cells where other vehicles confirmed or contradicted a flag.
+    The count starts with TRUST_PRIOR_PEERS imagined cells, of which a share TRUST_PRIOR was
+    confirmed. If the share of confirmations is below TRUST_NONE, the flags support no alert. So a
+    vehicle whose flag is always on is excluded after two dry cells.
     """
     right = c.TRUST_PRIOR * c.TRUST_PRIOR_PEERS + peers["flags_confirmed"]
     whole = c.TRUST_PRIOR_PEERS + peers["flags_confirmed"] + peers["flags_contradicted"]
@@ -271,9 +272,9 @@ def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:
     """Return the slope λ in [0, 1] by which the fleet's values are too low per unit of μ left
     unused, and its standard error.
 
-    The slope comes from differences between visits of the same vehicle, in which an error common to
-    value and grip used cancels. λ corrects no value. It determines how far the interval of a value
-    is widened upwards if little grip was used (`shared.Shape`).
+    The slope comes from differences between visits of the same vehicle to the same cell, in which a
+    constant error of the vehicle cancels. λ does not correct values. It determines how far the
+    interval of a value is widened upwards if little grip was used (`shared.Shape`).
     """
     vehicles = len(weight)
     trust = np.minimum(weight.astype(np.float64), 1.0)

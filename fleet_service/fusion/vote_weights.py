@@ -1,4 +1,4 @@
-"""Weight of each vehicle's votes from an epoch (minute) on. Pure."""
+"""Weight of each vehicle's votes (effects of its reports on beliefs), per epoch (minute). Pure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ UNCORRECTED: Final = {"bias": 0.0, "bias_std": c.BIAS_RELATIVE, "spread": 1.0, "
 
 
 class VoteWeights(NamedTuple):
-    """Weight of each vehicle's votes from an epoch on.
+    """Weight of each vehicle's votes (effects of its reports on beliefs) from one epoch (minute)
+    on.
 
     Attributes:
         epoch: first epoch in which the weights are used; -1: from the beginning.
@@ -29,8 +30,8 @@ class VoteWeights(NamedTuple):
     heeded: BoolArray
 
     def weights(self, vehicle: IntArray) -> Float32Array:
-        """Return the weights of vehicles (n,), given by index; an unknown index gets the initial
-        weight.
+        """Return the weights of the votes of vehicles, (n,), for their indices (n,); an unknown
+        index gets the initial weight.
         """
         known = np.append(self.weight, np.float32(self.initial))
         return np.asarray(known[np.minimum(vehicle, len(self.weight))])
@@ -44,5 +45,5 @@ class VoteWeights(NamedTuple):
 
 
 def initial_vote_weights(initial: float) -> VoteWeights:
-    """Return the vote weights of a service that knows no vehicle yet."""
+    """Return the vote weights of a service that knows no vehicle yet: every vehicle gets `initial`."""
     return VoteWeights(-1, np.zeros(0, np.float32), initial, np.zeros(0, np.bool_))

@@ -67,9 +67,9 @@ _WITNESS_SLOPE: Final = UNKNOWN_SHAPE.alarm
 
 @refcount_free_inlined
 def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scratch: Bins) -> None:
-    """Set the kind of an entry's vote (VALUE, or BOUND for a lower bound), its mean, standard
-    deviation and P(slippery). The likelihood is written to `scratch`. An entry is an observation in
-    one cell, and its vote is the effect on the belief.
+    """Fill in the kind of one stored observation (VALUE, or BOUND for a lower bound) and its mean,
+    standard deviation and P(slippery). `entry` is its row in `entries`; its likelihood is written
+    to `scratch`.
 
     If the vehicle reported a value (`reported` (3,) is not NaN), these numbers are taken from the
     report, even if only a part of its likelihood is used.
@@ -114,9 +114,11 @@ def _clear_padding(scratch: Bins) -> None:
 @refcount_free_inlined
 def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
     """Compute how much of a vote is new information, given the vehicle's earlier reports in this
-    cell. Recent reports are in the lateness window, older ones in a record per vehicle and cell.
+    cell. Reports younger than the checkpoint are stored one by one, older ones in one record per
+    vehicle and cell.
 
-    All times are rounded to whole seconds, so that the result is the same for both sources.
+    All times are rounded to whole seconds, so that the result is the same for both kinds of
+    storage.
     """
     kind = int(entries[entry].kind)
     pair = entries[entry].pair
@@ -201,7 +203,8 @@ def update(
     scratch: Bins,
 ) -> None:
     """Update the state of a cell, row `row`, with one entry (an observation), whose likelihood is
-    in `scratch`. `sources` is the row of the vehicles that corroborate ice or grip in this cell.
+    in `scratch`. `sources` is the row of the list of vehicles that recently reported ice or grip in
+    this cell.
     """
     belief = rows.belief
     cells = rows.cells
@@ -265,8 +268,8 @@ def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
     """Lower P(slippery) of a belief after a visit without a value and without an intervention of a
     slip controller. `noticed` is the probability that a visitor of a slippery road gives a value.
 
-    P(slippery) does not fall below UNSURE or the prior's P(slippery), whichever is larger: such a
-    visit can end the certainty of ice, but it does not show grip.
+    P(slippery) does not fall below the larger of UNSURE and the prior's P(slippery), because such a
+    visit can end the certainty of ice but does not show grip.
     """
     if noticed <= 0.0:
         return
@@ -289,7 +292,7 @@ def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
 
 @refcount_free_inlined
 def _remembered_parts(seconds: float) -> np.uint16:
-    """Return a time [s], limited to FORGET_S, as an integer number of 1/AGED s."""
+    """Return a time [s], limited to FORGET_S, as an integer in units of 1/AGED s."""
     return np.uint16(min(seconds, c.FORGET_S) * AGED + 0.5)
 
 
@@ -310,14 +313,14 @@ def is_ice_source(entries: RecordArray, entry: int) -> bool:
 
 @refcount_free_inlined
 def ice_evidence(entries: RecordArray, entry: int) -> float:
-    """Return the evidence of a value for ice against grip [nat]: a log-likelihood ratio that allows
-    for an unknown tyre.
+    """Return the evidence of one friction value for ice against grip [nat]: a log-likelihood ratio
+    that allows for an unknown tyre.
 
     A vehicle that used grip u on a road μ may report a value that is too low, with a standard
-    deviation of d(μ) = μ·clip(λ·(SHARED_SHARE - u/μ), 0, SHARED_MOST). λ is the slope that an alarm
-    assumes for an unknown fleet, because each report is judged alone. Let L be the reported
-    likelihood, scaled to maximum 1. The likelihood of grip is the maximum of L(r)·exp(-½·((μ -
-    r)/d(μ))²) over all roads μ ≥ SLIPPERY and readings r ≤ μ.
+    deviation of d(μ) = μ·clip(λ·(SHARED_SHARE - u/μ), 0, SHARED_MOST). λ is the slope (error per
+    unit of unused grip) that an alarm assumes for an unknown fleet, because each report is judged
+    alone. Let L be the reported likelihood, scaled to maximum 1. The likelihood of grip is the
+    maximum of L(r)·exp(-½·((μ - r)/d(μ))²) over all roads μ ≥ SLIPPERY and readings r ≤ μ.
     """
     evidence = entries[entry].evidence
     used = entries[entry].used / USED
@@ -368,7 +371,8 @@ def _untrusted_weight(
     vehicles in the cell. The k-th new vehicle counts 1/k², so all together count at most 1.6 votes.
 
     Therefore an attacker gains nothing from many new names. Repeated votes of one vehicle are
-    already discounted by their `power`. The weight of a trusted vehicle is returned unchanged.
+    already discounted by `power` (share of new information). The weight of a trusted vehicle is
+    returned unchanged.
     """
     if not 0.0 < weight < c.SOURCE_TRUST:
         return weight
@@ -379,8 +383,8 @@ def _untrusted_weight(
 
 @refcount_free
 def _note_source(reporters: RecordArray, row: int, side: int, vehicle: int, time: int) -> None:
-    """Record a vehicle that corroborates ice or grip in a cell. It replaces the vehicle's earlier
-    report, or else the oldest report.
+    """Record that a vehicle reported ice or grip (`side`) in a cell at a time. The record replaces
+    the vehicle's earlier one, or else the oldest one in the cell's list.
     """
     source = reporters[row].source
     source_time = reporters[row].source_time

@@ -68,8 +68,9 @@ class Reports:
 
 
 class Weather(NamedTuple):
-    """Road time (weather-scaled age) of regions. Rows `start[k]` to `start[k + 1]` belong to
-    `region[k]`, in order of time; row 0 is for regions without reports.
+    """Road time of regions: time that runs faster when weather changes a road faster. Rows
+    `start[k]` to `start[k + 1]` belong to `region[k]`, in order of time; row 0 is for regions
+    without reports.
 
     Attributes:
         region: (r,) sorted.
@@ -118,8 +119,8 @@ def report_priors(reports: Reports) -> Float32Array:
 
 
 def weather_of(reports: Reports) -> Weather:
-    """Return the road time of all regions in `reports`. If several reports have the same region and
-    time, the last one counts.
+    """Return the road time (time scaled by weather) of all regions in `reports`. If several reports
+    have the same region and time, the last one counts.
     """
     last = np.lexsort((np.arange(len(reports.time)), reports.time, reports.region))
     keep = np.append(np.diff(reports.region[last]) != 0, True) | np.append(

@@ -1,5 +1,5 @@
-"""The lateness window: recent observations, kept per cell in order of time. The belief takes them
-in this order, whatever their order of arrival.
+"""The lateness window: observations younger than the checkpoint, stored per cell in order of time.
+They change the belief in this order, whatever their order of arrival.
 
 A slot is the storage of one cell and sector. Its live row contains the belief after all
 observations. A slot has a window while it has observations younger than the checkpoint. The window
@@ -82,7 +82,8 @@ class Votes(NamedTuple):
 
 class Marks(NamedTuple):
     """Marks that are made while a batch is processed: observations left out (n,), observations
-    accepted (n,), and windows that must be computed again (k,).
+    accepted (n,), and windows (recent observations of a cell) whose belief must be computed again
+    (k,).
     """
 
     left_out: BoolArray
@@ -119,8 +120,8 @@ def _absorb_votes(
     marks: Marks,
     scratch: Bins,
 ) -> int:
-    """Add the votes (effects of observations on cells) to the windows of their cells and fill the
-    marks; return the number of stale windows, which must be computed again.
+    """Add the votes (effects of observations on cells) to the lateness windows of their cells and
+    fill the marks. Return the number of windows whose belief must be computed again.
     """
     cells = state.live.cells
     windows = state.windows
@@ -164,7 +165,9 @@ def _absorb_votes(
 
 @refcount_free_inlined
 def _fill_entry(state: State, arrivals: Arrivals, row: int) -> int:
-    """Copy an observation into a free window entry; return the row of the entry."""
+    """Copy an observation (row `row` of `arrivals`) into a free row of the state's entries; return
+    this row.
+    """
     state.used[FREE_ENTRIES] -= 1
     entry = int(state.free_entries[state.used[FREE_ENTRIES]])
     new = state.entries[entry]
@@ -283,7 +286,7 @@ def commit_windows(
     before: int,
 ) -> None:
     """Advance the checkpoint to `before` [ns] for the given windows (k,), one after the other.
-    Older observations are moved from the window into the base.
+    Older observations are moved from the window into the base, the cell's final state.
     """
     _commit_windows(
         state, weather, peers, names, due_windows, before, np.zeros((3, SCRATCH), np.float32)
@@ -377,8 +380,8 @@ def _shorten_window(state: State, slot: int, window: int, entry: int) -> None:
 
 @refcount_free_inlined
 def _link_entry(windows: RecordArray, entries: RecordArray, window: int, entry: int) -> None:
-    """Insert an entry (an observation) into its window in order of time. The search starts at the
-    newest entry, because nearly all entries belong there.
+    """Insert an observation (row `entry` of `entries`) into its lateness window in order of time.
+    The search starts at the newest observation, because nearly all arrive in order.
     """
     after = windows[window].tail
     while after != NONE and comes_before(entries, entry, after):

@@ -1,5 +1,5 @@
-"""Vehicles that reported ice on the slippery stretch around a cell; their reports confirm an alert.
-Pure.
+"""Search for the witnesses of an alert: vehicles that reported ice on the slippery stretch of road
+around a cell. Pure.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from schemas.numeric import BoolArray, IntArray
 
 def stretch_slots(fusion: Fusion, slots: IntArray) -> IntArray:
     """Return, for each slot (cell and sector), the slots of the slippery stretch of road around it,
-    the slot itself first; positions without a slot are NONE.
+    (k, n). The slot itself comes first; positions without a slot are NONE.
     """
     return stretches(fusion.store.state.live, fusion.store.table, slots)
 
@@ -28,7 +28,7 @@ class StretchSources(NamedTuple):
     Attributes:
         who: index of the vehicle, (k, n).
         when: time of the vehicle's newest report [ns], (k, n); 0 for no vehicle.
-        around: mask (k,), True for slots with such vehicles both before and behind them.
+        around: mask (k,): True if such vehicles reported ice both before and behind the slot.
     """
 
     who: IntArray
@@ -37,8 +37,8 @@ class StretchSources(NamedTuple):
 
 
 def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> StretchSources:
-    """Return the vehicles that reported ice on the stretches around the slots (cells and sectors)
-    after `since` (k,) [ns]; each vehicle counts once per stretch.
+    """Return the vehicles that reported ice on the slippery stretches of road around the slots
+    (cells and sectors) after the times `since` (k,) [ns]. Each vehicle occurs once per stretch.
     """
     along = stretch_slots(fusion, slots)
     places = along.shape[1]

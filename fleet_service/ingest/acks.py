@@ -104,8 +104,8 @@ def _split_stream(
 
 
 def consecutive_ranges(numbers: Iterable[int]) -> tuple[tuple[int, int], ...]:
-    """Return the ranges of consecutive numbers, both ends included; numbers may be repeated and
-    unsorted.
+    """Return the ranges of consecutive numbers as pairs (first, last), both included; the given
+    numbers may be repeated and unsorted.
     """
     ordered = sorted(set(numbers))
     if ordered and ordered[-1] - ordered[0] == len(ordered) - 1:  # as most often

@@ -76,7 +76,8 @@ def _scan_messages(
 
 
 def _reencode_message(kind: Kind, payload: bytes, encoding: str) -> bytes:
-    """Return a message in the plain form that our own encoder writes.
+    """Return a message as protobuf bytes in the form that our own encoder writes, which
+    `protobuf_scan` understands.
 
     Raises:
         WireError: the payload is not a message of this kind.
@@ -88,7 +89,7 @@ def _reencode_message(kind: Kind, payload: bytes, encoding: str) -> bytes:
 
 
 class _Fields(NamedTuple):
-    """Positions of the fields of k messages in their bytes."""
+    """Positions of the fields of k protobuf messages in their bytes."""
 
     kind: Kind
     data: NDArray[np.uint8]

@@ -40,8 +40,8 @@ class Bucket:
         self._left: dict[int, tuple[float, float]] = {}
 
     def take(self, vehicle: int, wanted: int, now: float) -> int:
-        """Take up to `wanted` from a vehicle's budget at time `now` [s]; return the amount
-        taken.
+        """Take up to `wanted` tokens from a vehicle's bucket at time `now` [s]; return the number
+        of tokens taken.
         """
         left, since = self._left.get(vehicle, (self._at_once, now))
         left = min(self._at_once, left + max(now - since, 0.0) * self._rate)
@@ -63,8 +63,8 @@ class NewCells:
 
     def beyond(self, vehicle: IntArray, cell: IntArray, now: float) -> BoolArray:
         """Return a mask of rows (n,): True if the row is beyond its vehicle's limit on new cells.
-        All given rows must be in cells without earlier visits. The other rows are charged to the
-        limit. `now` is the time [s].
+        All given rows must be in cells without earlier visits. Rows within the limit use it up.
+        `now` is the time [s].
         """
         out = np.zeros(len(vehicle), bool)
         order = np.lexsort((cell, vehicle))

@@ -1,6 +1,6 @@
-"""Record of accepted batches, which detects duplicates: per stream (vehicle, start, kind, region) a
-watermark, up to which no sequence number is open any more, and the set of accepted sequence numbers
-above it. Pure.
+"""Record of accepted batches, which detects duplicates. Each stream (batches of one vehicle, start,
+kind and region) has a watermark and a set of numbers. No batch with a sequence number up to the
+watermark is expected any more. The set contains the accepted sequence numbers above it. Pure.
 
 The record's size is bounded by accepted data. Every number above a watermark is a batch in the
 archive, a stream has at most MAX_GAPS such numbers, and a stream is dropped when its newest record
@@ -59,8 +59,8 @@ class SequenceTracker:
         return seq <= self.low or seq in self.seen
 
     def accept(self, seq: int, time: int = 0) -> bool:
-        """Record a sequence number and the newest time of its records [ns]. Return False, without
-        recording, if too many numbers are missing before it.
+        """Record a sequence number and the newest time of its records [ns]. Return False and record
+        nothing if too many sequence numbers are missing before it.
         """
         if seq == self.low + 1:
             self.low = seq
@@ -86,7 +86,9 @@ class SequenceTracker:
                 self.accept(seq)
 
     def raise_to(self, first_held: int) -> None:
-        """Raise the watermark, because sequence numbers below `first_held` will never arrive."""
+        """Raise the watermark (number up to which no batch is expected any more), because sequence
+        numbers below `first_held` will never arrive.
+        """
         if first_held - 1 > self.low:
             if isinstance(self.seen, set):
                 if first_held - self.low > len(self.seen):
@@ -150,8 +152,8 @@ class SequenceTrackers:
 
     def columns(self) -> tuple[dict[str, IntArray], IntArray]:
         """Return two items: all streams as columns (n,), and the accepted sequence numbers above
-        the watermarks of all streams in one array. The column `above` is the number of items of
-        this array that belong to each stream.
+        the watermarks (see module) of all streams in one array. The column `above` is the number of
+        items of this array that belong to each stream.
         """
         streams = list(self._streams.values())
         above = [sorted(stream.seen) for stream in streams]

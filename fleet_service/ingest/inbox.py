@@ -1,4 +1,5 @@
-"""Inbox: a bounded queue behind the Zenoh subscribers, and the path from bytes to accepted rows.
+"""Inbox: a bounded queue for messages that Zenoh subscribers receive, and the processing of their
+bytes to accepted rows.
 
 The subscriber's callback only copies bytes into the queue. If the queue is full, the message is
 dropped and counted. It is not acknowledged, so its sender keeps it and sends it again. Senders are
@@ -113,8 +114,8 @@ class Inbox:
         self._queue.put(message)
 
     def drain(self, wait_s: float) -> list[Message]:
-        """Return waiting messages, at most as many as one processing step handles. Wait up to
-        `wait_s` [s] for the first message, then a moment for more.
+        """Return the waiting messages, at most as many as one processing step handles. Wait up to
+        `wait_s` [s] for the first message, then a few milliseconds for more.
         """
         out: list[Message] = []
         size = 0
@@ -190,7 +191,7 @@ class BatchIntake:
         return out
 
     def witness_of(self, name: str) -> int:
-        """Return the permanent number of a sender in the map.
+        """Return the permanent number by which the map knows a sender.
 
         Raises:
             OSError: the key can neither be read nor written.
@@ -247,8 +248,8 @@ class BatchIntake:
         return self._rows(kind, new, found, clock) if new else AcceptedBatches([], {})
 
     def _forget(self, clock: Clock) -> None:
-        """Drop streams that are too old to matter, and cached stream names of days from which
-        hardly any data arrive now.
+        """Drop streams (batches of one vehicle, start and region) that are too old to matter, and
+        cached stream names of days from which hardly any data arrive now.
 
         Active streams are kept in place. If they were allocated again, they would be scattered
         between other objects, and the process would grow by some megabytes each time.
@@ -285,8 +286,8 @@ class BatchIntake:
             self.times[name] = max(self.times.get(name, 0), measured)
 
     def _new(self, kind: Kind, heads: Heads, time: IntArray, good: BoolArray) -> dict[BatchId, int]:
-        """Return the valid batches that were not accepted before, each once, with their positions
-        in `heads` (fields of the batches other than records).
+        """Return the valid batches (mask `good`) that were not accepted before, each once, with
+        their positions in `heads` (fields of the batches other than records).
         """
         out: dict[BatchId, int] = {}
         numbers = (heads.boot, heads.region, time // DAY_NS, heads.seq, heads.first_held)
@@ -318,9 +319,9 @@ class BatchIntake:
     def _look_up(
         self, kind: Kind, name: tuple[str, int, int, int], time: int
     ) -> SequenceTracker | None:
-        """Return the stream of a (vehicle, start, region, day). Return None if a key cannot be
-        read, or if the vehicle opens too many streams. The vehicle then keeps its batch until the
-        disk works again, or until the next hour.
+        """Return the stream (record of accepted batches) of a (vehicle, start, region, day). Return
+        None if a key cannot be read, or if the vehicle opens too many streams. The vehicle then
+        keeps its batch until the disk works again, or until the next hour.
         """
         vehicle, boot, region, _ = name
         try:

@@ -3,9 +3,9 @@ it reports. Pure.
 
 A vehicle's path is a list of at most ANCHORS "anchors" (time and place), over all its batches,
 starts and regions. A report is plausible if the vehicle could drive from the previous anchor to it,
-and from it to the next anchor, at the speed FASTEST. Positions jump when satellite reception
-returns after a tunnel or a ferry. Therefore a vehicle has a budget of LEAP_M for jumps. This budget
-refills slowly, so that a vehicle cannot jump with every row.
+and from it to the next anchor, at no more than the speed FASTEST. Positions jump when satellite
+reception returns after a tunnel or a ferry. Therefore a vehicle has a budget of LEAP_M metres for
+jumps. This budget refills slowly, so that a vehicle cannot jump with every row.
 
 Reports may come in any order, for example old reports between live ones. When a path is full, one
 anchor is dropped, so old anchors are farther apart than new ones. A later report about such a gap

@@ -62,8 +62,8 @@ class ScannedFields(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Fields of a kind of message, as arrays: the role of each field number; for each column the
-    width [bytes], the number of elements per record, and True if it is required.
+    """Fields of a kind of message, as arrays for compiled code: the role of each field number; for
+    each column the width [bytes], the number of elements per record, and True if it is required.
     """
 
     roles: IntArray
@@ -73,8 +73,8 @@ class _Layout(NamedTuple):
 
 
 class _Scan(NamedTuple):
-    """Input and output of a scan: all bytes, the layout, whether names must be ASCII, and the
-    result.
+    """Input and output of a scan of messages: all bytes, the layout of the fields, True if names
+    must be ASCII, and the result.
     """
 
     data: ByteArray
@@ -204,8 +204,8 @@ def _scan_fields(scan: _Scan, ends: IntArray, first: int) -> None:
 
 @refcount_free
 def _scan_field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
-    """Record one field of message `k`; return the position after it, or -1 if the field does not
-    have the form that our encoder writes.
+    """Record the position of one field of message `k` in `scan.out`; return the byte after it, or
+    -1 if the field does not have the form that our encoder writes.
     """
     data = scan.data
     out = scan.out

@@ -78,8 +78,8 @@ class Clock(NamedTuple):
 
 
 class Refusal(NamedTuple):
-    """Reason for refusing a batch: the rule (for counting), the row number, and the text for the
-    sender.
+    """Reason for refusing a batch: name of the broken rule (for counting), row number, and text for
+    the sender.
     """
 
     rule: str
@@ -247,8 +247,8 @@ def _broken_ranges(kind: Kind, columns: Columns) -> tuple[list[NDArray[np.bool_]
 
 
 def _cell_of(columns: Columns) -> IntArray:
-    """Return the cell of the pose (position). For a pose that is not finite the cell is arbitrary,
-    because another rule refuses the row.
+    """Return the cell of each row's position, (n,). For a position that is not finite the cell is
+    arbitrary, because another rule refuses the row.
     """
     return grid.cell_of(
         *(np.nan_to_num(np.clip(columns[n], -180.0, 180.0)) for n in ("latitude", "longitude"))

@@ -91,8 +91,8 @@ class WeatherInbox:
         return self._archive_reports(found, now) if found else None
 
     def begin(self, path: Path, known: Reports, now: int) -> Reports | None:
-        """Archive those reports of a weather file that may still affect the map and are not in
-        `known`; return them, or None if there are none.
+        """Archive those reports of a weather file that may still affect the map at `now` [ns] and
+        are not in `known` (the reports used so far). Return them, or None if there are none.
 
         Raises:
             InputError: the file cannot be read, or a row breaks a rule.

@@ -2,7 +2,7 @@
 
 Legend
     μ      friction of the road                                                      (n,)
-    b, a   a vehicle's own relative and additive error, the same at every visit        (V,)
+    b, a   a vehicle's own relative error [-] and additive error [μ], constant           (V,)
     k      relative error that all vehicles share in one place                         (n,)
     s      share of the grip used in a visit                                           (n,)
     ρ      relative noise of a visit, smaller if more of the grip is used              (n,)
@@ -60,10 +60,11 @@ class ErrorModel(NamedTuple):
         stated: ratio of the standard deviation that a vehicle states to its true one.
         share: smallest and largest share of the grip that an excited visit uses (one that measures
             the friction).
-        low: how much too low a value is, per share of the grip that was left unused.
+        low: how much too low a value of μ is, per share of the grip that was left unused.
         tyres: relative error common to all tyres of the fleet.
         half: relative error that every second vehicle has in addition.
-        alike: share of the passes at a place that do its most frequent manoeuvre.
+        alike: share of the passes at a place in which the vehicle does the place's most frequent
+            manoeuvre.
     """
 
     bias: float = BIAS_RELATIVE
@@ -83,8 +84,8 @@ CLEAN: Final = ErrorModel()
 
 @dataclass(frozen=True)
 class Errors:
-    """Own errors of V vehicles: relative error, additive error, and slope of their lower bounds
-    [nat]; each (V,).
+    """Own errors of V vehicles: relative error, additive error, and slope of the likelihood above a
+    lower bound [nat]; each (V,).
     """
 
     relative: FloatArray
@@ -200,7 +201,7 @@ def reading_likelihood(
 def overconfident_likelihood(
     claim: FloatArray | float, std: float = OVERCONFIDENT_STD
 ) -> FloatArray:
-    """Return normal log-likelihoods (n, 32) of a vehicle that claims a friction μ (n,) with a
-    standard deviation that is too small.
+    """Return the normal log-likelihoods (n, 32) that a vehicle sends if it claims the friction
+    `claim` (n,) with the standard deviation `std`, which is smaller than its error.
     """
     return np.asarray(-0.5 * np.square((mugrid.CENTRES - np.reshape(claim, (-1, 1))) / std))

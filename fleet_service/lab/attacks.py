@@ -5,10 +5,10 @@ The attackers of `claim_random`, `shifted_pose` and `flood_one_cell` are enrolle
 honest, and are therefore trusted, until the attack begins. `add_newcomers` uses new names.
 `replay_messages` sends messages through the service's admission: old messages again, other
 vehicles' messages under the attacker's key, and old visits under the attacker's name. A cell is
-counted if its alert differs at any minute from that of the same drive without the attack. An alert
-that an attack raises counts in dry or wet cells (μ > CLEARLY_DRY), one that an attack suppresses
-counts in icy cells (μ < CLEARLY_ICY). Only cells are considered in which at least ENOUGH honest
-vehicles used enough grip to measure the friction.
+counted if its alert differs at any minute from that of the same drive without the attack. Raised
+alerts are counted in dry or wet cells (μ > CLEARLY_DRY), suppressed alerts in icy cells (μ <
+CLEARLY_ICY). Only cells are considered in which at least ENOUGH honest vehicles used enough grip to
+measure the friction.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ ENOUGH = 5
 
 @dataclass(frozen=True)
 class AttackedDrive:
-    """Drive of the honest fleet to which an attack is added later."""
+    """Simulated drive of the honest fleet, to which the attacks of this module are added."""
 
     town: Town
     visits: Visits
@@ -96,8 +96,8 @@ def _attacking_rows(v: Visits, count: int) -> BoolArray:
 
 
 def claim_random(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return visits in which the attackers claim random values, with high confidence, at every
-    visit.
+    """Return the visits of the drive with the attackers' reports replaced: at every visit they
+    claim a random friction, with high confidence.
     """
     v = drive.visits
     claim = rng.uniform(0.05, 1.2, len(v))
@@ -116,8 +116,8 @@ def _with_claims(v: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
 
 
 def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return visits in which the attackers report their correct measurements from a wrong place in
-    the town.
+    """Return the visits of the drive with the attackers' places replaced: they report correct
+    measurements from a wrong place in the town.
     """
     v = drive.visits
     moved = (v.place + int(rng.integers(CELLS // 4, 3 * CELLS // 4))) % CELLS
@@ -140,8 +140,9 @@ def victim_cells(drive: AttackedDrive) -> IntArray:
 
 
 def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return visits with hundreds of false reports per minute: ice in the driest cell and a dry
-    road in the iciest. The values vary, so that they seem new.
+    """Return the visits of the drive and of the attackers. The attackers send hundreds of false
+    reports per minute, of ice in the driest cell and of a dry road in the iciest. The values vary,
+    because equal values would count as repetitions.
     """
     count = FLOODERS * FLOOD
     seconds = rng.uniform(60.0 * BEGIN, 60.0 * MINUTES, count)
@@ -153,8 +154,9 @@ def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
 
 
 def add_newcomers(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return visits with forty additional names that each pass once and agree with each other: ice
-    on the road of the driest cell, a dry road at the iciest.
+    """Return the visits of the drive and of the attackers: forty additional vehicle names that each
+    pass once and agree with each other. The attackers report ice on the road of the driest cell,
+    and a dry road at the iciest.
     """
     roads = victim_cells(drive) // LENGTH * LENGTH
     who, which, along = (
@@ -221,8 +223,9 @@ def replay_messages(rng: Generator, drive: AttackedDrive) -> int:
 def _alerts_by_minute(
     sent: list[SentMessage], at: FloatArray, forged: list[Message], key: bytes
 ) -> list[BoolArray]:
-    """Return the alerts (masks of cells) of each minute. With the same `key`, vehicles have the
-    same numbers in each run, and are therefore compared with the same other vehicles.
+    """Send messages through the service's admission, and return the alerts of each minute, as masks
+    of cells. `key` determines the vehicles' numbers, and so which vehicles the service compares;
+    with the same `key`, two runs differ only by the attack.
     """
     out = []
     with tempfile.TemporaryDirectory() as folder:

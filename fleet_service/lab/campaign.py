@@ -108,7 +108,7 @@ def drives_end_to_end(quick: bool) -> Drives:
 
 
 def all_hold(found: Sequence[Figure]) -> bool:
-    """Return True if every figure meets its target; a missing figure does not."""
+    """Return True if every figure meets its target; a figure that was not measured misses it."""
     return all(figure.holds for figure in found if figure.bar is not None)
 
 
@@ -144,8 +144,8 @@ def _measure_resampled(ways: Drives, folder: Path, seeds: range) -> dict[str, fl
 
 
 def parts_of(seeds: range, log_line: LogLine) -> dict[str, Part]:
-    """Return the parts of the evaluation that need no simulated vehicle, by the names that `--only`
-    accepts.
+    """Return the parts of the evaluation that need no end-to-end drive, as functions by name; the
+    option `--only` accepts these names.
     """
     few = seeds[:EXACT_SEEDS]
     return {

@@ -87,7 +87,9 @@ def draw_arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
 
 
 def novel_deliveries(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
-    """Return the deliveries that the service accepts: the first delivery of each visit."""
+    """Return the indices of the deliveries that the service accepts: the first delivery of each
+    visit.
+    """
     streams = SequenceTrackers()
     kept = []
     region = rows["region"].tolist()
@@ -103,7 +105,8 @@ def novel_deliveries(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -
 
 @dataclass
 class AlertWatch:
-    """Fusion and its alerts, which are read and stored at some minutes of a drive.
+    """Fusion of a simulated drive, and its alerts; both are read and stored at some minutes of the
+    drive.
 
     Attributes:
         beliefs: beliefs about the cells by minute, (cells, 32).

@@ -30,8 +30,8 @@ PARTS: Final = 60  # portions in which a shuffled drive comes
 
 
 def largest_difference(a: Fusion, b: Fusion) -> float:
-    """Return the largest difference of any probability in any cell between two fusions; 1 if a cell
-    exists in only one of them.
+    """Return the largest difference between two fusions in any probability of any cell's belief; 1
+    if a cell exists in only one of them.
     """
     there = b.slots_of(a.cell[: a.size], a.sector[: a.size])
     if a.size != b.size or (there < 0).any():

@@ -69,7 +69,7 @@ class Found:
     """Results of one fleet over all seeds.
 
     Attributes:
-        ours: scores of the map.
+        ours: scores of GripMap's map.
         theirs: scores of each of the simple rules.
         false_ice, missed_ice: masks of false and of missed alerts.
         false_settled, missed_settled: the same, after the service has got to know the vehicles.
@@ -159,7 +159,7 @@ def _fleet_figures(fleet: Fleet, found: Found) -> dict[str, float]:
 
 def _reliability_curve(ours: Scores) -> dict[str, float]:
     """Return the points of the map's reliability diagram: for each quantile level, the share of
-    true frictions below that quantile of the belief.
+    true frictions that lie below this quantile of the map's belief.
     """
     return {
         f"fusion.clean.reliability.{level:.2f}": float(share)

@@ -2,7 +2,7 @@
 
 A map that is calibrated after a minute may later become overconfident about errors that all
 vehicles share. A map that is calibrated after half an hour may have been overconfident in the first
-minute. Therefore the map is read at all MOMENTS, and the worst of them counts.
+minute. Therefore the map is read at all MOMENTS, and the worst result counts.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ class AskedWay(NamedTuple):
 
     Attributes:
         scores: scores of the cells that several vehicles had visited.
-        measured: True for each of these cells that was measured.
+        measured: mask of these cells: True if a vehicle measured friction there, and not only a
+            lower bound.
     """
 
     scores: Scores

@@ -3,9 +3,9 @@ town. Pure.
 
 The simulated vehicle of `agent` has the errors that the fusion assumes, which makes the fusion look
 too good. Here each vehicle of a town takes its errors from one vehicle of the drives, with all
-errors that persist in it (offsets, a tilted sensor, tyres). Each of its visits is replaced with one
-that this vehicle made on a road with nearly the same friction, with enough grip used to measure the
-friction ("excited") if the town's visit has this too:
+errors that persist in it (offsets, a tilted sensor, tyres). Each of its visits gets the report of a
+visit that this vehicle made on a road with nearly the same friction. Both visits are "excited"
+(enough grip was used to measure the friction), or neither is:
 
     μ, μ_w   friction of the town's road, and of the road in the visit that is drawn     (n,)
     c        μ/μ_w, scale factor: value, interval and grip used are multiplied by c, because
@@ -37,8 +37,8 @@ FARTHEST: Final = 0.35
 
 
 class TrueVisits(NamedTuple):
-    """True values of visits, (m,): vehicle, start [ns], mean friction, and largest share of the
-    friction that was used.
+    """True values of visits, each (m,): number of the vehicle, start [ns], mean friction, and
+    largest share of the friction that was used.
     """
 
     vehicle: IntArray
@@ -48,7 +48,7 @@ class TrueVisits(NamedTuple):
 
 
 class DrivenVisits(NamedTuple):
-    """Visits of simulated drives, each attribute (k,).
+    """Visits of simulated drives with the real estimator, each attribute (k,).
 
     Attributes:
         vehicle: number of the vehicle.
@@ -137,8 +137,8 @@ def _nearest_friction(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntA
 
 
 def _scale_reports(reports: SimulatedReports, row: IntArray, by: FloatArray) -> SimulatedReports:
-    """Return the selected rows of reports, scaled to roads with a friction that is `by` times as
-    large.
+    """Return the rows `row` (n,) of reports, converted to roads with a friction that is `by` (n,)
+    times as large.
     """
     width = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
     place = np.clip(

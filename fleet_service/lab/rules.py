@@ -54,8 +54,8 @@ _NEWEST, _ALL, _ONE, _INTERSECTION, _FEDERATED = range(_KALMAN)
 def vehicle_posteriors(
     vehicle: IntArray, reading: FloatArray, std: FloatArray, vehicles: int
 ) -> FloatArray:
-    """Return the posterior (m, P), mean and variance, that the vehicle sends at each visit, (n, 2).
-    It is the state of the vehicle's filter, which returns to the prior along the road.
+    """Return the posterior (mean m, variance P) that the vehicle's own filter sends at each visit,
+    (n, 2). Before each visit the filter's variance grows, at most to that of the prior.
     """
     mean = np.full(vehicles, PRIOR_MEAN)
     variance = np.full(vehicles, PRIOR_VAR)
@@ -83,7 +83,9 @@ def fuse_by_rules(
     asked: FloatArray,
     cells: int,
 ) -> FloatArray:
-    """Return mean and variance of the first five rules at each query time, (times, 5, cells, 2)."""
+    """Return mean and variance of μ by the first five rules (see module) in each cell at each time
+    in `asked` [s], (times, 5, cells, 2).
+    """
     mean = np.full((5, cells), PRIOR_MEAN)
     variance = np.full((5, cells), PRIOR_VAR)
     last = np.zeros(cells)

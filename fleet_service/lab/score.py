@@ -177,8 +177,8 @@ def coverage(s: Scores) -> float:
 
 
 def safe_share(s: Scores) -> float:
-    """Return the share of true values above the lower end of the interval, from which the 95 % safe
-    deceleration is computed.
+    """Return the share of answers in which the true friction is above the lower end of the 90 %
+    interval. Readers compute a safe deceleration from this lower end.
     """
     return float((s.rank >= ALPHA / 2.0).mean()) if len(s.rank) else float("nan")
 
@@ -240,15 +240,15 @@ def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
 
 
 def false_grip(s: Scores) -> float:
-    """Return the share of true values below the interval. There the road is more slippery than the
-    map states.
+    """Return the share of answers whose 90 % interval lies above the true friction, so that the
+    road is more slippery than the map states.
     """
     return _mean_or_nan(s.rank < ALPHA / 2.0)
 
 
 def false_ice(s: Scores) -> float:
-    """Return the share of true values above the interval. There the road has more grip than the map
-    states.
+    """Return the share of answers whose 90 % interval lies below the true friction, so that the
+    road has more grip than the map states.
     """
     return _mean_or_nan(s.rank > 1.0 - ALPHA / 2.0)
 
@@ -258,7 +258,7 @@ def _mean_or_nan(values: FloatArray | BoolArray) -> float:
 
 
 def reliability(s: Scores) -> FloatArray:
-    """Return, for each of LEVELS, the share of true values below this quantile of the belief. For
-    calibrated beliefs the result equals LEVELS.
+    """Return, for each quantile level in LEVELS, the share of answers in which the true friction is
+    below this quantile of the belief. For calibrated beliefs the result equals LEVELS.
     """
     return np.asarray((s.rank[:, None] <= LEVELS).mean(axis=0))

@@ -42,9 +42,7 @@ VALUED: Final = 0.3  # of such passes look like values: a tenth to a third with 
 
 def bound_excess(used: float, path: str) -> float:
     """Return how far the lower end of the map's interval of friction lies above the larger of two
-    numbers: the grip that was used, and the prior's lower end. BOUNDED vehicles have used the grip
-    `used`. `path` is the form in which they report it: protobuf or JSON, as posterior or as
-    likelihood.
+    numbers: the grip that was used, and the prior's lower end.
 
     BOUNDED vehicles have used the grip `used`. `path` is the form in which they report it: protobuf
     or JSON, as posterior or as likelihood.
@@ -105,8 +103,8 @@ def _decode_batch(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
 
 
 def lower_excess() -> float:
-    """Return the largest `bound_excess` over all values in USED, and over all forms of the report:
-    protobuf or JSON, as posterior or as likelihood.
+    """Return the largest `bound_excess` (see there) over all values of the grip used in USED, and
+    over all forms of the report: protobuf or JSON, as posterior or as likelihood.
     """
     paths = ("protobuf posterior", "json posterior", "protobuf likelihood", "json likelihood")
     return max(bound_excess(used, path) for used in USED for path in paths)

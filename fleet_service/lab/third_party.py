@@ -97,7 +97,9 @@ def make_reports(
 
 
 def make_observations(drive: ForeignDrive) -> Observations:
-    """Return the visits of a drive as observations for the fusion, without any optional column."""
+    """Return the visits of a drive as observations for the fusion; their optional columns are
+    absent.
+    """
     rows = rows_of(drive.visits, drive.cells)
     rows["used_longitudinal"] = rows["used_lateral"] = np.full(
         len(drive.visits), np.nan, np.float32
@@ -183,7 +185,7 @@ def measure_honest(name: str, gain_std: float, seeds: range) -> dict[str, float]
 
 
 def share_of(cells: BoolArray) -> float:
-    """Return the share of cells for which the mask is true; NaN if there are no cells."""
+    """Return the share of cells for which the mask `cells` is True; NaN if there are no cells."""
     return float(cells.mean()) if len(cells) else float("nan")
 
 

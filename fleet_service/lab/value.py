@@ -58,8 +58,8 @@ class TownTraffic(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """Answers of the map and of the two simple rules each time the map is read, with the true
-    friction; arrays of shape (times, CELLS).
+    """Answers of the map and warnings of the two simple rules at each time at which the map is
+    read, with the true friction; arrays of shape (times, CELLS).
     """
 
     truth: FloatArray

@@ -59,7 +59,9 @@ class MapMirror:
         self.heard = 0.0  # when any service said anything [s since 1970]
 
     def take_tile(self, tile: int, table: pa.Table, now: float) -> None:
-        """Replace the content of a tile with a received table."""
+        """Replace the content of a tile with a received table of its cells; `now` is the time [s
+        since 1970].
+        """
         cells = records.of_table(table)
         with self._lock:
             self.heard = now
@@ -82,8 +84,8 @@ class MapMirror:
     def take_standing(
         self, standing: Iterable[Alert], served: Callable[[int], bool], now: float
     ) -> None:
-        """Replace the active alerts with the given ones. `served` tells if a service answers for a
-        cell; alerts of cells without a service are kept.
+        """Replace the active alerts with the given ones. `served` is a function that returns True
+        if a service answers for a cell; alerts of cells without a service are kept.
         """
         with self._lock:
             self.heard = now
@@ -166,8 +168,8 @@ class MapMirror:
         return [tile for _, tile in sorted(late)[:most]]
 
     def touch(self, tile: int, now: float) -> None:
-        """Record that a tile was queried at time `now`, and is unchanged or has no service that
-        answers.
+        """Record that a tile was queried at time `now` [s since 1970], and that its content stays:
+        it is unchanged, or no service answered.
         """
         with self._lock:
             if tile in self._tiles:

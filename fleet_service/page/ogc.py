@@ -85,8 +85,9 @@ class FeatureRoutes:
         )
 
     async def items(self, request: Request) -> Response:
-        """Return features ordered by key (cell and sector), from `after` on. The link `next`
-        continues after the last key, even if features change meanwhile.
+        """Return features (one heading sector of one cell each), ordered by key (cell · 4 +
+        sector), from the key `after` on. The link `next` continues after the last key, even if
+        features change meanwhile.
         """
         question = request_params.parse_features(request, time.time_ns())
         if not self._reader.is_served:
@@ -146,8 +147,8 @@ class FeatureRoutes:
         return PlainTextResponse("no vehicle has visited this place: its grip is unknown\n", 404)
 
     def _cells(self, question: FeatureQuestion) -> pa.Table:
-        """Return the requested cells ordered by key. If there are more cells than the limit, one
-        additional row is returned, which shows that a next page exists.
+        """Return the requested cells, ordered by key (cell · 4 + sector). If there are more cells
+        than the limit, one additional row is returned, which shows that a next page exists.
 
         Raises:
             InputError: a service refused the query.

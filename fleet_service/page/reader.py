@@ -1,5 +1,5 @@
 """Zenoh client of the page, with the rights of a reader. It receives tiles and alerts, queries
-those that it has missed, and tracks served regions.
+those that it has missed, and tracks for which regions a service answers.
 
 It publishes nothing. If the access list hides liveliness tokens, it works without them.
 """
@@ -120,8 +120,9 @@ class Reader:
         ]
 
     def _note_fallen(self, services: presence.PresenceTracker) -> None:
-        """Record regions without known cells that have lost their service. Regions with known cells
-        are checked by queries about these cells.
+        """Record regions that no service announces any more and of which the page knows no cells.
+        Regions with known cells need no record, because queries about these cells show if a service
+        answers.
         """
         here = {token.region for token in services.active}
         known = [keys.chunks(region, grid.REGION_ZOOM) for region in self._queriers]
@@ -171,8 +172,8 @@ class Reader:
             (names.add if sample.kind == zenoh.SampleKind.PUT else names.discard)(str(parsed.name))
 
     def _ask_all(self, session: zenoh.Session) -> None:
-        """Query all tiles and alerts that existed before this session. The reader subscribed to
-        changes earlier, so no change in between is missed.
+        """Query all tiles and alerts that existed before this session. The subscription to changes
+        has begun before this query, so no change is missed.
         """
         try:
             for tile, table in self.ask(map_client.EVERYWHERE, {}):
@@ -257,7 +258,9 @@ def _box_of_expression(region: str) -> list[float]:
 
 @contextlib.contextmanager
 def _refusals_logged(sample: zenoh.Sample) -> Iterator[None]:
-    """Log an error that a malformed message causes inside the block, and continue."""
+    """Provide a context that logs an error which a malformed message causes, and suppresses the
+    error.
+    """
     try:
         yield
     except (InputError, WireError, KeyError) as error:

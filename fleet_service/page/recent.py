@@ -1,5 +1,5 @@
-"""Recent moments of the live map in memory. They are the map's past in the first hour, before a
-snapshot exists. Pure.
+"""Recent moments of the live map in memory. In the first hour, before a service has stored a
+snapshot, they are the only past that the page can show. Pure.
 """
 
 from __future__ import annotations

@@ -46,7 +46,9 @@ def parse_tiles(request: Request) -> list[int]:
 
 
 def parse_view(request: Request) -> View:
-    """Return the part of the map that a browser shows: box and zoom level."""
+    """Return the part of the map that a browser shows, from the parameters of its request: box and
+    zoom level.
+    """
     text = request.query_params.get("bbox")
     box = WORLD if text is None else query.parse({"bbox": text}).bbox or WORLD
     return View(box, parse_level(request))

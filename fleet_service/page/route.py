@@ -1,5 +1,5 @@
-"""Friction along a route: stretches in order, each within the same cell and heading, measured or
-not.
+"""Friction along a route, as a list of stretches in driving order. A stretch lies within one cell
+and heading, and is measured or not.
 
 An unmeasured part is a stretch without a value. It counts neither as dry nor as slippery, but its
 length is counted.

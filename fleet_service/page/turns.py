@@ -1,5 +1,5 @@
-"""Queues for requests, so that one client cannot block the page, or queries about the past, for the
-others.
+"""Queues for requests. One client can then not block the page, or its queries about the past, for
+other clients.
 
 At most RUNNING requests of one client are computed at a time; its other requests wait.
 

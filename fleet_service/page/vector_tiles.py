@@ -42,7 +42,7 @@ class TileShape(NamedTuple):
 
     Attributes:
         kind: points, lines or rings.
-        parts: coordinates of each part in units of the tile (EXTENT across, y down).
+        parts: coordinates of each part, as integers from 0 to EXTENT across the tile, y downwards.
         tags: properties of the shape.
     """
 

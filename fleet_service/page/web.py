@@ -40,7 +40,7 @@ BLOCKS: Final = "application/vnd.gripmap.blocks"
 
 
 class Sources(NamedTuple):
-    """Data sources from which the routes of the page take their answers."""
+    """Data sources from which the HTTP routes of the page take their answers."""
 
     world: MapMirror
     reader: Reader
@@ -246,7 +246,9 @@ class Routes:
         return None
 
     async def history(self, request: Request) -> Response:
-        """Return the belief about a cell at each past moment of which the map is stored."""
+        """Return the belief (mu with its interval and P(slippery)) about a cell at each past moment
+        of which the map is stored.
+        """
         return JSONResponse(
             await run_in_threadpool(self._of.moments.history, *request_params.parse_place(request))
         )
@@ -312,8 +314,8 @@ class Routes:
 def with_turns(
     turns: RequestTurns, answer: Callable[[Request], Awaitable[Response]]
 ) -> Callable[[Request], Awaitable[Response]]:
-    """Return a request handler in which a client waits for its turn. An invalid request is answered
-    with the problem and the fix.
+    """Return the handler `answer` with a limit: it runs only when `turns` allows another request of
+    the client. An invalid request is answered with the problem and the fix.
     """
 
     async def answer_or_refuse(request: Request) -> Response:

@@ -44,8 +44,8 @@ class Taken(NamedTuple):
 
     Attributes:
         tables: tables by name.
-        cut: position of the last segment that the tables include.
-        weather: names of the weather files that the tables include.
+        cut: position of the last segment (file of new rows) that the tables include.
+        weather: names of the files of weather reports that the tables include.
     """
 
     tables: dict[str, pa.Table]

@@ -128,8 +128,8 @@ class Since(NamedTuple):
 
     Attributes:
         begin: day and segment at which the replay starts.
-        known: record of batches that are left out, because compacted files may contain batches from
-            before the start.
+        known: record of the batches before the start; they are left out, because a compacted file
+            may also contain older batches.
         until: only rows received until this time are selected [ns].
         box: only rows near this box are selected [deg].
         most: maximum number of rows; if there are more, an error is raised.
@@ -142,8 +142,8 @@ class Since(NamedTuple):
     most: int | None = None
 
     def near(self) -> Box | None:
-        """Return the box enlarged by twice the margin; None without a box. The files of all zones
-        (map squares of zoom 7) that touch it must be read.
+        """Return the box enlarged by twice the margin [deg]; None without a box. All files of zones
+        (map squares of zoom 7) that touch the enlarged box must be read.
         """
         if self.box is None:
             return None
@@ -171,7 +171,7 @@ Heard = Callable[[Observations], AbstractContextManager[None]]
 
 
 def ignore_observations(_: Observations) -> AbstractContextManager[None]:
-    """Return a context that does nothing, for a replay without a listener."""
+    """Return a context that does nothing; it is the default listener of a replay."""
     return nullcontext()
 
 
@@ -201,7 +201,7 @@ def past_fusion(
     listener: Callable[[Fusion], Heard] | None = None,
 ) -> Fusion:
     """Return the state of the fusion after everything that was received until the time `until`
-    [ns], near a box [deg].
+    [ns], near a box (west, south, east, north [deg]).
 
     `listener` is called with the fusion. It returns a context in which each group of observations
     is fused, so that the listener can follow the fusion.
@@ -241,8 +241,8 @@ def replay(
     damaged: Damaged = skip_damaged,
     heard: Heard = ignore_observations,
 ) -> Iterator[Updated]:
-    """Replay the archive into `fusion` in order of time, with the vote weights that were used at
-    the first fusion; yield once per epoch of the fusion.
+    """Replay the archive into `fusion` in order of time, with the vote weights (trust in vehicles)
+    that the service used at first. Yield once per epoch (minute) of the fusion.
 
     One day is read at a time, a large day in parts, so that memory does not grow with the archive.
 
@@ -283,8 +283,8 @@ def replay(
 
 
 def _recorded_result(rows: segments.Rows) -> RecordedResult:
-    """Return lateness and vote weight of archived rows, as the service recorded them when it first
-    fused these rows.
+    """Return lateness (True if late) and vote weight (trust in the vehicle) of archived rows, as
+    the service recorded them when it first fused these rows.
     """
     return RecordedResult(rows["late"].astype(bool), rows["late_by"], rows["weight"])
 
@@ -410,7 +410,8 @@ def _split_parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
 
 
 class _Held:
-    """Rows that wait until their chunk is complete. They are compressed to a third of their memory.
+    """Rows of a replay that wait until their chunk (rows between two times) is complete. They are
+    compressed to a third of their memory.
 
     Args:
         name: name of the column that contains the time.
@@ -425,7 +426,9 @@ class _Held:
         self.rows = 0
 
     def take(self, table: pa.Table) -> None:
-        """Add rows provisionally; `keep` or `forget` then decides about them."""
+        """Add rows of a file provisionally, until the whole file has been read: then `keep`
+        confirms them, or `forget` drops them.
+        """
         time = segments.to_nanoseconds(table[self._name])
         order = np.argsort(time, kind="stable")
         table = _with_numbers(table).take(order)

@@ -34,7 +34,8 @@ class Restart(NamedTuple):
         fusion: fusion of the checkpoint, or a new one.
         streams: record of the batches that were accepted when the checkpoint was taken.
         standing: alerts that were active when the checkpoint was taken.
-        cut: position of the last segment that is included; None without a checkpoint.
+        cut: position of the last segment (file of new rows) that is included; None without a
+            checkpoint.
         weather: names of the weather files that are included.
         refused: number of checkpoints that could not be used: damaged, or of another version.
         extra_tables: additional tables of the checkpoint, as columns.

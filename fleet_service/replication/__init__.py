@@ -1,9 +1,9 @@
 """Ownership of an archive: lease, bucket replica, and fence against former owners.
 
 One service at a time owns an archive. `ownership` locks the folder, waits for the `lease` of the
-bucket, lets the `replica` synchronise folder and bucket, and writes a `fence` before it serves.
-`archive/` does not import this package: the segment log calls `BucketReplica.upload_segments`
-through a callback.
+bucket, lets the `replica` synchronise folder and bucket, and writes a `fence` (list of valid
+objects) before it serves. `archive/` does not import this package: the segment log (files of new
+rows) calls `BucketReplica.upload_segments` through a callback.
 
 **States of one service.** A turn is one renewal of the lease; a token announces a live service.
 

@@ -1,5 +1,6 @@
 """Fence of an archive's bucket copy: it excludes files that a former owner uploads too late. A term
-is the time during which one service owns the copy.
+is the time during which one service owns the copy. An epoch is a number in file names; it is larger
+in each later term.
 
     fence/NUMBER-TURN       in the bucket, {"epoch", "names"}: the highest is valid
     ARCHIVE/term            the epoch of the service that owns the folder
@@ -27,8 +28,8 @@ FOLDER: Final = "fence"
 
 
 class Term(NamedTuple):
-    """Term: ownership of the copy by one service. It consists of the lease number and the epoch in
-    the service's file names.
+    """Term: ownership of the copy by one service. It consists of the lease number and the epoch, a
+    number in the names of all files that the service writes.
     """
 
     number: int
@@ -50,8 +51,8 @@ class Fence(NamedTuple):
 
 
 def put_fence(bucket: ObjectBucket, number: int, turn: int, fence: Fence) -> None:
-    """Upload the fence (list of valid objects) to the bucket. Each renewal (`turn`) of the lease
-    has a file name of its own, so that a delayed upload never replaces a later fence.
+    """Upload the fence (list of valid objects) to the bucket. Its name contains the lease `number`
+    and the `turn` (count of renewals), so that a delayed upload never replaces a later fence.
 
     Raises:
         CopyError: it is unknown whether the upload succeeded.
@@ -79,5 +80,5 @@ def fence_of(bucket: ObjectBucket) -> Fence:
 
 
 def largest_epoch(names: Iterable[str]) -> int:
-    """Return the largest epoch in the given file names, or 0."""
+    """Return the largest epoch (number of an owner's term) in the given file names, or 0."""
     return max((layout.term_of(name) or 0 for name in names), default=0)

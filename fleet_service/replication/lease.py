@@ -1,13 +1,15 @@
-"""Lease of an archive's bucket copy: at most one service owns the copy. The lease needs only a
-bucket with conditional create.
+"""Lease of an archive's bucket copy: at most one service owns the copy. The bucket needs only one
+special operation, conditional create (an object is written only if its name is new).
 
     lease/NUMBER.json       {"holder", "service", "epoch", "turn", "released", "before", "to",
                             "lease_s"}: the highest number is the current holder
     ARCHIVE/holder.json     identity of this folder, kept over restarts
 
 A service takes over by creating the next number; the bucket lets only one service do so. The holder
-renews by writing its own object again with the next turn, and then checking that no higher number
-exists. The clocks of different machines are never compared.
+renews by writing its own object again with the next turn (count of renewals), and then checking
+that no higher number exists. A token (Zenoh liveliness token) shows that a service is alive. The
+epoch is a number in the names of all files that a holder writes. The clocks of different machines
+are never compared.
 
 **No acknowledged data are lost.** Let A be the holder, and let B create the next number at time T.
 
@@ -25,7 +27,8 @@ exists. The clocks of different machines are never compared.
 - Only after this does B list the bucket, so it finds everything that A has acknowledged. An
   acknowledgement that A's network delivers later is still correct.
 - If A was frozen and uploads files after the listing, they have an older epoch and are not in B's
-  fence (see `fence`). They are ignored, and A has acknowledged none of them.
+  fence (list of valid files, see `fence`). All readers ignore these files, and A has acknowledged
+  none of them.
 - A deletes a file only after it has uploaded the replacement and found no higher number, so B finds
   the replacement.
 
@@ -118,8 +121,8 @@ class LeaseRecord(NamedTuple):
 
 
 class Standby(NamedTuple):
-    """Functions that a waiting (standby) service gives to the lease; see the comments of the
-    fields.
+    """Functions that a standby (a service that waits for the lease) gives to `Lease.wait`; see the
+    comments of the fields.
     """
 
     may: Callable[[], bool]  # whether it would be heard if it took over now
@@ -174,8 +177,8 @@ class Lease:
 
     @property
     def left_s(self) -> float:
-        """Return the time [s] for which the service may acknowledge data in the bucket without
-        another renewal; 0 or less if it may not.
+        """Return the time [s] for which the service may still acknowledge data in the bucket
+        without another renewal of its lease; 0 or less if it may not.
         """
         return (
             0.0
@@ -327,7 +330,9 @@ class Lease:
                 return
 
     def _was_held_here(self, found: LeaseRecord) -> bool:
-        """Return True if an earlier start of the service on this folder had the lease."""
+        """Return True if this folder's service held the lease record `found` before its last
+        restart.
+        """
         return found.holder == self._holder
 
     def _read_newest(self) -> LeaseRecord | None:
@@ -415,8 +420,8 @@ def forget_holder(root: Path) -> None:
 
 
 def _check_settings(found: LeaseRecord, lease_s: float) -> None:
-    """Raise InputError if the live holder uses another lease time, because it could then
-    acknowledge after a take-over.
+    """Raise InputError if the lease's live holder (record `found`) uses another lease time than
+    `lease_s` [s]: it could then still acknowledge data after a take-over.
     """
     if found.lease_s not in (0.0, lease_s):
         problem = (
@@ -455,8 +460,8 @@ def _parse_record(name: str, content: bytes) -> LeaseRecord | None:
 
 
 def _unknown_holder(name: str, content: bytes, previous: LeaseRecord | None) -> LeaseRecord:
-    """Return a record that stands for a damaged lease object: its holder is unknown, and its turn
-    changes whenever the content of the object changes.
+    """Return a lease record that stands for a damaged lease object: its holder is unknown, and its
+    turn (count of renewals) changes whenever the content of the object changes.
     """
     log.warning("the lease object %s is damaged", name)
     turn = int.from_bytes(blake2b(content, digest_size=6).digest(), "big")

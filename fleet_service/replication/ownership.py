@@ -53,7 +53,9 @@ class Ownership:
 
     @property
     def may_acknowledge(self) -> bool:
-        """Return True if the next owner of the archive will find all data that are durable now."""
+        """Return True if the service may acknowledge data: the next owner of the archive will find
+        all data that are on disk and in the bucket now.
+        """
         return self.lease is None or self.lease.may_acknowledge
 
     @property
@@ -129,8 +131,9 @@ def acquire_archive(
         root: folder of the archive.
         stop: event that ends the wait.
         say: called with a line of text whenever the reason for waiting changes.
-        signs: functions of a standby service: whether it is reachable, whether a service's token is
-            active, and one that is called at each check. None if this service is no standby.
+        signs: three functions of a standby service: return True if a router is reachable, return
+            True if the service of a name is alive, and a function that is called at each check.
+            None if this service is no standby.
 
     Raises:
         InputError: another service has the folder or the copy, or the copy cannot be used with
@@ -247,12 +250,12 @@ def _sync_folder(
 
 
 class _BusyError(Exception):
-    """Error: another process is using the compacted files of the folder."""
+    """Error: another process is using the compacted (merged) files of the archive folder."""
 
 
 def _wait_for_compaction(root: Path) -> BinaryIO:
-    """Lock the compacted files of the folder. A compaction of the folder's former service may still
-    be running, and may have read rows that are no longer valid.
+    """Lock the compacted (merged) files of the folder. A compaction that the folder's former
+    service started may still be running, and may have read rows that are no longer valid.
 
     Raises:
         _BusyError: such a compaction is running; try again later.

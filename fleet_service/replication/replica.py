@@ -4,8 +4,8 @@ Files on which an acknowledgement depends (segments, keys, vehicle identities) a
 the acknowledgement (`upload_segments`). All other files follow later (`sync`). Uploads come first
 and deletions last, so that the copy contains every row at least once at any time. At start
 (`sync_without_lease`), files that only the bucket has are downloaded (all files, if the disk is
-empty), and files that only the folder has are uploaded. Only objects recorded in the upload journal
-are ever deleted.
+empty), and files that only the folder has are uploaded. An object is deleted only if the upload
+journal (list of own uploads) contains it.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class BucketReplica:
         self._copied.close()
 
     def attach_lease(self, may: Callable[[], bool], alone: Callable[[], None]) -> None:
-        """Write to the bucket only under a lease from now on.
+        """From now on, write to the bucket only while this service has the lease.
 
         Args:
             may: function that returns True if this service certainly has the lease.
@@ -147,11 +147,11 @@ class BucketReplica:
         self, service: str | None, term: Term | None = None, *, succeeds: bool = False
     ) -> int:
         """Synchronise like `sync_without_lease`, but under the `term` of a lease: files that a
-        former holder uploads later are ignored.
+        former holder of the lease uploads later are ignored.
 
         Args:
             service: name of the service; None for a standby, which follows the owner of the bucket.
-            term: term of the lease; None without a lease.
+            term: lease number and epoch (number in file names); None without a lease.
             succeeds: True if another machine had the lease before. Data that only this folder has
                 were then never acknowledged and are removed.
 
@@ -192,7 +192,8 @@ class BucketReplica:
 
     def _raise_fence(self, term: Term) -> None:
         """Write a fence (list of valid objects) for this term of ownership: objects that appear
-        later are valid only with the epoch of the term. Delete objects that are not valid.
+        later are valid only if their names contain the epoch of the term. Delete objects that are
+        not valid.
         """
         names = [
             name
@@ -224,8 +225,8 @@ class BucketReplica:
         return self._download_missing(there)
 
     def _select_counted(self, there: Mapping[str, int]) -> dict[str, int]:
-        """Return names and sizes of those objects in `there` that are valid according to the
-        bucket's fence.
+        """Return names and sizes [bytes] of those objects in `there` that are valid according to
+        the bucket's fence (list of valid objects).
         """
         fence = fence_of(self._slow)
         return {name: size for name, size in there.items() if fence.counts_object(name)}
@@ -269,7 +270,8 @@ class BucketReplica:
         """Upload new and rewritten files, then delete removed ones; return the number of changed
         objects.
 
-        Segments of the inbox are excluded; only `upload_segments` uploads them.
+        Segments (files of new rows) in the inbox folder are excluded; only `upload_segments`
+        uploads them.
 
         Raises:
             CopyError: the work is incomplete; the next call continues.
@@ -357,8 +359,8 @@ class BucketReplica:
         self._copied.add(name, stamp)
 
     def _upload_new(self, name: str, content: bytes, bucket: ObjectBucket) -> None:
-        """Upload a file whose name must be new. The exception is a key that a former service
-        uploaded after it had lost its lease: it belongs to rows that are not valid, and is
+        """Upload a file whose name must be new. The exception is a file of keys that a former
+        service uploaded after it had lost its lease: it belongs to rows that are not valid, and is
         replaced.
         """
         if self._alone is None or name.startswith(LOG) or bucket.create(name, content):

@@ -4,8 +4,8 @@ time at the upload.
     ARCHIVE/copied      {"copy": URL}, then a line for each put, [name, bytes, time], and for each
                         delete, [name]
 
-A lost line is harmless: a file is uploaded once more, or a deleted file comes back and is deleted
-again. A lost line never deletes a file.
+A lost line is harmless: a file is uploaded once more, or a file that was deleted locally is
+downloaded and deleted again. No file is deleted because of a lost line.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Low-friction alerts. An alert is raised when at least two vehicles support a firm belief that a
-cell is slippery. It is cleared with hysteresis, and with a stated reason. Pure.
+"""Low-friction alerts. An alert is raised when at least two vehicles reported ice and the cell is
+slippery with high probability. It is cleared only when the probability has clearly fallen
+(hysteresis), and the end message states a reason. Pure.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ class Alerts:
 
     Args:
         fusion: owner of the cells.
-        idle_roads: limit on alerts on roads where only the supporting vehicles drive; None for no
-            limit, in simulations.
+        idle_roads: limit on alerts on roads where no vehicle drives except those that report the
+            ice; None for no limit, in simulations.
         is_private: True if times and numbers of vehicles are rounded for privacy.
     """
 
@@ -67,7 +68,7 @@ class Alerts:
 
     @property
     def standing_alerts(self) -> list[Alert]:
-        """Return the active alerts, as they were when they were raised."""
+        """Return the active alerts with the content that they had when they were raised."""
         return list(self._standing.values())
 
     def resume(self, standing: Sequence[Alert]) -> None:

@@ -1,4 +1,4 @@
-"""Encoding of a view of cells as Arrow, GeoJSON or JSON. Pure."""
+"""Encoding of map cells (a `CellView`) as Arrow, GeoJSON or JSON. Pure."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _END: Final = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # a message without a head: t
 
 
 def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
-    """Return cells of the map as an Arrow batch in the schema of the map, with their age at `now`
-    [ns]. `mu` is null for a cell with only a lower bound.
+    """Return cells of the map as an Arrow record batch with the columns of the published map, with
+    their age at `now` [ns]. `mu` is null for a cell with only a lower bound.
     """
     latitude, longitude = grid.centre(cells.cell)
     west, south, east, north = grid.bounds(cells.cell)
@@ -62,8 +62,8 @@ def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
 
 
 def cell_table(fusion: Fusion, slots: IntArray, now: int) -> pa.Table:
-    """Return the cells of `slots` (cells and sectors) as a table in the schema of the map, with
-    beliefs for the time `now` [ns].
+    """Return the cells of `slots` (cells and sectors) as a table with the columns of the published
+    map, with friction and its interval for the time `now` [ns].
     """
     return pa.Table.from_batches([batch_of(view_cells(fusion, slots, now), now)])
 

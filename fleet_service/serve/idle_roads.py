@@ -1,10 +1,10 @@
 """Limit on alerts that two vehicles raise alone, on roads without other vehicles. Pure.
 
 Two enrolled vehicles that collude could report ice anywhere along plausible paths. On a road with
-other traffic, other vehicles contradict them. On a road that no third vehicle has reported, no
-other vehicle does. Therefore each vehicle may support such alerts in at most MOST_AREAS areas of
-AREA_M within AREA_NS. Beyond this limit a third vehicle is needed; until then the map shows the
-ice, but no alert is raised.
+other traffic, other vehicles contradict them; on an idle road, which no third vehicle has reported,
+nobody does. Therefore each vehicle may support such alerts in at most MOST_AREAS areas of AREA_M
+within AREA_NS. Beyond this limit a third vehicle is needed; until then the map shows the ice, but
+no alert is raised.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ VEHICLES: Final = 100_000  # that are remembered
 
 
 class IdleRoads:
-    """Record of the areas in which each vehicle has recently supported alerts on idle roads."""
+    """Record of the areas in which each vehicle has recently supported alerts on idle roads (roads
+    that no third vehicle has reported).
+    """
 
     def __init__(self) -> None:
         self._areas: dict[int, list[tuple[int, FloatArray]]] = {}

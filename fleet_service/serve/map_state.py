@@ -43,8 +43,8 @@ class MapState:
         self._changed.update(dict.fromkeys(tiles, self.change))
 
     def changed_at(self, tile: int) -> int:
-        """Return the value of the counter `change` at the last change of a tile; 0 if it never
-        changed.
+        """Return the number that the map's counter of changes had at the last change of a tile; 0
+        if the tile never changed.
         """
         return self._changed.get(tile, 0)
 

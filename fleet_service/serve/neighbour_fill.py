@@ -29,8 +29,8 @@ def impute_cells(
     source: Readable, tile: int, known: IntArray, route: IntArray | None, now: int
 ) -> CellView:
     """Return a view of unvisited cells of a tile with beliefs estimated from visited neighbours.
-    These are the cells next to the cells in `known`, in the same sector; along a `route`, the cells
-    of its keys.
+    These are the cells next to the visited cells in `known`, in the same heading sector; if a
+    `route` is given, the cells along it.
 
     A belief is half the prior and half the mean of the visited neighbours; at greater distance, the
     share of the neighbours is smaller. `vehicles` is the minimum over these neighbours, so that an
@@ -88,7 +88,7 @@ def _route_gaps(
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Return three arrays for the unvisited parts of a route in a tile: the keys (cell and sector),
     the slots of the nearest visited keys before or behind each, and the share of that neighbour in
-    the estimate.
+    the estimate, [0, 1].
 
     A key appears once for each side on which a visited key is within REACH. Directly adjacent keys
     are excluded, because they are handled as neighbours.

@@ -83,15 +83,15 @@ class PublicCells:
 
     @property
     def live(self) -> Cells:
-        """Return the cells in the state in which they were last copied for readers. Rows of cells
-        that are not public must not be shown to readers.
+        """Return the cells in the state in which they were last copied for readers. The result also
+        has rows of cells that are not public; these must not be shown to readers.
         """
         self._add_slots()
         return cells_of(self._rows)
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
-        """Return the belief about the road for each slot (cell and sector), (k, 32), as readers may
-        see it at `now` [ns].
+        """Return the belief about the road (32 probabilities of μ) for each slot (cell and sector),
+        (k, 32), as readers may see it at `now` [ns].
         """
         self._add_slots()
         return self._fusion.beliefs(slots, now, self._rows)
@@ -102,8 +102,8 @@ class PublicCells:
 
     @contextmanager
     def follow(self, o: Observations) -> Iterator[None]:
-        """Provide a context in which the caller fuses observations; at the end of the context,
-        update the public copy of the cells.
+        """Provide a context in which the caller fuses the observations `o`; at the end of the
+        context, update the public copy of the cells.
         """
         now = int(o.time.max(initial=0))
         self.publish(now)
@@ -212,8 +212,8 @@ class PublicCells:
         self._period = int(present["period"].max(initial=0))
 
     def _copy_more_slippery(self, slots: IntArray, now: int) -> None:
-        """Copy those of the slots (cells and sectors) that have become clearly more slippery than
-        readers see.
+        """Publish (copy for readers) those of the slots (cells and sectors) that have become
+        clearly more slippery than readers see.
         """
         current = self._fusion.beliefs(slots, now)
         shown = self.beliefs(slots, now)
@@ -224,7 +224,9 @@ class PublicCells:
         self._pending[slots[self._shown[slots]]] = 0
 
     def _copy(self, slots: IntArray) -> None:
-        """Copy the current state of cells to the public copy."""
+        """Copy the current state of the slots (cells and sectors) to the public copy, which readers
+        see.
+        """
         live = self._fusion.store.state.live
         self._rows.belief[slots] = live.belief[slots]
         self._rows.cells[slots] = live.cells[slots]

@@ -93,8 +93,8 @@ def _select_tiles(
 def _view_tile(
     cache: TileCache, tile: int, query: MapQuery, route: IntArray | None, now: int
 ) -> ShownTile:
-    """Return the cells of one tile that may match, including estimated cells if the query asks for
-    them; along a route, in the order of the route.
+    """Return the cells of one tile that may match the query, including estimated (unvisited) cells
+    if it asks for them. For a query along a route, they are in the order of the route.
     """
     with cache.guard:
         fusion = cache.state.fusion
@@ -117,7 +117,8 @@ def _view_tile(
 
 
 def _select_rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
-    """Return the rows of the cells that have enough vehicles and touch the box.
+    """Return the rows of the tile's cells that enough vehicles have visited and that touch the
+    query's box.
 
     Usually this is a complete tile, or a contiguous part of it. Each step that releases the
     interpreter lock may wait ten times as long as the step takes, so cells are compared one by one

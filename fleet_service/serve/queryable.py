@@ -98,7 +98,9 @@ class _Answered:
 
 
 class _TokenBucket:
-    """Token bucket that limits the total cost of cheap answers per second."""
+    """Token bucket that limits the total estimated cost of the queries that are answered at once,
+    per second.
+    """
 
     def __init__(self) -> None:
         self._left = LIGHT_PER_S
@@ -106,8 +108,8 @@ class _TokenBucket:
         self._guard = threading.Lock()
 
     def take(self, cost: float) -> bool:
-        """Take `cost` from the bucket; return False, and take nothing, if the bucket contains
-        less.
+        """Take `cost` tokens (estimated cost of a query) from the bucket; return False, and take
+        nothing, if the bucket contains less.
         """
         with self._guard:
             now = time.monotonic()

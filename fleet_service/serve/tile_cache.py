@@ -120,7 +120,9 @@ class TileCache:
 
     @property
     def source(self) -> Readable:
-        """Return the cells that readers may see: the public copy, or the fusion itself."""
+        """Return the object from which readers' cells are read: the public copy if persons are kept
+        private, otherwise the fusion itself.
+        """
         return self.state.fusion if self._public is None else self._public
 
     def coarse(self, cells: CellView) -> CellView:

@@ -34,7 +34,7 @@ class CellView(NamedTuple):
     Attributes:
         cell, sector: place and direction.
         belief: belief about the friction of the road.
-        values: number of votes with a value of μ (not only a lower bound).
+        values: number of reports with a value of μ (not only a lower bound).
         vehicles, observations: number of vehicles and of observations.
         first, last: times of the first and the last observation [ns].
         imputed: True if the belief was estimated from neighbours.
@@ -61,8 +61,8 @@ class Readable(Protocol):
         """Return the present state of the cells as columns."""
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
-        """Return the belief about the road for each slot (cell and sector), (k, 32), predicted to
-        `now` [ns].
+        """Return the belief about the road (32 probabilities of μ) for each slot (cell and sector),
+        (k, 32), predicted to `now` [ns].
         """
 
     def slots_of(self, cell: IntArray, sector: IntArray) -> IntArray:
@@ -113,14 +113,15 @@ def join_views(*views: CellView) -> CellView:
 def is_measured(
     lower: FloatArray, upper: FloatArray, values: Float32Array, p_slippery: FloatArray
 ) -> BoolArray:
-    """Return a mask of beliefs (k,): True if the belief contains more than a lower bound.
+    """Return a mask of beliefs about friction (k,): True if the belief contains more information
+    than a lower bound.
 
     A belief that the road is slippery always counts as measured, even if it comes from values of
     other headings, because known ice must never be shown as unknown.
 
     Args:
         lower, upper: ends of the interval of μ, (k,).
-        values: number of votes with a value, (k,).
+        values: number of reports with a value of μ (not only a lower bound), (k,).
         p_slippery: probability of μ below SLIPPERY_MU, (k,).
     """
     narrow = upper - lower < MEASURED_WIDTH * PRIOR_WIDTH

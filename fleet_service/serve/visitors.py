@@ -104,7 +104,9 @@ class Visitors:
             self._bits = longer
 
     def _move_on(self, part: int) -> None:
-        """Begin the part with number `part` of the time window, and drop parts that are too old."""
+        """Begin to count in the part with number `part` of the time window, and drop the counts of
+        parts that are too old.
+        """
         ago = part - self._part
         if ago > 0:
             self._bits[:, ago:] = self._bits[:, : max(PARTS - ago, 0)]
@@ -113,7 +115,7 @@ class Visitors:
 
 
 def bit_of(vehicle: IntArray) -> NDArray[np.uint64]:
-    """Return an integer with one of 64 bits set for each vehicle; two vehicles may have the same
-    bit.
+    """Return, for each vehicle number (n,), a 64-bit integer with one bit set; two vehicles may
+    have the same bit.
     """
     return np.uint64(1) << ((vehicle.astype(np.uint64) * _FIBONACCI) >> _SHIFT)

@@ -6,8 +6,8 @@ Legend
     w    weight of a cell, n_b·n_a / (n_b + n_a), zero where a period has no value
     D    difference Σ w·(mean after - mean before) / Σ w
     u_v  influence of a vehicle: Σ over its values of ±w/(n·Σw)·(y - mean of cell and period)
-    sd   sqrt(V/(V-1)·Σ u_v²): values of a vehicle count as one (Liang and Zeger 1986, the sandwich
-         of clusters)
+    sd   sqrt(V/(V-1)·Σ u_v²): values of a vehicle count as one (Liang and Zeger 1986, cluster-
+         robust variance)
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def find_difference(row: dict[str, Any]) -> dict[str, float]:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return two rows, before and after: mean of mu, its difference with interval, and the number
-    of cells, vehicles and values used.
+    """Return two rows, before and after: mean of mu; difference between the periods with its 90 %
+    interval; numbers of cells, vehicles and values used.
 
     Raises:
         InputError: no time is given, or no cell was measured in both periods.

@@ -1,9 +1,9 @@
 """`calibration`: how often later values lay within the interval that the map had published.
 
-Each value is compared with the map snapshots of the preceding HORIZON_S. `held` means that the
-value itself lies inside the published interval. The value's own error is part of this figure, so a
-calibrated 90 % map stays slightly below 0.9. `compatible` means that the value's interval overlaps
-the published interval.
+Each value is compared with the map snapshots of the preceding HORIZON_S. The share `held` counts
+values that lie inside the published interval. The value's own error is part of this figure, so a
+calibrated 90 % map stays slightly below 0.9. The share `compatible` counts values whose own
+interval overlaps the published interval.
 """
 
 from __future__ import annotations

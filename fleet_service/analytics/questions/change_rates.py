@@ -188,8 +188,9 @@ BEGINS: Final = tuple(
 
 
 def fit(counts: FloatArray, begins: Sequence[tuple[float, float]] = BEGINS) -> tuple[float, float]:
-    """Return the maximum-likelihood estimates of λ [1/s] and e. Return NaN if no pair differs, or
-    if all values are on one side of the slippery limit.
+    """Return the maximum-likelihood estimates of λ, the rate of change [1/s], and e, the
+    probability of an error (see module). Return NaN if no pair differs, or if all values are on one
+    side of the slippery limit.
 
     Args:
         counts: (bins, 4): number of pairs, number of unlike pairs (one slippery, one not), number

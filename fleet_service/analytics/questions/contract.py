@@ -140,7 +140,7 @@ def longest_breach(
     Args:
         slot: (n,) numbers of time slots, ascending.
         lower, mu, upper: (n,) interval and mean of each slot.
-        level: required friction.
+        level: friction that the maintenance contract requires.
         span: begin and end [s] of all measurements. Nothing is known outside it, so slots are cut
             to it.
     """
@@ -159,9 +159,9 @@ def longest_breach(
 
 
 def _find_runs(is_below: BoolArray, far: BoolArray | None = None) -> tuple[IntArray, IntArray]:
-    """Return two arrays for the runs of true values in `is_below`: the first position of each run,
-    and the position after its last value. If `far` is given, a run also ends before each time slot
-    for which `far` is true.
+    """Return two arrays for the runs of successive True values in `is_below`: the first position of
+    each run, and the position after its last value. If `far` is given, a run also ends before each
+    time slot for which `far` (a gap lies before it) is True.
     """
     number = np.cumsum(~is_below if far is None else ~is_below | far)
     at = np.flatnonzero(is_below)

@@ -119,8 +119,8 @@ def _label_components(cell: IntArray, sector: IntArray) -> IntArray:
 
 
 def _stretch_cells(cell: IntArray, label: IntArray, count: int) -> pa.Array[Any]:
-    """Return the list of cells of each stretch. It makes it possible to draw a bent road as it is,
-    and not as a box.
+    """Return the list of cells of each stretch. With these cells a bent road can be drawn in its
+    true shape instead of its bounding box.
     """
     order = np.lexsort((cell, label))
     ends = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=count))])

@@ -50,7 +50,7 @@ SCHEMA: Final = pa.schema(_TYPES)
 
 
 class _Marks(NamedTuple):
-    """Points ("marks") every STEP_M along all links; each attribute is a column (n,).
+    """Points ("marks") every STEP_M metres along all road links; each attribute is a column (n,).
 
     Attributes:
         link: number of the link.
@@ -116,7 +116,7 @@ def join_roads(network: RoadNetwork) -> pa.Table:
 
 
 def _join_cells(network: RoadNetwork, marks: _Marks, scale: FloatArray, side: float) -> _Joined:
-    """Assign the cells near links to the links with a matching heading.
+    """Assign the cells near road links to the links with a matching heading.
 
     `scale` (marks,) is the cosine of the latitude, and `side` the width of a cell [m].
     """
@@ -210,7 +210,9 @@ def _link_marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
 
 
 def _nearby_cells(marks: _Marks, side: float) -> IntArray:
-    """Return the cells that may lie on a link: at least all cells within REACH_M of a mark."""
+    """Return the cells that may lie on a road link: all cells within REACH_M metres of a mark, and
+    some further ones.
+    """
     x, y = grid.deinterleave(np.unique(grid.cell_of(marks.latitude, marks.longitude)))
     wide = int(np.ceil(REACH_M / side))
     offsets = np.arange(-wide, wide + 1)
@@ -219,7 +221,9 @@ def _nearby_cells(marks: _Marks, side: float) -> IntArray:
 
 
 def _first_of(order: IntArray, *groups: IntArray) -> IntArray:
-    """Return the first element of each group; `order` must sort the elements by the groups."""
+    """Return the first index of each group in `order`. Elements with equal numbers in all arrays
+    `groups` form a group; `order` contains the indices of the elements, sorted by group.
+    """
     new = np.zeros(len(order), np.bool_)
     new[:1] = True
     for group in groups:

@@ -43,7 +43,9 @@ class Extract(NamedTuple):
 
 
 def read_observations(root: Path, part: Extract) -> pa.Table:
-    """Return the selected observations as points; new rows in the inbox are included."""
+    """Return the selected observations as points; new rows in the inbox (files that are not yet
+    sorted by cell) are included.
+    """
     where = [_time_filter("leave_time", part)]
     if part.bbox is not None:
         west, south, east, north = part.bbox
@@ -76,7 +78,7 @@ def _find_snapshot(root: Path, part: Extract) -> Path:
 
 
 def with_vehicles(table: pa.Table, vehicles: int) -> pa.Table:
-    """Return the rows of cells that at least `vehicles` vehicles have visited."""
+    """Return the rows of a map snapshot whose cells at least `vehicles` vehicles have visited."""
     return table.filter(pc.greater_equal(table["vehicles"], pa.scalar(vehicles, pa.int32())))
 
 
@@ -96,7 +98,8 @@ def map_then(root: Path, part: Extract) -> pa.Table:
 
 def mask_unmeasured(table: pa.Table, names: Sequence[str], known: BoolArray) -> pa.Table:
     """Return the table with nulls in the columns `names` where `known` (n,) is False. In these rows
-    only a lower bound is known, which must not be shown with a colour.
+    only a lower bound of friction is known; without the nulls a map program would colour it like a
+    measured value.
     """
     for name in names:
         column = table[name]
@@ -191,8 +194,8 @@ def iso_text(us: int) -> str:
 
 
 def _json_values(table: pa.Table, name: str) -> list[Any]:
-    """Return a column as values for JSON: times as ISO 8601 text, null for NaN, floats rounded to
-    single precision.
+    """Return a table column as a list of values for JSON: times as ISO 8601 text, null for NaN,
+    floats rounded to single precision.
     """
     column = table[name]
     if pa.types.is_timestamp(column.type):

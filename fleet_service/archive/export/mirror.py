@@ -1,5 +1,5 @@
-"""Mirror of an archive's compacted files, snapshots and roll-ups on another file system: a folder,
-S3, GCS or HDFS.
+"""Mirror of an archive's compacted (sorted) files, map snapshots and roll-ups (hourly statistics)
+on another file system: a folder, S3, GCS or HDFS.
 """
 
 from __future__ import annotations

@@ -1,1 +1,3 @@
-"""File format of an archive: file names, versions, segments, snapshots, and reading."""
+"""File format of an archive: file names, versions, segments (files of new rows), map snapshots, and
+reading.
+"""

@@ -71,14 +71,15 @@ def write_table(
     *,
     named: bool = True,
 ) -> None:
-    """Write a Parquet file that is complete and durable when this returns; on failure nothing
-    changes.
+    """Write a Parquet file. It is complete and durable (synced to disk) when this returns; on
+    failure nothing changes.
 
     Args:
         table: rows to write.
         path: path of the file; an existing file is replaced.
         encoding: encoding of the columns.
-        footer: key-value pairs for the footer, in addition to version and digest.
+        footer: key-value pairs for the footer, in addition to version and digest (checksum of the
+            columns).
         named: True to sync the folder too, so that the file name is durable; False if the caller
             syncs the folder.
 

@@ -59,7 +59,7 @@ _DAY: Final = re.compile(
 
 class Cut(NamedTuple):
     """Position in the sequence of segments (files of new rows). It stands for all rows up to and
-    including this segment. Positions only increase, independent of the clock.
+    including this segment. A later segment always has a larger position, whatever the clock shows.
     """
 
     epoch: int
@@ -166,9 +166,8 @@ def segment_name(prefix: str, number: int) -> str:
 
 def with_term(name: str, term: int) -> str:
     """Return the first part of a file name with the term (lease epoch) of the service that writes
-    the file. A term of an earlier writer in the name is replaced. So the new file does not
-    overwrite a file of another service. Without a lease (term 0), the name is returned without a
-    term.
+    the file. If the name contains the term of an earlier writer, this is replaced. Thus two
+    services never write the same file. For term 0 (no lease), the result contains no term.
     """
     return f"{_TERM.sub('', name)}.{term:010d}" if term else name
 
@@ -196,16 +195,16 @@ def term_of(name: str) -> int | None:
 
 
 def age_key(name: str) -> tuple[int, int, str]:
-    """Return a key that sorts segments, or compacted files, from old to new: epoch, number, name of
-    the service.
+    """Return a sort key that orders the names of segments, or of compacted files, from old to new:
+    epoch (number of the writer's start), number of the segment, name of the service.
     """
     shard, epoch, number = Path(name).stem.rsplit("-", 2)
     return int(epoch), int(number), shard
 
 
 def read_epoch(root: Path) -> int:
-    """Return the epoch of the service that owns an archive folder; 0 if the archive is used without
-    a lease.
+    """Return the epoch (number of the owner's lease term) of the service that owns an archive
+    folder; 0 if the archive is used without a lease.
     """
     with suppress(OSError, ValueError):
         return int((root / EPOCH_FILE).read_text())
@@ -213,7 +212,8 @@ def read_epoch(root: Path) -> int:
 
 
 def write_epoch(root: Path, epoch: int) -> None:
-    """Store the epoch that the names of files compacted from now on must contain.
+    """Store the epoch (number of the owner's lease term) that the names of files compacted from now
+    on must contain.
 
     Raises:
         OSError: the file cannot be written.

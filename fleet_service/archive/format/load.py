@@ -1,9 +1,9 @@
 """Reading and verification of one file of the archive.
 
 The result has the columns that this version knows: a missing column is null, and an unknown column
-is ignored. A file is damaged if a checksum, a digest or a text is wrong. The service that writes
-the archive, and its compaction, rename a damaged file so that it is not read again. Readers skip it
-with a warning and change nothing.
+is ignored. A file counts as damaged if a checksum or digest does not match, or a text is not valid
+UTF-8. The service that writes the archive, and its compaction, rename a damaged file so that it is
+not read again. Readers skip it with a warning and change nothing.
 """
 
 from __future__ import annotations
@@ -138,7 +138,8 @@ def load_groups(
     take: Callable[[pa.Table], None],
     damaged: Damaged = skip_damaged,
 ) -> bool:
-    """Read a file like `load`, but pass the matching rows to `take`, one row group at a time.
+    """Read a file like `load`, but pass the matching rows to `take`, one Parquet row group at a
+    time.
 
     This saves memory: reading a complete file takes several times the memory of its rows. In a row
     group without a matching row, only the columns of `where` are read. The result is False if the
@@ -177,8 +178,8 @@ def _read_batches(file: pq.ParquetFile, group: int, names: list[str]) -> Iterato
 
 
 def _read_row_groups(file: pq.ParquetFile, names: list[str] | None, where: Where) -> pa.Table:
-    """Return the rows that match the filter; read only row groups that may contain such rows, one
-    after the other.
+    """Return the rows that match the filter `where`. Only Parquet row groups that may contain such
+    rows are read, one after the other.
     """
     own = file.schema_arrow
     known = [one for one in where if one.column in own.names]

@@ -99,8 +99,8 @@ def read_wanted(
 
 
 class Listing:
-    """State of an archive at one moment: the rows of the inbox, and a list of compacted files,
-    which are read later.
+    """State of an archive at one moment: the new rows of the inbox, and a list of compacted
+    (sorted) files, which are read later.
 
     Args:
         the same as for `read_tables` and `read_wanted`.
@@ -121,7 +121,9 @@ class Listing:
         self.files = [path for path in files_near(files, wanted.box) if wanted.newer(path)]
 
     def inbox(self) -> Iterator[pa.Table]:
-        """Yield the inbox rows that no compacted file contains; call this only once."""
+        """Yield tables of the new rows (inbox) that no compacted (sorted) file contains; call this
+        only once.
+        """
         fresh = self._fresh
         self._fresh = []
         for path, table in fresh:
@@ -130,9 +132,9 @@ class Listing:
             )
 
     def load_groups(self, path: Path, where: Where, take: Callable[[pa.Table], None]) -> bool:
-        """Read a file like `load`, but pass the matching rows to `take`, one row group at a time.
-        Return False if the file is damaged or missing; the caller must then discard the rows passed
-        to `take`.
+        """Read a file like `load`, but pass the matching rows to `take`, one Parquet row group at a
+        time. Return False if the file is damaged or missing; the caller must then discard the rows
+        passed to `take`.
         """
         both = [*(self._wanted.where or ()), *where]
         try:
@@ -203,8 +205,8 @@ def compacted_partitions(files: Iterable[Path], names: set[str]) -> dict[str, se
 
 
 def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Table:
-    """Return the rows that do not belong to the partitions `done`, because rows of these partitions
-    are already in compacted files.
+    """Return the rows that do not belong to the partitions `done`, because compacted files already
+    contain the rows of these partitions (day and map square).
     """
     if not done or not table.num_rows:
         return table

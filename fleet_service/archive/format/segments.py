@@ -56,7 +56,8 @@ class Writer:
     Args:
         root: folder of the archive.
         shard: name of the service.
-        epoch: smallest number that may be used as the epoch in segment names, from the lease.
+        epoch: smallest number that may be used as the epoch (number of the start) in segment names;
+            the lease determines it.
     """
 
     def __init__(self, root: Path, shard: str, epoch: int = 0) -> None:
@@ -89,12 +90,14 @@ class Writer:
 
     @property
     def newest(self) -> layout.Cut:
-        """Return the position of the last written segment (file of new rows)."""
+        """Return the position of the last written segment (file of new rows) in the sequence of all
+        segments.
+        """
         return layout.Cut(self._epoch, self._seq)
 
     def write(self, kind: Kind, rows: Rows) -> Path:
-        """Write one segment from columns (n,); return its path. The segment is durable only after
-        `sync`.
+        """Write columns (n,) of new rows as one segment file; return its path. The file is durable
+        only after `sync`.
 
         `log_likelihood` is (n, 32); `with_likelihood` (n,) is true for rows that have a likelihood.
 
@@ -122,8 +125,9 @@ class Writer:
 
 
 def round_to_steps(rows: Rows) -> Rows:
-    """Return rows with floats rounded to multiples of their column's step and times rounded down to
-    microseconds. The fusion then uses exactly the values that are stored.
+    """Return rows with floats rounded to multiples of their column's step (resolution in
+    `schemas/tables.py`) and times rounded down to microseconds. The fusion then uses exactly the
+    values that are stored.
     """
     out = {
         name: np.rint(c / _STEPS[name]) * _STEPS[name] if name in _STEPS else c

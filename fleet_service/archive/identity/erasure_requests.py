@@ -1,5 +1,5 @@
-"""Erasure requests from the archive's owner to the running service, as files. Only the service may
-erase data.
+"""Erasure requests from the archive's owner to the running service, as files. Only the service
+itself may erase data, because it also has data in memory.
 
     requests/NAME.json           the request: a month, and a vehicle or none
     requests/NAME.answer.json    the result, or the reason of refusal; replaces the request

@@ -111,8 +111,8 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
 
 
 class _Rest(NamedTuple):
-    """Segments (files of new rows) that are not compacted yet, oldest first. For each segment, the
-    partitions (date and zone) to which an earlier, interrupted run already moved rows.
+    """Segments (files of new rows) that are not compacted yet, oldest first. Each has a set of
+    partitions (date and map square) to which an earlier, interrupted run already moved its rows.
     """
 
     root: Path

@@ -1,5 +1,5 @@
-"""Apache Iceberg tables of the compacted files. Files are registered without copying; the inbox is
-never registered.
+"""Apache Iceberg tables of an archive's compacted (sorted) files. Files are registered without
+copying; new rows in the inbox are never registered.
 
 Only one process may register files of a table. Before retention or erasure removes or rewrites
 files, these files are removed from the tables (`unregister`), because a table that refers to a
@@ -243,7 +243,9 @@ def _file_url(root: Path, place: Place, path: Path) -> str:
 
 @contextmanager
 def _one_line_errors(place: Place) -> Iterator[None]:
-    """Convert any error of the catalogue into an InputError with a message of one line."""
+    """Convert any error of the Iceberg catalogue inside the block into an InputError with a message
+    of one line (context manager).
+    """
     try:
         yield
     except InputError:

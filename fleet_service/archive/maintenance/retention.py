@@ -222,7 +222,8 @@ def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]
 
 
 def forget_witness(root: Path, vehicle: str, month: str) -> None:
-    """Remove the line with the permanent number by which the map knew a vehicle in a month.
+    """Remove the line that links a vehicle's pseudonym of a month to its permanent number in the
+    map.
 
     Raises:
         OSError: the file cannot be written.

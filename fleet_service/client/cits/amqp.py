@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 
 class Parcel(NamedTuple):
-    """Message to send, with the name by which its sender recognises it when it is accepted."""
+    """Message to send. Its name is passed to `on_accepted` when the interchange has accepted it."""
 
     name: str
     body: bytes
@@ -130,7 +130,8 @@ class AmqpLink:
 
     Attributes:
         is_connected: True while the interchange answers.
-        is_waking: True from the time when a message is queued until the thread reads the queue.
+        is_waking: True while the connection's thread has been notified of queued messages but has
+            not yet read the queue.
         rejected: number of messages that the interchange refused.
     """
 

@@ -219,8 +219,8 @@ def _write_location(out: BitWriter, denm: Denm) -> None:
 
 def _encode_deltas(origin: Point, points: Iterable[Point]) -> list[int]:
     """Return the encoded offsets of points from `origin`. Each point has the offsets to the north
-    and to the east, with one number of bits for both, and a height that is marked as unavailable.
-    Points that are too far away for these bits are left out.
+    and to the east, both encoded with the same number of bits, and a height that is marked as
+    unavailable. Points that are too far away for these bits are left out.
     """
     found = list[int]()
     height = 12_800 - LEAST["height"]

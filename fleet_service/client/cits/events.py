@@ -1,5 +1,5 @@
-"""Events of one originating station: the event number of each stretch of road with an active alert,
-and the messages that must be sent. Pure.
+"""Events (hazards in the sense of DENM) of one originating station: the event number of each
+stretch of road with an active alert, and the messages that must be sent. Pure.
 
 A stretch is one event from its first to its last cell, even over restarts, because the events are
 saved to a file. An event is sent when it begins, when it changes, before its validity ends, and
@@ -29,7 +29,7 @@ TERMINATED_NS: Final = VALID_NS  # for which the number of an ended event is not
 
 @dataclass(frozen=True)
 class OpenEvent:
-    """Event that has been sent to the interchange.
+    """Event (hazard) that has been sent to the interchange.
 
     Attributes:
         name: id of the stretch of road.
@@ -90,8 +90,8 @@ class EventBook:
     def update(
         self, standing: Sequence[StretchAlert], now: int, is_heard: Callable[[float, float], bool]
     ) -> list[Denm]:
-        """Return the messages that are due now. Events at places for which no service answers are
-        not ended.
+        """Return the messages (DENM) that are due now. Events at places for which no service
+        answers are not ended, because their state is unknown.
 
         Args:
             standing: every stretch of road with an active alert.

@@ -80,8 +80,8 @@ def begin_slot(live: Rows, slot: int, key: int) -> None:
 
 @refcount_free_inlined
 def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
-    """Copy the state of a cell from one row to another. The references of the target row to its
-    window and reporters stay unchanged.
+    """Copy the state of a cell from one row to another. The target row keeps its own references to
+    recent observations and recent reporters.
     """
     for i in range(mugrid.BINS):
         target.belief[to, i] = source.belief[at, i]

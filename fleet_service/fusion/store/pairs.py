@@ -1,6 +1,5 @@
-"""Store of the earlier reports of a pair, which is one vehicle in one cell: a linked list of the
-reports that may still be reordered by a late one (entries of the lateness window), and one record
-that sums up the older reports.
+"""Store of the earlier reports of a pair, which is one vehicle in one cell. Recent reports form a
+linked list, because a late one may still come between them. One record sums up the older reports.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ _FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its
 
 @refcount_free_inlined
 def comes_before(entries: RecordArray, a: int, b: int) -> bool:
-    """Return True if entry `a` (an observation) of a lateness window comes before entry `b`:
-    ordered by time, then by vehicle, start and sequence number.
+    """Return True if observation `a` comes before observation `b` in the order of fusion: by time,
+    then by vehicle, start of the vehicle, and sequence number. Both are row numbers of `entries`.
     """
     if entries[a].time != entries[b].time:
         return bool(entries[a].time < entries[b].time)
@@ -51,8 +50,8 @@ def pair_of(pairs: RecordArray, used: IntArray, slot: int, vehicle: int) -> int:
 
 @refcount_free_inlined
 def link_pair(entries: RecordArray, pairs: RecordArray, pair: int, entry: int) -> None:
-    """Insert an entry, in order of time, into the linked list of its vehicle's entries in its
-    window.
+    """Insert an observation (row `entry` of `entries`), in order of time, into the linked list of
+    its vehicle's recent observations in the cell.
     """
     pairs[pair].waiting += 1
     entries[entry].pair = pair
@@ -72,8 +71,8 @@ def link_pair(entries: RecordArray, pairs: RecordArray, pair: int, entry: int) -
 
 @refcount_free_inlined
 def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
-    """Move the report of an entry (an observation) into the record of its vehicle's older reports,
-    and unlink the entry from later entries of the vehicle.
+    """Add an observation (row `entry` of `entries`) to the record of its vehicle's older reports in
+    the cell, and unlink it from the vehicle's later observations.
     """
     pair = int(entries[entry].pair)
     kind = int(entries[entry].kind)
@@ -92,7 +91,7 @@ def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 @refcount_free_inlined
 def _must_stay(pairs: RecordArray, place: int, least: int) -> bool:
     """Return True if the record of a vehicle and cell must stay: the vehicle reported there at
-    `least` [s] or later, or has entries (observations) in the lateness window.
+    `least` [s] or later, or has observations there that are younger than the checkpoint.
     """
     pair = pairs[place]
     return bool(pair.last != NONE or pair.time[0] >= least or pair.time[1] >= least)
@@ -145,8 +144,9 @@ def returning_bit(number: int) -> np.uint64:
 
 @compiled
 def mark_returned(state: State, slots: IntArray, numbers: IntArray) -> None:
-    """Record in cells (k,) that vehicles (k,) have visited them, because the vehicles' reports
-    there are about to be forgotten.
+    """Record in each cell (slots (k,)) that a vehicle (numbers (k,)) has visited it. This is done
+    before the vehicle's reports there are deleted, so that a later visit does not count it as a new
+    vehicle.
     """
     for k in range(len(slots)):
         slot = slots[k]

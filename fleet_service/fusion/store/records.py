@@ -55,14 +55,15 @@ class CellRecord:
             vehicle is not counted twice; see `pairs.returning_bit`.
         visits: number of observations.
         vehicles: number of distinct vehicles.
-        values: number of votes with a value; a repeated vote counts as a fraction.
+        values: number of observations with a friction value; a repeated one of the same vehicle
+            counts as a fraction.
         window: row of the slot's window, or NONE.
         reporters: row of its recent reporters, or NONE if no vehicle recently gave a value or
             corroborated an alert.
-        aged: time before `time` that the belief has not forgotten yet, in units of 1/AGED s.
+        aged: time before `time` by which the belief must still be aged, in units of 1/AGED s.
         used: weighted mean grip used by the vehicles that gave values, in units of 1/USED.
-        shared: weighted mean of the relative standard deviation that these values share, in units
-            of 1/SHARED.
+        shared: weighted mean of the relative error that these values have in common (standard
+            deviation), in units of 1/SHARED.
         untrusted: number of bounds and of values from untrusted vehicles, fading with time, in
             units of 1/UNTRUSTED.
         manoeuvres: weight of the values by manoeuvre, see `shared`; in units of 1/WEIGHT.
@@ -145,7 +146,7 @@ class EntryRecord:
 
 
 class WindowRecord:
-    """The lateness window of a slot (cell and sector).
+    """The lateness window (observations younger than the checkpoint) of a slot (cell and sector).
 
     Attributes:
         slot: the slot; NONE if the window is not in use.
@@ -174,8 +175,9 @@ class PairRecord:
         waiting: number of the pair's observations in the window.
         std: standard deviation of the last value, in units of 1/FINE.
         time: time [s] of the last lower bound and of the last value; 0 for none.
-        mean, spent: mean friction, and votes already used up, at the last lower bound and at the
-            last value; in units of 1/FINE.
+        mean, spent: mean friction, and the part of the vehicle's allowed votes (effects on the
+            belief) that is used up, at the last lower bound and at the last value; in units of
+            1/FINE.
     """
 
     slot: np.int32
@@ -199,8 +201,8 @@ class SourcesRecord:
 
 class ReportersRecord:
     """The recent reporters of a cell and sector: the last REPORTERS vehicles that gave a value,
-    with time [s], mean, standard deviation and grip used. The record also contains the vehicles
-    that corroborate ice or grip, as in `SourcesRecord`.
+    with time [s], mean, standard deviation and grip used. The record also contains the last
+    vehicles that reported ice or grip there, as in `SourcesRecord`.
     """
 
     reporter: Annotated[Int32Array, c.REPORTERS]
@@ -213,7 +215,8 @@ class ReportersRecord:
 
 
 class PeersRecord:
-    """Comparisons of one vehicle with others, and of its values with each other.
+    """Comparisons of one vehicle's friction values with those of other vehicles and with each
+    other.
 
     Attributes:
         other: index of the other vehicle.
@@ -238,7 +241,7 @@ class PeersRecord:
 
 
 class VehicleRecord:
-    """Vehicle that has reported. Its key in the hash table is its permanent number."""
+    """Vehicle that has reported. Its permanent number is its key in the hash table of vehicles."""
 
     key: int
 
@@ -280,7 +283,7 @@ class State(NamedTuple):
         live: the current slots.
         base: the slots (cells and sectors) in the state before the observations in their windows,
             one row per row of `windows`; of the reporters only the sources are copied.
-        windows, entries: pools.
+        windows, entries: pools (arrays with free rows) of `WindowRecord` and `EntryRecord`.
         free_windows, free_entries: stacks of the pools' free rows.
         pairs: hash table that contains the pair records.
         used: (4,) counts, see FREE_WINDOWS.

@@ -112,9 +112,9 @@ class Store:
         older than `before` [ns]: first the windows without a value of friction, then those with a
         value, sorted by cell.
 
-        Values that leave the window are compared with other values to compute trust. The order of
-        these comparisons must not depend on the order of arrival, so windows with values are
-        sorted. All others stay in the order of memory, which is faster.
+        Friction values that leave the window are compared with other values to compute trust in
+        vehicles. The order of these comparisons must not depend on the order of arrival, so windows
+        with values are sorted. All others stay in the order of memory, which is faster.
         """
         plain, valued = find_due_windows(self.state.windows, before)
         return plain, valued[
@@ -173,7 +173,9 @@ class Store:
         return index
 
     def reserve(self, rows: int) -> None:
-        """Enlarge every memory pool so that it has space for `rows` more votes."""
+        """Enlarge every array of records so that it has space for `rows` more votes (effects of one
+        observation on one cell).
+        """
         used = self.state.used
         if used[FREE_ENTRIES] < rows:
             self._more_entries(self.waiting + rows)
@@ -261,8 +263,8 @@ class Store:
         self.state = state._replace(pairs=new)
 
     def _rebuild_reporters(self, least: int) -> None:
-        """Delete lists of recent reporters whose last report was before `least` [s]. Cells with a
-        lateness window keep their lists.
+        """Delete lists of recent reporters whose last report was before `least` [s]. Cells with
+        observations younger than the checkpoint keep their lists.
         """
         live = self.state.live
         cells = self.state.live.cells[: self.size]
@@ -333,8 +335,8 @@ def _grow_rows(old: Array, rows: int) -> Array:
 
 
 def _free_rows(old: Int32Array, used: IntArray, which: int, rows: int) -> Int32Array:
-    """Return the stack of free rows of a memory pool after it has grown to `rows`: the earlier free
-    rows and the new ones. The number of free rows is stored in `used[which]`.
+    """Return the list of free rows of an array of records that has grown to `rows`: the earlier
+    free rows `old` and the new rows. The number of free rows is stored in `used[which]`.
     """
     count = int(used[which])
     more = rows - len(old)

@@ -1,5 +1,5 @@
 """Open-addressing hash tables: arrays of row numbers; the keys are stored in the rows themselves.
-Compiled. At least one place of a table must be free.
+Compiled. At least one place (array item) of a table must be free.
 
 A place contains the row number in its lower half and a part of the key's hash in its upper half.
 Comparing the hash parts first avoids nearly all reads of rows with another key, each of which would
@@ -59,8 +59,8 @@ def _row_at(held: int) -> int:
 
 @refcount_free_inlined
 def _place_content(mixed: np.uint64, row: int) -> int:
-    """Return the integer that a place of the table must contain for a key and its row. It never
-    equals NONE.
+    """Return the integer that represents a key and its row in the table: the row number, and a part
+    of the key's hash `mixed`. It never equals NONE, which marks a free place.
     """
     return int((np.int64(mixed & np.uint64(_TAG)) << 32) | row)
 
@@ -178,8 +178,8 @@ def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
 
 def places_for(entries: int, most: float) -> int:
     """Return the length of a hash table (number of places) that has room for 35 % more than
-    `entries` when at most a share `most` of the places is in use. For records of vehicles in cells,
-    which live three hours, this allows for the growth of another hour.
+    `entries` when at most a share `most` of the places is in use. Records of vehicles in cells live
+    three hours, so 35 % is their growth in about one more hour.
     """
     return max(LEAST, int(1.35 * entries / most))
 
