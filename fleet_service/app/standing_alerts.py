@@ -48,7 +48,9 @@ class StandingAlerts:
         return self._shared.state.alerts.standing_alerts
 
     def encode_tiles(self, is_wanted: Callable[[int], bool]) -> list[tuple[int, bytes]]:
-        """Return (tile number, payload) for each tile with active alerts that `is_wanted` accepts."""
+        """Return (tile number, payload) for each tile that has active alerts and that `is_wanted`
+        accepts.
+        """
         tiles: dict[int, list[Alert]] = {}
         with self._shared.guard:
             for alert in self.all:

@@ -45,5 +45,5 @@ class VoteWeights(NamedTuple):
 
 
 def initial_vote_weights(initial: float) -> VoteWeights:
-    """Return the vote weights of a service that knows no vehicle yet: every vehicle gets `initial`."""
+    """Return the vote weights of a service that knows no vehicle: each vehicle gets `initial`."""
     return VoteWeights(-1, np.zeros(0, np.float32), initial, np.zeros(0, np.bool_))

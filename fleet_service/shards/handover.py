@@ -109,7 +109,7 @@ def _find_server(there: presence.PresenceTracker, region: str) -> str | None:
 
 
 def _request_handover(session: zenoh.Session, service: str, to: str) -> str:
-    """Send the hand-over request to a service; return the regions that it will hand over, as text."""
+    """Send the hand-over request to a service; return the regions that it hands over, as text."""
     for reply in session.get(f"{keys.shard_key(service)}?to={to}", timeout=ANSWER_S):
         if reply.ok is not None:
             return reply.ok.payload.to_string().replace(",", ", ")

@@ -137,7 +137,7 @@ def _month_files(folder: Path) -> list[Path]:
 
 
 def _undamaged_lines(data: bytes) -> Iterator[tuple[int, int]]:
-    """Yield (pseudonym, permanent number) for every undamaged line in the content `data` of a file."""
+    """Yield (pseudonym, permanent number) for each undamaged line of a file's content `data`."""
     for at in range(0, len(data) - _LINE + 1, _LINE):
         pseudonym, number = (int.from_bytes(data[at + k : at + k + 8], signed=True) for k in (0, 8))
         if data[at : at + _LINE] == _encode_line(pseudonym, number):
