@@ -94,7 +94,8 @@ def open_page(
 
 _COLOURS: Final = """panel => {
   const canvas = document.querySelectorAll("canvas.map")[panel];
-  const bytes = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data, found = {};
+  const bytes = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+  const found = {};
   for (let k = 0; k < bytes.length; k += 4) if (bytes[k + 3] === 255) {
     const name = [bytes[k], bytes[k + 1], bytes[k + 2]].join(",");
     found[name] = (found[name] || 0) + 1;

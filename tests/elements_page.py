@@ -33,8 +33,8 @@ Every equation, table and figure of the five papers, and whether the code follow
 - *Corrected*: changed, with the reason.
 - *Left out*: not in the code, with the reason.
 
-The lists are in the modules of the estimators. Paths in the column "where" are relative to `edge_agent`, mostly below
-`edge_agent/estimators`.
+The lists are in the modules of the estimators. Paths in the column "where" are relative to
+`edge_agent`, mostly below `edge_agent/estimators`.
 """
 
 

@@ -153,7 +153,8 @@ class Fuzzer:
         parser: the parser to fuzz.
         inputs: initial corpus.
         seed: seed of the random mutations.
-        keep: function that stores an input; called with its kind (corpus, crash or hang) and content.
+        keep: function that stores an input; called with its kind (corpus, crash or hang) and
+            content.
     """
 
     def __init__(

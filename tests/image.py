@@ -174,8 +174,8 @@ def main() -> int:
         assert user.isdecimal(), "Kubernetes must see that it is not root"
         assert int(user) > 0 < int(group)
         print(
-            f"a service of the image is ready after {time_start(image):.1f} s, with kernels that the "
-            "build has compiled"
+            f"a service of the image is ready after {time_start(image):.1f} s, with kernels that "
+            "the build has compiled"
         )
     return 0
 

@@ -31,8 +31,10 @@ NOT_OURS: Final = ("NOTICE.md", "results.md")  # a licence; texts of figures
 OPENING: Final = re.compile(r"(What|Who|Whether|Of|How)\b")
 # "who is late", "what the map knows": relative clauses without a noun.
 FREE_RELATIVE: Final = re.compile(
-    r"\b(?:who (?:is|was|has|had|may|said|told|comes|asks|waits|would|can|does|did|knows|says|reads|sends)"
-    r"|what (?:is|was|has|had|may|it|they|a|an|the|no|was|comes|does|can|would|goes|lies|stands|others?|we|nobody))\b",
+    r"\b(?:who (?:is|was|has|had|may|said|told|comes|asks|waits|would|can|does|did"
+    r"|knows|says|reads|sends)"
+    r"|what (?:is|was|has|had|may|it|they|a|an|the|no|was|comes|does|can|would|goes|lies"
+    r"|stands|others?|we|nobody))\b",
     re.IGNORECASE,
 )
 # Words that are archaic or translated, with the standard word.

@@ -35,8 +35,12 @@ PACKAGES: Final = {
     "maplibre-gl": Package(  # BSD-3-Clause
         "5.24.0",
         {
-            "dist/maplibre-gl.js": "45a9b07a9189ce56054c620a947ccf41e291e58c95e9b61533b740aaa65ee5cb",
-            "dist/maplibre-gl.css": "ab1e70d59ec40465bae7e7030da2f3ccf28133fd502e62bd598eefbadfd7a732",
+            "dist/maplibre-gl.js": (
+                "45a9b07a9189ce56054c620a947ccf41e291e58c95e9b61533b740aaa65ee5cb"
+            ),
+            "dist/maplibre-gl.css": (
+                "ab1e70d59ec40465bae7e7030da2f3ccf28133fd502e62bd598eefbadfd7a732"
+            ),
         },
     ),
 }

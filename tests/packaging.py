@@ -25,7 +25,8 @@ assert {"schemas", "edge_agent", "fleet_service", "deploy"} == set(gripmap.PACKA
 import deploy, edge_agent, fleet_service, schemas
 from importlib.metadata import metadata
 about = metadata("gripmap")
-assert about["License-Expression"] == "Apache-2.0" and about["Summary"] and about["Description"], about
+assert about["License-Expression"] == "Apache-2.0", about
+assert about["Summary"] and about["Description"], about
 from pathlib import Path
 for package in (schemas, edge_agent, fleet_service, deploy):
     assert (Path(package.__file__).parent / "py.typed").is_file(), package

@@ -339,8 +339,8 @@ def results_page() -> str:
         "## Missed targets\n",
         "|figure|value|target|unit|command|commit|\n|---|---|---|---|---|---|",
         *(
-            f"|`{row['name']}` {MISSED}|{format_number(row['value'])}|{format_bar(row)}|{escape_unit(row['unit'])}|"
-            f"`{CAMPAIGNS[name].command}`|{row['commit']}|"
+            f"|`{row['name']}` {MISSED}|{format_number(row['value'])}|{format_bar(row)}"
+            f"|{escape_unit(row['unit'])}|`{CAMPAIGNS[name].command}`|{row['commit']}|"
             for name, row in missed
         ),
     ]
@@ -359,7 +359,10 @@ def _campaign_section(name: str) -> Iterator[str]:
         yield "No complete run is kept."
         return
     for commit, run in _read_runs(name).items():
-        yield f"- Commit {commit}, {run['date'][:10]}, {run['machine']}, seeds {format_seeds(run['seeds'])}"
+        yield (
+            f"- Commit {commit}, {run['date'][:10]}, {run['machine']}, "
+            f"seeds {format_seeds(run['seeds'])}"
+        )
     tables = [table for table in TABLES if table.campaign == name]
     rows = [
         row for row in found.values() if row["bar"] is not None or not _is_in_table(row, tables)
@@ -370,7 +373,8 @@ def _campaign_section(name: str) -> Iterator[str]:
     for row in rows:
         mark = "" if row["bar"] is None else HOLDS if row["holds"] else MISSED
         yield (
-            f"|`{row['name']}`|{mark}|{format_number(row['value'])}|{format_bar(row)}|{escape_unit(row['unit'])}|{row['commit']}|"
+            f"|`{row['name']}`|{mark}|{format_number(row['value'])}|{format_bar(row)}"
+            f"|{escape_unit(row['unit'])}|{row['commit']}|"
         )
     values = {key: math.nan if row["value"] is None else row["value"] for key, row in found.items()}
     for table in tables:

@@ -410,7 +410,7 @@ FIGURES: Final = (
     Figure("functions with more than 6 parameters", 0, 35, functions_with_many_parameters),
     Figure("packed assignments per 1,000 lines", 2, 2, packed_assignments, per_1000=True),
     Figure("fmt: skip", 40, 0, fmt_skips),
-    Figure("lines over 100 columns", 0, 156, long_lines),
+    Figure("lines over 100 columns", 0, 0, long_lines),
     Figure("functions with nesting over 4", 0, 2, deep_nesting),
     Figure("functions with more than 40 local names", 0, 0, many_locals),
     Figure("named constants between sensor and map", 230, 399, named_constants),
@@ -433,9 +433,8 @@ def main(arguments: list[str]) -> None:
         print(f"{figure.name:<44}{value:>9g}{figure.bar:>9g}{figure.ceiling:>9g}{mark}")
     for package in PACKAGES[:3]:
         loose = len(loose_modules(root, package))
-        print(
-            f"{package}: {loose} loose modules, {len(list_room_imports(root, package))} arrows between rooms"
-        )
+        arrows = len(list_room_imports(root, package))
+        print(f"{package}: {loose} loose modules, {arrows} arrows between rooms")
     print(f"class names used more than once: {len(ambiguous_classes(root))}")
     milliseconds, modules, heavy = light_import(root)
     print(

@@ -312,7 +312,9 @@ def test_unwritable_estimates_are_refused_in_one_line(
 def test_every_module_of_a_command_says_what_it_is() -> None:
     for line in LINES.values():
         for command in line.COMMANDS:
-            assert importlib.import_module(command.module).__doc__.startswith("`")  # type: ignore[union-attr]
+            text = importlib.import_module(command.module).__doc__
+            assert text is not None
+            assert text.startswith("`")
 
 
 def test_missing_package_is_one_line_with_its_extra(capsys: pytest.CaptureFixture[str]) -> None:

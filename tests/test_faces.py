@@ -168,7 +168,11 @@ def steep(theta):
     return np.minimum(2.0 * theta, 1.0)
 
 
-busiest = Question("busiest", "rows", "rows", None, lambda engine, options: pa.table({"rows": [engine.rows()]}))
+def count_rows(engine, options):
+    return pa.table({"rows": [engine.rows()]})
+
+
+busiest = Question("busiest", "rows", "rows", None, count_rows)
 """
 POINTS = """[gripmap.estimators]
 at-least = their_plugin:bank

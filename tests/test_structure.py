@@ -322,8 +322,9 @@ def test_a_name_of_a_class_stands_for_one_thing() -> None:
 
 # Numbers that stand in schemas/thresholds.py and nowhere else, however they are written.
 SHARED_NUMBER = re.compile(
-    r"(?<![\w.])(9\.81|9\.80665|1\.64\d+|6_?378_?137(\.0)?|40_?075_?01\d[\d._]*|111_?[123]\d\d(\.0)?|10\*\*9|1e9|"
-    r"1_?000_?000_?000|(EXCITED|SLIPPERY)\w*(: Final)? = 0?\.\d+)(?![\w])"
+    r"(?<![\w.])(9\.81|9\.80665|1\.64\d+|6_?378_?137(\.0)?|40_?075_?01\d[\d._]*"
+    r"|111_?[123]\d\d(\.0)?|10\*\*9|1e9|1_?000_?000_?000"
+    r"|(EXCITED|SLIPPERY)\w*(: Final)? = 0?\.\d+)(?![\w])"
 )
 
 
@@ -462,7 +463,8 @@ def test_everything_public_has_a_docstring(package: str) -> None:
 
 def test_a_missing_docstring_is_seen_and_a_private_one_is_not_missed() -> None:
     tree = ast.parse(
-        '"""M."""\nclass A:\n    """A."""\n    def f(self): ...\n    def _g(self): ...\ndef _h(): ...'
+        '"""M."""\nclass A:\n    """A."""\n    def f(self): ...\n'
+        "    def _g(self): ...\ndef _h(): ..."
     )
     assert [name for _, name in find_undocumented(tree)] == ["f"]
 

@@ -63,7 +63,8 @@ def show_clients(folder: Path, endpoint: str, comparison: compare.MapComparison)
 The observations are Parquet files; for example, with DuckDB:
   import duckdb
   print(duckdb.sql("select sector, count(*), median(mu), count(distinct vehicle)
-                    from '{folder}/archive/observations/*/*/*.parquet' where value group by sector"))""")
+                    from '{folder}/archive/observations/*/*/*.parquet'
+                    where value group by sector"))""")
 
 
 def report_figures(

@@ -23,7 +23,12 @@ def main(archive: Path, folder: Path) -> None:
     files = f"{archive}/observations/*/*/*.parquet"
     # A row whose `value` is false says only that mu is at least mu_utilised: it is left out.
     sql = f"select cell, sector, median(mu) as mu from '{files}' where value group by all"
-    by_duckdb = duckdb.sql(sql).df().set_index(["cell", "sector"]).sort_index()  # type: ignore[union-attr]
+    by_duckdb = (
+        duckdb.sql(sql)  # type: ignore[union-attr]
+        .df()
+        .set_index(["cell", "sector"])
+        .sort_index()
+    )
 
     rows = pd.concat(
         pd.read_parquet(path) for path in sorted(archive.glob("observations/*/*/*.parquet"))

@@ -3,10 +3,10 @@ uses, and the rate of forgetting.
 
 | if | then | kind |
 |---|---|---|
-| the mismatch of the wheels or axles is in one of five sets | ln R of that group changes by the set's step | Sugeno |
+| mismatch of wheels or axles is in one of five sets | ln R changes by the set's step | Sugeno |
 | the wheels' mismatch is FAR | offsets, slope and bank return to their prior faster | Sugeno |
 | steering is WIDE | R of the axle that is steered is larger | Sugeno |
-| slide, demand, new forces and strain are in one set each | ln of the share of evidence that is used | Takagi–Sugeno |
+| slide, demand, new forces, strain are in a set each | ln of the evidence share | Takagi–Sugeno |
 
 Sugeno: the result is the consequent of a rule times its membership. The first line is implemented
 in `fuzzy.py`. Sets are ramps from a foot (membership 0) to a peak (membership 1); feet, peaks and

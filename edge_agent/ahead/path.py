@@ -2,8 +2,8 @@
 module is pure.
 
 Legend
-    s        distance ahead of the car                                             [m]     (M,)  1, 2, 3 …
-    key      cell·4 + sector: a place of the map                                   int64
+    s        distance ahead of the car [m], (M,): 1, 2, 3 …
+    key      cell·4 + sector: a place of the map, int64
     places   (M, C) keys that a metre may lie in, the likeliest first; NONE fills unused columns
 
 A car of the fleet may have driven one lane away from the path, with a position error of 1.5 m.

@@ -77,7 +77,8 @@ def update_warnings(
             if nearest.braking_energy > 0.5 * speed**2:
                 continue
             first = min(nearest.places)
-            name = f"{grid.quadkey(first // grid.SECTORS, grid.CELL_ZOOM)}{first % grid.SECTORS}-{pose.time // NS:x}"
+            cell = grid.quadkey(first // grid.SECTORS, grid.CELL_ZOOM)
+            name = f"{cell}{first % grid.SECTORS}-{pose.time // NS:x}"
             one = _make_warning(name, "raised", nearest, pose, sure)
             issued.append(one)
             kept[name] = Active(one, places, pose.time, nearest.start)

@@ -100,7 +100,12 @@ class KuksaProvider:
                     return
                 self._write_all(publish, *latest)
 
-    def _write_all(self, publish: Any, signals: Mapping[str, float], time_ns: int) -> None:  # noqa: ANN401
+    def _write_all(
+        self,
+        publish: Any,  # noqa: ANN401
+        signals: Mapping[str, float],
+        time_ns: int,
+    ) -> None:
         messages = self._connection.messages
         values: dict[str, Any] = {
             path: messages.Value(float=signals[path]) if path in signals else None

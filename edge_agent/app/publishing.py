@@ -84,6 +84,7 @@ def print_status(progress: Progress, publisher: Publisher, log_line: Callable[[s
     text = (
         f"{progress.signals_s:7.1f} s  {publisher.status.links} sessions, "
         f"{sum(counts.published.values())} records published, "
-        f"{sum(counts.acknowledged.values())} acknowledged, {publisher.count_unsettled()} unsettled{late}"
+        f"{sum(counts.acknowledged.values())} acknowledged, "
+        f"{publisher.count_unsettled()} unsettled{late}"
     )
     log_line(LogLine(text, event="status", **final_counts(progress, publisher)))

@@ -2,10 +2,10 @@
 the force (paper 002).
 
 Legend
-    tau         motor torque at the wheel, K_t*i [N m]              J   inertia of wheel and rotor [kg m^2]
-    tau_u       stationary torque for the applied voltage [N m]     T_e electric time constant L/R [s]
-    omega       wheel speed [rad/s]                                 R   wheel radius [m]
-    F, F'       longitudinal force and its derivative [N, N/s]      k1, k2  sliding mode [N/s^2, 1/s]
+    tau     motor torque at the wheel, K_t*i [N m]           J    inertia, wheel and rotor [kg m^2]
+    tau_u   stationary torque for the voltage [N m]          T_e  electric time constant L/R [s]
+    omega   wheel speed [rad/s]                              R    wheel radius [m]
+    F, F'   longitudinal force, its derivative [N, N/s]      k1, k2  sliding mode [N/s^2, 1/s]
 
 tau' = (tau_u - tau)/T_e (10), J*omega' = tau - R*F (11), F'' = -k1*sgn(F') - k2*F' (31). Torque is
 used in place of current, because the paper's K_a, K_t and J do not belong to one machine, and there

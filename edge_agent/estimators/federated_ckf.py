@@ -209,7 +209,11 @@ def _update_sub_filter(
 
 
 @compiled
-def _write_estimates(memory: JointMemory, nothing: EmptyRecord, output: FloatArray) -> float:  # noqa: ARG001
+def _write_estimates(
+    memory: JointMemory,
+    nothing: EmptyRecord,  # noqa: ARG001 all filters have this signature
+    output: FloatArray,
+) -> float:
     write_states(output, memory.motion.mean, memory.motion.root, PlanarState.YAW_RATE)
     for wheel in range(WHEELS):
         std = math.sqrt(variance(memory.root, wheel))

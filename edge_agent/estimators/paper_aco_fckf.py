@@ -229,7 +229,11 @@ def _adapt_noise(memory: FuzzyMemory, context: FuzzyContext, pace: float, keep: 
 
 
 @compiled
-def _write_estimates(memory: FuzzyMemory, context: FuzzyContext, output: FloatArray) -> float:  # noqa: ARG001 as of all filters
+def _write_estimates(
+    memory: FuzzyMemory,
+    context: FuzzyContext,  # noqa: ARG001 all filters have this signature
+    output: FloatArray,
+) -> float:
     mean = memory.mean
     root = memory.root
     write_states(output, mean, root, PlanarState.YAW_RATE)

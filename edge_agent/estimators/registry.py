@@ -32,13 +32,25 @@ from schemas.errors import InputError
 from schemas.vehicle import Vehicle
 
 ESTIMATORS = {
-    "aco-fckf": "default: friction mixture of cubature filters, fuzzy noise adaptation tuned by the ant colony",
+    "aco-fckf": (
+        "default: friction mixture of cubature filters, fuzzy noise adaptation tuned by the "
+        "ant colony"
+    ),
     "fckf": "the same with untuned memberships",
     "ckf": "the same without adaptation",
-    "paper-aco-fckf": "paper 004 as printed, errata corrected: friction as a state, fuzzy R, wheel speed as an input",
-    "federated-ckf": "paper 000: two cubature sub-filters and a master, for motion and for four-wheel friction",
-    "adaptive-federated-ckf": "paper 001: the same for motion, with fuzzy R and adaptive shares; friction is set",
-    "compensated-wckf": "paper 002: electric drive wheels, then motion by compensated tyre forces; friction is set",
+    "paper-aco-fckf": (
+        "paper 004 as printed, errata corrected: friction as a state, fuzzy R, wheel speed as an "
+        "input"
+    ),
+    "federated-ckf": (
+        "paper 000: two cubature sub-filters and a master, for motion and for four-wheel friction"
+    ),
+    "adaptive-federated-ckf": (
+        "paper 001: the same for motion, with fuzzy R and adaptive shares; friction is set"
+    ),
+    "compensated-wckf": (
+        "paper 002: electric drive wheels, then motion by compensated tyre forces; friction is set"
+    ),
     "sr-ukf": "paper 003: square-root unscented filter for four-wheel friction with wheel torque",
 }
 # whose memberships come from the ant colony, and the name of the file that `banks.bank_of` takes

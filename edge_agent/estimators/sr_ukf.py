@@ -278,7 +278,11 @@ def _update_filter(
 
 
 @compiled
-def _write_estimates(memory: UnscentedMemory, nothing: EmptyRecord, output: FloatArray) -> float:  # noqa: ARG001
+def _write_estimates(
+    memory: UnscentedMemory,
+    nothing: EmptyRecord,  # noqa: ARG001 all filters have this signature
+    output: FloatArray,
+) -> float:
     mean = memory.mean
     root = memory.root
     first = WheelFrictionState.MU

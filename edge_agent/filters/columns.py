@@ -2,9 +2,9 @@
 per second.
 
 Legend
-    m, L        state's mean (n,), and its lower-triangular square root of the covariance, P = L*L'     (n, n)
-    x           points in columns                                                                      (n, 2n)
-    q           standard deviations of the process noise, independent                                  (n,)
+    m, L     state's mean (n,), and lower-triangular square root of its covariance, P = L*L' (n, n)
+    x        points in columns (n, 2n)
+    q        standard deviations of the process noise, independent (n,)
 
 Points and prediction equal those of `points` and `householder` with `sigma.cubature_rule`, but need
 less work, because all weights are 1/(2n). Points lie along the contiguous axis, so that the

@@ -1,10 +1,11 @@
 """Measurement updates of a square-root filter with one scalar measurement after the other.
 
 Legend
-    m, L        state's mean (n,), and its square root of the covariance, P = L*L'                      (n, n)
-    f           deviation of the measurement in the axes of L's columns, h = L*f its covariance with x   (n,)
-    r, a        variance of the noise, and of the innovation, a = f'*f + r
-    nu          innovation, measured minus predicted
+    m, L     state's mean (n,), and square root of its covariance, P = L*L' (n, n)
+    f        deviation of the measurement in the axes of L's columns (n,); h = L*f is its covariance
+             with x
+    r, a     variance of the noise, and of the innovation, a = f'*f + r
+    nu       innovation, measured minus predicted
 
 No variance is ever subtracted from another, so variances cannot become negative. Rows with
 independent noise may be applied in any order. An update changes L, and with it the deviations f of

@@ -67,7 +67,10 @@ RULES: Final[dict[str, Rule]] = {
 }
 STEERING: Final[Rule] = (
     r"^delta|steer|lenk.*winkel|sas.*angle|lwi",
-    rf"{STATES}|rate|speed|geschw|torque|req|cmd|target|desired|init|fraction|crc|qual|override|driver|cal|^sensor",
+    (
+        rf"{STATES}|rate|speed|geschw|torque|req|cmd|target|desired|init"
+        r"|fraction|crc|qual|override|driver|cal|^sensor"
+    ),
 )
 COURSE: Final = re.compile(r"heading|course|track")
 

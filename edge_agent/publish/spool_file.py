@@ -22,8 +22,8 @@ log = logging.getLogger(__name__)
 SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS batch (
     id INTEGER PRIMARY KEY AUTOINCREMENT,
-    vehicle TEXT NOT NULL, boot INTEGER NOT NULL, kind TEXT NOT NULL, region INTEGER NOT NULL, seq INTEGER NOT NULL,
-    records INTEGER NOT NULL, payload BLOB NOT NULL, checksum INTEGER,
+    vehicle TEXT NOT NULL, boot INTEGER NOT NULL, kind TEXT NOT NULL, region INTEGER NOT NULL,
+    seq INTEGER NOT NULL, records INTEGER NOT NULL, payload BLOB NOT NULL, checksum INTEGER,
     UNIQUE (vehicle, boot, kind, region, seq)
 );
 CREATE INDEX IF NOT EXISTS batch_age ON batch (kind, id);

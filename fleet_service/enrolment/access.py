@@ -1,14 +1,14 @@
 """Configuration of a Zenoh router: mutual TLS, and an access list that denies everything not listed
 here. Pure.
 
-| role    | may publish                              | may read and query                  |
-|---------|------------------------------------------|-------------------------------------|
-| vehicle | obs/*/*/*/NAME, state/*/*/*/NAME, PRIVATE, token alive/NAME | map, alert and serves; ack/NAME, PRIVATE |
-| owner   | nothing                                  | map, alert, serves; PRIVATE of its own |
-| reader  | nothing                                  | map, alert and serves               |
-| weather | weather/**                               | nothing                             |
-| service | everything under gripmap/ but PRIVATE    | the same                            |
-| router  | messages that others may publish, between routers | the same                   |
+| role    | may publish                                       | may read and query            |
+|---------|---------------------------------------------------|-------------------------------|
+| vehicle | obs/*/*/*/NAME, state/*/*/*/NAME, PRIVATE, alive/NAME | as a reader; ack/NAME, PRIVATE |
+| owner   | nothing                                           | as a reader; PRIVATE of its own |
+| reader  | nothing                                           | map, alert and serves         |
+| weather | weather/**                                        | nothing                       |
+| service | everything under gripmap/ but PRIVATE             | the same                      |
+| router  | messages that others may publish, between routers | the same                      |
 
 NAME is the name in the certificate. PRIVATE stands for the keys ahead/NAME and vss/NAME: the road
 ahead of a vehicle, and the friction at the vehicle. Zenoh decides by the common name of the

@@ -126,7 +126,9 @@ def judge_flag(
     for k in range(c.REPORTERS):
         other = int(here.reporter[k])
         time = int(here.time[k])
-        if other == NOBODY or other == vehicle or now - time > c.PEER_S or time <= newest:  # noqa: SIM109 as above
+        if other == NOBODY or other == vehicle:  # noqa: SIM109 as above
+            continue
+        if now - time > c.PEER_S or time <= newest:
             continue
         newest = time
         away = (SLIPPERY_MU - here.mean[k]) / max(float(here.std[k]), c.NOVELTY_STD)

@@ -55,8 +55,8 @@ HILLS: Final = World(
     "hills-20000", 0.5, f"{WHOLE_WAY}.hills"
 )  # frictions and hills that nobody tuned on
 # Half of the vehicles as real cars are, on ten towns' own frictions and hills: the figures without
-# a further name, see `moments.ask_moments`. All cells of a way share one snow, so that fewer ways say little
-# about P(slippery).
+# a further name, see `moments.ask_moments`. All cells of a way have the same snow,
+# so that P(slippery) needs many ways.
 WAYS: Final = tuple(
     World(f"hills-{seed}", 0.5, f"{WHOLE_WAY}.{seed}", seed) for seed in range(20_001, 20_011)
 )

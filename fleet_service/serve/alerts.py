@@ -30,12 +30,12 @@ CLEAR_BELOW: Final = 0.05  # grip must be as sure as ice was: clearing too early
 # an alert without confirmation ends as soon as ice is less likely than grip
 FADE_BELOW: Final = 0.5
 # Distinct vehicles that reported ice, here or, unless a source of grip opposes, on the stretch: one
-# liar, or one bad sensor, moves nothing. Of the slippery cell-minutes of eight tuning towns .926 are
-# under alert with the stretch, .907 without.
+# liar, or one bad sensor, moves nothing. Of the slippery cell-minutes of eight tuning towns .926
+# are under alert with the stretch, .907 without.
 LEAST_SOURCES: Final = 2
-# ... and MOST_SOURCES here where a source of grip is not older than they are by this: a road changes,
-# so that earlier visits do not contradict it. With one minute instead of ten, three trusted vehicles
-# that flood a dry cell raised an alert in two of six tuning towns.
+# ... and MOST_SOURCES here where a source of grip is not older than they are by this: a road
+# changes, so that earlier visits do not contradict it. With one minute instead of ten, three
+# trusted vehicles that flood a dry cell raised an alert in two of six tuning towns.
 FRESH_NS: Final = 600 * NS
 MOST_SOURCES: Final = 4
 SOURCE_NS: Final = 3600 * NS  # sources count for an hour; older ice belongs to an older road

@@ -74,7 +74,8 @@ def encode_tile(cells: pa.RecordBatch, form: Format, tile: int) -> bytes:
         return arrow_stream(cells)
     rows = _json_rows(cells)
     if form is Format.JSON:
-        return f'{{"tile": "{grid.quadkey(tile, grid.TILE_ZOOM)}", "cells": [{_encode_rows(rows)}]}}'.encode()
+        name = grid.quadkey(tile, grid.TILE_ZOOM)
+        return f'{{"tile": "{name}", "cells": [{_encode_rows(rows)}]}}'.encode()
     outlines = np.stack(
         grid.outline(cells["cell"].to_numpy(), cells["sector"].to_numpy()), axis=-1
     ).tolist()

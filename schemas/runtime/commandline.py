@@ -79,7 +79,12 @@ def join_negative_numbers(argv: Sequence[str]) -> list[str]:
     return out
 
 
-def add_command(commands: Any, name: str, about: str, example: str) -> argparse.ArgumentParser:  # noqa: ANN401 argparse's own
+def add_command(
+    commands: Any,  # noqa: ANN401 a private type of argparse
+    name: str,
+    about: str,
+    example: str,
+) -> argparse.ArgumentParser:
     """Add a subcommand with help text, example and the common options to a parser; return the
     subcommand's parser.
     """

@@ -95,15 +95,19 @@ def _prefetch(context: Any, array: Any, row: Any, line: Any) -> Any:  # noqa: AN
         whole = ir.IntType(32)
         data = target.make_array(kind)(target, builder, values[0])
         place = [values[1], *[long(0)] * (kind.ndim - 1)]
-        begin = builder.ptrtoint(cgutils.get_item_pointer(target, builder, kind, data, place), long)  # type: ignore[no-untyped-call]
+        pointer = cgutils.get_item_pointer(  # type: ignore[no-untyped-call]
+            target, builder, kind, data, place
+        )
+        begin = builder.ptrtoint(pointer, long)
         address = builder.inttoptr(
             builder.add(begin, builder.mul(values[2], long(LINE))), cgutils.voidptr_t
         )
         hint = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, whole, whole, whole])
-        function = cgutils.get_or_insert_function(builder.module, hint, "llvm.prefetch.p0")  # type: ignore[no-untyped-call]
-        builder.call(
-            function, [address, whole(0), whole(3), whole(1)]
-        )  # to read, into every cache, data
+        function = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
+            builder.module, hint, "llvm.prefetch.p0"
+        )
+        # to read, into every cache, data
+        builder.call(function, [address, whole(0), whole(3), whole(1)])
         return target.get_dummy_value()
 
     return types.void(array, types.int64, types.int64), generate
@@ -134,7 +138,8 @@ def _compile(
 ) -> Callable[P, R]:
     kept = "NUMBA_CACHE_DIR" in os.environ or cache_root() is not None
     if kept and "NUMBA_CACHE_DIR" not in os.environ:
-        numba.config.CACHE_DIR = kernel_cache(function.__module__.partition(".")[0])  # type: ignore[attr-defined]
+        package = function.__module__.partition(".")[0]
+        numba.config.CACHE_DIR = kernel_cache(package)  # type: ignore[attr-defined]
     options: dict[str, Any] = {"nogil": nogil, "forceinline": forceinline, "_nrt": references}
     kernel = numba.njit(cache=kept, error_model="numpy", **options)(function)
     if kept:

@@ -32,8 +32,8 @@ def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
     A thread sends the signals, because a waiting process may be busy for a long time.
 
     Returns:
-        a function that the process must call repeatedly; the signals stop `most_s` seconds after its
-        last call.
+        a function that the process must call repeatedly; the signals stop `most_s` seconds after
+        its last call.
     """
     last = time.monotonic()
     every_s = float(os.environ.get(_WITHIN, _USUAL_US)) * 1e-6 / 4

@@ -185,7 +185,12 @@ def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
     return Batch(kind, *found.heads.at(0)[1:-1], found.columns, message.estimator)
 
 
-def _read_column(message: Any, name: str, dtype: np.dtype[Any], n: int) -> NDArray[Any]:  # noqa: ANN401
+def _read_column(
+    message: Any,  # noqa: ANN401
+    name: str,
+    dtype: np.dtype[Any],
+    n: int,
+) -> NDArray[Any]:
     """Return a column of a message (n,), integers as int64. A column that was not sent is filled
     with its default.
     """

@@ -144,7 +144,7 @@ def measure_questions(root: Path, readings: Path) -> list[Figure]:
     def query_history(cell: int) -> None:
         t.filter(t.cell == cell).select(*columns).order_by("time").to_pyarrow()
 
-    spent = np.median([median_s(lambda cell=int(cell): query_history(cell), 1) for cell in chosen])  # type: ignore[misc]
+    spent = np.median([median_s(partial(query_history, int(cell)), 1) for cell in chosen])
     return [*found, Figure("analytics.one_cell_ms", float(spent) * 1e3, "ms", 50)]
 
 

@@ -104,15 +104,18 @@ _THEIRS: Final = """() => {
   };
   globalThis.there = () => true;
 }"""
-_MAPLIBRE: Final = """<!doctype html><meta charset="utf-8"><link rel="stylesheet" href="maplibre-gl.css">
+_MAPLIBRE: Final = """<!doctype html><meta charset="utf-8">
+<link rel="stylesheet" href="maplibre-gl.css">
 <style>body { margin: 0 } #map { width: 1184px; height: 1000px }</style><div id="map"></div>
 <script src="maplibre-gl.js"></script><script>
-const colour = ["step", ["coalesce", ["get", "mu"], 1], "#4c007b", .2, "#aa5271", .4, "#f58c41", .6, "#eeea79"];
+const mu = ["coalesce", ["get", "mu"], 1];
+const colour = ["step", mu, "#4c007b", .2, "#aa5271", .4, "#f58c41", .6, "#eeea79"];
 const paint = { "fill-antialias": false, "fill-color": colour };
 const layers = [{ id: "cells", type: "fill", source: "cells", paint }];
 const style = { version: 8, sources: { cells: { type: "geojson", data: "town.geojson" } }, layers };
 const map = new maplibregl.Map({
-  container: "map", center: [LON, LAT], zoom: ZOOM - 1, fadeDuration: 0, attributionControl: false, style,
+  container: "map", center: [LON, LAT], zoom: ZOOM - 1, fadeDuration: 0,
+  attributionControl: false, style,
 });
 map.once("idle", () => { globalThis.shown = performance.now(); });
 </script>"""

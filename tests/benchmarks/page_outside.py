@@ -57,7 +57,10 @@ _SPACES: Final = {
 }
 READERS: Final = {
     "GDAL": "import pyogrio; found = pyogrio.read_dataframe('OAPIF:{address}', layer='grip')",
-    "geopandas": "import geopandas; found = geopandas.read_file('{address}collections/grip/items?limit=10000')",
+    "geopandas": (
+        "import geopandas; "
+        "found = geopandas.read_file('{address}collections/grip/items?limit=10000')"
+    ),
 }
 _COUNT: Final = (
     "; print(len(found), int((found.basis == 'bound').sum()), int(found.mu.notna().sum()))"

@@ -140,7 +140,8 @@ def _time_queries(root: Path) -> tuple[list[float], int]:
             at = datetime.fromtimestamp(
                 START_NS // 10**9 + int(rng.integers(DAY_S, WORLD.days * DAY_S)), UTC
             )
-            selector = f"{keys.ROOT}/map/**?bbox={','.join(f'{v:.6f}' for v in box)};at={at:%Y-%m-%dT%H:%M:%SZ}"
+            bbox = ",".join(f"{v:.6f}" for v in box)
+            selector = f"{keys.ROOT}/map/**?bbox={bbox};at={at:%Y-%m-%dT%H:%M:%SZ}"
             seconds, tables = _time_answer(session, selector)
             spent.append(seconds)
             cells += sum(table.num_rows for table in tables)

@@ -241,9 +241,11 @@ def service() -> list[Figure]:
     with those of a bare queryable.
     """
     tile = keys.map_key(_TILE)
+    # The first cell. The box goes from it over all columns and half of the lines. It is a little
+    # smaller, because a box contains its borders.
     west, south, east, north = (
         float(v[0]) for v in grid.bounds(grid.interleave(np.array([_X]), np.array([_Y])))
-    )  # the first cell: the box goes over all columns and half of the lines from it; borders lie in it, so less a bit
+    )
     wide = COLUMNS * (east - west)
     high = LINES // 2 * (north - south)
     box = f"{west + 1e-6},{north - high + 1e-6},{west + wide - 1e-6},{north - 1e-6}"

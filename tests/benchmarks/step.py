@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from functools import partial
 from importlib.util import find_spec
 from typing import TypeVar
 
@@ -127,7 +128,7 @@ def step() -> list[Figure]:
         if find_spec(name) is None:
             print(f"  {name} is not installed: pip install '.[bench]'", flush=True)
             continue
-        seconds = median_s(lambda peer=peer: peer.drive(problem), 3) / PYTHON_STEPS  # type: ignore[misc]
+        seconds = median_s(partial(peer.drive, problem), 3) / PYTHON_STEPS
         found.append(
             Figure(f"bench.step.vs_{name}", seconds / per_step, "times as fast", peer.bar, "more")
         )
@@ -162,7 +163,12 @@ def bank() -> list[Figure]:
         ours, threaded = time_in_turn(
             # called before the loop goes on
             lambda: bank_of(NAME, fleet).advance(t, signals, threads=THREADS),  # noqa: B023
-            lambda: make_limit(Limit, drive, vehicles, speed).drive(readings, drive.gone),  # noqa: B023
+            lambda: make_limit(
+                Limit,
+                drive,
+                vehicles,  # noqa: B023
+                speed,
+            ).drive(readings, drive.gone),  # noqa: B023
         )
         cost[vehicles] = ours / (vehicles * samples)
         if vehicles > 100:

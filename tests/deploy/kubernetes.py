@@ -24,7 +24,7 @@ import tempfile
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -294,9 +294,11 @@ class Cluster:
         ]
         assert "readinessProbe" in names
         for name in names:
-            holds = partial(has_answered, pod, container, container[name])
+            has_ended_or_answers = partial(
+                _has_ended_or, process, partial(has_answered, pod, container, container[name])
+            )
             try:
-                until(lambda holds=holds: process.poll() is not None or holds(), START_S)  # type: ignore[misc]
+                until(has_ended_or_answers, START_S)
             except TimeoutError:
                 self.failed.append(f"{pod.name}: {name} never answered")
                 return
@@ -318,6 +320,10 @@ class Cluster:
                 return str(page.read().decode())
         except (OSError, http.client.HTTPException):  # refused, cut off, or late
             return ""
+
+
+def _has_ended_or(process: subprocess.Popen[bytes], holds: Callable[[], bool]) -> bool:
+    return process.poll() is not None or holds()
 
 
 def has_answered(pod: Pod, container: Manifest, probe: Manifest) -> bool:

@@ -21,7 +21,8 @@ class Lives(ABC, Generic[BatchType]):
     Attributes:
         lives: number of lives.
         operations: upper limit of the number of operations until power loss.
-        full_after: upper limit of the number of operations until the disk may be full for a short time.
+        full_after: upper limit of the number of operations until the disk may be full for a
+            short time.
         acknowledged: batches that were acknowledged.
         at_stake: number of batches that were acknowledged before a power loss.
     """

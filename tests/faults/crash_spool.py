@@ -11,6 +11,7 @@ from __future__ import annotations
 import random
 import shutil
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -33,6 +34,10 @@ class Files(NamedTuple):
     def read_files(path: Path) -> Files:
         log = Path(f"{path}-wal")
         return Files(path.read_bytes(), log.read_bytes() if log.exists() else b"")
+
+
+def _return_payload(payload: bytes, sequence: int, first: int) -> bytes:
+    return payload
 
 
 def spool_history(number: int) -> list[str]:
@@ -60,7 +65,7 @@ def _run_history(random_: random.Random, folder: Path) -> list[str]:
         outbox.settle_ranges(stream, [(seq, seq) for seq in settled])
         payload = random_.randbytes(random_.choice((50, 3000, 400_000)))
         batches = outbox.store(
-            [Draft("car-a", Kind.OBSERVATION, 1, 1, lambda s, f, p=payload: p)] * 2,  # type: ignore[misc]
+            [Draft("car-a", Kind.OBSERVATION, 1, 1, partial(_return_payload, payload))] * 2,
             0.0,
         )
         held.update({batch.seq: batch.payload for batch in batches})

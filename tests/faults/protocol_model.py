@@ -62,7 +62,8 @@ class Service(NamedTuple):
     """State of a service.
 
     Attributes:
-        role: "waiting", "taking" (has created its number, but not listed yet), "serving", or "gone".
+        role: "waiting", "taking" (has created its number, but not listed yet), "serving", or
+            "gone".
         number: number of its lease; 0 without a lease.
         age: ticks since the beginning of its last valid renewal, capped.
         begun: age of a renewal that is under way; NOT_YET without one.

@@ -60,7 +60,12 @@ def session(router: ZenohSettings) -> Iterator[zenoh.Session]:
 @contextmanager
 def running(router: ZenohSettings, root: Path, **changed: object) -> Iterator[Running]:
     """Yield a running service on an archive, and stop it after the block."""
-    config = ServiceConfig(zenoh=router, put_s=PUT_S, segment_s=0.1, **changed)  # type: ignore[arg-type]
+    config = ServiceConfig(
+        zenoh=router,
+        put_s=PUT_S,
+        segment_s=0.1,
+        **changed,  # type: ignore[arg-type]
+    )
     lines: list[str] = []
     service = Service(config, root, lines.append)
     stop = threading.Event()

@@ -181,7 +181,10 @@ def main(endpoint: str) -> None:
                 or (len(heard.acks) == len(sent) and heard.alerts and heard.tiles and heard.batches)
             )
         )
-        box = f"bbox={LONGITUDE - 0.01},{LATITUDE - 0.01},{LONGITUDE + 0.01},{LATITUDE + 0.01};min_vehicles=2"
+        box = (
+            f"bbox={LONGITUDE - 0.01},{LATITUDE - 0.01},{LONGITUDE + 0.01},{LATITUDE + 0.01};"
+            "min_vehicles=2"
+        )
         ((arrow, tile),) = query_replies(session, f"{keys.ROOT}/map/**?{box}")
         ((_, document),) = query_replies(session, f"{keys.ROOT}/map/**?{box};format=json")
         ((_, features),) = query_replies(session, f"{keys.map_key(TILE)}?{box};format=geojson")

@@ -399,7 +399,15 @@ def main() -> int:
             ) as missing:  # a browser that is not there: not measured does not hold
                 house.print_measured(name, missing)
                 value = float("nan")
-            found.append(Figure(f"usability.{name}", value, unit, bar, better))  # type: ignore[arg-type]
+            found.append(
+                Figure(
+                    f"usability.{name}",
+                    value,
+                    unit,
+                    bar,
+                    better,  # type: ignore[arg-type]
+                )
+            )
     finally:
         shutil.rmtree(place, ignore_errors=True)
     figures.write(FOLDER / "figures.json", "usability", [SEED], found)

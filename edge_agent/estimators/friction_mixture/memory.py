@@ -32,8 +32,8 @@ class VelocityGain:
 
 
 class BlockSums:
-    """Sums of the inputs and of the motion over the samples of the current block (.05 s), from which
-    the block's means are computed when it ends.
+    """Sums of the inputs and of the motion over the samples of the current block (.05 s), from
+    which the block's means are computed when it ends.
     """
 
     time: float  # at which it began [s]

@@ -5,7 +5,8 @@
     steer_lag   delay of the yaw rate that a bicycle model computes from the measured steering angle
                 against the gyroscope's (Rajamani 2012, section 2.3)
 
-    m (v̇_y + v r) = F_f + F_r,   I ṙ = a F_f − b F_r,   F_f = C_f (δ − (v_y + a r)/v),   F_r = −C_r (v_y − b r)/v
+    m (v̇_y + v r) = F_f + F_r,           I ṙ = a F_f − b F_r,
+    F_f = C_f (δ − (v_y + a r)/v),       F_r = −C_r (v_y − b r)/v
 
 The lag is the shift with the largest correlation of both sides; a parabola through three samples
 refines the peak. A lateral force builds up a little later than its slip, so wheels and steering

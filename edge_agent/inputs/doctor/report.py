@@ -37,7 +37,8 @@ STYLE: Final = (
     "1em;color:#222}"
     "table{border-collapse:collapse}td,th{padding:.2em .8em;border-bottom:1px solid "
     "#ddd;text-align:left}"
-    "figure{display:inline-block;margin:.5em}figcaption{font-size:13px;color:#555}.bad{color:#b00020}"
+    "figure{display:inline-block;margin:.5em}figcaption{font-size:13px;color:#555}"
+    ".bad{color:#b00020}"
 )
 
 
@@ -117,14 +118,15 @@ def report_page(diagnosis: Diagnosis, title: str) -> str:
     return (
         f"<!doctype html><meta charset='utf-8'><title>{escape(title)}</title><style>{STYLE}</style>"
         f"<h1>{escape(title)}</h1><p>{escape(publishing_advice(diagnosis))}</p>"
-        f"<table><tr><th>channel<th>finding<th>evidence{''.join(rows)}</table>{_identity_table(diagnosis.fits)}{plots}\n"
+        f"<table><tr><th>channel<th>finding<th>evidence{''.join(rows)}</table>"
+        f"{_identity_table(diagnosis.fits)}{plots}\n"
     )
 
 
 def _identity_table(fits: dict[str, Fit]) -> str:
     rows = [
-        f"<tr><td>{name}<td>{fit.gain:.3g}<td>{fit.offset:.3g}<td>{fit.correlation:.2f}<td>{fit.excited_s:.0f}"
-        f"<td>{fit.lag_s:+.2f} ± {fit.lag_error_s:.2f}"
+        f"<tr><td>{name}<td>{fit.gain:.3g}<td>{fit.offset:.3g}<td>{fit.correlation:.2f}"
+        f"<td>{fit.excited_s:.0f}<td>{fit.lag_s:+.2f} ± {fit.lag_error_s:.2f}"
         for name, fit in fits.items()
         if len(fit.right)
     ]

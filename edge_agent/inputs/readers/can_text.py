@@ -18,7 +18,8 @@ MILLI: Final = 1e-3
 LONGEST_LINE: Final = 4096
 _TRACE: Final = re.compile(
     r"^\s*\d+\)\s+(?P<time>\d+(?:\.\d+)?)\s+(?:(?P<bus>\d{1,2})\s+)?(?:(?:Rx|Tx|DT)\s+)?"
-    r"(?P<id>[0-9A-Fa-f]{3,8})\s+(?:(?:Rx|Tx|-)\s+)?(?P<size>\d)\s+(?P<data>(?:[0-9A-Fa-f]{2}\s*)*)$"
+    r"(?P<id>[0-9A-Fa-f]{3,8})\s+(?:(?:Rx|Tx|-)\s+)?(?P<size>\d)\s+"
+    r"(?P<data>(?:[0-9A-Fa-f]{2}\s*)*)$"
 )
 
 

@@ -30,7 +30,8 @@ _MESSAGE: Final = re.compile(r"^\s*BO_\s+(\d+)\s+([^:\s]+)\s*:\s*(\d+)")
 # line.
 _SIGNAL: Final = re.compile(
     r"^\s*SG_\s(?P<label>[^:]+):\s*(?P<start>\d+)\|(?P<size>\d+)@(?P<order>[01])(?P<sign>[+-])"
-    r"\s*\(\s*(?P<factor>[^,\s][^,]*),(?P<offset>[^)]+)\)\s*(?:\[[^\]]*\])?\s*(?:\"(?P<unit>[^\"]*)\")?"
+    r"\s*\(\s*(?P<factor>[^,\s][^,]*),(?P<offset>[^)]+)\)\s*(?:\[[^\]]*\])?"
+    r"\s*(?:\"(?P<unit>[^\"]*)\")?"
 )
 _MULTIPLEXED: Final = re.compile(r"M|m\d+M?")  # the last word before the colon, after the name
 Bytes: TypeAlias = NDArray[np.uint8]

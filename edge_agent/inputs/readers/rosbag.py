@@ -115,7 +115,10 @@ def read_bag(reader: Any, path: Path, wanted: set[str] | None) -> Recording:  # 
     return recording
 
 
-def _read_messages(reader: Any, connections: list[Any]) -> Iterator[tuple[Any, int, int, Any]]:  # noqa: ANN401
+def _read_messages(
+    reader: Any,  # noqa: ANN401
+    connections: list[Any],
+) -> Iterator[tuple[Any, int, int, Any]]:
     """Yield (connection, time of the recorder [ns], time of the message [ns], message) for each
     message of the connections.
     """
@@ -150,7 +153,12 @@ def leaves_of(message: Any, prefix: str = "", depth: int = 0) -> Iterator[Leaf]:
             yield from leaves_of(value, path, depth + 1)
 
 
-def _array_leaves(message: Any, path: str, value: Any, prefix: str) -> Iterator[Leaf]:  # noqa: ANN401
+def _array_leaves(
+    message: Any,  # noqa: ANN401
+    path: str,
+    value: Any,  # noqa: ANN401
+    prefix: str,
+) -> Iterator[Leaf]:
     if not 0 < len(value) <= LONGEST_ARRAY or not all(
         isinstance(v, int | float | np.number) for v in value
     ):
@@ -159,7 +167,8 @@ def _array_leaves(message: Any, path: str, value: Any, prefix: str) -> Iterator[
     named = isinstance(labels, list) and len(labels) == len(value)
     take = attrgetter(path[1:])
     for index in range(len(value)):
-        yield f"{path}[{labels[index] if named else index}]", _element_at(take, index)  # type: ignore[index]
+        label = labels[index] if named else index  # type: ignore[index]
+        yield f"{path}[{label}]", _element_at(take, index)
 
 
 def _element_at(take: Callable[[Any], Any], index: int) -> Callable[[Any], Any]:

@@ -186,7 +186,11 @@ def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
     )
 
 
-def _parse_seconds(column: Any, name: str, unit: str | None) -> tuple[FloatArray, int | None]:  # noqa: ANN401 Arrow columns are not generic
+def _parse_seconds(
+    column: Any,  # noqa: ANN401 Arrow columns are not generic
+    name: str,
+    unit: str | None,
+) -> tuple[FloatArray, int | None]:
     """Return the seconds since the first row, and the [ns UTC] of that row if the time is a date,
     else None.
     """

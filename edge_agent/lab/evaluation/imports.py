@@ -75,7 +75,11 @@ def _recorded_frames(log: Log, message: Any) -> list[bytes]:  # noqa: ANN401 can
     ]
 
 
-def _compare_decoders(ours: Database, message: Any, frames: Sequence[bytes]) -> tuple[int, int]:  # noqa: ANN401 cantools has no types
+def _compare_decoders(
+    ours: Database,
+    message: Any,  # noqa: ANN401 cantools has no types
+    frames: Sequence[bytes],
+) -> tuple[int, int]:
     table = np.frombuffer(
         b"".join(frame.ljust(LONGEST, b"\0") for frame in frames), np.uint8
     ).reshape(-1, LONGEST)

@@ -191,4 +191,5 @@ def foreign(scenario: DriveSpec, kind: str) -> DriveSpec:
     """Return the scenario with tyres of the given kind (a key of FOREIGN), which the estimators do
     not model.
     """
-    return replace(scenario, vehicle=replace(scenario.vehicle, **FOREIGN[kind]))  # type: ignore[arg-type]
+    vehicle = replace(scenario.vehicle, **FOREIGN[kind])  # type: ignore[arg-type]
+    return replace(scenario, vehicle=vehicle)

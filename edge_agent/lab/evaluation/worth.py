@@ -219,7 +219,10 @@ def comparison_table(values: dict[str, float]) -> str:
     by name.
     """
     lines = [
-        "| figure | compares | ratio | paired difference ± standard error | share of seeds better |",
+        (
+            "| figure | compares | ratio | paired difference ± standard error "
+            "| share of seeds better |"
+        ),
         "|---|---|---|---|---|",
     ]
     for name, (over, under) in RATIOS.items():

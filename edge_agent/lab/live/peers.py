@@ -136,7 +136,10 @@ def send_ros2(address: str, samples: int, rate: float) -> int:
         ]
         report_ready()
         # the stubs call a matching status a bool
-        while not all(publisher.matching_status.matching for publisher in put):  # type: ignore[attr-defined]
+        while not all(
+            publisher.matching_status.matching  # type: ignore[attr-defined]
+            for publisher in put
+        ):
             time.sleep(0.01)
         for k, t in enumerate(pace_samples(samples, rate)):
             now = time.time_ns()

@@ -25,6 +25,7 @@ systems).
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -179,7 +180,7 @@ def optimise(
         odds = transition_probabilities(
             pheromone, eta, reachable, alpha=habits.alpha, theta=habits.theta
         )
-        paths = [ledger.draw(lambda odds=odds: _walk_ant(odds, rng)) for _ in range(ants)]  # type: ignore[misc]
+        paths = [ledger.draw(partial(_walk_ant, odds, rng)) for _ in range(ants)]
         if iteration == 0 and problem.start is not None:
             paths[0] = nearest(graph, problem.start)
         values = [ledger.evaluate(path) for path in paths]

@@ -14,18 +14,19 @@ from schemas.tables import Field
 NAME: Final = "README.md"
 _HEAD: Final = f"""# A GripMap archive
 
-Road friction measured by vehicles. The files are plain Parquet (zstd), partitioned by date of measurement (UTC) and z7
-zone (a quadkey behind the letter q); pyarrow, pandas, polars, DuckDB, Spark and GeoPandas can read them directly. Unit
-and meaning of a column are also in its field metadata. This page is generated.
+Road friction measured by vehicles. The files are plain Parquet (zstd), partitioned by date of
+measurement (UTC) and z7 zone (a quadkey behind the letter q); pyarrow, pandas, polars, DuckDB,
+Spark and GeoPandas can read them directly. Unit and meaning of a column are also in its field
+metadata. This page is generated.
 
 | folder | holds |
 |---|---|
-| `observations/date=…/zone=…/` | one row per visit of a vehicle to a cell; sorted by cell and time |
+| `observations/date=…/zone=…/` | a row per visit of a vehicle to a cell; sorted by cell and time |
 | `states/date=…/zone=…/` | position and motion of vehicles; sorted in the same way |
 | `map/date=…/` | snapshots of the map, one per hour; GeoParquet 1.1 |
-| `rollup/cell_hour/date=…/zone=…/` | mergeable statistics per cell, sector and hour; never removed |
+| `rollup/cell_hour/date=…/zone=…/` | mergeable statistics by cell, sector and hour; never removed |
 | `weather/` | road weather that the map used |
-| `inbox/`, `drafts/`, `keys/`, `checkpoints/`, `requests/` | private to the service: do not read or change them |
+| `inbox/`, `drafts/`, `keys/`, `checkpoints/`, `requests/` | private: do not read or change |
 
 ```python
 import duckdb
@@ -34,14 +35,17 @@ duckdb.sql('''select cell, sector, count(distinct vehicle), median(mu) filter (v
               from 'observations/*/*/*.parquet' group by cell, sector''')
 ```
 
-- mu is the peak tyre–road adhesion coefficient, mean of the four wheels. NaN means unknown, which does not
-  mean dry.
-- `value` is true if mu was measured. If it is false, the vehicle used little grip and mu is mostly a prior. Leave such
-  rows out of every mean, median and colour. It is only known that mu is at least `mu_utilised`.
-- `log_likelihood`: {mugrid.BINS} bytes for {mugrid.BINS} equal bins of mu on [{mugrid.LOWER}, {mugrid.UPPER}]; byte k
-  is {mugrid.STEPS_PER_NAT} times the distance of bin k below the best bin in nats. Add the values of several vehicles
-  to combine their evidence; a mean of mu ignores its uncertainty.
-- `cell` is a quadint: the base-4 digits of a Web-Mercator quadkey of zoom 21; a parent is a shift, `cell >> 2*(21-z)`.
+- mu is the peak tyre–road adhesion coefficient, mean of the four wheels. NaN means unknown, which
+  does not mean dry.
+- `value` is true if mu was measured. If it is false, the vehicle used little grip and mu is mostly
+  a prior. Leave such rows out of every mean, median and colour. It is only known that mu is at
+  least `mu_utilised`.
+- `log_likelihood`: {mugrid.BINS} bytes for {mugrid.BINS} equal bins of mu on [{mugrid.LOWER},
+  {mugrid.UPPER}]; byte k is {mugrid.STEPS_PER_NAT} times the distance of bin k below the best bin
+  in nats. Add the values of several vehicles to combine their evidence; a mean of mu ignores its
+  uncertainty.
+- `cell` is a quadint: the base-4 digits of a Web-Mercator quadkey of zoom 21; a parent is a shift,
+  `cell >> 2*(21-z)`.
 - `vehicle` is a pseudonym that changes with the month.
 - `late` rows were not fused into the map; `weight` is the weight of the vehicle's vote.
 """

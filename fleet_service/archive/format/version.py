@@ -4,7 +4,7 @@
 |---|---|
 | 1.0 | no version and no digest; the columns are exactly those of FIRST |
 | 1.1 | `gripmap.version` and `gripmap.digest` in the footer |
-| 1.2 | observations: `value`; roll-up: `value_count`, `value_sum`; map: `mu` is null where only bounds are known |
+| 1.2 | observations: `value`; roll-up: `value_count`, `value_sum`; map: `mu` null if only bounded |
 | 1.3 | observations: `esc_active`, `tcs_active`, `wiper` |
 | 1.4 | states: `p_slippery` |
 

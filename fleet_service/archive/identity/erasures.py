@@ -73,7 +73,9 @@ def record_erasure(folder: Path, month: str, newest: int, pseudonym: str | None 
     until = min(newest + US_STEP, span_of(month).until)  # the archive keeps times in whole steps
     if pseudonym is not None:
         (folder / f"{month}.{pseudonym}.{max(until, 0)}.erased").touch(0o600)
-    else:  # the month's says more than those of its vehicles; what these forgot may be newer than all that is there
+    else:
+        # The erasure of a month replaces those of its vehicles. A vehicle's erasure may reach
+        # further than the newest row that is left.
         names = [
             name
             for path in folder.glob(f"{month}.*.erased")

@@ -68,8 +68,8 @@ def write_town(town: StreetTown, path: Path) -> None:
         for n, (a, b) in enumerate(town.crossings)
     ]
     ways = [
-        f'<way id="{n + 1}" version="1"><nd ref="{a + 1}"/><nd ref="{b + 1}"/><tag k="highway" v="residential"/>'
-        f'<tag k="name" v="Street {n + 1}"/></way>'
+        f'<way id="{n + 1}" version="1"><nd ref="{a + 1}"/><nd ref="{b + 1}"/>'
+        f'<tag k="highway" v="residential"/><tag k="name" v="Street {n + 1}"/></way>'
         for n, (a, b) in enumerate(town.streets)
     ]
     path.write_text("\n".join(['<osm version="0.6">', *nodes, *ways, "</osm>"]), encoding="utf-8")

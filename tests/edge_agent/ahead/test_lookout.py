@@ -274,7 +274,9 @@ def test_where_it_is_the_car_believes_its_filter_and_the_map(
     with driving(router) as car:
         car.lookout.believe(np.array([-1]), flat)
         car.drive_until(lambda seen: (seen.runs.basis == local_map.MEASURED).sum() > 10)
-        assert car.lookout.outlook(CAR).here[0] == pytest.approx(0.625, abs=0.02)  # type: ignore[union-attr]
+        outlook = car.lookout.outlook(CAR)
+        assert outlook is not None
+        assert outlook.here[0] == pytest.approx(0.625, abs=0.02)
 
         def is_informed(seen: Outlook) -> bool:
             car.lookout.believe(

@@ -12,12 +12,18 @@ from schemas.errors import InputError
 from tests.edge_agent.ahead.roads import HOME, line
 
 POINTS = list(zip(*(side[::20].tolist() for side in line()), strict=True))
-GPX = '<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{}</trkseg></trk></gpx>'
+GPX = (
+    '<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1">'
+    "<trk><trkseg>{}</trkseg></trk></gpx>"
+)
 TRACK = GPX.format("".join(f'<trkpt lat="{a}" lon="{o}"/>' for a, o in POINTS))
 GEOMETRY = {"type": "LineString", "coordinates": [[o, a] for a, o in POINTS]}
 FEATURE = {"type": "Feature", "geometry": GEOMETRY, "properties": {}}
 COLLECTION = {"type": "FeatureCollection", "features": [FEATURE]}
-LAUGHS = '<!DOCTYPE g [<!ENTITY a "ha"><!ENTITY b "&a;&a;">]><gpx><rte><rtept lat="57" lon="11">&b;</rtept></rte></gpx>'
+LAUGHS = (
+    '<!DOCTYPE g [<!ENTITY a "ha"><!ENTITY b "&a;&a;">]>'
+    '<gpx><rte><rtept lat="57" lon="11">&b;</rtept></rte></gpx>'
+)
 
 
 @pytest.mark.parametrize(

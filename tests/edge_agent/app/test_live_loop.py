@@ -118,7 +118,13 @@ def run(
     reported = []
     report = lambda progress: reported.append(progress.signals_s)  # noqa: E731
     chosen = LoopOptions(report, **options)  # type: ignore[arg-type]
-    progress = run_live_loop(parts, pipeline_of(fleet), basket, stop, chosen)  # type: ignore[arg-type]
+    progress = run_live_loop(
+        parts,
+        pipeline_of(fleet),
+        basket,  # type: ignore[arg-type]
+        stop,
+        chosen,
+    )
     return progress, basket, reported
 
 

@@ -25,7 +25,10 @@ def oracle_of(path: Path) -> list[cantools.database.can.Message]:
 
 
 def frames_of(message: cantools.database.can.Message, data: list[bytes]) -> list[dict[str, float]]:
-    return [dict(message.decode_simple(frame, decode_choices=False)) for frame in data]  # type: ignore[arg-type]
+    return [
+        dict(message.decode_simple(frame, decode_choices=False))  # type: ignore[arg-type]
+        for frame in data
+    ]
 
 
 def columns(data: list[bytes]) -> Bytes:
@@ -80,8 +83,10 @@ def test_a_multiplexed_signal_is_missing_where_its_switch_says_so() -> None:
 
 def test_lines_that_make_no_sense_are_left_out_and_the_rest_is_read() -> None:
     text = (
-        'junk\nBO_ 2147483653 A: 8 X\n SG_ odd name : 0|8@1+ (1,0) [0|0] "" X\n SG_ T : 60|9@1+ (1,0) [0|0] "" X\n'
-        ' SG_ N : 0|0@1+ (1,0) [0|0] "" X\n SG_ F : 8|8@1+ (nan,0) [0|0] "" X\nCM_ "SG_"\n SG_ Z : 0|8@1+ (1,0) \n'
+        "junk\nBO_ 2147483653 A: 8 X\n"
+        ' SG_ odd name : 0|8@1+ (1,0) [0|0] "" X\n SG_ T : 60|9@1+ (1,0) [0|0] "" X\n'
+        ' SG_ N : 0|0@1+ (1,0) [0|0] "" X\n SG_ F : 8|8@1+ (nan,0) [0|0] "" X\n'
+        'CM_ "SG_"\n SG_ Z : 0|8@1+ (1,0) \n'
     )
     message = parse_dbc(text)["A"]
     assert (message.identifier, message.extended) == (5, True)

@@ -112,7 +112,8 @@ from edge_agent.publish.batching import Draft
 from edge_agent.publish.outbox import Outbox
 from schemas.wire import Kind
 outbox = Outbox(pathlib.Path({str(path)!r}), boot={BOOT})
-outbox.store([Draft("car-a", Kind.OBSERVATION, {REGION}, 3, lambda s, f: b"kept %d" % s) for _ in range(4)], 0.0)
+draft = Draft("car-a", Kind.OBSERVATION, {REGION}, 3, lambda s, f: b"kept %d" % s)
+outbox.store([draft] * 4, 0.0)
 gone = outbox.store([Draft("car-a", Kind.STATE, {REGION}, 3, lambda s, f: b"gone")], 0.0)
 outbox.settle_ranges(gone[0].stream, [(1, 1)])
 outbox.delete_settled()
@@ -292,7 +293,8 @@ from edge_agent.publish.batching import Draft
 from edge_agent.publish.outbox import Outbox, Stream
 from schemas.wire import Kind
 outbox = Outbox(pathlib.Path({str(path)!r}), boot={BOOT})
-held = outbox.store([Draft("car-a", Kind.STATE, {REGION}, 3, lambda s, f: b"seen") for _ in range(2)], 0.0)
+draft = Draft("car-a", Kind.STATE, {REGION}, 3, lambda s, f: b"seen")
+held = outbox.store([draft] * 2, 0.0)
 outbox.settle_ranges(held[0].stream, [(1, 1)])
 os.kill(os.getpid(), signal.SIGKILL)
 """

@@ -116,7 +116,8 @@ def test_a_finger_moves_the_map(tmp_path: Path) -> None:
           const canvas = document.querySelector("canvas.map"), box = canvas.getBoundingClientRect();
           canvas.setPointerCapture = () => {};
           const send = (type, x) => canvas.dispatchEvent(new PointerEvent(type, {
-            pointerId: 7, pointerType: "touch", clientX: box.left + x, clientY: box.top + 200, bubbles: true }));
+            pointerId: 7, pointerType: "touch", clientX: box.left + x, clientY: box.top + 200,
+            bubbles: true }));
           send("pointerdown", 100); send("pointermove", 2000); send("pointerup", 2000);
         }""")
         assert found.errors == []

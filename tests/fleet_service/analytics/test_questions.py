@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -107,16 +108,16 @@ def test_spells_are_the_runs_of_slippery_values(asked: Ask, rows: pd.DataFrame) 
     expected = []
     told = rows[rows["value"]].sort_values(["time", "vehicle", "boot", "seq", "row"])
     for place, group in told.groupby(PLACE):
-        run: list[object] = []
+        run: list[Any] = []
         for row in [*group.itertuples(), None]:
             if row is not None and row.mu < 0.4:
                 run.append(row)
                 continue
-            if len({one.vehicle for one in run}) >= 2:  # type: ignore[attr-defined]
+            if len({one.vehicle for one in run}) >= 2:
                 first = run[0]
-                other = min(one.time for one in run if one.vehicle != first.vehicle)  # type: ignore[attr-defined]
+                other = min(one.time for one in run if one.vehicle != first.vehicle)
                 end = None if row is None else row.time
-                expected.append((*place, first.time, end, len(run), other - first.time))  # type: ignore[attr-defined]
+                expected.append((*place, first.time, end, len(run), other - first.time))
             run = []
     table = asked("spells")
     names = (*PLACE, "onset", "end", "values", "to_alert_s")

@@ -43,7 +43,11 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_both_engines_write_the_same_bytes(session: Any, archive: Path, tmp_path: Path) -> None:  # noqa: ANN401
+def test_both_engines_write_the_same_bytes(
+    session: Any,  # noqa: ANN401
+    archive: Path,
+    tmp_path: Path,
+) -> None:
     done: dict[str, list[RebuildResult]] = {}
     for engine in ("local", "spark"):
         (tmp_path / engine).mkdir()
@@ -78,7 +82,9 @@ def _refuse_task(task: str) -> str:
     raise InputError("log", f"{task} is no log", "give another")
 
 
-def test_bad_input_comes_as_itself_and_a_task_that_always_fails_as_a_line(session: Any) -> None:  # noqa: ANN401
+def test_bad_input_comes_as_itself_and_a_task_that_always_fails_as_a_line(
+    session: Any,  # noqa: ANN401
+) -> None:
     with pytest.raises(InputError, match="log: 1.parquet is no log; give another"):
         spark.spread(session, ["1.parquet"], _refuse_task)
     with pytest.raises(InputError, match="engine: Spark gave up: "):

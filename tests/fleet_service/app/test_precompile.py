@@ -31,14 +31,17 @@ def kernels():
 
 def drive(root):
     engine = Engine(ServiceConfig(), root)
-    columns = make_visits(np.random.default_rng(0), np.zeros(8000, np.int64), time.time_ns(), 256).columns
+    rng = np.random.default_rng(0)
+    columns = make_visits(rng, np.zeros(8000, np.int64), time.time_ns(), 256).columns
     home = columns["cell"] >> 22
     mine = np.flatnonzero(home == home[0])
     messages = []
-    for row in mine:  # each visit by a vehicle of its own, because no vehicle can be at all these places
+    # each visit by a vehicle of its own, because no vehicle can be at all these places
+    for row in mine:
         taken = {name: column[row : row + 1] for name, column in columns.items()}
-        batch = wire.Batch(wire.Kind.OBSERVATION, f"sim-{row}", 1, int(home[0]), 1, 1, taken, "test")
-        key, encoding = keys.observation_key(int(home[0]), f"sim-{row}"), wire.ENCODING[batch.kind]
+        name = f"sim-{row}"
+        batch = wire.Batch(wire.Kind.OBSERVATION, name, 1, int(home[0]), 1, 1, taken, "test")
+        key, encoding = keys.observation_key(int(home[0]), name), wire.ENCODING[batch.kind]
         messages.append(Message(batch.kind, key, wire.encode(batch), encoding))
     for start in range(0, len(messages), 40):
         engine.intake.ingest(messages[start : start + 40], time.time_ns())

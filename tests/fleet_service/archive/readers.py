@@ -51,7 +51,8 @@ def by_polars(root: Path) -> Seen:
 
     frame = pl.scan_parquet(root / "observations", hive_partitioning=True).collect()
     told = len(frame) - frame["log_likelihood"].null_count()
-    return Seen(len(frame), float(frame["mu"].mean()), told, frame["zone"].n_unique())  # type: ignore[arg-type]
+    mean = float(frame["mu"].mean())  # type: ignore[arg-type]
+    return Seen(len(frame), mean, told, frame["zone"].n_unique())
 
 
 def by_duckdb(root: Path) -> Seen:

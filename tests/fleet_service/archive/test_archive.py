@@ -59,7 +59,7 @@ def test_an_acknowledgement_follows_fsync_rename_and_fsync_of_the_folder(
     rename = Path.rename
 
     def seen_fsync(handle: int) -> None:
-        order.append("folder" if os.path.isdir(f"/proc/self/fd/{handle}") else "file")  # noqa: PTH112
+        order.append("folder" if Path(f"/proc/self/fd/{handle}").is_dir() else "file")
         fsync(handle)
 
     def seen_rename(path: Path, target: Path) -> Path:

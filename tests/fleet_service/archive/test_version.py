@@ -117,7 +117,10 @@ def test_kept_and_new_files_compact_together_to_the_same_map(old: Path) -> None:
     compact(old)
     rollup.complete_parts(old)
     assert not any(segments.list_segments(old, kind) for kind in Kind)
-    said = Counter(str(read_content(path).version) for path in files(old))  # type: ignore[union-attr]
+    said = Counter(
+        str(read_content(path).version)  # type: ignore[union-attr]
+        for path in files(old)
+    )
     assert said.keys() == {"1.0", str(version.VERSION)}
     assert {str(kind): _identities(old, kind) for kind in Kind} == rows
     with closing(Engine(ServiceConfig(), old)) as engine:

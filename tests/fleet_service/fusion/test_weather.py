@@ -34,7 +34,8 @@ def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGIO
     """Return weather reports.
 
     Args:
-        rows: (hours after START, (air temperature [°C], road temperature [°C], precipitation [mm/h])).
+        rows: (hours after START, (air temperature [°C], road temperature [°C], precipitation
+            [mm/h])).
         region: region of the reports.
     """
     air, road, water = np.array([row[1] for row in rows]).T

@@ -142,7 +142,8 @@ _BLUE: Final = """(() => {
   const map = document.getElementById("map"), x = map.width >> 1, y = map.height >> 1;
   const points = map.getContext("2d").getImageData(x - 20, y - 20, 40, 40).data;
   let blue = 0;
-  for (let k = 0; k < points.length; k += 4) blue += points[k + 2] - points[k] > 60 && points[k + 2] > points[k + 1];
+  for (let k = 0; k < points.length; k += 4)
+    blue += points[k + 2] - points[k] > 60 && points[k + 2] > points[k + 1];
   return blue > 400;
 })()"""
 

@@ -28,7 +28,10 @@ ITEMS = "/collections/grip/items"
 # this one.
 READERS = {
     "GDAL": "import pyogrio; found = pyogrio.read_dataframe('OAPIF:{address}', layer='grip')",
-    "geopandas": "import geopandas; found = geopandas.read_file('{address}collections/grip/items?limit=10000')",
+    "geopandas": (
+        "import geopandas; "
+        "found = geopandas.read_file('{address}collections/grip/items?limit=10000')"
+    ),
 }
 
 

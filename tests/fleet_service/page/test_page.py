@@ -124,7 +124,8 @@ _POINTS: Final = """colour => {
   const map = document.getElementById("map");
   const points = map.getContext("2d").getImageData(0, 0, map.width, map.height).data;
   let n = 0;
-  for (let k = 0; k < points.length; k += 4) n += [points[k], points[k + 1], points[k + 2]].join() === colour;
+  for (let k = 0; k < points.length; k += 4)
+    n += [points[k], points[k + 1], points[k + 2]].join() === colour;
   return n;
 }"""
 _COLOURED: Final = """() => {
@@ -152,7 +153,8 @@ def test_the_first_picture_that_is_painted_has_cells(page: RunningPage, drive: D
 _PAINTED: Final = """
   globalThis.painted = [];
   document.addEventListener("DOMContentLoaded", () => new MutationObserver(
-    () => painted.push(document.body.dataset.drawn)).observe(document.body, { attributeFilter: ["data-drawn"] }));
+    () => painted.push(document.body.dataset.drawn)
+  ).observe(document.body, { attributeFilter: ["data-drawn"] }));
 """
 
 
@@ -356,7 +358,8 @@ def test_a_route_is_clicked_or_dropped_and_tells_what_is_unknown(
 
 
 _FITTED: Final = """(() => {
-  const { view, now } = gripmap, extent = now.extent, held = [...now.known].every(tile => now.tiles.has(tile));
+  const { view, now } = gripmap, extent = now.extent;
+  const held = [...now.known].every(tile => now.tiles.has(tile));
   if (!extent || !held) return false;
   const wide = (extent.east - extent.west) * view.scale / view.width;
   const high = (extent.south - extent.north) * view.scale / view.height;

@@ -39,14 +39,17 @@ _ROW: Final = """async ([side, first, unknown]) => {
   const n = PLACES, all = value => new Uint8Array(n).fill(value);
   const rows = { count: n, basis: all(1), unknown: all(unknown), mu: all(160) };
   const column = Uint8Array.from({ length: n }, (_, k) => k), kind = all(kindOf(1, 160, 155, 165));
-  const pixels = new Pixels(), view = { scale: side, left: x => x * side + first, top: y => y * side + 1 };
+  const pixels = new Pixels();
+  const view = { scale: side, left: x => x * side + first, top: y => y * side + 1 };
   pixels.begin(400, 40, 1, true);
   for (const west of [0, n]) {
     const tile = { rows, column, row: all(0), kind, side: 1, west, north: 0, steps: n };
     pixels.squares(view, tile, null, new Array(8).fill(0));
   }
-  const begin = Math.round(first + 1e-4), end = Math.round(first + 2 * n * side + 1e-4), high = Math.round(1 + side);
-  const white = y => [...pixels.points.slice(400 * y + begin, 400 * y + end)].filter(p => p === pixels.ground).length;
+  const begin = Math.round(first + 1e-4), end = Math.round(first + 2 * n * side + 1e-4);
+  const high = Math.round(1 + side);
+  const row = y => [...pixels.points.slice(400 * y + begin, 400 * y + end)];
+  const white = y => row(y).filter(p => p === pixels.ground).length;
   const lines = Array.from({ length: high - 1 }, (_, k) => white(1 + k));
   return [lines[0], Math.max(...lines), lines.reduce((a, b) => a + b), (end - begin) * (high - 1)];
 }""".replace("PLACES", str(PLACES))

@@ -32,7 +32,8 @@ _RIBBON: Final = """kind => {
     const i = lane.kind.indexOf(kind);
     if (i < 0 || lane.x[i + 1] <= lane.x[i]) continue;
     const off = view.width ? gripmap.asRoads : 0;
-    return [view.left((lane.x[i] + lane.x[i + 1]) / 2), view.top((lane.y[i] + lane.y[i + 1]) / 2), off];
+    const x = (lane.x[i] + lane.x[i + 1]) / 2, y = (lane.y[i] + lane.y[i + 1]) / 2;
+    return [view.left(x), view.top(y), off];
   }
 }"""
 _UNDER: Final = """kind => {
@@ -112,7 +113,8 @@ def test_overview_names_slippery_stretches_and_the_unknown_share(
         waits(seen, "document.querySelectorAll('.stretch').length >= 2")
         words = seen.page.locator(".stretch").first.inner_text()
         assert re.search(
-            rf"^Slippery on {STREET} (east|west)bound\n\d+ m; at worst ice, up to \d\d % sure; 6 veh",
+            rf"^Slippery on {STREET} (east|west)bound\n"
+            r"\d+ m; at worst ice, up to \d\d % sure; 6 veh",
             words,
         )
         look(seen, "overview")

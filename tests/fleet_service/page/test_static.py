@@ -47,10 +47,17 @@ def test_modules_joined_do_what_they_do_apart_each_with_names_of_its_own() -> No
     two modules must become two variables.
     """
     modules = {
-        "main": 'import { add as sum, ONE } from "./a.js";\nimport { two } from "./b.js";\nsay(sum(two(), ONE));\n',
-        "a": "const own = 1;\nexport const ONE = own;\nexport function add(x, y) { return x + y; }\n"
-        "export class Not {}\n",
-        "b": 'import { ONE } from "./a.js";\nconst own = 41;\nexport const two = () => own + ONE;\n',
+        "main": (
+            'import { add as sum, ONE } from "./a.js";\n'
+            'import { two } from "./b.js";\nsay(sum(two(), ONE));\n'
+        ),
+        "a": (
+            "const own = 1;\nexport const ONE = own;\n"
+            "export function add(x, y) { return x + y; }\nexport class Not {}\n"
+        ),
+        "b": (
+            'import { ONE } from "./a.js";\nconst own = 41;\nexport const two = () => own + ONE;\n'
+        ),
     }
     assert bundle_modules(modules, "main") == (
         "const from_a = (() => {\nconst own = 1;\nconst ONE = own;\nfunction add(x, y) { return x "

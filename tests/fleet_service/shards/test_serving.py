@@ -124,10 +124,10 @@ def test_answers_over_three_services_are_ordered_and_name_gaps(
             assert (np.diff(passed) < 0).all()
             assert along.table.num_rows == len(LONGITUDES)
             for form in ("json", "geojson"):
-                document = ask(router, route=ROUTE, format=form).document
+                document: Any = ask(router, route=ROUTE, format=form).document
                 assert document is not None
-                cells = [cell for tile in document.get("tiles", []) for cell in tile["cells"]]  # type: ignore[attr-defined]
-                cells += [one["properties"] for one in document.get("features", [])]  # type: ignore[attr-defined]
+                cells = [cell for tile in document.get("tiles", []) for cell in tile["cells"]]
+                cells += [one["properties"] for one in document.get("features", [])]
                 assert [cell["longitude"] for cell in cells] == passed.tolist()
             assert ask(router, bbox=box).gap_description is None
             watcher.start()

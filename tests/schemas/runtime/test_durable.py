@@ -20,7 +20,7 @@ def test_a_file_has_its_name_when_it_is_whole_and_synced(
     rename = Path.rename
 
     def seen_fsync(handle: int) -> None:
-        order.append("folder" if os.path.isdir(f"/proc/self/fd/{handle}") else "file")  # noqa: PTH112
+        order.append("folder" if Path(f"/proc/self/fd/{handle}").is_dir() else "file")
         fsync(handle)
 
     def seen_rename(path: Path, target: Path) -> Path:

@@ -69,7 +69,8 @@ def test_the_json_mapping_says_the_same_as_the_bytes(kind: Kind) -> None:
 def test_protobuf_and_arrow_agree_field_by_field(
     message: type, fields: tuple[tables.Field, ...]
 ) -> None:
-    on_wire = [f for f in message.DESCRIPTOR.fields if f.name not in HEADER]  # type: ignore[attr-defined]
+    descriptor = message.DESCRIPTOR  # type: ignore[attr-defined]
+    on_wire = [f for f in descriptor.fields if f.name not in HEADER]
     assert [f.name for f in on_wire] == [f.name for f in fields]
     kind = Kind.OBSERVATION if fields is tables.OBSERVATION else Kind.STATE
     names = {

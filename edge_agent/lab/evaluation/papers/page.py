@@ -13,10 +13,12 @@ from edge_agent.estimators.elements import VERDICTS, Element
 from edge_agent.lab.evaluation.papers.outcome import COLUMNS, PaperRow, PaperTable, Reproduction
 
 STYLE: Final = """\
-body { font: 15px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 72em; padding: 0 1em; color: #1a1a1a; }
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 72em; padding: 0 1em;
+  color: #1a1a1a; }
 h1 { font-size: 1.5em; } h2 { font-size: 1.2em; margin-top: 2em; } h3 { font-size: 1em; }
 table { border-collapse: collapse; width: 100%; font-size: .92em; }
-th, td { text-align: left; padding: .25em .6em; border-bottom: 1px solid #ddd; vertical-align: top; }
+th, td { text-align: left; padding: .25em .6em; border-bottom: 1px solid #ddd;
+  vertical-align: top; }
 td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 td.missed { background: #fde0dc; font-weight: bold; } td.held { background: #e3f2e1; }
 img { max-width: 100%; } figure { margin: 1em 0; } .sum { font-size: 1.1em; }

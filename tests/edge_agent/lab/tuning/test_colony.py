@@ -237,10 +237,12 @@ def test_habits_outside_their_range_are_refused_by_name(name: str) -> None:
 
 @pytest.mark.parametrize("search", [colony, random_search])
 def test_a_vertex_without_positions_and_an_empty_budget_are_refused(search: object) -> None:
+    optimise = search.optimise  # type: ignore[attr-defined]
+    rng = np.random.default_rng(0)
     with pytest.raises(InputError, match="choices"):
-        search.optimise(Problem(bowl(0), []), ants=1, iterations=1, rng=np.random.default_rng(0))  # type: ignore[attr-defined]
+        optimise(Problem(bowl(0), []), ants=1, iterations=1, rng=rng)
     problem = Problem(bowl(0), CHOICES)
     with pytest.raises(InputError, match="ants"):
-        search.optimise(problem, ants=4, iterations=0, rng=np.random.default_rng(0))  # type: ignore[attr-defined]
+        optimise(problem, ants=4, iterations=0, rng=rng)
     with pytest.raises(InputError, match="admissible"):
         run(search, bowl(0), 0, admissible=lambda _vector: False)
