@@ -54,7 +54,7 @@ LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 
 @dataclass
 class Drive:
-    """Result of one simulated drive, computed from the simulator's true values."""
+    """Result of one simulated drive of all cars, computed from the simulator's true values."""
 
     slid: set[tuple[int, int]] = field(
         default_factory=set
@@ -167,7 +167,9 @@ class ListeningTown:
             self.heard.store_alert(decode_alert_message(key, wire.encode_alert(alert), now), now)
 
     def _hear(self, second: int) -> None:
-        """Pass the active alerts to the listening cars, and at intervals the tiles of the map."""
+        """Pass the active alerts, and at intervals the tiles of the map, to the cars that receive
+        the map.
+        """
         now = self._now()
         for alert in self.alerts.standing_alerts:
             self.heard.store_alert(alert, now)

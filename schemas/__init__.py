@@ -1,3 +1,3 @@
-"""The contract (common definitions) between vehicles, service and clients: messages, tables on
-disk, keys and queries.
+"""The contract, that is, the common definitions of vehicles, service and clients: messages, tables
+on disk, Zenoh keys and queries.
 """

@@ -66,14 +66,14 @@ def _gather_bits(v: IntArray) -> IntArray:
 
 
 def interleave(x: IntArray, y: IntArray) -> IntArray:
-    """Return the quadint (number of a grid square) from its tile column and row at the same
+    """Return the quadint (number of a grid square) from the square's column x and row y at its
     zoom.
     """
     return _spread_bits(x) | (_spread_bits(y) << 1)
 
 
 def deinterleave(cell: ArrayLike) -> tuple[IntArray, IntArray]:
-    """Return the tile column and row of a grid square, given by its quadint."""
+    """Return column x and row y of a grid square, given by its quadint (number of the square)."""
     c = np.asarray(cell, dtype=np.int64)
     return _gather_bits(c), _gather_bits(c >> 1)
 

@@ -65,7 +65,9 @@ TOPICS: Final = {
 
 
 def chunks(quadint: int, zoom: int) -> str:
-    """Return the quadkey digits of a region (zoom 10) or a tile (zoom 14), separated by slashes."""
+    """Return the part of a key that names a region (zoom 10) or a tile (zoom 14): its quadkey
+    digits in chunks of 4, 3, 3 (and 4), separated by slashes.
+    """
     digits = grid.quadkey(quadint, zoom)
     parts = []
     for size in _CHUNKS:
@@ -125,12 +127,16 @@ def weather_key(region: int) -> str:
 
 
 def alive_key(vehicle: str) -> str:
-    """Return the key of a vehicle's liveliness token, which shows that the vehicle is connected."""
+    """Return the key of a vehicle's liveliness token, which exists in Zenoh while the vehicle is
+    connected.
+    """
     return f"{ROOT}/alive/{vehicle}"
 
 
 def shard_key(service: str) -> str:
-    """Return the key of a service's liveliness token, which shows that the service is running."""
+    """Return the key of a service's liveliness token, which exists in Zenoh while the service is
+    running.
+    """
     return f"{ROOT}/shard/{service}"
 
 
@@ -156,8 +162,8 @@ class ServiceToken(NamedTuple):
         return self.key_under(SERVES)
 
     def key_under(self, root: str) -> str:
-        """Return the key of the token under another root: CLAIMS for a service that serves or will
-        soon serve the region, WAITS for a standby service.
+        """Return the key of the token with the first part `root` instead of `gripmap/v1/serves`:
+        CLAIMS for a service that serves or will soon serve the region, WAITS for a standby service.
         """
         return f"{root}/{self.region.replace('*', _ALL)}/{self.service}/{self.start}"
 

@@ -43,8 +43,8 @@ def region_of(tile: int) -> str:
 
 
 def unserved_expressions(asked: MapQuery, served: Collection[str]) -> list[str]:
-    """Return the fewest region expressions that cover the unserved part of a query. For a query
-    without a place, this is the area outside every service's regions.
+    """Return as few region expressions as possible that cover the part of a query for which no
+    service answers. For a query without a place, this is the area outside every service's regions.
 
     Raises:
         InputError: the route is too long.
@@ -81,8 +81,8 @@ class Rank:
         self._place = {key: place for place, key in enumerate(keys_along(route).tolist())}
 
     def of(self, cell: int, sector: int) -> int:
-        """Return the position of a cell and sector along the route. The number serves only for
-        comparison with other positions.
+        """Return a number that grows along the route, for a cell and sector. It only serves to
+        compare positions; it is not a distance.
         """
         return self._place.get(cell * grid.SECTORS + sector, len(self._place))
 

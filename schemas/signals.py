@@ -53,7 +53,7 @@ CONTEXT: Final = tuple(CONTEXT_UNITS)
 
 class C(IntEnum):
     """Index of a context signal (controller flags, air temperature, wiper) on the last axis of an
-    array of context signals. The flags come first, in the order of FLAGS.
+    array of context signals. The controller flags come first, in the order of FLAGS.
     """
 
     ABS = CONTEXT.index("abs_active")

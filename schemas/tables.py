@@ -363,8 +363,8 @@ CELL_HOUR_SCHEMA: Final = arrow_schema(*CELL_HOUR)
 
 
 def stored_columns(*fields: Field) -> tuple[Field, ...]:
-    """Return the columns as they are stored on disk: times in microseconds instead of
-    nanoseconds.
+    """Return the given columns with the types in which they are stored on disk: times in
+    microseconds instead of nanoseconds.
     """
     return tuple(
         f._replace(type=US, unit="us since 1970, UTC") if f.type == NS else f for f in fields

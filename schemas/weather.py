@@ -66,7 +66,9 @@ def decode(payload: bytes, encoding: str = wire.WEATHER_ENCODING) -> Report:
 
 
 def broken(values: dict[str, float], prior: NDArray[np.float64] | None) -> WireError | None:
-    """Return the first rule that a report violates, as an error; None if the report is valid."""
+    """Return the first rule that a weather report violates, as an error; None if the report is
+    valid.
+    """
     for name, (least, most) in RANGES.items():
         if not (np.isnan(values[name]) or least <= values[name] <= most):
             return WireError(

@@ -39,7 +39,7 @@ LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 
 
 def demo_works(found: Sequence[Figure]) -> bool:
-    """Return True if all figures whose targets the demo must meet do so.
+    """Return True if every figure of the demo with a mandatory target meets its target.
 
     A late alert, wide intervals, few passes or a busy machine do not count as a failure.
     """
@@ -54,8 +54,9 @@ def demo_works(found: Sequence[Figure]) -> bool:
 
 @dataclass(frozen=True)
 class MapComparison:
-    """Cells of the map for which the true friction is known, one per row. `truth` is the true
-    friction at the end of the demo.
+    """Table of the map's cells (with heading sector) for which the true friction is known, one per
+    row. `truth` is the true friction at the end of the demo; the other columns are those of the
+    map.
     """
 
     cells: pa.Table
@@ -74,8 +75,8 @@ class MapComparison:
 
     @property
     def is_measured(self) -> BoolArray:
-        """Return a mask of rows, (n,): True if the cell's belief is based on more than lower
-        bounds.
+        """Return a mask of rows, (n,): True if vehicles measured friction in the cell, and did not
+        only report lower bounds.
         """
         return np.asarray(self.cells["basis"].to_numpy(zero_copy_only=False) == "measured")
 
@@ -320,8 +321,8 @@ def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
 
 
 def per_stretch(alerts: list[tuple[int, Alert]], visits: pa.Table) -> float:
-    """Return the number of road stretches under alert, divided by the number of icy stretches
-    (counted per driving direction); NaN without ice.
+    """Return the number of road stretches for which an alert was raised, divided by the number of
+    truly icy stretches (counted per driving direction); NaN without ice.
     """
     road = Stretches()
     ids = set[str]()

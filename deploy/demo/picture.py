@@ -52,8 +52,8 @@ def draw_maps(comparison: MapComparison, path: Path, grip: LostGrip | None = Non
 
 
 def _mark_passes(axes: Axes, grip: LostGrip, drawn: IntArray) -> None:
-    """Mark passes over the new ice: circles for warned drivers, squares for others; black if grip
-    was lost, else white.
+    """Draw a mark for each pass over the new ice: a circle if the driver was warned, else a square;
+    black if grip was lost, else white.
     """
     shapes = cell_shapes(np.concatenate([drawn, grip.cell]))[
         len(drawn) :

@@ -1,4 +1,5 @@
-"""Fuzzy inference of a bounded factor on the measurement noise from the innovation mismatch.
+"""Fuzzy inference of a bounded factor on the measurement noise R. Its input is the mismatch between
+actual and theoretical variance of the innovations (measurement minus prediction).
 
 Legend
     nu2         actual innovation variance, averaged over a window [unit^2]
@@ -45,7 +46,8 @@ def adapted_factor(
     factor: float, actual: float, theoretical: float, inputs: FloatArray, outputs: FloatArray
 ) -> float:
     """Return the next factor on the measurement noise R: factor*exp(infer_step(actual/theoretical -
-    1)), limited to [LEAST_FACTOR, LARGEST_FACTOR].
+    1)), limited to [LEAST_FACTOR, LARGEST_FACTOR]. `actual` and `theoretical` are variances of the
+    innovations; `inputs` and `outputs` are those of `infer_step`.
     """
     return adapted_within(
         factor, actual, theoretical, inputs, outputs, 1.0, (LEAST_FACTOR, LARGEST_FACTOR)
@@ -63,7 +65,7 @@ def adapted_within(
     bounds: tuple[float, float],
 ) -> float:
     """Return the next factor on the measurement noise R like `adapted_factor`, but limited to
-    `bounds`, and with the step of ln R multiplied by `pace`.
+    `bounds` (least, largest), and with each change of ln R multiplied by `pace`.
     """
     if not theoretical > 0.0:
         return factor

@@ -35,8 +35,8 @@ LEAST_OVERLAP: Final = 0.02
 
 @dataclass(frozen=True)
 class LowerVertices:
-    """Fuzzy sets of the mismatch and of the step of ln R. Their feet are free, and given as shares
-    of the distance between neighbouring peaks.
+    """Triangular fuzzy sets of the mismatch (of the innovation variance) and of the step of ln R.
+    Their feet (lower corners) can be chosen, as shares of the distance between neighbouring peaks.
 
     Attributes:
         feet: alternately how far set k extends towards peak k + 1, and set k + 1 towards peak k
@@ -78,21 +78,23 @@ class LowerVertices:
             )
 
     def triangle_sets(self) -> tuple[FloatArray, FloatArray]:
-        """Return the fuzzy sets of the mismatch and of the step of ln R, (5, 3) each: left foot,
-        peak, right foot.
+        """Return two arrays (5, 3): the fuzzy sets of the mismatch (of the innovation variance) and
+        those of the step of ln R. The columns are left foot, peak, right foot.
         """
         return _triangle_sets(self.peaks, self.feet), _triangle_sets(self.out_peaks, self.out_feet)
 
     def step(self, mismatch: float) -> float:
-        """Return ln of the factor on R [nat] for a mismatch of the innovation variance [1]."""
+        """Return ln of the factor on R [nat] for a mismatch of the innovation variance,
+        actual/theoretical - 1 [1].
+        """
         inputs, outputs = self.triangle_sets()
         weight = _membership_weights(inputs, mismatch)
         total = float(weight.sum())
         return float(weight @ outputs.mean(axis=1)) / total if total > 0.0 else 0.0
 
     def knot_table(self, knots: int) -> tuple[FloatArray, FloatArray]:
-        """Return a table for linear interpolation of the step: mismatches [1] and steps of ln R
-        [nat], (knots,) each.
+        """Return a table for linear interpolation of `step`: mismatches of the innovation variance
+        [1] and steps of ln R [nat], (knots,) each.
         """
         inputs, _ = self.triangle_sets()
         corners = np.unique(np.clip(inputs.ravel(), self.peaks[0], self.peaks[-1]))
@@ -124,8 +126,9 @@ class LowerVertices:
 
 
 def _triangle_sets(peaks: tuple[float, ...], feet: tuple[float, ...]) -> FloatArray:
-    """Return left foot, peak and right foot of each set, (5, 3). The outer feet of the first and
-    last set lie at their peaks.
+    """Return left foot, peak and right foot of five triangular fuzzy sets, (5, 3), from their
+    `peaks` (5,) and their feet between the peaks `feet` (8,). The outer feet of the first and last
+    set lie at their peaks.
     """
     sets = np.repeat(np.asarray(peaks, float)[:, None], 3, axis=1)
     for k in range(SETS - 1):

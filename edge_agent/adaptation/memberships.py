@@ -1,4 +1,5 @@
-"""Parameters of the adaptation's fuzzy sets, with conversions for files and optimisers.
+"""Parameters of the fuzzy sets that adapt the measurement noise R, with conversions for files and
+optimisers.
 
 Legend
     mismatch    actual over theoretical innovation variance, minus 1 [1]; 0 if R is right, -1 is

@@ -1,5 +1,5 @@
-"""Fuzzy rules by which the default estimator adapts the noise, the share of the evidence that it
-uses, and the rate of forgetting.
+"""Fuzzy rules by which the default estimator adapts three quantities: the measurement noise R, the
+share of the evidence on friction that it uses, and the rate at which it forgets offsets.
 
 | if | then | kind |
 |---|---|---|
@@ -10,8 +10,8 @@ uses, and the rate of forgetting.
 
 Sugeno: the result is the consequent of a rule times its membership. The first line is implemented
 in `fuzzy.py`. Sets are ramps from a foot (membership 0) to a peak (membership 1); feet, peaks and
-consequents are `Memberships`. Inputs come from the block that has just ended, so that no rule uses
-its own effect as input.
+consequents are `Memberships`. Inputs come from the block (0.05 s of samples) that has just ended,
+so that no rule uses its own effect as input.
 
 `plain_rules` has no fuzzy set: the share of evidence is a product of two ramps, and nothing else
 changes. It is the baseline for the evaluation of the rules (`fuzzy.worth`).
@@ -39,7 +39,8 @@ WIDE = (0.1, 0.35)  # [rad] angles between which the maps of real steering leave
 
 
 class RuleBase(NamedTuple):
-    """Parameters of the fuzzy rules: a ramp (foot, peak) per set, and the consequents.
+    """Parameters of the fuzzy rules: a ramp (foot, peak) per fuzzy set, and the consequents
+    (outputs) of the rules.
 
     If `by_sets` is False, `plain_share` with the parameters `plain` replaces the fuzzy rules of
     the share of evidence.
@@ -72,8 +73,8 @@ def rule_base(memberships: Memberships) -> RuleBase:
 
 
 def plain_rules(half: float, power: float, steady: float) -> RuleBase:
-    """Return a rule base without fuzzy sets: `plain_share` gives the share of evidence, and
-    neither R nor forgetting is adapted.
+    """Return a rule base without fuzzy sets: `plain_share` with these arguments gives the share of
+    the evidence that is used, and neither the measurement noise R nor forgetting is adapted.
     """
     idle = Memberships(consequents=(0.0, 0.0))
     return rule_base(idle)._replace(by_sets=False, plain=np.array([half, power, steady]))
@@ -91,7 +92,7 @@ def forgetting_rate(rules: RuleBase, wheels: float) -> float:
     """Return the rate [1/s] at which offsets, slope and bank return to their prior, in addition to
     the usual rate.
 
-    `wheels` is the innovation mismatch of the wheels [1].
+    `wheels` is the mismatch of the wheel speeds' innovation variance, actual/theoretical - 1 [1].
     """
     return rules.pace * is_high(wheels, rules.far)
 
@@ -107,7 +108,8 @@ def wide_noise(rules: RuleBase, angle: float) -> float:
 @compiled
 def plain_share(plain: FloatArray, demand: float, new: float) -> float:
     """Return ln of the share of evidence from a block (0.05 s) that is used if there are no fuzzy
-    rules.
+    rules. `demand` is force over load of an axle [1], `new` the degree (0 to 1) to which the forces
+    are new.
 
     The share is (steady + (1 - steady)*new)/(1 + (half/demand)^power), with `plain` = (half, power,
     steady).

@@ -65,8 +65,9 @@ def rule_table(printed: tuple[str, ...] = PRINTED) -> FloatArray:
 def infer_two(
     alpha: float, rate: float, at: FloatArray, of: FloatArray, levels: FloatArray
 ) -> float:
-    """Return ln of the factor on R [nat], bilinear in alpha (peaks `at` (7,)) and rate (peaks `of`
-    (5,)), and constant beyond the outer peaks.
+    """Return ln of the factor on R [nat] by bilinear interpolation in the table `levels` (5, 7).
+    The arguments are alpha (mismatch; peaks `at` (7,)) and rate (of alpha; peaks `of` (5,)). Beyond
+    the outer peaks the result is constant.
     """
     i, u = bracket_peaks(alpha, at)
     j, v = bracket_peaks(rate, of)

@@ -23,7 +23,7 @@ _BASIS: Final = {name: number for number, name in enumerate(BASES)}
 
 
 def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells]:
-    """Return the tile (z14 quadint) and the cells in a message about the map.
+    """Return the tile (its number at zoom 14) and the cells in a message about the map.
 
     A message is its `key` and its `payload`; `now` is the car's time [ns UTC].
 
@@ -91,7 +91,8 @@ def decode_alert_message(key: str, payload: bytes, now: int) -> Alert:
 
 
 def decode_standing_alerts(key: str, payload: bytes, now: int) -> tuple[int, list[Alert]]:
-    """Return the tile (z14 quadint) and the active alerts in a message about all alerts of a tile.
+    """Return the tile (its number at zoom 14) and the active alerts in a message about all alerts
+    of a tile.
 
     Raises:
         WireError: the message is invalid.

@@ -116,8 +116,8 @@ def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
 
 
 def justifies_warning(found: PlaceBelief) -> BoolArray:
-    """Return an array (n,) of booleans: True if a place (map cell with heading sector) is slippery
-    with enough certainty for a warning.
+    """Return a mask (n,) of the places (map cells with heading sector) in `found`: True if a place
+    is slippery with enough certainty for a warning.
     """
     firm = (
         (found.basis == MEASURED)

@@ -67,8 +67,8 @@ class PlaceBelief(NamedTuple):
 def belief_of(
     lower: FloatArray, mu: FloatArray, upper: FloatArray, slippery: FloatArray
 ) -> FloatArray:
-    """Return probabilities on the friction grid (n, 32) for n cells, computed from the values in a
-    map tile; `mu` may be NaN.
+    """Return the belief about n cells, probabilities on the friction grid (n, 32), computed from
+    the values in a map tile; `mu` may be NaN.
 
     `lower`, `mu` and `upper` are the 5 %, 50 % and 95 % quantiles, `slippery` is P(slippery). The
     distribution function is linear between these values.

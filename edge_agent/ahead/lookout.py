@@ -51,7 +51,9 @@ class _Watcher:
 
 @dataclass
 class LookoutCounts:
-    """Counters of the lookout: looks ahead, warnings, failures and processor time."""
+    """Counters of the lookout (thread that looks ahead in the map): looks ahead, warnings, failures
+    and processor time.
+    """
 
     looks: int = 0
     warnings: int = 0
@@ -130,7 +132,9 @@ class Lookout:
             watcher.subscriber = self.counts.subscribers[name] = subscriber
 
     def see(self, poses: Sequence[Pose]) -> None:
-        """Update the poses of the vehicles; row k is vehicle k."""
+        """Store the present poses (position, heading, speed) of the vehicles; row k is vehicle
+        k.
+        """
         self._poses = poses
 
     def believe(self, places: IntArray, beliefs: tuple[FloatArray, FloatArray] | None) -> None:
@@ -256,8 +260,8 @@ class Lookout:
 def paths_ahead(
     pose: Pose, route: GivenRoute | None, subscriber: MapSubscriber, length: float
 ) -> list[Path]:
-    """Return the possible paths ahead: the route given by the user, else the roads visible in the
-    map, else one path straight on.
+    """Return the possible paths ahead of a vehicle, `length` [m] long: the route given by the user,
+    else the roads visible in the map, else one path straight on.
 
     The caller must hold the subscriber's lock.
     """

@@ -128,8 +128,9 @@ class MapSubscriber:
             self._map.drop_old(pose.time)
 
     def publish_view(self, payload: Callable[[], bytes]) -> None:
-        """Publish the encoded outlook (the map's values for the road ahead) on the vehicle's own
-        Zenoh key, if there is a subscriber."""
+        """Publish `payload`, the encoded outlook (the map's values for the road ahead), on the
+        vehicle's own Zenoh key, if there is a subscriber.
+        """
         if self._publisher.matching_status.matching:  # type: ignore[attr-defined] # stub: bool
             self._publisher.put(payload())
             self.counts["told"] += 1

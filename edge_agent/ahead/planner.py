@@ -63,8 +63,8 @@ def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
 
 
 def cautious_bound(mu: FloatArray, mu_lower: FloatArray) -> FloatArray:
-    """Return the friction that a road exceeds with a probability of 99.5 %, computed from the
-    median and the 5 % quantile of its friction; NaN if unknown.
+    """Return the friction that the road exceeds with a probability of 99.5 %; NaN if unknown. It is
+    extrapolated from the median `mu` and the 5 % quantile `mu_lower` of its friction.
     """
     below = np.nan_to_num(mu - mu_lower)
     return np.asarray(np.maximum(mu_lower - CAUTION * below, LEAST_GRIP))
@@ -126,7 +126,8 @@ def encode_limit(limit: float, now: int) -> bytes:
 
 
 class PlannerKey:
-    """Zenoh key and attachments of one sender of speed limits.
+    """Zenoh key, and message attachments, by which one sender publishes speed limits to ROS through
+    rmw_zenoh.
 
     Args:
         domain: ROS domain.

@@ -35,7 +35,9 @@ LEAVE_S: Final = 20.0
 
 
 class Box(NamedTuple):
-    """Rectangle of the map, given by the latitude or longitude of its sides [deg]."""
+    """Rectangle of the map: latitudes of its south and north side, longitudes of its west and east
+    side [deg].
+    """
 
     west: float
     south: float
@@ -58,8 +60,8 @@ class RequestLog:
     def missing_boxes(self, path: Path, pose: Pose, within: float) -> list[Box]:
         """Return the boxes to request now along a path, and record them as requested.
 
-        `within` is a length [m]. The result is empty while recently requested boxes cover that
-        length of the path. Otherwise the boxes cover all missing parts of the path.
+        The result is empty while recently requested boxes cover the first `within` metres of the
+        path. Otherwise the boxes cover all parts of the path that no recently requested box covers.
         """
         latitude, longitude = to_degrees(path.x[::STEP], path.y[::STEP], pose)
         open_ = np.ones(len(latitude), np.bool_)
@@ -125,8 +127,8 @@ def _in_order(tiles: IntArray) -> list[int]:
 
 
 def _split_path(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
-    """Return pairs (first metre, last metre): parts of the path that together contain every wanted
-    point. Each part has a small bounding box.
+    """Return parts of the path as pairs (first metre, last metre). Together they contain every
+    metre of the mask `wanted`, and each has a small bounding box.
     """
     found: list[tuple[int, int]] = []
     first = last = -1

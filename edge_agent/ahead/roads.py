@@ -111,8 +111,8 @@ class _Neighbours:
 def _follow_way(
     graph: _Neighbours, way: list[int], pose: Pose, length: float, forks: list[list[int]]
 ) -> list[int]:
-    """Follow a road that begins with the places (keys) in `way` to its end; append the other
-    branches at forks to `forks`.
+    """Follow a road that begins with the places in `way` (keys: cell·4 + sector) over at most
+    `length` [m]; append the other branches at forks to `forks`.
 
     Return the keys of the places along the road.
     """

@@ -56,7 +56,7 @@ class AgentOptions:
         config: configuration of the agent.
         estimator: name of the estimator; None for the one named in the configuration.
         memberships: fuzzy sets that replace the estimator's own.
-        duration_s: time to drive [s].
+        duration_s: time after which the agent stops [s].
     """
 
     vehicles: Sequence[Vehicle]

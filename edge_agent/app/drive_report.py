@@ -43,7 +43,7 @@ class Panel:
     """Plot of one quantity of the estimates over time.
 
     Attributes:
-        name, unit: name and unit of the quantity.
+        name, unit: name of the quantity, and unit in which it is plotted.
         column: column of the estimates that contains the quantity.
         scale: factor from the column's unit to the displayed unit.
         band: columns with lower and upper end of the interval, or the column with the standard
@@ -114,8 +114,8 @@ def curve_of(
 
 
 def thin_parts(count: int) -> list[slice]:
-    """Divide the `count` samples of a curve into at most MOST_POINTS slices and return the slices.
-    Each slice becomes one point of the plot.
+    """Return at most MOST_POINTS slices that divide the `count` samples of a curve. Each slice
+    becomes one point of the plot.
     """
     step = max(1, math.ceil(count / MOST_POINTS))
     return [slice(k, min(k + step, count)) for k in range(0, count, step)]

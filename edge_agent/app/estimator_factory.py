@@ -31,8 +31,8 @@ def bank_of(
     """Return a bank of estimators, one per vehicle.
 
     Args:
-        estimator: a key of `known_estimators()`; NAME@CURVE uses the tyre curve CURVE of another
-            installed package.
+        estimator: a key of `known_estimators()`; NAME@CURVE is the estimator NAME with the tyre
+            curve CURVE of another installed package.
         vehicles: nominal vehicles, N of them.
         memberships: fuzzy sets that replace those in this package.
 

@@ -3,7 +3,7 @@ the publisher, until the loop is stopped.
 
 The loop waits so that no block is processed before its time. A block counts as late if its
 processing ends more than the block's own duration behind real time. No block is skipped: a loop
-that fell behind catches up as fast as possible.
+that is behind real time processes the next blocks without waiting.
 """
 
 from __future__ import annotations

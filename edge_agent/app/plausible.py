@@ -1,5 +1,5 @@
-"""Plausibility check of the estimates of a replayed log: it gives a summary line, and the exit code
-IMPLAUSIBLE for implausible estimates.
+"""Plausibility check of the estimates of a recorded drive. It yields a summary line, and the exit
+code IMPLAUSIBLE for implausible estimates.
 """
 
 from __future__ import annotations
@@ -41,8 +41,9 @@ def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
 
 @dataclass
 class Plausibility:
-    """Counters over the blocks of samples of one replayed log. The plausibility check is computed
-    from them."""
+    """Sums over the samples of one recorded drive, from which the plausibility of its estimates is
+    judged.
+    """
 
     radius: float
     first: float = np.inf

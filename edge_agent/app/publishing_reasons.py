@@ -33,7 +33,7 @@ class PublisherState(Protocol):
 
     @property
     def cut_off(self) -> bool:
-        """Return True if an open Zenoh session has no connection to a router."""
+        """Return True if an open Zenoh session has lost its connection to a router."""
         ...
 
     @property

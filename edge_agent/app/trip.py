@@ -2,10 +2,10 @@
 result is stored next to the outbox.
 
 Nothing is published before the doctor has found the signals free of faults. This may have been in
-an earlier trip with the same vehicle file and profile. A trip is examined in parts of PART_S. The
-calibration is learned from each part that passes; a part with a fault ends the publishing until a
-later part passes. Learned values are used from the next trip on, because an estimator's vehicle
-does not change during a trip.
+an earlier trip with the same vehicle file and profile. A trip is examined in parts of PART_S
+seconds. The calibration is learned from each part that passes; a part with a fault ends the
+publishing until a later part passes. Learned values are used from the next trip on, because an
+estimator's vehicle does not change during a trip.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ class Trip:
         vehicle: vehicle file of the car.
         profile: profile that maps its signals.
         path: file with the stored knowledge about the car; it need not exist.
-        trusted: True to publish regardless of the doctor's findings.
+        trusted: True to publish regardless of the findings of the signal doctor (automatic check of
+            the signals).
     """
 
     def __init__(
@@ -100,8 +101,8 @@ class Trip:
     def corrected_blocks(
         self, source: Generator[Block], ground: Callable[[], FloatArray]
     ) -> Generator[Block]:
-        """Yield the blocks of samples of a source, in which known sensor errors are corrected. The
-        uncorrected blocks are stored for the doctor.
+        """Yield the blocks of samples of a source after correction of the known sensor errors. The
+        uncorrected blocks are stored for the signal doctor (automatic check of the signals).
 
         `ground` returns the speed over ground (T,) [m/s] of the last block.
         """

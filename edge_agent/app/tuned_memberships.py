@@ -1,4 +1,4 @@
-"""Files of tuned memberships (fuzzy sets): their membership functions, their scores, and the
+"""Files of tuned memberships (parameters of the fuzzy sets): the memberships, their scores, and the
 command that reproduces them.
 """
 
@@ -158,7 +158,8 @@ def load_tuned(path: Path | str) -> Tuned:
 
 
 def shipped_memberships(estimator: str) -> Memberships:
-    """Return the memberships (fuzzy sets) that this package contains for an estimator.
+    """Return the tuned memberships (parameters of the fuzzy sets) that this package contains for an
+    estimator.
 
     Raises:
         InputError: the package has no memberships for that estimator.

@@ -36,8 +36,8 @@ Drive: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 class Prediction(NamedTuple):
-    """Score of a calibration on one drive: how well a filter with this calibration predicts the
-    measurements.
+    """Score of a calibration on one drive: how well an estimator with this calibration predicts the
+    drive's measurements.
     """
 
     log_likelihood: float  # of the innovations [nat/s]

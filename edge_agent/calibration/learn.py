@@ -152,8 +152,8 @@ def weigh_estimates(drives: Sequence[DriveEstimates], vehicle: Vehicle) -> Calib
 
 
 def surer_values(one: Calibration | None, other: Calibration | None) -> Calibration | None:
-    """Combine two calibrations of a car: for each quantity, return the value with the smaller
-    standard deviation.
+    """Return a calibration that combines two of the same car: for each quantity, the value with the
+    smaller standard deviation.
     """
     if one is None or other is None:
         return one or other
@@ -219,8 +219,8 @@ def _estimate_quantities(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
 
 
 def trace_steering(drive: EvenDrive) -> DriveEstimates:
-    """Return offset, gain and understeer of the steering with their standard deviations, from a
-    comparison of steering angle and path curvature.
+    """Return offset [rad], gain [1] and understeer gradient of the steering with their standard
+    deviations, by regression of the steering angle on path curvature and lateral acceleration.
     """
     fast = np.maximum(drive.v, STEERED_M_S)
     across = drive.v * drive.r
@@ -287,7 +287,7 @@ def _force_gain(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
 
 def _wheel_slips(drive: EvenDrive, vehicle: Vehicle, rows: BoolArray) -> FloatArray:
     """Return, for n samples, the slip of each wheel minus the mean slip of the four wheels, (n, 4).
-    Slip is computed from the driving force of each axle and its rolling resistance.
+    Slip is computed from the driving force and the rolling resistance of each axle.
 
     The driving force comes from the accelerometer, which measures tyre force minus air drag, also
     on slopes. The offset of the accelerometer is estimated as the difference between its reading

@@ -70,8 +70,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:
-    """Estimate a recorded drive with a vehicle; return a score of how well the estimator predicts
-    the measurements.
+    """Estimate a recorded drive with a vehicle; return a score of how well the estimator with this
+    vehicle predicts the measurements.
     """
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.calibration.held_out import Prediction

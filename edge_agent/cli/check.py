@@ -97,8 +97,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _doubted_flags(log: SignalLog) -> dict[str, str]:
-    """Return the controller flags of a log that are ignored as implausible at some time, with the
-    reason.
+    """Return the names of controller flags (ABS, ESC, traction control) that the estimator ignores
+    as implausible at some time of a log, each with the reason.
     """
     from edge_agent.observe.controller_flags import doubted_flags, new_flag_records, trusted_context
 

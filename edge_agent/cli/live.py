@@ -1,5 +1,5 @@
-"""Parts of an agent for `run` and `fleet`: warnings of the road ahead, friction as VSS signals, and
-warm-up of the simulation.
+"""Optional parts of the agent, for the commands `run` and `fleet`: warnings of the road ahead,
+friction as VSS signals, and warm-up of the simulation.
 """
 
 from __future__ import annotations

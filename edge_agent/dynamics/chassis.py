@@ -1,5 +1,5 @@
-"""Vehicle body and four tyres together: the accelerations for a given state, steering, wheel speeds
-and friction.
+"""Model of the vehicle body with four tyres: computes the accelerations for a given state,
+steering, wheel speeds and friction.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def _wheel_slips(
 ) -> tuple[float, float]:
     """Return the (longitudinal, lateral) slips of a wheel.
 
-    `ahead` and `aside` [m/s] are the velocity of the wheel centre in body axes; `cos` and `sin`
-    belong to the steering angle. A wheel with unknown speed (NaN) has no longitudinal slip.
+    `ahead` and `aside` [m/s] are the velocity of the wheel centre in body axes; `cos` and `sin` are
+    those of the steering angle. A wheel with unknown speed (NaN) has no longitudinal slip.
     """
     along = cos * ahead + sin * aside
     across = cos * aside - sin * ahead
@@ -57,8 +57,9 @@ def stiffness(body: Body, load: float, mu: float, rear: bool) -> tuple[float, fl
     """Return the slip stiffness (longitudinal [N], lateral [N/rad]) of a tyre under `load` [N] on
     friction `mu`.
 
-    The stiffness is proportional to the load, unless the parameter row selects PROPORTIONAL,
-    QUADRATIC or REAR_SLOPE.
+    The stiffness is proportional to the load. Three parameters in `body` change this: PROPORTIONAL
+    makes it proportional to friction too, QUADRATIC reduces it per load under high load, and
+    REAR_SLOPE is a factor for the rear axle.
     """
     by_load = 1.0 + body.quadratic - body.quadratic * load * (4.0 / (body.mass * GRAVITY))
     share = (1.0 + body.proportional * (mu - 1.0)) * by_load

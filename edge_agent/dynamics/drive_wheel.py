@@ -29,7 +29,9 @@ SOFT_N_S = 500.0  # the sign is smoothed over so much
 
 
 class WheelState(NamedTuple):
-    """State of a driven wheel: torque, wheel speed, longitudinal force and its derivative."""
+    """State of an electric drive wheel: motor torque [N m], wheel speed [rad/s], longitudinal force
+    [N] and its derivative [N/s].
+    """
 
     torque: float  # tau
     omega: float
@@ -57,8 +59,9 @@ def drive_wheel(
 
 @compiled
 def slip_share(radius: float, omega: float, along: float) -> float:
-    """Return the weight of the tyre model's force, 1/2 + 2^(-1/|s|), by equation (33) of paper 002,
-    with the slip s of equation (15). The weight is about one half at all ordinary slips.
+    """Return the weight, 1/2 + 2^(-1/|s|), that the tyre model's force has in the compensated force
+    (`blend_forces`). Source: equation (33) of paper 002, with the slip s of equation (15). The
+    weight is about one half at all ordinary slips.
     """
     turning = radius * omega
     most = max(abs(turning), abs(along), 1e-3)
@@ -70,8 +73,9 @@ def slip_share(radius: float, omega: float, along: float) -> float:
 def blend_forces(
     share: FloatArray, model: FloatArray, observed: FloatArray, out: FloatArray
 ) -> None:
-    """Compute the compensated force by equation (33) of paper 002: out (4,) = share*model + (1 -
-    share)*observed.
+    """Fill `out` (4,) with the compensated wheel forces [N] by equation (33) of paper 002:
+    share*model + (1 - share)*observed. `model` (4,) are forces of a tyre model, `observed` (4,)
+    those of an observer.
     """
     for wheel in range(4):
         out[wheel] = share[wheel] * model[wheel] + (1.0 - share[wheel]) * observed[wheel]

@@ -3,13 +3,13 @@ information shares.
 
 "Driving state estimation of distributed drive electric vehicles by an adaptive fuzzy federated
 Kalman filter", Sustainability 2023, 15, 13446 (paper 001). Motion and sub-filters: see
-`gaussian/federated_motion`. A fuzzy rule base of 7 x 5 rules scales R of each sub-filter (section
-3.1, table 1, see `rules`). Its inputs are the mismatch between actual and expected innovation
-variance over a window, and the rate of that mismatch. The information shares follow from the
-predicted residuals, (30) to (33): beta_i = min(1, c/gamma_i), normalised.
+`gaussian/federated_motion`. A fuzzy rule base of 7 x 5 rules scales the measurement noise R of each
+sub-filter (section 3.1, table 1, see `rules`). Its inputs are the mismatch between actual and
+expected innovation variance over a window, and the rate of that mismatch. The information shares
+follow from the predicted residuals, (30) to (33): beta_i = min(1, c/gamma_i), normalised.
 
 Friction is not a state of the filter. It is set by hand (section 4.1), here to DRY (a dry road).
-The bank reports the prior distribution of friction as its result.
+The estimator's output for friction is the prior distribution.
 
 ELEMENTS lists each element of the paper and every departure with its reason.
 """
@@ -98,7 +98,9 @@ samples would change v_x by decimetres per second, because no printed measuremen
 def make_bank(
     vehicles: Sequence[Vehicle], friction: float = DRY, setting: AdaptiveSetting | None = None
 ) -> EstimatorBank:
-    """Return a bank of filters, one per vehicle, on a road with the given friction [1]."""
+    """Return a bank of paper 001's filters, one per vehicle, which assume a road with the given
+    friction [1].
+    """
     chosen = AdaptiveSetting() if setting is None else setting
     design = records(AdaptiveDesign, 1)
     design["friction"] = friction
@@ -130,8 +132,8 @@ def _step_filter(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> b
 
 @compiled
 def _adapt_noise_and_shares(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> None:
-    """Compute the factors on the measurement noise R of both sub-filters, and their information
-    shares, for the next sample.
+    """Compute the factors on the measurement noise R of both sub-filters, and the shares of the
+    master's information that they get, for the next sample.
     """
     motion = memory.motion
     keep = 0.5 ** (dt / WINDOW_S)

@@ -1,7 +1,7 @@
 """The estimator bank: a compiled kernel steps the filters of N vehicles in one call.
 
-The state of a vehicle is in its own record, and vehicles do not share numbers. Therefore results
-are bit-equal whatever N is and however the samples are split into calls.
+The filter state of each vehicle is stored in a record of its own. Therefore results are bit-equal
+whatever N is and however the samples are split into calls.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ them.
 
 
 class EstimatorBank:
-    """Filters of N vehicles, all of one estimator; `create` makes the bank."""
+    """Filters of N vehicles that are advanced together, all of one estimator; `create` makes the
+    bank.
+    """
 
     def __init__(
         self,
@@ -109,7 +111,8 @@ class EstimatorBank:
         return _pack_estimates(values, evidence, closes)
 
     def memory(self, name: str) -> FloatArray:
-        """Return a copy of the field `name` of the filter records of all vehicles, shape (N, …).
+        """Return a copy of one field of the filter's internal state, given by `name`, for all
+        vehicles, (N, …).
 
         Plots use it to show the internal state of a filter.
         """

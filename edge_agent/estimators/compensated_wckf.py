@@ -11,8 +11,8 @@ Tyre forces: Magic Formula (12), compensated by (33). Filter WCKF-B: states [v_x
 measurement [r, a_x, a_y] (35), (36). Both filters compute R from a weighted moving window (25), see
 `adaptation.windows`.
 
-Friction is not a state of the filters. It is set by hand, here to DRY (a dry road). The bank
-reports the prior distribution of friction as its result.
+Friction is not a state of the filters. It is set by hand, here to DRY (a dry road). The estimator's
+output for friction is the prior distribution.
 
 `EstimatorBank.memory("mean")` returns the states of WCKF-A, and `memory("compensated")` the
 compensated forces; the paper's figures compare A with B. ELEMENTS lists each element of the paper
@@ -100,7 +100,9 @@ class CompensatedMemory(PaperMemory):
 
 
 class FrictionSet:
-    """Friction that is set by hand, and scratch arrays that a step writes before it reads them."""
+    """Friction that is set by hand, and scratch arrays of a filter step; each step writes them
+    before it reads them.
+    """
 
     friction: Annotated[FloatArray, 4]
     points: Annotated[FloatArray, 2 * A_STATES, A_STATES]
@@ -193,8 +195,8 @@ def _compensated_forces(
 
 @compiled
 def _step_wheel_filter(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
-    """Run a step of the filter of the wheels, WCKF-A. Its lateral forces come from the tyre model
-    at the last motion that the filter of the vehicle, WCKF-B, estimated.
+    """Run a step of `dt` [s] of WCKF-A, the filter of the wheels. Its lateral forces come from the
+    tyre model at the last motion that WCKF-B, the filter of the vehicle, has estimated.
     """
     row = memory.row
     mean = memory.mean
@@ -249,7 +251,9 @@ def _step_wheel_filter(memory: CompensatedMemory, context: FrictionSet, dt: floa
 
 @compiled
 def _step_motion_filter(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
-    """Run a step of WCKF-B: estimate the motion from the compensated forces."""
+    """Run a step of `dt` [s] of WCKF-B, which estimates the vehicle's motion from the compensated
+    tyre forces.
+    """
     row = memory.row
     track = memory.track
     mean = memory.fused

@@ -1,4 +1,6 @@
-"""Output of a bank: the array that kernels write, with a named column per estimated quantity."""
+"""Output of an estimator bank: the array that compiled kernels write, with a named column per
+estimated quantity.
+"""
 
 from __future__ import annotations
 

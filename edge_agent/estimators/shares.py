@@ -22,7 +22,8 @@ DOUBLE = np.dtype(np.float64)
 def check_arrays(
     t: FloatArray, signals: FloatArray, closes: BoolArray | None, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return t (T, N) and signals (T, N, 18) as contiguous float64, for a bank of `count` vehicles.
+    """Check the shapes of the arrays for a bank of `count` vehicles. Return t (T, N) and signals
+    (T, N, 18) as contiguous float64 arrays.
 
     Raises:
         InputError: shapes do not agree with the bank or with each other.

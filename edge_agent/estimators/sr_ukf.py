@@ -152,7 +152,7 @@ def _begin_filter(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noq
 def _point_friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArray) -> None:
     """Compute the friction mu (4,) of a point x (7,), limited to the range of friction.
 
-    The deviation of the point's friction from the mean is multiplied by `share`.
+    The deviation of the point's friction from that of `mean` (7,) is first multiplied by `share`.
     """
     for wheel in range(4):
         i = WheelFrictionState.MU + wheel

@@ -1,8 +1,9 @@
 """Cholesky factor of a covariance, and covariance of a square root.
 
 Legend: P covariance, L its lower-triangular factor with P = L*L' (Cholesky), both (n, n); q
-variances (n,). A pivot is the variance of a state given the states before it, so it is at least the
-variance of the state's own noise. If rounding makes it smaller, the noise variance replaces it.
+variances (n,). A pivot (squared diagonal element of L) is the variance of a state given the states
+before it, so it is at least the variance of the state's own noise. If rounding makes it smaller,
+the noise variance replaces it.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def covariance_of_factor(
 
 @compiled
 def variance(sqrt_cov: FloatArray, i: int) -> float:
-    """Return the variance of state i of a covariance with factor sqrt_cov (n, n)."""
+    """Return the variance of state i from the factor sqrt_cov (n, n) of a covariance."""
     total = 0.0
     for j in range(i + 1):
         total += sqrt_cov[i, j] * sqrt_cov[i, j]

@@ -1,5 +1,5 @@
-"""Import of recordings into a signal log: choose the reader of each file, apply the profile, and
-write a Parquet file whose metadata records its origin.
+"""Import of recordings into a signal log: choose the reader of each file, apply the profile
+(assignment of signals to channels), and write a Parquet file whose metadata records its origin.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ PROVENANCE = b"gripmap.import"
 def read_source(path: Path, profile: Profile | None, database: Database | None) -> Recording:
     """Read a recording of any supported kind.
 
-    Return the signals that the profile needs, or all signals if `profile` is None.
+    Return the signals that the profile (assignment of signals to channels) needs, or all signals if
+    `profile` is None.
 
     Raises:
         InputError: the file is missing, of an unknown kind, broken or too large for the memory, or

@@ -1,7 +1,7 @@
 """Context signals: flags of controllers and state of the surroundings, converted from readings of a
 source to rows of a log.
 
-A flag or a temperature is not interpolated. A row of the log contains the last reading at or before
+Flags and temperatures are not interpolated. A row of the log contains the last reading at or before
 its time, if that reading is at most HELD_S old. A channel that the profile marks as `lasting` is
 sent only when it changes; its last reading is valid until the next one.
 """

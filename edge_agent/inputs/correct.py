@@ -26,9 +26,10 @@ class Corrector:
     """Correction of one vehicle's signals by its calibration; the samples may be passed in blocks
     of any length.
 
-    Devices that send early are delayed to match the latest device. For each early device the
-    reading nearest to the time of the latest device's reading is used, without interpolation. A row
-    therefore describes a moment up to a tenth of a second before its time stamp.
+    Devices have different delays. The signals of faster devices are delayed to match the slowest
+    device: a row gets their reading nearest to the moment that the slowest device's reading
+    describes, without interpolation. This moment is up to a tenth of a second before the row's time
+    stamp.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -53,8 +54,8 @@ class Corrector:
         )
 
     def _wait_for_latest(self, t: FloatArray, signals: FloatArray) -> FloatArray:
-        """Return signals (T, 18) in which each row describes one moment: early devices are delayed
-        to match the latest.
+        """Return signals (T, 18) in which all readings of a row describe one moment: signals of
+        faster devices are delayed to match the slowest device.
         """
         times = np.concatenate([self._t, t])
         rows = np.concatenate([self._rows, signals])
@@ -131,8 +132,8 @@ def _correct_signals(signals: FloatArray, known: Calibration) -> FloatArray:
 
 
 def _device_waits(known: Calibration | None) -> dict[tuple[int, int], float]:
-    """Return the delay [s] that is added to the channels of each device so that all devices match
-    the latest one. The latest device itself is left out.
+    """Return, by device, the delay [s] that must be added to its channels so that all devices match
+    the slowest one. The slowest device itself is left out.
     """
     if known is None or (known.wheel_lag is None and known.steer_lag is None):
         return {}

@@ -1,5 +1,5 @@
-"""A profile, stored as validated JSON: it maps signals of a recording to channels of the signal
-log.
+"""A profile, stored as validated JSON: it maps the signals of a recording, by name, to channels of
+the signal log.
 
     value of a channel = scale · (sum of its signals, in SI) · sign + offset,
     at the time (time stamp − delay_s)
@@ -34,8 +34,8 @@ class Part(BaseModel):
 
 
 class Sign(Part):
-    """Separate signal for the sign of a value: the value is negative where `signal` equals
-    `negative`.
+    """Separate signal that gives the sign of a channel's value: the value is negative where
+    `signal` equals `negative`.
     """
 
     signal: Text

@@ -122,8 +122,8 @@ def _read_context(table: pa.Table) -> FloatArray | None:
 def _float_column(table: pa.Table, name: str) -> FloatArray:
     """Return a column as float64, with NaN for null.
 
-    The result is a copy, because Arrow's array is read-only and numba would compile a second
-    version for it.
+    The result is a writable copy. Arrow's own array is read-only, and numba would compile a second
+    version of each function for it.
     """
     try:
         values: Any = pc.cast(table[name], pa.float64())

@@ -5,8 +5,8 @@ A visit (passage of one map cell) begins with a position fix in a new cell or he
 are noisy, and a road may run along a border. Therefore a visit ends only when a fix lies clearly
 outside: CELL_MARGIN beyond the cell, or SECTOR_KEEP beyond the sector. After FIX_HELD_S without a
 fix the vehicle is in no cell (cell -1). Without yaw the course over ground is used. The module is
-pure: the state between blocks is a `CellTrack` per vehicle. Any division of the samples into blocks
-gives the same result.
+pure: the state between blocks of samples is a `CellTrack` per vehicle. Any division of the samples
+into blocks gives the same result.
 """
 
 from __future__ import annotations
@@ -104,8 +104,7 @@ def locate_vehicles(
         tracks: (N,) tracks after the previous block.
         t: (T, N) [s].
         signals: (T, N, channels).
-        lost: if True, the last position fixes are dropped, which ends every visit (passage of a
-            cell).
+        lost: True to forget the last position fixes, which ends every visit (passage of a cell).
 
     Returns:
         the tracks for the next block, and the cells per sample.
@@ -129,8 +128,9 @@ def locate_vehicles(
 
 
 def _receiver_samples(signals: FloatArray) -> RecordArray:
-    """Return the samples of the position receiver, as an array of records (T, N), taken from the
-    signals (T, N, channels)."""
+    """Return position, yaw and cell of each sample as an array of records (T, N), taken from the
+    signals (T, N, channels).
+    """
     fixes = records(ReceiverSample, *signals.shape[:-1])
     latitude = signals[..., S.LATITUDE]
     longitude = signals[..., S.LONGITUDE]
@@ -145,7 +145,9 @@ def _receiver_samples(signals: FloatArray) -> RecordArray:
 
 @compiled
 def _update_course(track: CellTrack, latitude: float, longitude: float) -> None:
-    """Update the course over ground [rad from east] when the vehicle has moved far enough."""
+    """Update the course over ground [rad from east] in the vehicle's track if it has moved far
+    enough since the last update.
+    """
     north = (latitude - track.course_latitude) * METRES_PER_DEGREE
     east = (longitude - track.course_longitude) * METRES_PER_DEGREE * np.cos(np.radians(latitude))
     distance = np.hypot(north, east)

@@ -112,8 +112,8 @@ def doubted_flags(record: RecordArray) -> list[tuple[int, str, str]]:
 def _check_flags(
     flags: Records[FlagRecord], t: FloatArray, standing: FloatArray, context: FloatArray
 ) -> None:
-    """Advance the records of the flags sample by sample, and set implausible flags in the context
-    to NaN; this is the compiled part of `trusted_context`.
+    """Update the records of the controller flags sample by sample, and set implausible flags in the
+    context to NaN; this is the compiled part of `trusted_context`.
     """
     for k in range(t.shape[0]):
         for n in range(t.shape[1]):

@@ -1,5 +1,5 @@
-"""Construction of the records for publication from estimates: one observation per visit of a cell,
-and states at a given rate.
+"""Construction of the records for publication from estimates: one observation per visit (passage)
+of a map cell, and states of the vehicle at a given rate.
 
 For each block of samples: `located` marks the samples at which visits (passages of a map cell) end
 (`cell_tracker`), the estimator bank is advanced with these `closes`, and `build_records` constructs
@@ -48,8 +48,9 @@ EXCLUDED_NATS: Final = (
 
 
 class RecordBlock(NamedTuple):
-    """Records of one kind: columns of the message (n, …), index of the vehicle (n,), and True for
-    each urgent record, which is sent immediately (n,).
+    """Records of one kind (observations or states) that are ready for publication: columns of the
+    message (n, …), index of the vehicle (n,), and a mask (n,) of urgent records, which are sent
+    immediately.
     """
 
     kind: Kind
@@ -99,8 +100,9 @@ class Visit:
 
 
 class Sample:
-    """Output of the estimator for one vehicle at one sample, with the measured accelerations, as a
-    record."""
+    """Estimates for one vehicle at one sample, with the measured accelerations, as a record for
+    compiled code.
+    """
 
     health: int
     speed: float  # [m/s]
@@ -170,8 +172,8 @@ class SampleNotes(NamedTuple):
     """Additional data per sample for the visits (passages of a map cell).
 
     `row` (T, N): index of a row of `told` at a sample where friction changed within a visit, else
-    -1. `told` (k, 32): evidence of the part of the visit before that change. `context` (T, N,
-    len(CONTEXT)): controllers and surroundings; empty if unknown.
+    -1. `told` (k, 32): evidence (log-likelihood of friction) from the part of the visit before that
+    change. `context` (T, N, len(CONTEXT)): controllers and surroundings; empty if unknown.
     """
 
     row: IntArray  # -1: nowhere
@@ -325,8 +327,8 @@ def _add_context(visit: Visit, context: FloatArray) -> None:
 @compiled
 def _update_felt_grip(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
     """Update the grip of a visit (passage of a map cell) that the accelerometers show, `dt` [s]
-    after the previous sample. Without accelerometer readings this grip stays infinite and excludes
-    no friction.
+    after the previous sample. Without accelerometer readings the grip of a new visit stays
+    infinite, and then does not limit the grip used.
     """
     if np.isfinite(sample.ax + sample.ay):
         share = 1.0 - np.exp(-dt / FELT_S)
@@ -372,8 +374,8 @@ def _grip_used(ended: RecordArray) -> FloatArray:
     """Return the grip used (force over load) in n visits (passages of a map cell), (n,) [1].
 
     It is limited by the accelerometers in this cell, because the time window of `mu_utilised` may
-    reach into the previous cell. If friction changed within the visit, the smallest value of all
-    parts is used.
+    reach into the previous cell. If friction changed within the visit, the result is the smallest
+    value of its parts (before and after each change).
     """
     last = np.minimum(ended["mu_utilised"], ended["felt"])
     return np.asarray(np.minimum(last, ended["earlier_used"]))

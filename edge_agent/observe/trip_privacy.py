@@ -86,7 +86,7 @@ class TripEnds:
 
     def _distance_at(self, time: IntArray, vehicle: IntArray) -> FloatArray:
         """Return the distance (n,) [m] that each vehicle had driven at a time (n,) [ns UTC],
-        interpolated between the ends of blocks.
+        interpolated between the ends of blocks of samples.
         """
         times = np.vstack(self._times)
         odometers = np.vstack(self._odometers)

@@ -1,5 +1,5 @@
-"""Processing of acknowledgements from fleet services: they settle (finish) batches in the outbox,
-the store on disk, and show how far the vehicle's clock is behind.
+"""Processing of acknowledgements from fleet services: they settle batches (end their storage in the
+outbox, the store on disk), and show how far the vehicle's clock is behind.
 """
 
 from __future__ import annotations

@@ -27,7 +27,9 @@ UNNUMBERED: Final = 0  # the outbox numbers a batch when it takes it in
 
 @dataclass(frozen=True)
 class Draft:
-    """Batch without a sequence number; `encode(seq, first_held)` returns its payload."""
+    """Batch of records that has no sequence number yet; `encode(seq, first_held)` returns its
+    payload with this number.
+    """
 
     vehicle: str
     kind: Kind
@@ -131,8 +133,8 @@ class Batcher:
 
 
 def _batch_ranges(time: IntArray, ready: int, rows: int) -> Iterator[tuple[int, int]]:
-    """Yield the range [first, last) of the records of each batch. Its number of rows and its time
-    span are limited, because a replayed drive may be long.
+    """Divide records into batches: yield the range [first, last) of each. The number of rows and
+    the time span of a batch are limited, because a replayed drive may be long.
     """
     first = 0
     for at in range(1, ready + 1):

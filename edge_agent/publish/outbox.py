@@ -72,7 +72,9 @@ class StoredBatch:
 
 @dataclass
 class OutboxCounts:
-    """Numbers of records that were stored, settled, evicted, damaged or never answered."""
+    """Numbers of records in the outbox's history: stored, settled (finally answered), evicted for
+    lack of space, damaged, or never answered.
+    """
 
     stored: int = 0
     settled: int = 0
@@ -85,8 +87,8 @@ class OutboxCounts:
 
 @dataclass(slots=True)
 class _Entry:
-    """State of a batch without its payload. While the batch is in flight, `due` is the time of its
-    next resend.
+    """State of a stored batch without its payload. While the batch is in flight (sent and not
+    answered), `due` is the time [s] of its next resend.
     """
 
     stream: Stream
@@ -307,7 +309,9 @@ class Outbox:
         return StoredBatch(key, stream, seq, draft.records, payload)
 
     def _mark_in_flight(self, key: int, now: float) -> None:
-        """Mark a batch as in flight, and set the time of its next resend."""
+        """Mark the batch with this key as in flight (sent and not answered), and set the time of
+        its next resend.
+        """
         entry = self._entries[key]
         delay = min(
             max(LONGEST_RESEND_S, self.first_resend_s),
@@ -322,8 +326,8 @@ class Outbox:
         return self._random.uniform(1 - JITTER, 1 + JITTER)
 
     def reset_in_flight(self, vehicle: str, now: float) -> None:
-        """Treat all batches in flight of a vehicle as lost, because the vehicle has just
-        reconnected.
+        """Treat all batches of a vehicle that are in flight (sent and not answered) as lost,
+        because the vehicle has just reconnected.
         """
         for (name, _), pacer in self._pacers.items():
             if name == vehicle:
@@ -415,8 +419,9 @@ class Outbox:
         return [batch for key in sorted(keys) if (batch := self._read_batch(key)) is not None]
 
     def _is_passed_over(self, entry: _Entry) -> bool:
-        """Return True if this batch is the oldest of its stream in the outbox, and PASSED_OVER
-        later batches of the stream (same vehicle, start, kind, region) were settled.
+        """Return True if the service seems to ignore this batch: it is the oldest of its stream
+        (same vehicle, start, kind, region) in the outbox, and PASSED_OVER later batches of the
+        stream were settled.
         """
         sequence = self._streams[entry.stream]
         later = sequence.next - entry.seq - len(sequence.held)

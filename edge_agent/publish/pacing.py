@@ -2,9 +2,9 @@
 network. The module is pure.
 
 State "open", while acknowledgements arrive: fresh batches are sent immediately. Of waiting batches,
-as many are in flight as a window allows. The window grows with each settled batch and is halved
-when a batch is not answered in time (slow start and congestion avoidance, Jacobson 1988: loss
-indicates overload).
+as many are in flight (sent and not answered) as a window allows. The window grows with each settled
+batch and is halved when a batch is not answered in time (slow start and congestion avoidance,
+Jacobson 1988: loss indicates overload).
 
 State "silent", after SILENT_S without an answer: fresh batches stay on disk, and single batches are
 sent as probes at intervals that double up to LONGEST_PROBE_S. The first acknowledgement returns to
@@ -128,8 +128,8 @@ class Pacer:
             self._sure = self._window
 
     def record_reconnect(self, now: float) -> None:
-        """Record that a router is available again: batches in flight are lost, and in the silent
-        state a probe is sent immediately.
+        """Record that a router is available again: batches in flight (sent and not answered) are
+        lost, and in the silent state a probe is sent immediately.
         """
         self.flying = 0
         self._unanswered_since = None

@@ -220,7 +220,9 @@ class Publisher:
                 self._links.put_batch(batch)
 
     def _drop_unwritable(self) -> None:
-        """Drop the drafts that protobuf cannot encode, and keep the others."""
+        """Drop the drafts (batches not stored yet) that protobuf cannot encode, and keep the
+        others.
+        """
         waiting = self._waiting
         self._waiting = []
         for draft in waiting:

@@ -39,7 +39,7 @@ class PublisherStatus:
 
     @property
     def link_watches(self) -> list[LinkWatch]:
-        """Return the watch of each session's link to its router."""
+        """Return, for each Zenoh session, the object that watches its link to the router."""
         return self._sessions.link_watches
 
     @property

@@ -28,7 +28,7 @@ _NEGATIVE: Final = re.compile(r"^-[\d.]")
 
 
 class Command(NamedTuple):
-    """Subcommand of a command line: its name, module, help text and example. The module has
+    """Subcommand of a command-line program: its name, module, help text and example. The module has
     `add_arguments(parser)` and `run(arguments) -> int`.
     """
 
@@ -163,7 +163,8 @@ def run_guarded(run: Callable[[], int]) -> int:
 
 
 def out_folder(field: str, path: Path) -> Path:
-    """Check that a file can be written at `path`, before anything is computed, and return the path.
+    """Check that a file can be written at `path`, and return the path. A command calls this before
+    it computes anything.
 
     Raises:
         InputError: the path is a folder, or its parent folder does not exist.
@@ -181,7 +182,7 @@ def out_folder(field: str, path: Path) -> Path:
 
 @contextmanager
 def report_write_errors(path: Path) -> Iterator[None]:
-    """Convert errors of writing the `--out` file inside this block into input errors.
+    """Provide a context that converts errors of writing the `--out` file into input errors.
 
     Raises:
         InputError: the file cannot be written.

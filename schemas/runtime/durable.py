@@ -59,7 +59,8 @@ def open_durably(
 
 @contextmanager
 def own_drafts(folder: Path) -> Iterator[Path]:
-    """Create a temporary folder within `folder` for drafts that are renamed when they are complete.
+    """Provide a temporary folder within `folder` for drafts (unfinished files) that the caller
+    renames when they are complete.
 
     Two concurrent attempts to write one file, on one or two machines, write different drafts.
     `sweep_drafts` removes the drafts of a killed attempt.
@@ -69,8 +70,8 @@ def own_drafts(folder: Path) -> Iterator[Path]:
 
 
 def sweep_drafts(folder: Path) -> None:
-    """Remove the drafts of attempts that were killed; call this only while no attempt is
-    running.
+    """Remove the folders of drafts (unfinished files) that killed attempts have left in `folder`;
+    call this only while no attempt is running.
     """
     for drafts in folder.glob(f"{_OWN}*"):
         shutil.rmtree(drafts, ignore_errors=True)

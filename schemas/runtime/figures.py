@@ -46,7 +46,9 @@ class Figure:
 
 
 def header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:
-    """Return the conditions of a measurement: commit, machine, versions, seeds, date."""
+    """Return the header of a file of figures, with the conditions of the measurement: commit,
+    machine, versions, seeds, date.
+    """
     return {
         "campaign": campaign,
         "commit": commit(Path(__file__)),

@@ -24,7 +24,9 @@ from schemas.runtime import progress_messages
 
 
 class _Told(event.Listener):
-    """Listener that reports compilations to the user, because they take time."""
+    """Listener to events of numba that reports each compilation to the user, because it takes
+    time.
+    """
 
     def on_start(self, event: event.Event) -> None:
         """Report a compilation as the current activity, and once per process as a message."""
@@ -119,8 +121,8 @@ prefetch = cast(Callable[[NDArray[Any], Any, int], None], intrinsic(_prefetch))
 
 
 def entry_point(kernel: Callable[P, R]) -> Callable[P, R]:
-    """Return the machine code of a compiled function as a callable without numba's argument check,
-    which costs 0.3 µs per call.
+    """Return a callable that runs the machine code of a compiled function directly. It omits
+    numba's check of the arguments, which costs 0.3 µs per call.
 
     The function must have been called before. Every argument must have the same type as in that
     call, because types are not checked again.

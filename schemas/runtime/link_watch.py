@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 class LinkWatch:
-    """Watch over the current links of `session`.
+    """Watch over the links (connections to routers) of a Zenoh session.
 
     Attributes:
         epoch: number of times that the session was connected to a router.

@@ -26,8 +26,8 @@ READ_S: Final = 5.0  # a client whose request is not complete is cut off
 
 
 class Metric(NamedTuple):
-    """Metric with one or several values. `label` is the name of the dimension that distinguishes
-    the values; "" for a single value.
+    """Metric with one or several values. `label` is the name of the OpenMetrics label that
+    distinguishes the values; "" for a single value.
     """
 
     name: str

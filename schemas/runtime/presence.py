@@ -31,7 +31,9 @@ def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToke
 
 
 class PresenceTracker:
-    """Set of liveliness tokens of services, which is updated continuously."""
+    """Set of the liveliness tokens of services that are active now, updated as tokens come and
+    go.
+    """
 
     def __init__(self) -> None:
         self._guard = Lock()
@@ -67,7 +69,7 @@ class PresenceTracker:
         return active_tokens(session) | self.active
 
     def record(self, token: ServiceToken, *, stands: bool) -> None:
-        """Record that a token became active (`stands` is True) or was lost (False)."""
+        """Record that a service's token became active (`stands` is True) or was lost (False)."""
         with self._guard:
             (self._here.add if stands else self._here.discard)(token)
             (self._withdrawn.discard if stands else self._withdrawn.add)(token)

@@ -108,8 +108,9 @@ def print_line(line: str, stream: TextIO) -> None:
 
 
 def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], None]:
-    """Return a function that prints log lines. A JSON line contains the time, the process and the
-    values `who`; the first word of the text is the event.
+    """Return a function that prints log lines in the given form: as text or as JSON. A JSON line
+    contains the time, the process, the values `who`, and the first word of the text as name of the
+    event.
     """
 
     def text(line: str) -> None:

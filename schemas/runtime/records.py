@@ -52,7 +52,9 @@ KINDS: dict[Any, Any] = {
 
 
 class Records(Protocol[R_co]):
-    """Type of a record array in compiled code: its rows have the fields of the class R."""
+    """Type annotation for a record array that is passed to compiled code: its rows have the fields
+    of the class R.
+    """
 
     def __getitem__(self, index: int | tuple[int, int], /) -> R_co:
         """Return a row, which is a view into the array."""

@@ -114,7 +114,7 @@ def spread(
 
 
 def _unpack_column(column: Any) -> Iterator[tuple[int, Any]]:  # noqa: ANN401 an array of Arrow's
-    """Yield pairs from a column of pickled bytes: the number of a task, and the task or its
-    outcome.
+    """Yield pairs from a column of pickled bytes: the number of a task, and the unpickled task or
+    outcome of this task.
     """
     return (pickle.loads(one) for one in column.to_pylist())

@@ -18,8 +18,8 @@ _at_work = threading.Event()
 
 
 def notify_alive() -> None:
-    """Notify the service manager that the process is ready and working; do nothing without a
-    service manager.
+    """Notify the service manager (systemd) that the process is ready and working; do nothing
+    without a service manager.
     """
     _at_work.set()
     _notify_systemd()

@@ -43,7 +43,7 @@ class GripWarning:
     reason: str
 
     def line(self) -> str:
-        """Return the warning as one line of text for people."""
+        """Return the warning as one line of text for the driver."""
         if self.state == "ended":
             return f"warning over: {self.reason}; id {self.id}"
         where = "here" if self.distance_m <= 0.0 else f"in {self.distance_m:.0f} m"

@@ -58,7 +58,7 @@ class Heads(NamedTuple):
     estimator: list[str]
 
     def at(self, index: int) -> Head:
-        """Return the head (fields other than records) of the batch at an index."""
+        """Return the head (fields other than records) of the batch at position `index`."""
         return Head(
             self.kind,
             self.vehicle[index],
@@ -85,7 +85,8 @@ class Heads(NamedTuple):
 
 
 class Decoded(NamedTuple):
-    """The k valid batches among several messages.
+    """The k valid batches that were decoded from several messages, with the errors of the other
+    messages.
 
     Attributes:
         indices: index of the message of each batch, (k,).
@@ -125,7 +126,8 @@ class PresentColumns(NamedTuple):
 
 # protobuf messages are untyped
 def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN401
-    """Parse a batch with the protobuf library and check that its columns have equal lengths.
+    """Parse the bytes of a batch with the protobuf library and check that its columns have equal
+    lengths.
 
     Raises:
         WireError: the payload is too large or not the expected message, or a required column is
@@ -279,7 +281,7 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
 def _derive_columns(columns: Columns, sent: PresentColumns, unplaced: BoolArray) -> None:
     """Fill the columns that a sender of observations may leave out.
 
-    `unplaced` is True for rows that have a finite position but no cell.
+    `unplaced` is a mask of rows, True where a row has a finite position but no cell.
     """
     without = ~sent.records("leave_time")
     columns["leave_time"] = np.where(without, columns["enter_time"], columns["leave_time"])

@@ -274,7 +274,7 @@ def encode_alert(alert: Alert) -> bytes:
 
 
 def decode_alert(payload: bytes) -> Alert:
-    """Decode the bytes of a message; return the alert.
+    """Decode the bytes of an alert's message; return the alert.
 
     Raises:
         WireError: the payload is not an Alert message.

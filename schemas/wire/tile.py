@@ -1,4 +1,4 @@
-"""Reader for map tiles: Arrow streams from an untrusted sender.
+"""Reader for the messages with map tiles, which are Arrow streams from an untrusted sender.
 
 The Arrow library trusts its input: it decompresses data to any size, and uses lengths and offsets
 without checks. Therefore this module checks the header of each message before Arrow reads the body,

@@ -1,4 +1,6 @@
-"""Largest grip used (force over load) within the last second, kept in a ring of time slots."""
+"""Largest grip used (force over load) within the last second, stored in a ring of short time
+intervals (slots).
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ def begin_excitation(ring: Excitation) -> None:
 
 @compiled
 def note_excitation(ring: Excitation, time: float, used: float) -> None:
-    """Store the grip used at `time` [s] in the ring of time slots, and update `largest`."""
+    """Store the grip used at `time` [s] in the ring of time slots, and update `ring.largest`, the
+    largest value of the last second.
+    """
     place = ring.newest
     if not time - ring.time[place] < SLOT_S:
         place = (place + 1) % SLOTS
@@ -52,8 +56,8 @@ def note_excitation(ring: Excitation, time: float, used: float) -> None:
 
 @compiled
 def _find_largest(ring: Excitation, time: float) -> None:
-    """Search all time slots for the largest grip used, because the slot of the previous maximum has
-    expired.
+    """Search all time slots of the last second for the largest grip used, and store it in
+    `ring.largest`. This is needed because the slot of the previous maximum has expired.
     """
     ring.largest = 0.0
     for k in range(SLOTS):

@@ -56,8 +56,8 @@ def take_sample_in(
 ) -> tuple[int, int, float]:
     """Process sample (18,) of a vehicle at `time` [s].
 
-    Return (health flags; REFUSED, BEGUN or STEPPED: the filter skips the sample, starts at it or
-    steps to it; seconds since the previous sample).
+    Return three items: health flags; REFUSED, BEGUN or STEPPED (the filter must skip the sample,
+    start at it or step to it); seconds since the previous sample.
     """
     begins = not track.started
     dt = time - track.time
@@ -81,8 +81,8 @@ def take_sample_in(
 
 @compiled
 def _reset_track(track: InputTrack) -> None:
-    """Reset the record of inputs to its state before the first sample, with the wheels straight
-    ahead.
+    """Reset the stored input signals of a vehicle to the state before the first sample, with the
+    wheels straight ahead.
     """
     track.started = True
     track.position_time = -math.inf
@@ -103,8 +103,8 @@ def _store_inputs(track: InputTrack) -> None:
 
 @compiled
 def _fill_inputs(track: InputTrack, row: FloatArray, anew: bool) -> None:
-    """Fill `inputs` from the readings, and replace missing values. If the last argument is True,
-    values of earlier samples are not used as replacements.
+    """Fill `track.inputs` from the readings, and replace missing values. If `anew` is True, values
+    of earlier samples are not used as replacements.
     """
     now = track.now
     use = track.inputs

@@ -24,7 +24,8 @@ def has_diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
     """Return True if a filter has diverged, that is, if its motion is not finite or physically
     impossible.
 
-    States 0 and 1 of `mean` are v_x and v_y; `yaw_rate` is the index of the yaw rate.
+    States 0 and 1 of `mean` (n,) are v_x and v_y; `yaw_rate` is the index of the yaw rate. `root`
+    (n, n) is the covariance root.
     """
     bad = not (abs(mean[0]) < FASTEST_M_S and abs(mean[1]) < FASTEST_M_S)
     bad = bad or not abs(mean[yaw_rate]) < FASTEST_TURN
@@ -35,8 +36,8 @@ def has_diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
 
 @compiled
 def sliding_flag(row: FloatArray, track: InputTrack, vx: float, vy: float, mu: float) -> int:
-    """Return the health flag SLIDING if the longitudinal slip of any wheel lies beyond the peak of
-    the tyre curve; else return 0.
+    """Return the health flag SLIDING if the longitudinal slip of any wheel, at velocity vx, vy
+    [m/s] and friction `mu`, lies beyond the peak of the tyre curve; else return 0.
     """
     health = 0
     yaw_rate = track.inputs[S.YAW_RATE]

@@ -35,7 +35,7 @@ def write_motion(
     var_rate: float,
 ) -> None:
     """Write velocity [m/s], yaw rate [rad/s] and sideslip [rad] with their standard deviations to
-    the output.
+    `output`, the estimates of one sample.
 
     `var_x`, `var_y` and `var_rate` are the variances of v_x, v_y and the yaw rate.
     """
@@ -67,8 +67,8 @@ def write_states(output: FloatArray, mean: FloatArray, root: FloatArray, yaw_rat
 def write_quality(
     output: FloatArray, utilised: float, nis: float, adaptation: float, log_likelihood: float
 ) -> None:
-    """Write the grip in use, the innovation statistics and the largest factor on R to the
-    output.
+    """Write four quality figures to `output`: grip in use `utilised`, normalised squared innovation
+    `nis`, largest factor on the measurement noise R, and log-likelihood.
     """
     output[Column.MU_UTILISED], output[Column.INNOVATION_NIS] = utilised, nis
     output[Column.ADAPTATION], output[Column.INNOVATION_LOG_LIKELIHOOD] = adaptation, log_likelihood
@@ -120,8 +120,8 @@ def write_unknown(output: FloatArray) -> None:
 
 @compiled
 def limit_friction(mean: FloatArray, root: FloatArray, i: int, largest_std: float) -> None:
-    """Clip state i, the friction, to its possible range, and its standard deviation to at most
-    `largest_std`.
+    """Clip state i of a filter, the friction, to its possible range in `mean` (n,). Reduce its
+    standard deviation in the covariance root (n, n) to at most `largest_std`.
     """
     mean[i] = min(max(mean[i], LOWER), UPPER)
     std = math.sqrt(variance(root, i))

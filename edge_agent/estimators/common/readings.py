@@ -70,8 +70,8 @@ def position_time(sample: FloatArray, time: float, last: float) -> float:
 
 @compiled
 def position_health(time: float, last: float) -> int:
-    """Return the health flag NO_POSITION if the last position is more than POSITION_S
-    old, else 0.
+    """Return the health flag NO_POSITION if the last position (time `last` [s]) is more than
+    POSITION_S seconds old, else 0.
     """
     return 0 if time - last <= POSITION_S else flags.NO_POSITION
 

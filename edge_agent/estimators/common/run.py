@@ -43,7 +43,8 @@ def kernel_of(
     step: Callable[[Memory, Context, float], bool],
     report: Callable[[Memory, Context, FloatArray], float],
 ) -> Kernel:
-    """Return the compiled kernel that `EstimatorBank` calls for a filter.
+    """Return the compiled function (kernel) that `EstimatorBank` calls to process samples with a
+    filter.
 
     Args:
         begin: starts the filter at the sample in memory.track.
@@ -102,7 +103,8 @@ def new_filters(
     """Return an array of records of type `kind`, one per vehicle, with the vehicle's parameters in
     `row`.
 
-    All other fields are zero: this tells the kernel that no sample has been processed.
+    All other fields are zero, by which the compiled kernel recognises that no sample has been
+    processed.
     """
     filters = records(kind, len(vehicles))
     filters["row"] = parameter_table(vehicles)

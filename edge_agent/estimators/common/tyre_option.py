@@ -34,7 +34,7 @@ PROPORTIONAL: Final = TyreOption("proportional-to-friction")
 
 
 def fit_tyres(filters: RecordArray, tyre: TyreOption) -> None:
-    """Write the tyre option into the parameter rows of the filters.
+    """Write the tyre option (see module) into the vehicle parameters of each filter record.
 
     Raises:
         InputError: the name of the stiffness is unknown, or a number is out of range.

@@ -34,8 +34,8 @@ def mixture_bank(
     """Return a bank of friction mixtures, one per vehicle; `rows` (N, 15) are the vehicles'
     parameters.
 
-    `spreads` and `means` (N, STATES) are standard deviations and means of the priors of the states.
-    By default they are the priors in the tables of `design`.
+    `spreads` and `means` (N, STATES) are standard deviations and means of the priors of the
+    filter's states. By default they are the priors in the tables of `design`.
     """
     context = records(MixtureContext, 1)
     put_record(context["design"][0], design)
@@ -110,7 +110,9 @@ def close_visit(
 
 @compiled
 def write_estimates(memory: MixtureMemory, design: MixtureDesign, output: FloatArray) -> None:
-    """Write the current estimates of a vehicle's filter into `output`, except the health flags."""
+    """Write the current estimates of a vehicle's filter (`memory`) into `output`, the row of one
+    sample; the caller adds the health flags.
+    """
     if not memory.started:
         report_prior(design, output)
         return

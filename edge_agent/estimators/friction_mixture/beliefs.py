@@ -1,4 +1,4 @@
-"""Read-only access to the current friction beliefs of the filters."""
+"""Read-only access to the current friction beliefs of the default estimator's filters."""
 
 from __future__ import annotations
 

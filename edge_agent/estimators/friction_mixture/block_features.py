@@ -1,5 +1,5 @@
-"""Inputs of the measurement equations (`BlockFeatures`), computed from the sums of a block (the
-samples within 0.05 s).
+"""Computation of `BlockFeatures`, the inputs of the measurement equations, from the sums over a
+block (the samples within 0.05 s).
 
 Longitudinal force comes from torque, F_x = (T - J*omega')/R. Where torque or speed is missing, the
 force m*a_x is divided among the axles, with a larger standard deviation, because this division is
@@ -157,8 +157,8 @@ def _compute_wheel_forces(
 
 @compiled
 def lone_axle(memory: MixtureMemory, features: BlockFeatures) -> int:
-    """Return 0 if torque is known on the front axle only, 1 if on the rear axle only, and -1 if on
-    both axles or on neither.
+    """Return the index of the only axle with known torque: 0 front, 1 rear; -1 if torque is known
+    on both axles or on neither.
     """
     known = 0
     axle = -1
@@ -255,8 +255,8 @@ def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
 @compiled
 def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> None:
     """Write the standard deviation of each measurement residual to `features.noise_std`, and the
-    noise of the slips. The residual is a total-least-squares distance between slip and force. The
-    noise of each enters with half of its variance.
+    noise of the slips. The residual is a total-least-squares distance between slip and force, so
+    the noise of slip and of force each enter with half of their variance.
     """
     row = memory.row
     constants = design.constants
@@ -334,8 +334,8 @@ def wheel_speed_jump(
 
 @compiled
 def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
-    """Return the forward speed [m/s] of the centre of gravity computed from one wheel that rolls
-    freely; NaN without a reading.
+    """Return the forward speed [m/s] of the centre of gravity, computed from the speed of one wheel
+    under the assumption that it rolls freely; NaN without a reading.
     """
     px, py = wheel_position(row, wheel)
     across = features.steer_sin[wheel] * (row[Parameter.TO_REAR] + px) * features.yaw_rate
@@ -347,8 +347,8 @@ def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
 
 @compiled
 def _compute_information(constants: Constants, features: BlockFeatures) -> None:
-    """Compute informs_x and informs_y of both axles: factors, 0 to 1, on the effect that the
-    stiffness states have on the slips of the axle.
+    """Compute features.informs_x and informs_y of both axles. They are factors, 0 to 1, that reduce
+    how strongly the filter's stiffness states change the slips of the axle.
 
     The factors are near 0 at small forces, because the stiffness that slip then suggests is only
     noise.

@@ -24,7 +24,7 @@ ROWS = 6  # of measurement: four wheels along, two axles across
 
 
 class NodeState(IntEnum):
-    """Index of a state in the filter of a node (friction hypothesis)."""
+    """Index of a state in the state vector of a node (the filter of one friction hypothesis)."""
 
     VX = 0  # [m/s]
     VY = 1  # [m/s], at the centre of gravity

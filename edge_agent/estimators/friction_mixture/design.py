@@ -1,5 +1,5 @@
-"""Tables that the kernels read, computed once from the constants; they do not change
-while driving.
+"""Tables of the default estimator, computed once from its constants for the compiled kernels; they
+do not change while driving.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from schemas.numeric import FloatArray
 
 
 class Nominal(NamedTuple):
-    """Prior of the states that describe the vehicle, its sensors or the road; the velocity states
-    have no prior.
+    """Prior (mean and standard deviation) of the filter states that describe the vehicle, its
+    sensors or the road; the velocity states have no prior.
     """
 
     mean: Annotated[FloatArray, STATES]
@@ -87,8 +87,8 @@ def design_of(
     constants: Constants | None = None,
     curve: Curve | None = None,
 ) -> MixtureDesign:
-    """Return the tables of a friction mixture. Studies pass other `constants`; other tyres need
-    another `curve`.
+    """Return the tables of a friction mixture (grid of friction hypotheses) for the given fuzzy
+    sets. Studies pass other `constants`; other tyres need another `curve`.
     """
     mu, prior = node_table(NODES)
     constants = constants or Constants()

@@ -47,7 +47,7 @@ def change_road(
     The road changes to any friction with probability `hazard`, and to a neighbouring node with
     probability of about `drift`. Only the first `chain` nodes have neighbours; the other nodes
     change to any friction also with probability `leaving`. The exchange between neighbours is in
-    detailed balance with the prior, so the prior does not change.
+    detailed balance with the prior: probabilities equal to the prior do not change.
     """
     count = w.shape[0]
     left = 0.0
@@ -82,8 +82,9 @@ def multiply_likelihood(w: FloatArray, log_likelihood: FloatArray) -> None:
 
 @compiled
 def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> float:
-    """Return the q-quantile of mu (friction). The density is linear between nodes (grid values) and
-    constant beyond the first and last node.
+    """Return the q-quantile of the friction, given probabilities w (K,) of the grid values mu (K,).
+    The density between grid values is interpolated linearly; beyond the first and last value it is
+    constant.
     """
     count = mu.shape[0]
     total = 0.0
@@ -106,8 +107,9 @@ def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> floa
 
 @compiled
 def probability_below(mu: FloatArray, prior: FloatArray, w: FloatArray, limit: float) -> float:
-    """Return P(mu < limit) of the friction mu, for a limit between two nodes (grid values). The
-    density is the same as in `quantile`."""
+    """Return the probability that the friction is below `limit`, given probabilities w (K,) of the
+    grid values mu (K,). The density is the same as in `quantile`.
+    """
     count = mu.shape[0]
     below = total = 0.0
     for j in range(count + 1):
@@ -125,8 +127,8 @@ def probability_below(mu: FloatArray, prior: FloatArray, w: FloatArray, limit: f
 
 @compiled
 def _segment_mass(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
-    """Return the unnormalised probability mass between nodes j - 1 and j. Node -1 and node K are
-    the ends of the friction range.
+    """Return the unnormalised probability mass between the grid values (nodes) of friction j - 1
+    and j. For j = 0 and j = K, one end is the end of the friction range.
     """
     count = mu.shape[0]
     if j == 0:
@@ -140,8 +142,8 @@ def _segment_mass(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> f
 def visit_evidence(
     mu: FloatArray, prior: FloatArray, w: FloatArray, centres: FloatArray, out: FloatArray
 ) -> None:
-    """Compute out = log(w/prior) at the bin centres (32,), interpolated between nodes (grid values
-    of friction), with maximum 0.
+    """Compute the evidence of a visit, out = log(w/prior), at the centres (32,) of the friction
+    bins. It is interpolated between nodes (grid values of friction) and shifted to maximum 0.
     """
     count = mu.shape[0]
     top = -math.inf

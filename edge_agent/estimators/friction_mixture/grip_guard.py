@@ -25,7 +25,9 @@ AT_PEAK = 0.95
 
 @compiled
 def note_grip(grip: GripInUse, ax: float, ay: float, dt: float) -> None:
-    """Update the grip in use with the measured accelerations [m/s^2] of the last dt [s]."""
+    """Update the smoothed grip in use (horizontal acceleration over g) with the accelerations
+    [m/s^2] measured over the last dt [s].
+    """
     size = math.hypot(ax, ay) / GRAVITY
     grip.slow += (1.0 - math.exp(-dt / SLOW_S)) * (size - grip.slow)
     grip.fast += (1.0 - math.exp(-dt / FAST_S)) * (size - grip.fast)
@@ -47,7 +49,8 @@ def guard_penalty(grip: GripInUse, constants: Constants, side_mu: FloatArray) ->
 
 @compiled
 def reported_upper(grip: GripInUse, friction: Quantiles) -> float:
-    """Return the upper end of the friction interval, raised to the grip in use if necessary.
+    """Return the upper end of the friction interval: that of `friction`, but at least ABOVE more
+    than the recent grip in use.
 
     The result may exceed 1.2, the end of the friction grid, because the friction of racing tyres
     does.

@@ -1,5 +1,5 @@
-"""Intake of a sample: rejection of impossible readings, a filter of the yaw rate, and the sums of
-the block (the samples within 0.05 s).
+"""Intake of a sample: it rejects impossible readings, filters the yaw rate, and adds the sample to
+the sums of the block (the samples within 0.05 s).
 
 Missing readings are replaced: a_x by zero and a_y by r*v_x, both with the process noise of a random
 walk; the yaw rate by the speed difference of the rear wheels; steering by its last value. All other
@@ -44,8 +44,8 @@ LOST_AY = 0.7  # [m/s/s^.5] random walk without a_y or yaw rate
 def take_sample(
     memory: MixtureMemory, design: MixtureDesign, time: float, sample: FloatArray
 ) -> tuple[int, bool]:
-    """Add a sample to the block (the samples within 0.05 s); return the health flags of the sample,
-    and True if the block is complete.
+    """Add a sample (18,) at `time` [s] to the current block (the samples within 0.05 s). Return the
+    health flags of the sample, and True if the block is complete.
     """
     last = memory.last
     dt = time - last.time
@@ -129,8 +129,8 @@ def _filter_yaw_rate(memory: MixtureMemory, dt: float) -> None:
 
 @compiled
 def _drop_outlier(value: float, used: float, read: float) -> float:
-    """Return the accelerometer's reading, or NaN if it is far both from the last accepted value and
-    from the last value of the signal.
+    """Return the accelerometer's reading `value` [m/s^2], or NaN if it is far from two values:
+    `used`, the last accepted reading, and `read`, the last reading of any kind.
     """
     jumps = abs(value - read) > JUMP_M_S2 and abs(value - used) > JUMP_M_S2
     return math.nan if jumps else value

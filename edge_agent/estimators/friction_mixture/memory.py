@@ -23,8 +23,9 @@ class PlanarVector:
 
 
 class VelocityGain:
-    """Velocity [m/s] that the vehicle has gained since the block (0.05 s) began, in the current
-    vehicle axes."""
+    """Change of velocity [m/s], integrated from the accelerometers since the block (0.05 s) began,
+    in the current vehicle axes.
+    """
 
     measured: PlanarVector  # by the measured accelerations
     leak_y: PlanarVector  # the part of it from a_y
@@ -52,7 +53,7 @@ class BlockSums:
 
 
 class LastInputs:
-    """Latest value of each input that is needed between samples."""
+    """Latest value of each input signal that the next sample needs."""
 
     time: float  # of the last sample [s]
     position_time: float  # of the last position [s]
@@ -73,7 +74,9 @@ class LastInputs:
 
 
 class GripInUse:
-    """Grip in use according to the accelerometers: horizontal acceleration over g [1]."""
+    """Grip in use according to the accelerometers, that is, horizontal acceleration over g [1],
+    smoothed.
+    """
 
     slow: float  # smoothed, for the nodes
     fast: float  # smoothed less

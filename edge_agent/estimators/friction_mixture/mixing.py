@@ -42,8 +42,9 @@ LARGEST_DRIFT = 0.5
 
 @compiled
 def active_nodes(memory: MixtureMemory) -> int:
-    """Return the number of active nodes (friction hypotheses): NODES, or ALL_NODES while those of
-    split roads are active too."""
+    """Return the number of active nodes (friction hypotheses): NODES, or ALL_NODES while the nodes
+    of split roads (different friction left and right) are active too.
+    """
     return ALL_NODES if memory.split else NODES
 
 

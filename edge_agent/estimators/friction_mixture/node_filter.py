@@ -53,7 +53,7 @@ DOUBTED = 0.05  # of distrust_noise, at the brink of it
 
 class NodeUpdate(NamedTuple):
     """Result of the measurement update of one node (friction hypothesis): its log-likelihood, the
-    number of measurement rows used, and similar values.
+    number of measurement rows (scalar measurements) used, and similar values.
     """
 
     log_likelihood: float  # with the inflated R and the price of sliding [nat]
@@ -74,7 +74,8 @@ def update_node(
     inputs are steady. With steady inputs, errors of the tyre curve and of offsets repeat from block
     to block; if they were treated as noise, the filter would average them into stiffness and shape.
 
-    The function also writes the innovation and the variance expected for it without `inflation`.
+    The function also stores each innovation (measurement minus prediction), and its expected
+    variance without `inflation`.
     """
     constants = design.constants
     nominal = memory.nominal
@@ -119,8 +120,9 @@ def update_node(
 
 @compiled
 def linearize_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
-    """Compute node.derivative and, at the node's mean state, node.force of node j (friction
-    hypothesis); return the penalty [nat] for sliding wheels.
+    """For node j (friction hypothesis) at its mean state, compute node.force (tyre forces over
+    load) and node.derivative (of the measurement rows by the linear states). Return the penalty
+    [nat] for sliding wheels.
 
     The leak (gravity in a_y when the body rolls) and the offset of a_y change the same forces.
     Therefore the derivative by the one is computed from the derivative by the other.
@@ -182,9 +184,9 @@ def _by_wheel_speeds(
     """Compute the derivatives of the measurement rows by the four wheel radii, and by the time lag
     of the wheel speed signals.
 
-    Each wheel's row depends on the speed of this wheel. One evaluation with all four radii changed
-    gives all derivatives, because the radii hardly change the rows of the axles. node.force must
-    already be computed at the mean.
+    Each wheel's measurement row depends on the speed of this wheel. One evaluation with all four
+    radii changed gives all derivatives, because the radii hardly change the rows of the axles.
+    node.force must already be computed at the mean.
     """
     row = memory.row
     mean = memory.mean[j]
@@ -214,8 +216,8 @@ def _by_wheel_speeds(
 def weigh_slopes(
     curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, flat: float, node: NodeWorkspace
 ) -> float:
-    """Compute node.noise, the noise variances of the measurement rows at node.slip; return the
-    penalty [nat] for sliding wheels.
+    """Compute node.noise, the noise variances of the six measurement rows at the slips node.slip;
+    return the penalty [nat] for sliding wheels.
 
     The penalty applies to wheels on the flat part of the curve: a sliding wheel may have any slip,
     so its probability density is low.
@@ -254,15 +256,16 @@ def slip_noise_correction(slope: float) -> float:
     A residual is the distance normal to the curve. On a line of slope k, the share k^2/(1 + k^2) of
     the slip noise enters it (errors in variables); at slope 1 this is one half, which
     features.noise_std already contains. A constant share would be too large on the flat part of the
-    curve, where hardly any slip noise enters, and would favour nodes whose wheels slide.
+    curve, where hardly any slip noise enters. It would favour nodes (friction hypotheses) by which
+    the wheels slide.
     """
     return 0.5 - slope * slope / (1.0 + slope * slope)
 
 
 @compiled
 def spread_points(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> None:
-    """Compute the predicted measurements (rows) at the cubature points of node j (friction
-    hypothesis).
+    """Compute the predicted measurements at the cubature points (sample states) of node j, a
+    friction hypothesis.
 
     Fill node.deviation (A), node.residual with the predicted rows, and node.nonlinearity with the
     variance caused by nonlinearity. scratch.root[j] is lower triangular.
@@ -301,7 +304,8 @@ def spread_points(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
 
 @compiled
 def doubted_noise(trust: Trust, constants: Constants) -> float:
-    """Return the factor on R of the axles during the consistency test.
+    """Return the factor on the measurement noise R of the axles while the consistency test doubts
+    the model.
 
     It grows with the evidence against the model, so that contradicting readings do not change the
     motion estimate.
@@ -314,7 +318,8 @@ def doubted_noise(trust: Trust, constants: Constants) -> float:
 @compiled
 def rear_noise(memory: MixtureMemory, constants: Constants) -> float:
     """Return the factor on R (measurement noise) of the rear axle's rows. It is above 1 while the
-    front axle is already on another surface than the rear axle.
+    front axle is already on another surface than the rear axle, because then one friction cannot
+    explain both.
     """
     return constants.rear_unlike if memory.last.time < memory.slip.rear_unlike_until else 1.0
 
@@ -338,9 +343,9 @@ def take_rows(
     """Update a node (friction hypothesis) with the innovations node.residual (6,), one measurement
     row after the other.
 
-    Return (negative log-likelihood [nat] without constants, number of rows applied): the first is
-    half of the normalised squared innovations plus the ln det S terms. `axle_penalty` scales the ln
-    det S term of the axles; the rows of the wheels have no such term.
+    Return (negative log-likelihood [nat] without constants, number of rows applied). The former is
+    half of the normalised squared innovations, plus half of `axle_penalty`·ln(innovation variance)
+    for each row of the axles.
     """
     loss = 0.0
     used = 0
@@ -384,8 +389,8 @@ def predict_node(
     memory: MixtureMemory, scratch: Scratch, j: int, turn_cos: float, turn_sin: float
 ) -> None:
     """Predict the state of node j (friction hypothesis) to the end of the block (0.05 s): rotate
-    the velocity by the yaw angle, add the gained velocity, and add the process variances
-    scratch.process.
+    the velocity by the yaw angle (given by its cosine and sine), add the velocity gained by
+    acceleration, and add the process variances scratch.process.
 
     The prediction is affine, so cubature is exact: covariance <- F*L*(F*L)' + diag(noise). Vehicle
     and sensor states return to their prior by the factors scratch.keep. The function changes

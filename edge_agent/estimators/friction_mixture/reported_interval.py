@@ -47,8 +47,8 @@ def find_interval(
     likeness: float,
     friction: Quantiles,
 ) -> None:
-    """Compute median, interval and P(mu < SLIPPERY_MU) of friction from the probabilities (NODES,)
-    of the single-friction nodes.
+    """Compute median, interval and P(mu < SLIPPERY_MU) of friction from the probabilities `weight`
+    (NODES,) of the friction hypotheses.
 
     `patch` (PATCH_NODES,) are the probabilities that the car is on an ice patch. `blended` (NODES,)
     is scratch. `likeness`, 0 to 1, is the agreement of the car with its vehicle file.

@@ -14,7 +14,7 @@ Rows: the longitudinal residuals of four wheels, then the lateral residuals of t
 linear range e weights slip and force equally. On the flat part and beyond the peak only the force
 counts, so the row of a sliding wheel measures its friction (errata, what made the difference, 1).
 An axle has one mean slip; its wheels share the lateral force in proportion to load. The states of a
-node (leak, gain of torque, shape of the tyre) correct the measured force.
+node (gravity leaking into a_y, gain of torque, shape of the tyre) correct the measured force.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ FLATTEST = 0.03  # a sliding wheel's slip is not quite arbitrary: its inertia ho
 
 @compiled
 def curve_distance(along: float, across: float) -> float:
-    """Return the distance e to the tyre curve for e_a = along and e_b = across.
+    """Return the signed distance e [1] of a measured point (slip, force) from the tyre curve:
+    `along` is its distance e_a along the slip axis, `across` its distance e_b along the force axis.
 
     If e_a is infinite (the force exceeds the peak), return e_b.
     """
@@ -56,7 +57,8 @@ def curve_distance(along: float, across: float) -> float:
 @compiled
 def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
     """Return the velocity (forward, left) [m/s] gained in the block (0.05 s), corrected by the
-    states in x (n,): leak of gravity, sensor offsets, slope and bank.
+    states in x (n,): leak (gravity that tilted accelerometers measure), sensor offsets, slope and
+    bank.
 
     An offset of a_y has the same effect as an offset of a_x, rotated by 90 degrees.
     """
@@ -159,8 +161,8 @@ def steering_offset(x: FloatArray, features: BlockFeatures) -> float:
 def find_shape_force(
     curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace
 ) -> None:
-    """Compute node.shape_force: the change of force over load at node.slip if the shape of the tyre
-    curve changes by one standard deviation.
+    """Compute node.shape_force: how much the force over load at the slips node.slip changes if the
+    shape of the tyre curve changes by one standard deviation.
 
     side_mu (2,) is the friction under the left and right wheels.
     """
@@ -191,12 +193,13 @@ def correct_forces(
     node: NodeWorkspace,
 ) -> None:
     """Compute node.force, the measured force over load, and node.slip_at_force, the slip that the
-    tyre curve gives for it. Both are corrected by the states in node.point: leak of gravity,
-    offsets, torque gain and curve shape.
+    tyre curve gives for it. Both are corrected by the filter states in node.point: leak (gravity in
+    a_y when the body rolls), offsets, torque gain and curve shape.
 
-    Without torque only the sum of both sides is measured. On a split road the slippery side then
-    takes at most SPLIT_LIMIT of its friction, and the other side takes the rest. The unequal forces
-    turn the car, and the lateral forces of the axles balance that moment.
+    Without torque signals only the sum of the forces on both sides is measured. On a split road
+    (different friction left and right) the slippery side is then assumed to take at most
+    SPLIT_LIMIT of its friction, and the other side the rest. The unequal forces turn the car, and
+    the lateral forces of the axles balance that moment.
     """
     leak = node.point[NodeState.LEAK_Y]
     shape = node.point[NodeState.SHAPE]
@@ -241,8 +244,8 @@ def correct_forces(
 
 @compiled
 def share_by_sides(mean: float, most: float, most_other: float) -> float:
-    """Return the force over load of the wheel on one side, if the wheels of both sides have the
-    mean `mean`.
+    """Return the force over load [1] of the wheel on one side of an axle, given the mean over both
+    sides.
 
     The sides are equal until the slippery side reaches its limit.
 
@@ -259,8 +262,8 @@ def share_by_sides(mean: float, most: float, most_other: float) -> float:
 
 @compiled
 def _slip_at_force(curve: TyreCurve, mu: float, force: float, other: float) -> float:
-    """Return the slip that gives `force` over load while the component `other` acts at right angles
-    to it.
+    """Return the slip at which a tyre of friction `mu` has the force over load `force` [1] in one
+    direction, while its force over load at right angles is `other` [1].
 
     The slip is expressed as linear force over load [1]; it is infinite at or beyond the peak.
     """
@@ -279,8 +282,8 @@ def find_residuals(
     node: NodeWorkspace,
     out: FloatArray,
 ) -> None:
-    """Compute out (6,): for each measurement row, the distance e of node.slip and node.force from
-    the tyre curve; NaN if a reading of the row is missing.
+    """Compute out (6,): for each measurement row (four wheels, two axles), the distance e of the
+    measured slip and force from the tyre curve; NaN if a reading is missing.
     """
     slip = node.slip
     force = node.force

@@ -97,8 +97,9 @@ def start_vehicle(
 
 @compiled
 def forget_vehicle(memory: MixtureMemory) -> None:
-    """Reset the vehicle and sensor states in the mean and covariance of the mixture to their
-    prior."""
+    """Reset the vehicle and sensor states (not the motion) to their prior, in the mean and
+    covariance of the whole mixture of friction hypotheses.
+    """
     nominal = memory.nominal
     covariance = memory.overall_covariance
     for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
@@ -126,8 +127,8 @@ def put_split_to_sleep(memory: MixtureMemory) -> None:
 
 @compiled
 def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
-    """Set v_x of all nodes (filters of one friction hypothesis each) to `speed` [m/s] and v_y to
-    zero.
+    """Restart the velocity of all nodes (filters of one friction hypothesis each): v_x is `speed`
+    [m/s] and v_y zero.
 
     If `speed` is NaN, all nodes keep the mixture's v_x with standard deviation `spread` [m/s].
     """

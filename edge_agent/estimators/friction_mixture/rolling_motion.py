@@ -183,8 +183,8 @@ def _take_velocity(
     direction: tuple[float, float],
     reading: tuple[float, float, float],
 ) -> float:
-    """Update node j (friction hypothesis) with a velocity reading (innovation, variance, Huber
-    threshold) along `direction` (x, y).
+    """Update node j (friction hypothesis) with a measured velocity along `direction` (x, y).
+    `reading` is (innovation [m/s], variance, threshold of the Huber function that limits outliers).
 
     Return half of its normalised squared innovation [nat].
     """

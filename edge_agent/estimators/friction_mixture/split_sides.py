@@ -26,8 +26,8 @@ LEFT, RIGHT, BOTH = range(3)  # whose friction a share of cells is of; BOTH is t
 
 
 class Sides(NamedTuple):
-    """Friction under the left and right wheels for all nodes: first the single-friction nodes, then
-    the split nodes.
+    """Friction under the left and right wheels by each node (hypothesis): first the nodes with one
+    friction for both sides, then the split nodes with different ones.
     """
 
     mu: Annotated[FloatArray, ALL_NODES, 2]  # left, right
@@ -37,7 +37,9 @@ class Sides(NamedTuple):
 
 
 class Triangle(NamedTuple):
-    """A triangular density: it rises from the left end to the middle and falls to the right end."""
+    """Triangular probability density of friction: it rises from the left end to the middle and
+    falls to the right end.
+    """
 
     left: float
     middle: float
@@ -88,8 +90,8 @@ def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
 
 
 def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
-    """Return the probability that a triangular density has in each cell; `edges` are the borders of
-    the cells.
+    """Return the probability that a triangular density of friction has in each cell (range of
+    friction), (cells,); `edges` (cells + 1,) are the borders of the cells.
     """
     left, middle, right, _ = triangle
     rising = np.clip(edges - left, 0.0, middle - left)

@@ -55,7 +55,9 @@ from schemas.runtime.jit import compiled
 def step(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray
 ) -> int:
-    """Process one sample (18,); return the health flags of this sample only."""
+    """Process one sample (18,) of a vehicle at `time` [s] with the default estimator's filter;
+    return the health flags of this sample only.
+    """
     if not memory.started:
         return start_vehicle(memory, design, scratch, time, sample) | flags.RESET
     health, whole = take_sample(memory, design, time, sample)
@@ -162,8 +164,8 @@ def conclude_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scr
 
 @compiled
 def _find_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Compute median and interval of three frictions: that under the left wheels, that under the
-    right wheels, and the mean of both.
+    """Compute median and 90 % interval of three frictions: under the left wheels, under the right
+    wheels, and the mean of both.
     """
     if memory.split:
         _find_side(memory, design, scratch, LEFT, memory.friction_left)

@@ -10,11 +10,12 @@ also an input of the rules that decide how much of the evidence on friction is u
 **Contradiction** is a sequential test of two hypotheses (after Page 1954): that the model holds, or
 that the axles' innovations have FACTOR times the stated variance. The second happens with delayed
 steering signals or on the banking of a race track. Ice that explains the data does not count
-against the model, nor do unusual states alone. Log-likelihood ratios against the model add up to
-`odd` [nat] and fade within minutes. Straight driving, during which the model cannot fail, does not
-count in favour of the model. At `odd_least` the filter draws no conclusions: the interval returns
-to the prior, the axles do not affect the motion, and states learned meanwhile are reset. The test
-leaves out slides, slippery road and walking pace (`unexplained_ratio`).
+against the model, nor do unusual states alone. The sum of the log-likelihood ratios against the
+model is `odd` [nat]; old terms fade within minutes. Straight driving, during which the model cannot
+fail, does not count in favour of the model. While `odd` is at its limit `odd_least`, the filter
+draws no conclusions: the friction interval returns to the prior, the axles do not affect the
+motion, and states learned meanwhile are reset. The test leaves out slides, slippery road and
+walking pace (`unexplained_ratio`).
 
 After `patience` [s] without a possible test the model is tried again. Each further contradiction
 makes that time four times as long, because sensors do not repair themselves. A motion reset by the
@@ -52,8 +53,8 @@ SLOW_PEAK = 6.0
 def update_consistency(
     memory: MixtureMemory, design: MixtureDesign, duration: float, ratio: float, health: int
 ) -> None:
-    """Update memory.trust with the states, the innovations and the health flags of the block (0.05
-    s).
+    """Update memory.trust (strain, and evidence against the model) with the states, the innovations
+    and the health flags of the block (0.05 s).
 
     `ratio` is the sum of the axles' squared innovations of the block over their stated variance.
     """
@@ -96,8 +97,8 @@ def update_consistency(
 
 @compiled
 def unexplained_ratio(memory: MixtureMemory, design: MixtureDesign, ratio: float) -> float:
-    """Return the part of `ratio` (squared innovations over their variance) that neither a slide nor
-    slippery road explains.
+    """Return the part of `ratio` (squared innovations of the axles over their variance) that counts
+    as a contradiction of the model, because neither a slide nor slippery road explains it.
 
     While a wheel slides, or the road is estimated to be slippery, the axles' forces differ from the
     model for a while. Tight turns at walking pace are outside the model's range.
@@ -124,8 +125,9 @@ def belief_strain(cost: float, learned: float, prior: float) -> float:
     """Return the strain (chi-square per degree of freedom) of the estimated vehicle and sensor
     states. `cost` [nat] is half of their chi-square against the prior.
 
-    `learned` is the number of degrees of freedom that measurements have determined. The result is 1
-    if nothing was learned.
+    `learned` is the number of degrees of freedom that measurements have determined. `prior` is a
+    number of imagined further ones with chi-square 1 each, so the result is 1 if nothing was
+    learned.
     """
     return (2.0 * cost + prior) / (learned + prior)
 
@@ -161,15 +163,16 @@ def nominal_agreement(trust: Trust, constants: Constants) -> float:
 
 @compiled
 def used_evidence_share(trust: Trust, constants: Constants) -> float:
-    """Return the share of the evidence that is used: it decreases as evidence grows that the
-    measurements contradict the model, and is 0 once this is accepted.
+    """Return the share of the evidence on friction that is used: it decreases as evidence grows
+    that the measurements contradict the model, and is 0 once this is accepted.
     """
     return max(1.0 - (trust.odd / constants.odd_least) ** 2, 0.0)
 
 
 @compiled
 def axles_ratio(ratio: float) -> float:
-    """Return the log-likelihood ratio [nat] of FACTOR times the stated variance against the stated
-    variance, for normalised squared innovations `ratio`.
+    """Return the log-likelihood ratio [nat] of two hypotheses about the axles' innovations: their
+    variance is FACTOR times the stated one, against the stated one. `ratio` is the sum of their
+    squares over the stated variance.
     """
     return (1.0 - 1.0 / FACTOR) * ratio - math.log(FACTOR)

@@ -1,8 +1,8 @@
 """Reported grip in use: the larger force over load of the two axles, smoothed over SMOOTH_S.
 
-The report takes the largest value of the last second. It is smoothed because the largest of twenty
-noisy blocks would show the sensor noise more than the tyres. The value that weights the evidence on
-friction is not smoothed.
+The reported value is the largest of the last second. It is smoothed because the largest of twenty
+noisy values would show the sensor noise more than the tyre forces. The value that weights the
+evidence on friction is not smoothed.
 
 Where torque is missing, the brakes are assumed to load both axles in proportion to their load. This
 is how ABS and brake-force distribution act near the limit. With a fixed share instead, the force of

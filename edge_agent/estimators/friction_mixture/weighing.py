@@ -148,8 +148,8 @@ def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
 
 @compiled
 def slip_meaning(features: BlockFeatures, vx: float) -> float:
-    """Return the share of the evidence from slip that counts at this speed: 0 up to SLOWEST_M_S, 1
-    from twice that speed.
+    """Return the share, 0 to 1, of the evidence from slip that counts at the speed `vx` [m/s]: 0 up
+    to SLOWEST_M_S, 1 from twice that speed.
     """
     fastest = abs(vx)
     for wheel in range(4):
@@ -190,16 +190,16 @@ def update_novelty(
 def saturation(slip: float, mu: float) -> float:
     """Return the fuzzy truth value, 0 to 1, of "the axle slides" on friction `mu`.
 
-    It is 0 up to a slip (as linear force over load) of mu, and 1 from 1.5 mu on; 0 where the slip
-    is unknown.
+    `slip` is in units of the force over load of a linear tyre [1]. The result is 0 up to a slip of
+    mu and 1 from 1.5 mu on; 0 where the slip is unknown.
     """
     return 0.0 if math.isnan(slip) else min(max(2.0 * (abs(slip) / mu - 1.0), 0.0), 1.0)
 
 
 @compiled
 def advance_usual(usual: FloatArray, i: int, now: float, keep: float) -> float:
-    """Return the difference of the value `now` from its usual value usual[i], and smooth usual[i]
-    towards `now`. Without a reading return 0.
+    """Return the absolute difference between the value `now` and its usual value usual[i], and move
+    usual[i] towards `now`: it keeps the share `keep`. Return 0 if `now` is NaN.
     """
     if math.isnan(now):
         return 0.0
@@ -225,8 +225,8 @@ def axle_slip(row: FloatArray, features: BlockFeatures, vx: float, vy: float, ax
 
 @compiled
 def adapt_noise(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Update the innovation variances of the last blocks, and the factors on the measurement noise
-    R for the next block (0.05 s).
+    """Update the actual and expected variance of the innovations, averaged over the last blocks (of
+    0.05 s). Compute from them the factors on the measurement noise R for the next block.
     """
     keep = math.exp(-scratch.features.duration / design.constants.window)
     for group in range(2):

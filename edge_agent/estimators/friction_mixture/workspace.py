@@ -64,7 +64,9 @@ class BlockFeatures:
 
 
 class NodeSlip:
-    """Slip of wheels and axles computed at one state vector of a node (friction hypothesis)."""
+    """Slips of the wheels and axles, computed for one state vector of a node (filter of one
+    friction hypothesis).
+    """
 
     along: Annotated[FloatArray, 4]  # g_x, linear force over load [1]
     across: Annotated[FloatArray, 4]  # g_y
@@ -102,7 +104,9 @@ class NodeWorkspace:
 
 
 class Scratch:
-    """Scratch arrays for one block (the samples within 0.05 s)."""
+    """Scratch arrays for intermediate results of one block (the samples within 0.05 s) of one
+    vehicle.
+    """
 
     features: BlockFeatures
     node: NodeWorkspace

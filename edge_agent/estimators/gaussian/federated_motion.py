@@ -227,7 +227,8 @@ def _update_sub_filter(memory: FederatedMemory, at: SubFilter, dt: float) -> Non
 def mean_wheel_velocity(row: FloatArray, track: InputTrack, x: FloatArray, yaw_rate: int) -> float:
     """Return the mean speed [m/s] in the rolling direction of the wheels whose speed is measured.
 
-    x[0] and x[1] of the state are v_x and v_y; x[yaw_rate] is the yaw rate.
+    The motion is given by the state `x`: x[0] and x[1] are v_x and v_y, x[yaw_rate] is the yaw
+    rate.
     """
     total = 0.0
     count = 0

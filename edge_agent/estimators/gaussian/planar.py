@@ -113,7 +113,7 @@ def propagate_points(
 def _apply_heun_step(
     vehicle: Body, columns: FloatArray, first: int, last: int, drive: HeunInputs
 ) -> None:
-    """Apply one Heun step to the states in the columns first to last - 1, in place.
+    """Advance the states in the columns first to last - 1 by one step of Heun's rule, in place.
 
     The function is pure arithmetic, so that the compiler can process several points in parallel.
     """
@@ -165,14 +165,16 @@ def _apply_heun_step(
 
 @inlined
 def _with_friction(wheels: WheelInputs, mu: Four) -> WheelInputs:
-    """Return the wheel inputs with their friction replaced by `mu`."""
+    """Return the inputs of the wheels (steering, speed, force) with their friction replaced by
+    `mu`.
+    """
     return WheelInputs(wheels.cos, wheels.sin, wheels.omega, wheels.force_x, mu)
 
 
 @inlined
 def _interpolate_inputs(track: InputTrack, share: float, force_x: Four, mu: Four) -> WheelInputs:
-    """Return the wheel inputs interpolated between the previous sample (`share` 0) and this sample
-    (`share` 1).
+    """Return the inputs of the wheels (steering, speed, force, friction) interpolated between the
+    previous sample (`share` 0) and this sample (`share` 1).
     """
     before = track.inputs_before
     use = track.inputs

@@ -81,7 +81,7 @@ def dependence_factor(demand: float, dt: float) -> float:
 
 @compiled
 def visible_share(demand: float) -> float:
-    """Return the share of the friction's standard deviation that takes part in a measurement update
+    """Return the share of the friction's standard deviation that a measurement update may reduce,
     at a force of `demand` [g]: near 0 at low demand, near 1 at high demand.
     """
     used = (demand / DEMAND_HALF) ** 4

@@ -26,7 +26,7 @@ LEAST_SHARE: Final = 0.01  # of the information of a sub-filter
 
 
 class FederatedSetting(NamedTuple):
-    """Variances, initial friction and tyre option of the friction filter of paper 000."""
+    """Settings of the friction filter of paper 000: variances, initial friction and tyre option."""
 
     process: float = 1.0  # Q of each friction per sample
     start: float = 1.0  # P_0

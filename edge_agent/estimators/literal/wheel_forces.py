@@ -31,8 +31,8 @@ LEAST_MU = 0.02  # of a tyre that is not proportional: its slip over friction ne
 
 @dataclass(frozen=True)
 class WheelForces:
-    """Slips, loads and steering angles at each sample of a drive, with the kind of tyre
-    stiffness.
+    """Slips, loads and steering angles of the wheels at each sample of a drive, with the kind of
+    tyre stiffness (see module).
     """
 
     free: FloatArray  # (T, 4, 2) k*s of the wheels

@@ -148,10 +148,11 @@ def _root_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _square_root_step(
     model: _Model, k: int, mean: FloatArray, covariance: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
-    """Run one step in square-root form. This form does not use `covariance`, and returns the
-    argument as it is.
+    """Run one step in square-root form. This form does not use `covariance` and returns it
+    unchanged.
 
-    Return (mean, covariance, root, False); False states that no Cholesky factor was missing.
+    Return (mean, covariance, root, False). The last item tells whether a Cholesky factor was
+    missing; in this form it never is.
     """
     axes, sizes = _root_of(np.concatenate([root, model.process_root], axis=1))
     points = model.sigma_points(mean, axes * sizes)

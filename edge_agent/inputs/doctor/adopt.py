@@ -4,7 +4,8 @@ locked axles.
 The doctor reports a delay between devices that is too large for the filter. If the drive shows the
 size of the delay, the log is corrected before the estimator reads it. A delay of unknown size
 remains a finding (reported fault), and the records of the log are not published. Smaller delays are
-estimated by the filter's own states, so that the replay of a log without faults remains causal.
+estimated by the filter's own states, so that a log without faults is estimated causally, as in a
+car: no result depends on later samples.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ from schemas.vehicle import Vehicle
 
 
 class Adopted(NamedTuple):
-    """A corrected log, its vehicle, its diagnosis, and notes that describe the changes."""
+    """A corrected log with its vehicle, the signal doctor's diagnosis of it, and notes that
+    describe the changes.
+    """
 
     log: SignalLog
     vehicle: Vehicle

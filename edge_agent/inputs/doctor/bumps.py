@@ -57,8 +57,8 @@ def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
 
 
 def _side_unevenness(apart: FloatArray, wheelbase: float) -> FloatArray:
-    """Return the speed difference between the left and right wheel of an axle, (n,), minus its
-    running mean over WINDOW wheelbases.
+    """Return the speed difference `apart` (n,) between the left and right wheel of an axle, minus
+    its running mean over WINDOW wheelbases. What remains is road unevenness and noise.
     """
     width = 2 * round(0.5 * WINDOW * wheelbase / STEP_M) + 1
     if width >= len(apart):

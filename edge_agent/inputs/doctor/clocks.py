@@ -19,8 +19,9 @@ LARGEST_LAG_S: Final = 0.085  # devices of sound cars lie within .06 s
 
 
 def wheels_speak_late(axle: Fit, seconds: float) -> bool:
-    """Return True if the yaw rate computed from the wheels confirms the measured lag `seconds` of
-    the wheels: the lag of this yaw rate has the same sign and is larger than half of `seconds`.
+    """Return True if the yaw rate computed from the speeds of the wheels confirms that their
+    signals lag by `seconds`. `axle` is the fit of this yaw rate to the gyroscope's: its lag must
+    have the same sign and be larger than half of `seconds`.
     """
     return (
         axle.is_known

@@ -37,7 +37,7 @@ class Finding:
 @dataclass
 class Diagnosis:
     """Result of an examination: faults, channels without fault, channels about which the drive says
-    nothing, and the fits of the physical relations.
+    nothing, and the fitted physical relations between signals.
     """
 
     findings: list[Finding] = field(default_factory=list)

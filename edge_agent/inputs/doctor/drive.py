@@ -69,7 +69,8 @@ class EvenDrive:
 
 
 def smooth_twice(x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
-    """Return x after a running mean over `seconds`, applied twice. The mean skips NaN.
+    """Return the evenly sampled signal x (n,) after a running mean over `seconds`, applied twice.
+    The mean skips NaN.
 
     The result is NaN where x is NaN, or where less than about 40 % of the window is known.
     """
@@ -191,8 +192,8 @@ def prepare_drive(
 
 
 def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
-    """Return an array (n,) that is True where a wheel spins or locks. The function compares the
-    wheel speeds (n, 4) with each other, so their unit does not matter.
+    """Return a mask (n,) that is True where a wheel spins or locks. The function compares the wheel
+    speeds (n, 4) with each other, so their unit does not matter.
 
     The front and rear wheel of a side roll nearly alike, in turns too. A constant difference
     between them is attributed to different tyres. A wheel that differs all the time is not
@@ -218,9 +219,8 @@ def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
 
 
 def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
-    """Return an array (n,) that is True where all wheels spin or lock together: their speed,
-    compared with the speed over ground, is not in its usual ratio. The unit of the wheel speed does
-    not matter.
+    """Return a mask (n,) that is True where all wheels spin or lock together: there the ratio of
+    their speed to the speed over ground is unusual. The unit of the wheel speed does not matter.
     """
     known = np.isfinite(v) & np.isfinite(v_ground) & (np.abs(v) > 0.3 * fast)
     if known.sum() < 5 * RATE_HZ:
@@ -236,8 +236,9 @@ def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
 
 
 def _nearest_yaw(t: FloatArray, yaw: FloatArray, at: FloatArray) -> FloatArray:
-    """Return at each time the nearest reading of the yaw angle, which is recorded rarely. Readings
-    are not averaged, because averages of angles near ±π would be wrong.
+    """Return, for each time in `at`, the nearest reading of the yaw angle, which is recorded less
+    often than other signals. Readings are not averaged, because averages of angles near ±π would be
+    wrong.
     """
     good = np.flatnonzero(np.isfinite(yaw))
     if len(good) < 2:

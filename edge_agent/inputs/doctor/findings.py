@@ -161,7 +161,8 @@ def diagnose(
 def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
     """Return the times in seconds, and True if the sampling rate is unusable.
 
-    Times in another unit are converted. Both faults are added to the diagnosis.
+    Times in another unit are converted. A wrong unit and an unusable rate are added to the
+    diagnosis as faults.
     """
     step = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
     if step > 0.0 and not 1.0 / FASTEST_HZ <= step <= 1.0 / SLOWEST_HZ:
@@ -177,8 +178,8 @@ def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
 
 
 def _find_jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
-    """Find status bits in the upper bits of a wheel speed: readings that jump away from the other
-    three wheels and back.
+    """Add a finding (fault) to the diagnosis for each wheel speed whose upper bits are status bits:
+    its readings jump away from the other three wheels and back.
 
     A wheel that spins or locks also differs from the others, but gradually and by any amount. A
     status bit changes completely from one reading to the next, and adds the same amount each time.
@@ -308,8 +309,9 @@ def _holds_throughout(
 
 
 def _turns_as_steered(verdict: Verdict, found: dict[str, Fit]) -> bool:
-    """Return True if the car turns as its steering or its course predicts. Otherwise the car spins,
-    and v·r (speed times yaw rate) must not be compared with the lateral acceleration.
+    """Return True if the car turns as its steering or its course over ground predicts. Otherwise
+    the car slides, and v·r (speed times yaw rate) must not be compared with the lateral
+    acceleration.
     """
     for name in ("steering", "turning"):
         gain = 1.0
@@ -332,7 +334,8 @@ def _find_radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Fi
     straight and calmly, and about exchanged axles.
 
     In a bend, wheels slip with the force of the tyres, so only moments with hardly any force count.
-    If the error of a wheel is not confirmed while the car coasts, the wheels are added to `doubts`.
+    If the error of a wheel does not also appear while the car coasts, the wheel speeds are added to
+    `doubts`, the channels that remain unknown.
     """
     findings = []
     tracks = (vehicle.track_front, vehicle.track_front, vehicle.track_rear, vehicle.track_rear)

@@ -33,8 +33,9 @@ EXCHANGED: Final = {
 
 
 def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
-    """Return, by device, the lags [s] that are too small to be reported as faults, but too large
-    for the filter."""
+    """Return, by device, the delays [s] that are too small to be reported as faults, but too large
+    for the estimator.
+    """
     if any(finding.kind == "clock" for finding in diagnosis.findings):
         return {}
     return {name: lag for name, lag in late_devices(diagnosis).items() if abs(lag) > FILTER_BEARS_S}

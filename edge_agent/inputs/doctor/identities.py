@@ -79,9 +79,10 @@ class Relation(NamedTuple):
     k · term, each an array (n,).
 
     If `per` is given, the offset is multiplied by it and therefore not constant. If `bend` (n,) is
-    given, the left side also contains an unknown share of right · bend, because at one speed
-    understeer cannot be separated from a gain of the steering. `loose` are prior standard
-    deviations of the gains k of the last terms, which are also hard to separate from the main gain.
+    given, the left side also contains an unknown share of right · bend (understeer). Its share has
+    a prior, because at a single speed understeer cannot be separated from a gain of the steering.
+    `loose` are prior standard deviations of the gains k of the last terms, which are also hard to
+    separate from the main gain.
     """
 
     left: FloatArray
@@ -155,7 +156,7 @@ def fit_identities(drive: EvenDrive) -> dict[str, Fit]:
 
 def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) -> Fit:
     """Fit left = gain · right + offset + Σ k · term over the moving part of the drive, after
-    removal of the lag.
+    removal of the lag (delay) between both sides.
 
     The gain is the geometric mean of both regressions (left on right, right on left), so that noise
     on either side does not bias it.
@@ -297,7 +298,7 @@ def _fit_with_priors(
 
 def _gains_of_parts(x: FloatArray, y: FloatArray, excited: BoolArray) -> tuple[float, ...]:
     """Return the gain of an identity (left over right side) in each of PARTS consecutive parts of
-    the time with excitation. Parts that are too short are left out.
+    the time with excitation. Parts of the drive that are too short are left out.
     """
     rows = np.flatnonzero(excited)
     found = []

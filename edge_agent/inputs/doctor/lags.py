@@ -85,8 +85,8 @@ def find_lags(
 
 
 class _Peak(NamedTuple):
-    """Shift [s] of one series against another with the largest correlation, and that
-    correlation.
+    """Peak of a cross-correlation: the shift [s] of one series against another at which their
+    correlation is largest, and this correlation.
     """
 
     seconds: float
@@ -97,7 +97,8 @@ def _find_delay(
     left: FloatArray, right: FloatArray, among: BoolArray, least: float
 ) -> _Peak | None:
     """Return the delay [s] of the signal `left` relative to `right`, with the correlation at that
-    delay; None if the drive does not determine it.
+    delay, over the samples of the mask `among`. Return None if a signal varies too little, or if
+    the correlation is below `least`.
     """
     most = round(LONGEST_S * RATE_HZ)
     among = among.copy()

@@ -52,8 +52,9 @@ def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
 
 
 def _total_turn(angle: FloatArray) -> float:
-    """Return how much an angle (n,) [rad] varies after unwrapping: its 95 % quantile minus its 5 %
-    quantile."""
+    """Return how much an angle (n,) [rad] varies over a drive: its 95 % quantile minus its 5 %
+    quantile, after jumps by 2π have been removed.
+    """
     unwrapped = np.unwrap(angle)
     return float(np.percentile(unwrapped, 95) - np.percentile(unwrapped, 5))
 

@@ -8,9 +8,9 @@ An identity relates the quantities by
     ln |gain| = ln centre + Σ ± ln factor of its quantities + error
     sign(gain) = Π sign(factor)
 
-Every set of at most two faulty quantities is tried. A quantity is settled if every explanation with
-another fault of it costs at least SETTLED more than the best one. Clocks are treated in the same
-way: the lag of an identity is the difference between the lags of two devices.
+Every set of at most two faulty quantities is tried. A quantity is settled if each explanation that
+gives it another fault costs at least SETTLED more than the best explanation. Clocks are treated in
+the same way: the lag of an identity is the difference between the lags of two devices.
 """
 
 from __future__ import annotations

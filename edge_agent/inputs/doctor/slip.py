@@ -55,8 +55,9 @@ def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:
 
 
 def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float) -> bool:
-    """Return True if a wheel disagrees with the other three wheels (n, 3) most of the time while
-    they agree with each other.
+    """Return True if a wheel disagrees with the other three wheels most of the time while those
+    agree with each other. `rest` (n, 3) are the speeds of the other wheels, `others` (n,) their
+    common speed, and `off` (n,) is True where the wheel differs from it.
 
     No wheel spins for that long, so the caller reports that the signal is not the speed of this
     wheel.
@@ -146,7 +147,8 @@ def find_followed(drive: EvenDrive) -> BoolArray:
 
 def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
     """Return True if the ratio of speed over ground to wheel speed equals `gain` both while the car
-    gains speed and while it loses speed.
+    gains speed and while it loses speed. Then a wrong wheel radius, and not slip, explains the
+    ratio.
 
     Spinning wheels turn too fast while they are driven, and braked wheels turn too slowly. A wrong
     radius changes the ratio equally in both cases.
@@ -162,8 +164,8 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
 
 
 def spread_of_parts(beside: FloatArray) -> float:
-    """Return the standard deviation of a quantity between parts of a drive. The result
-    distinguishes a tilt of the sensor, which gives the same value in all parts, from a slide.
+    """Return the standard deviation of a quantity (n,) between parts of a drive. If it is small,
+    the quantity is a constant sensor error such as a tilt; a slide does not last over all parts.
     """
     parts = [
         float(np.nanmedian(part))
@@ -174,8 +176,9 @@ def spread_of_parts(beside: FloatArray) -> float:
 
 
 def is_steady(fit: Fit) -> bool:
-    """Return True if the gain of an identity (left over right side) in most parts of the drive
-    equals the gain over the complete drive."""
+    """Return True if the fitted gain of an identity (left over right side of a physical relation)
+    in most parts of the drive equals that over the complete drive.
+    """
     return share_of_parts(fit, fit.gain) >= STEADY_SHARE
 
 

@@ -43,7 +43,9 @@ class Decoder:
         }
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the signals, by name, in received frames (time, (identifier, extended, data))."""
+        """Return the signals, by name, that received CAN frames contain; a frame is (time,
+        (identifier, extended, data)).
+        """
         log: Log = {}
         for time, (identifier, extended, data) in heard:
             log.setdefault((0, identifier, extended), Frames()).add(time, data)

@@ -38,8 +38,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class HostClock:
-    """The host's clock since its start: the UTC time [ns] of the start, and the reading of a
-    monotonic clock [s] at that moment.
+    """The host's clock since its start: it holds the UTC time [ns] of the start, and the reading of
+    a monotonic clock [s] at that moment.
     """
 
     start_ns: int = field(default_factory=time.time_ns)
@@ -55,7 +55,7 @@ class HostClock:
 
 
 class Stamps:
-    """Conversion of a source's time stamps to the host's clock."""
+    """Conversion of the time stamps of one live source to the host's clock."""
 
     def __init__(self) -> None:
         self._before = self._lately = float("inf")
@@ -110,7 +110,7 @@ class Feed(ABC):
         """Open the source, increment `openings`, and call `hear` for each message until `stopping`
         is set.
 
-        An earlier return or an exception counts as a loss of the source; it is then opened again.
+        If this method returns earlier or raises, the source counts as lost and is opened again.
         """
 
     @abstractmethod
@@ -137,7 +137,9 @@ class Feed(ABC):
         return self._thread.is_alive()
 
     def hear(self, stamp_ns: int, what: object) -> None:
-        """Store a message with the source's own time stamp [ns UTC]."""
+        """Store the received message `what` with the source's own time stamp [ns UTC], for the next
+        `take`.
+        """
         self.last = self.clock.now()
         self.heard += 1
         if len(self._waiting) >= MOST_WAITING:

@@ -160,8 +160,8 @@ class Ros2Feed(Feed):
         self.hear(at, {name: float(take(message)) for name, take in self._leaves[topic]})
 
     def _publication_time(self, attachment: bytes) -> int:
-        """Return the time of publication [ns], 0 if it is missing, and count the messages that were
-        lost before this one.
+        """Return the time of publication [ns] in a message's attachment; 0 if it is missing. Gaps
+        in the attachment's sequence number are counted as lost messages.
         """
         if len(attachment) < ATTACHMENT.size:
             return 0

@@ -1,5 +1,5 @@
-"""Rows at a fixed rate built from the messages of live sources, with the same profile and merging
-as the importer, a tenth of a second at a time.
+"""Rows at a fixed rate built from the messages of live sources, a tenth of a second at a time.
+Profile and merging are the same as in the importer of recordings.
 
 A row is built DELAY_S after its time, so that readings before and after it have arrived. If an
 active source is delayed because its host is busy, the row waits for up to PATIENCE_S. Readings that
@@ -165,8 +165,9 @@ class LiveRows:
         )
 
     def _recent_recording(self, place: int, feed: Feed, oldest: float) -> Recording:
-        """Return the recent readings of a source, including those from before the current block of
-        rows."""
+        """Return the readings of a live source since the time `oldest` [s], including those from
+        before the current block of rows.
+        """
         kept = self._readings[place]
         fresh_ones = feed.take()
         if "course" not in fresh_ones:
@@ -256,8 +257,8 @@ class LiveRows:
 
 
 def _readings_at(series: Series | None, times: FloatArray) -> FloatArray:
-    """Return the readings of a signal at exactly the given times; NaN at times without a
-    reading.
+    """Return the readings of a signal at exactly the given times, without interpolation; NaN at
+    times without a reading.
     """
     found = np.full(len(times), np.nan)
     if series is not None and len(series.t):

@@ -47,7 +47,7 @@ class Frames:
         self.data += data[:LONGEST].ljust(LONGEST, b"\0")
 
     def to_columns(self) -> tuple[FloatArray, Bytes]:
-        """Return the times (n,) and the data bytes (n, LONGEST) of the frames."""
+        """Return the times of arrival (n,) and the data bytes (n, LONGEST) of the CAN frames."""
         return np.array(self.times), np.frombuffer(bytes(self.data), np.uint8).reshape(-1, LONGEST)
 
 

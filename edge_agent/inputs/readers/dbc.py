@@ -174,8 +174,8 @@ def parse_dbc(text: str) -> Database:
 
 
 def _parse_signal(found: re.Match[str]) -> tuple[Signal | None, str]:
-    """Return the signal in a line and its multiplexer mark. The signal is None if the line is
-    invalid.
+    """Return the signal that a line of a CAN database defines, and its multiplexer mark ("" for a
+    signal that every frame has). The signal is None if the line is invalid.
     """
     words = found["label"].split()
     mux = words.pop() if len(words) > 1 and _MULTIPLEXED.fullmatch(words[-1]) else ""

@@ -136,8 +136,8 @@ def stamp_of(message: Any) -> int:  # noqa: ANN401
 
 
 def leaves_of(message: Any, prefix: str = "", depth: int = 0) -> Iterator[Leaf]:  # noqa: ANN401
-    """Yield a pair for each number in a message: its name, and a function that reads it from a
-    message of the same type.
+    """Yield a pair for each number in a message: its signal name, which begins with `prefix`, and a
+    function that reads it from a message of the same type.
     """
     for name in getattr(message, "__dataclass_fields__", {}):
         if name.startswith("__") or any(name.endswith(word) for word in SKIPPED):

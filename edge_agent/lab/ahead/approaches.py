@@ -50,7 +50,9 @@ START_NS: Final = 1_800_000_000 * NS
 
 @dataclass
 class Approaches:
-    """Counts of approaches and warnings, of all cars in all towns."""
+    """Counts of approaches to slippery stretches and of warnings, summed over all cars and
+    towns.
+    """
 
     came: int = 0
     warned: int = 0
@@ -62,8 +64,8 @@ class Approaches:
 
 @dataclass
 class _Raised:
-    """One warning: the second in which it was raised, the distance and length of the slippery
-    stretch [m], and the second in which the warning ended.
+    """One warning: the time [s] at which it was raised, distance and length of the slippery stretch
+    then [m], and the time [s] at which the warning ended.
     """
 
     at: int
@@ -74,8 +76,8 @@ class _Raised:
 
 @dataclass
 class _Track:
-    """Record of one car for each second: distance driven [m], speed [m/s], friction, and smallest
-    friction near the car. It also contains the warnings given to the car.
+    """Record of one car: for each second the distance driven [m], speed [m/s], friction, and
+    smallest friction near the car; and the list of warnings given to the car.
     """
 
     metre: list[float] = field(default_factory=list)
@@ -121,7 +123,9 @@ def approach_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -
 def drive_town(
     seed: int, seconds: float, vehicles: int, counts: Approaches, *, routed: bool
 ) -> None:
-    """Simulate one town and add its approaches and warnings to `counts`."""
+    """Simulate one town, and add its approaches to slippery stretches and its warnings to `counts`.
+    With `routed`, the cars know their route.
+    """
     fleet = SimulatedFleet(f"hills-{seed}", vehicles, seed, RATE_HZ, rough=0.5)
     known = map_of_places(places_of(fleet.scenario, AFTER_S), START_NS)
     tracks = [_Track() for _ in range(vehicles)]

@@ -44,8 +44,8 @@ FAKE_M: Final = 22.0  # half of a fake stretch
 @dataclass
 class FilterTrace:
     """Records of N filters at T instants: place (map cell with heading sector) (T, N); friction
-    belief of the filter, `own`, and likelihood of the current visit (passage of the place),
-    `visit`, (T, N, 32); true friction (T, N).
+    belief of the filter, `own`, and log-likelihood of the measurements in the current visit
+    (passage of the place), `visit`, (T, N, 32); true friction (T, N).
     """
 
     place: IntArray
@@ -101,8 +101,8 @@ def entry_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> l
 def record_beliefs(
     fleet: SimulatedFleet, seconds: float, prior: LocalMap | None = None
 ) -> FilterTrace:
-    """Drive a fleet and record the beliefs of the filters. With `prior`, each car also computes its
-    belief with that map.
+    """Drive a fleet and record the beliefs of the filters. With `prior`, each car also computes the
+    belief that results if its own is combined with that map.
     """
     vehicles = len(fleet.vehicles)
     config = AgentConfig()
@@ -131,7 +131,7 @@ def record_beliefs(
 
 def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
     """Return the absolute error of the median friction within FIRST_S of entering a cell that the
-    map knows, (n, 2): with and without the map.
+    map knows, (n, 2): with and without the map as a prior.
     """
     with_prior = with_map(trace, known, now)
     alone = _median_friction(np.exp(trace.own))

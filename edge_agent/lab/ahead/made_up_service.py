@@ -67,8 +67,8 @@ class MadeUpService:
     """Simulated service with places of known friction (`mu` by cell·4 + sector) and active alerts;
     it records the queries.
 
-    The places were observed at the time `now`. With `kept`, its answers always contain the ages at
-    that time, as a store of old messages does.
+    The places were observed at the time `now`. With `kept`, its answers always state the ages that
+    the places had at `now`, like a store that repeats old messages.
     """
 
     settings: ZenohSettings

@@ -1,5 +1,5 @@
-"""Figures of the evaluation campaign: first those with a target ("bar"), then all other measures
-for context.
+"""List of the figures of the evaluation campaign: first those with a target ("bar"), then all other
+measures for context.
 """
 
 from __future__ import annotations
@@ -52,15 +52,16 @@ def noise_mean(experiment: str, measure: str) -> Callable[[Results], float]:
 
 
 def in_the_world(name: str) -> Callable[[Results], float]:
-    """Return a function that reads a figure of the default estimator in the towns with inaccurate
-    cars, or on a slope.
+    """Return a function that reads, from the results of the campaign, the default estimator's
+    figure called `name`. It belongs to the towns with inaccurate cars, or to cars on a slope.
     """
     return lambda results: results.world.get(DEFAULT, {}).get(name, math.nan)
 
 
 def worth_of(name: str) -> Callable[[Results], float]:
-    """Return a function that reads the ratio of two interval scores of friction, called `name`: for
-    example the score with fuzzy sets divided by the score without fuzzy sets.
+    """Return a function that reads, from the results of the campaign, the ratio called `name` of
+    two interval scores of friction: for example the score with fuzzy sets divided by the score
+    without fuzzy sets.
     """
     return lambda results: worth.ratio(results.worth, name)
 
@@ -71,8 +72,8 @@ def mean(values: FloatArray | None) -> float:
 
 
 def false_per_hour(results: Results) -> float:
-    """Return how often per hour the friction estimate of the default estimator changes falsely, in
-    scenarios with constant friction.
+    """Return the number of false changes per hour of the default estimator's friction estimate, in
+    scenarios whose friction is constant.
     """
     counted = [m for (_, name), m in results.real.items() if name == DEFAULT and "hours" in m]
     hours = sum(float(m["hours"].sum()) for m in counted)
@@ -200,7 +201,7 @@ UNITS: Final = {
 
 
 def unit_of(measure: str) -> str:
-    """Return the unit of a measure, from the end of its name."""
+    """Return the unit of a measure; it follows from the end of the measure's name."""
     if measure.startswith("coverage90"):
         return SHARE
     whole = (

@@ -1,5 +1,5 @@
 """Simulation of several drives of one scenario as a batch, and estimation of their motion and
-friction by a bank.
+friction by an estimator bank.
 """
 
 from __future__ import annotations
@@ -142,5 +142,5 @@ def repeat_drive(batch: DriveSet, count: int) -> DriveSet:
 
 
 def estimates(bank: EstimatorBank, batch: DriveSet) -> Estimates:
-    """Return the estimates that the bank computes from the drives' signals."""
+    """Return the estimates that an estimator bank computes from the signals of the drives."""
     return bank.advance(batch.t, batch.signals)

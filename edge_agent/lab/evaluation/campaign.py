@@ -44,8 +44,8 @@ class PlottedDrive:
 
 @dataclass
 class Results:
-    """Measures of the estimates per drive, by (scenario, estimator): `real` with ordinary sensors,
-    `ideal` with error-free sensors.
+    """Results of the campaign: measures of the estimates per drive, by (scenario, estimator);
+    `real` with ordinary sensors, `ideal` with error-free sensors.
     """
 
     real: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
@@ -120,8 +120,8 @@ def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str],
 
 
 def _as_in_paper(estimator: str, batch: DriveSet) -> EstimatorBank:
-    """Return a bank of an estimator for a paper's own conditions. An estimator without friction
-    state gets the true friction at the start of the drives.
+    """Return an estimator bank for drives under a paper's own conditions. An estimator that does
+    not estimate friction gets the true friction at the start of the drives.
     """
     friction = float(batch.mu[0, 0])
     if estimator == "adaptive-federated-ckf":

@@ -8,7 +8,7 @@ appear only after a long time. All figures of one kind pool the samples of its t
 Legend
     slide       a stretch in which the normalised slip θ of some wheel exceeds SLIDING for at least
                 SLIDE_S
-    value       the visit's likelihood falls by VALUE_NATS or more towards the upper end of the grid
+    value       the visit's likelihood falls by VALUE_NATS or more towards the largest friction
     favoured    max ln L(μ < .4) - max ln L(μ >= .4) >= FAVOURED_NATS
     on ice      visit: its mean friction is at most .2 and changes by less than MOVES; sample:
                 friction <= .2
@@ -86,7 +86,7 @@ class DetectionTally:
         self.count[name] = self.count.get(name, 0) + int(np.size(values))
 
     def add_case(self, name: str, *, holds: bool) -> None:
-        """Add one case (True or False) to the share called `name`."""
+        """Count one case in the share called `name`: the share of cases with `holds` True."""
         self.add(name, np.array([holds]))
 
     def merge(self, other: DetectionTally) -> None:
@@ -136,8 +136,8 @@ def bridge_gaps(on: NDArray[np.bool_], seconds: float) -> NDArray[np.bool_]:
 
 
 def slides_of(theta: NDArray[np.floating], seconds: float = SLIDE_S) -> Stretches:
-    """Return the slides of a car: stretches where θ (T, 4) of some wheel exceeds SLIDING for at
-    least `seconds`.
+    """Return the slides of a car, as pairs (first index, last index + 1): stretches where the
+    normalised slip θ (T, 4) of some wheel exceeds SLIDING for at least `seconds`.
     """
     some = bridge_gaps(np.asarray((theta > SLIDING).any(axis=1)), BRIDGED_S)
     least = round(seconds * RATE_HZ)
@@ -205,8 +205,9 @@ def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
 
 
 def passes_of(drive: DetectionDrive, n: int, kind: str) -> Stretches:
-    """Return the stretches of at least PASS_S in which car n is on ice, or on snow with friction up
-    to SLIPPERY_MU.
+    """Return the passes of car n over slippery road, as pairs (first index, last index + 1):
+    stretches of at least PASS_S seconds on ice, or on snow with friction up to SLIPPERY_MU, as
+    `kind` selects.
     """
     mu = drive.mu[:, n]
     on = mu <= ICE_MU if kind == "ice" else (mu > ICE_MU) & (mu <= SLIPPERY_MU)
@@ -273,8 +274,8 @@ def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
 def _judge_contradictions(
     tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches
 ) -> None:
-    """Count the onsets of the health flag CONTRADICTION during slides on slippery road and
-    elsewhere, and in both cases the time [s] without this flag.
+    """Count how often the health flag CONTRADICTION begins, during slides on slippery road and at
+    other times, and in both cases the time [s] without this flag.
     """
     sliding = np.zeros(len(drive.mu), np.bool_)
     extended = np.zeros(len(drive.mu), np.bool_)
@@ -359,8 +360,9 @@ def _note_visit(
 
 
 class TownTally(NamedTuple):
-    """Sums and counts of the detection evaluation (`Tally`) for one town, with the town's
-    season."""
+    """Sums and counts of the detection evaluation (`DetectionTally`) for one town, and True if it
+    is winter there.
+    """
 
     winter: bool
     tally: DetectionTally

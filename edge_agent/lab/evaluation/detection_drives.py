@@ -38,8 +38,8 @@ Samples: TypeAlias = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class DetectionVisits:
-    """V published visits (passages of a map cell): index of the vehicle (V,), first and last sample
-    (V,), ln L on the friction grid (V, 32).
+    """V published visits (passages of a map cell): index of the vehicle (V,), index of the first
+    and last sample (V,), log-likelihood ln L on the friction grid (V, 32).
     """
 
     vehicle: IntArray
@@ -161,8 +161,8 @@ def stood_where_it_appeared(
 def _estimate_chunk(
     bank: EstimatorBank, t: FloatArray, signals: FloatArray, closes: BoolArray
 ) -> tuple[Estimates, FloatArray]:
-    """Return the estimates of one chunk of the drive, their evidence, and an array (T, N): by how
-    much [nat] the belief favours a slippery road.
+    """Return three items for one chunk of a drive: the estimates, their evidence on friction, and
+    an array (T, N) of how much [nat] the belief favours a slippery road.
     """
     if bank.beliefs() is None:
         return bank.advance(t, signals, closes), np.full(t.shape, np.nan)

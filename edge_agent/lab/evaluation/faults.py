@@ -42,8 +42,8 @@ def in_order(t: FloatArray) -> FloatArray:
 
 
 def kept_samples(t: FloatArray) -> FloatArray:
-    """Return the clock t (T, N) with a gap of three seconds at BEGINS, as if the samples of that
-    time were missing.
+    """Return the clock t (T, N) with a gap of three seconds at time BEGINS, as if the samples of
+    that time were missing.
     """
     return np.where(t < BEGINS, t, t + 3.0)
 
@@ -58,8 +58,8 @@ def late_samples(t: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the table of faults. `flag` is the health flag that must be reported, or OK if no
-    sensor can detect the fault.
+    """One row of the table of sensor faults. `flag` is the health flag that estimators must report,
+    or OK if no estimator can detect the fault.
     """
 
     faults: tuple[Fault, ...]
@@ -69,7 +69,9 @@ class Case:
 
 
 def fault_on(kind: str, *channels: str, size: float = 0.0) -> tuple[Fault, ...]:
-    """Return a fault of the given kind for each of the channels, from BEGINS to ENDS."""
+    """Return a sensor fault of the given kind for each of the channels, from time BEGINS to
+    ENDS.
+    """
     return tuple(Fault(kind, channel, BEGINS, ENDS, size) for channel in channels)
 
 

@@ -38,8 +38,8 @@ START_S: Final = 1_700_000_000
 def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
     """Return (number of values that differ from those of cantools, number of compared values).
 
-    The frames have random bytes, for every shipped profile with a database. Frames of a recorded
-    log are added, if there is one.
+    The compared CAN frames have random bytes, for every shipped profile with a CAN database. Frames
+    of the log `recorded` are added if it is given.
     """
     wrong = compared = 0
     rng = np.random.default_rng(seed)

@@ -46,7 +46,9 @@ def is_covered(batch: DriveSet, reported: Estimates) -> BoolArray:
 
 
 def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Return the measures of estimates that are defined for every drive, by name, (N,) each."""
+    """Return, by name, those measures of the estimates that are defined for every kind of drive,
+    (N,) each.
+    """
     end = batch.last(LAST_S)
     found: dict[str, FloatArray] = {}
     for name, error in errors(batch, reported).items():

@@ -81,8 +81,8 @@ def speed(seeds: Sequence[int]) -> FloatArray:
 def _speed(heard: OracleSignals, n: int, rho: float) -> float:
     """Return the RMSE of the oracle's speed for drive n [m/s].
 
-    Each second, the error ρ of the wheel radius is estimated again from all earlier readings, and
-    the wheel speeds are corrected by it.
+    Each second, the oracle (ideal observer) estimates the error ρ of the wheel radius again from
+    all earlier readings, and corrects the wheel speeds by it.
     """
     batch = heard.batch
     car = PAPERS["002.sine"].vehicle
@@ -183,8 +183,8 @@ def _curve(shape: float, curvature: float) -> FloatArray:
 def _cost(
     measured: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stiff: float
 ) -> float:
-    """Return −ln of the likelihood of a friction and a curve shape. The other unknowns are
-    integrated out by Laplace's method.
+    """Return −ln of the likelihood of one friction and one shape of the tyre curve, given the
+    measurements. The other unknowns are integrated out by Laplace's method.
     """
     t = np.arange(len(v)) / 100.0
     std = np.array(

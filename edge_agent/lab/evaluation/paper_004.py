@@ -38,8 +38,8 @@ STILL = Memberships(outputs=(0.0,) * 5)  # fuzzy sets that leave R as it is
 
 
 def noisy(batch: DriveSet, variance: FloatArray, seeds: Sequence[int]) -> DriveSet:
-    """Return one copy of the drive per seed, with white noise of variance (T,) on a_x,
-    a_y and r.
+    """Return one copy of the drive per seed, with white noise of `variance` (T,) added to a_x, a_y
+    and yaw rate r [SI units].
     """
     copies = repeat_drive(batch, len(seeds))
     for n, seed in enumerate(seeds):

@@ -49,8 +49,8 @@ Spoil: TypeAlias = Callable[[Recorded], Recorded]
 
 
 class Planted(NamedTuple):
-    """A fault added to a drive, and the finding (channel and kind) with which the doctor must name
-    it.
+    """A recording fault that is added to a drive, and the finding (channel and kind) that the
+    signal doctor must report for it.
     """
 
     spoil: Spoil
@@ -106,7 +106,9 @@ def swap_columns(one: Sequence[int], other: Sequence[int]) -> Spoil:
 
 
 def status_bits(drive: Recorded) -> Recorded:
-    """Return the drive with a status bit added to a wheel speed in two of seven readings."""
+    """Return the drive with a status bit in the upper bits of a wheel speed, set in two of seven
+    readings, as wrongly decoded messages have it.
+    """
     signals = drive.signals.copy()
     signals[np.arange(len(signals)) % 7 < 2, S.OMEGA] += STATUS / drive.vehicle.wheel_radius
     return drive._replace(signals=signals)

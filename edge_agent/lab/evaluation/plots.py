@@ -102,8 +102,8 @@ def _scenario(scenario: str, drives: dict[str, PlottedDrive], seed: int, path: P
 
 
 def title(scenario: str, drive: PlottedDrive, seed: int) -> str:
-    """Return the title of a drive's plot: scenario, manoeuvre, speed, friction, vehicle
-    and seed.
+    """Return the title of a drive's plot, which states scenario, manoeuvre, speed, friction,
+    vehicle and seed.
     """
     spec = SCENARIOS.get(scenario)
     batch = drive.batch
@@ -207,8 +207,8 @@ def _surfaces(figures: Sequence[Figure], path: Path) -> Path:
 
 
 def _consistency(figures: Sequence[Figure], path: Path) -> Path:
-    """Plot NEES and NIS per scenario and estimator, with the 95 % bounds of their mean over the
-    drives at one instant.
+    """Plot NEES and NIS (normalised squared errors and innovations) per scenario and estimator,
+    with the 95 % bounds of their mean over the drives at one instant.
     """
     from matplotlib import pyplot as plt
 

@@ -1,5 +1,5 @@
-"""Figures printed in the papers, compared with our figures, and the reasons why some figures cannot
-be reproduced.
+"""Numbers printed in the papers, the figures of this evaluation that are compared with them, and
+the reasons why some numbers cannot be reproduced.
 """
 
 from __future__ import annotations

@@ -222,8 +222,8 @@ def judge_estimates(
 def known_friction(
     t: FloatArray, signals: FloatArray, moving: BoolArray, known: float | None
 ) -> float:
-    """Return a lower limit of the friction of a log's surface: CERTAIN times the known value, or
-    the grip that the car used, if it is larger.
+    """Return a lower limit (T,) of the friction of a log's surface: the larger of CERTAIN times the
+    known value, and the grip that the car used.
     """
     at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
     along, across = (
@@ -252,8 +252,8 @@ def root_mean_square(error: FloatArray, among: BoolArray) -> float:
 
 
 def summarise(found: Sequence[LogFigures]) -> list[Figure]:
-    """Return the evaluation figures over all logs: means weighted by the time of each log; where
-    even one bad log matters, the value of the worst log.
+    """Return the evaluation figures over all logs: means weighted by the time of each log; for
+    figures where even one bad log matters, the value of the worst log.
     """
     seconds = np.array([log.seconds for log in found])
 

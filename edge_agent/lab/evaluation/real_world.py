@@ -102,7 +102,9 @@ class Tally:
 
 
 def in_winter(seed: int) -> bool:
-    """Return True if the town with this seed is a winter town; half of the seeds have one."""
+    """Return True if the town with this seed is a winter town; half of the seeds give winter
+    towns.
+    """
     return seed % 2 == 1
 
 
@@ -132,8 +134,8 @@ def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
 
 
 def in_use(batch: DriveSet) -> FloatArray:
-    """Return the grip that the car as a whole uses, smoothed and reduced by the noise,
-    (T, N) [1].
+    """Return the grip that each car uses as a whole, (T, N) [1]: horizontal acceleration over g,
+    smoothed, minus an allowance for noise.
     """
     used = np.hypot(batch.truth["true_ax"], batch.truth["true_ay"]) / GRAVITY
     width = max(1, round(SMOOTH_S * RATE_HZ))

@@ -42,16 +42,17 @@ def estimate_with_ranks(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates
 
 
 def join_estimates(parts: list[Estimates]) -> Estimates:
-    """Join the estimates of successive parts of one drive and return them as one object, without
-    the evidence."""
+    """Return the estimates of successive parts of one drive, joined into one object, without the
+    evidence on friction.
+    """
     return Estimates(np.concatenate([part.values for part in parts]))
 
 
 def _rank_of_truth(
     bank: EstimatorBank, batch: DriveSet, now: int, reported: Estimates
 ) -> FloatArray:
-    """Return the posterior probability, (N,), of a friction below the true one at the sample before
-    `now`.
+    """Return, for each of N drives, the posterior probability of a friction below the true one at
+    the sample before index `now`.
     """
     truth = batch.mu[now - 1]
     closes = np.ones((1, len(truth)), np.bool_)

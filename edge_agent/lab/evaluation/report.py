@@ -229,7 +229,9 @@ def estimators(values: dict[str, float], prefix: str, suffix: str) -> list[str]:
 
 
 def scenarios(values: dict[str, float], prefix: str, measures: Sequence[str]) -> str:
-    """Return a Markdown table of the given measures with one row per scenario and estimator."""
+    """Return a Markdown table with one row per scenario and estimator and one column per given
+    measure.
+    """
     rows = []
     for found in estimators(values, prefix, ".rmse_vx"):
         scenario, _, estimator = found.rpartition(".")

@@ -111,8 +111,9 @@ def ways() -> dict[str, list[MixtureDesign]]:
 
 
 def without_sets() -> MixtureDesign:
-    """Return the tables (`design`) of the default filter for the variant without fuzzy sets. This
-    variant has strain (deviation of states from their prior) and the consistency test.
+    """Return the tables (`design`) of the default filter for the variant without fuzzy sets. Like
+    the default, this variant still adapts R to strain (deviation of states from their prior) and
+    runs the consistency test.
     """
     design = design_of(Memberships(), adaptive=True)
     c = design.constants
@@ -143,8 +144,9 @@ def manoeuvres(seed: int, seconds: float) -> DriveSet:
 
 
 def _score_drives(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[str, float]:
-    """Return the mean interval score over the drives ("all"), and over all samples of each surface
-    (NaN if a surface does not occur).
+    """Run the filter with these tables (`design`) on the drives. Return its mean interval score of
+    friction over all drives ("all"), and over the samples of each surface (NaN if a surface does
+    not occur).
     """
     drives = []
     samples = []

@@ -51,7 +51,9 @@ class Peer:
         raise RuntimeError(f"the peer ended with code {code} before it printed {word!r}")
 
     def send_go(self) -> None:
-        """Send the sender the line that makes it begin or end."""
+        """Write a line to the test sender's input; the first line makes it begin to send, the
+        second makes it end.
+        """
         assert self.process.stdin is not None
         self.process.stdin.write("\n")
         self.process.stdin.flush()

@@ -211,13 +211,15 @@ def send_gpsd(address: str, samples: int, rate: float) -> int:
 
 
 def report_ready() -> None:
-    """Print `ready`, and wait for the line that starts the sending."""
+    """Print `ready`, and wait for a line on standard input, which starts the sending of this test
+    sender.
+    """
     print("ready", flush=True)
     wait_for_line()
 
 
 def wait_for_line() -> None:
-    """Wait until a line is read from standard input or the input ends."""
+    """Wait until a line arrives on standard input, or the input ends."""
     sys.stdin.readline()
 
 
@@ -230,7 +232,9 @@ PEERS: Final[dict[str, Callable[[str, int, float], int]]] = {
 
 
 def main(words: Any) -> None:  # noqa: ANN401
-    """Run a peer with the given command-line arguments, and print the number of messages sent."""
+    """Run a test sender (peer) with the given command-line arguments, and print the number of
+    messages sent.
+    """
     kind, address, samples, rate = words
     print(json.dumps({"sent": PEERS[kind](address, int(samples), float(rate))}), flush=True)
     wait_for_line()

@@ -90,8 +90,9 @@ def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt:
 
 @compiled
 def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int, dt: float) -> None:
-    """Update the limit that ABS sets to the brake torque of wheel `i`, over a time step `dt`
-    [s]."""
+    """Advance by `dt` [s] the limit that ABS sets to the brake torque of wheel `i`: reduce, hold or
+    increase it, as the module describes.
+    """
     asked = u[Control.BRAKE, i] + x[Motion.HELD + i]
     limit = slip_limit(p, i)
     slip = w[Wheel.SLIP, i]
@@ -146,7 +147,9 @@ def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: fl
 
 @compiled
 def stabilise(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> tuple[int, float]:
-    """Return (wheel that ESC brakes, or -1; its brake torque divided by weight times radius)."""
+    """Update ESC by `dt` [s]. Return (index of the wheel that ESC brakes, or -1; its brake torque
+    divided by weight times radius).
+    """
     vx = x[Motion.VX]
     r = x[Motion.YAW_RATE]
     if p[TrueParameter.ESC] <= 0.0 or vx < ESC_SLOWEST:

@@ -112,8 +112,8 @@ def ways_of(ways: IntArray, lane: int) -> int:
 
 @compiled
 def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
-    """Advance the route state `g` to the vehicle's position. At the end of a lane, choose the next
-    lane at random.
+    """Advance the route state `g` (lane, and place on it) to the vehicle's position in the state
+    `x`. At the end of a lane, choose the next lane at random.
 
     Return the distance to the next point of the lane [m], at most the distance between two points.
     """
@@ -137,8 +137,8 @@ def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
 
 @compiled
 def place_ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[int, float]:
-    """Return the position `distance` [m] further along the route, as (row of a point, metres beyond
-    that point).
+    """Return the position `distance` [m] ahead of the vehicle on its route, as (row of a lane
+    point, metres beyond that point).
 
     The route is decided only to the end of the next lane; beyond that, the function assumes the
     first continuation of each lane.
@@ -208,8 +208,8 @@ def heeds_warning(d: FloatArray) -> bool:
 
 @compiled
 def traffic_braking(t: float, key: Key) -> float:
-    """Return the braking that traffic ahead demands now, as a share of the budget; 0 most of the
-    time.
+    """Return the braking that traffic ahead demands at time t [s], as a share of the driver's
+    budget (acceleration that the driver accepts); 0 most of the time.
     """
     window = int(t / ALERT_S)
     if t - window * ALERT_S > ALERT_LENGTH_S or uniform(key, 2 * window) > ALERT_SHARE:
@@ -221,7 +221,7 @@ def traffic_braking(t: float, key: Key) -> float:
 def is_stopping(t: float, share: float, key: Key) -> bool:
     """Return True if the driver is stopping or waiting now.
 
-    The driver stops in a share of all time windows of length ALERT_S; an argument gives this share.
+    In the share `share` of all time windows of length ALERT_S, drawn at random, the driver stops.
     """
     window = int(t / ALERT_S)
     return bool(
@@ -318,8 +318,8 @@ def wished_force(
 def wished_steer(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float
 ) -> float:
-    """Return the mean road-wheel angle [rad] for the circle through a point ahead, limited to the
-    range that the front tyres can follow.
+    """Return the mean road-wheel angle [rad] with which the driver steers on a circle to a point
+    ahead. It is limited to the angles that the front tyres can follow.
     """
     vx = max(x[Motion.VX], SLOWEST)
     base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]

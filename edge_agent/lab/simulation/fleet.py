@@ -158,7 +158,7 @@ class SimulatedFleet:
         rough: share of the vehicles with realistic errors: ROUGH_FLEET sensors, and drivers who
             stop now and then.
         winter: share of the vehicles with `winter_equipped` tyres and controllers. If half of all
-            vehicles are rough, so are half of these.
+            vehicles are rough (inaccurate), so are half of the winter vehicles.
 
     Raises:
         InputError: an argument is out of range or unknown.
@@ -340,8 +340,8 @@ def _truth(records: FloatArray, air_temperature: float) -> Truth:
 def _start(
     network: Network, parameters: FloatArray, rngs: list[np.random.Generator]
 ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
-    """Return the initial states of the vehicles: each starts at a start point of the network at
-    walking pace, with its own driver.
+    """Return the initial states of the vehicles. Each starts at a start point of the road network
+    at walking pace, with a driver of its own drawn at random.
     """
     count = len(rngs)
     vehicles = np.zeros((count, STATES))

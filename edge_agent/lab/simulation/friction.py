@@ -90,7 +90,8 @@ def friction_table(background: float, patches: tuple[Patch, ...]) -> FloatArray:
 @compiled
 def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> float:
     """Return the value of column MU (true friction) or LOOKS (expected friction) at (x, y) [m] and
-    t [s]: that of the topmost patch for which the column is defined.
+    t [s]: that of the topmost patch (last in the list) that covers the point and for which the
+    column is defined.
     """
     for i in range(table.shape[0] - 1, 0, -1):
         row = table[i]

@@ -55,7 +55,7 @@ class WarnedDrivers:
         self._warnings: queue.SimpleQueue[tuple[int, GripWarning]] = queue.SimpleQueue()
 
     def listens(self, k: int) -> bool:
-        """Return True if the driver of vehicle k is warned."""
+        """Return True if the driver of vehicle k belongs to those who receive warnings."""
         return bool(self.warned[k])
 
     def route_of(self, k: int) -> GivenRoute | None:
@@ -73,8 +73,8 @@ class WarnedDrivers:
     def heeding(
         self, blocks: Iterator[Block], hear: Callable[[], None] = lambda: None
     ) -> Iterator[Block]:
-        """Yield the blocks of samples of a source unchanged. After each block, call `hear` and pass
-        the stored warnings to the drivers.
+        """Yield the blocks of samples of a source unchanged. After each block, call `hear`, then
+        pass the warnings stored since then to the simulated drivers.
         """
         for number, block in enumerate(blocks):
             if number % EVERY == 0:

@@ -62,8 +62,8 @@ Friction = float | Callable[[float, float], float] | TimedFriction
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """A manoeuvre, one row of the table; `friction` and `speed` are defaults that a caller may
-    replace.
+    """A manoeuvre, one row of the table of manoeuvres; `friction` and `speed` [m/s] are defaults
+    that a caller may replace.
     """
 
     control: Control
@@ -88,8 +88,8 @@ def split(left: float, right: float) -> Callable[[float, float], float]:
 
 
 def hold(now: Moment, speed: float | None = None) -> float:
-    """Return the acceleration [m/s^2] that restores the speed `speed`, by default the demanded
-    speed.
+    """Return the acceleration [m/s^2] that brings the car back to `speed` [m/s], by default the
+    demanded speed.
     """
     error = (now.speed if speed is None else speed) - now.vx
     if now.motors is not None:

@@ -110,8 +110,8 @@ COLUMNS: Final = int(Misaligned.TORQUELESS) + 1
 
 
 def memory_of(rows: FloatArray, rate_hz: float) -> int:
-    """Return the number of past samples that must be stored: the largest clock delay in the rows
-    (N, COLUMNS), in samples, plus one; 0 without a delay.
+    """Return the number of past samples that the sensor model must store: one more than the largest
+    clock delay in the rows (N, COLUMNS), in samples; 0 without a delay.
     """
     lag = float(rows[:, Misaligned.LAG : Misaligned.LAG + DEVICES].max())
     return math.ceil(lag * rate_hz) + 1 if lag > 0.0 else 0
@@ -119,8 +119,8 @@ def memory_of(rows: FloatArray, rate_hz: float) -> int:
 
 @compiled
 def delayed_record(records: FloatArray, now: int, samples: float, record: FloatArray) -> None:
-    """Fill `record` with the record (T, 32) of the time `samples` before row `now`, interpolated
-    linearly.
+    """Fill `record` (32,) with the true values at `samples` samples before row `now` of `records`
+    (T, 32); a fraction of a sample is interpolated linearly.
 
     For times before the first record, the first record is used.
     """

@@ -72,8 +72,8 @@ STILL: Final = 0.02
 
 @compiled
 def gravity(u: FloatArray) -> tuple[float, float, float]:
-    """Return (g_x, g_y) in the body's axes [m/s^2], and the share of gravity that acts normal to
-    the road.
+    """Return (g_x, g_y, share): the gravity along the body's axes [m/s^2] on the slope in the
+    inputs `u`, and the share of gravity that acts normal to the road.
     """
     ahead = u[Control.TILT, 0]
     left = u[Control.TILT, 1]
@@ -90,8 +90,8 @@ def stiffness_per_load(slope: float, degression: float, load: float, at_rest: fl
 
 @compiled
 def allowed_share(slip: float, limit: float) -> float:
-    """Return the share of the demanded torque that slip control allows: 1 up to the slip `limit`,
-    decreasing to 0 at twice this limit.
+    """Return the share of the demanded torque that smooth slip control allows at a wheel: 1 up to
+    the slip `limit`, decreasing to 0 at twice this limit.
     """
     return min(max(2.0 - abs(slip) / limit, 0.0), 1.0)
 
@@ -286,8 +286,8 @@ def settle_standing(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> N
 def advance(
     x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float, substeps: int
 ) -> None:
-    """Advance the state `x` by `substeps` steps of `dt` [s] with constant inputs `u`; `w` (8, 4) is
-    scratch.
+    """Advance the state `x` of the simulated vehicle by `substeps` integration steps of `dt` [s]
+    with constant inputs `u`; `w` (8, 4) is scratch.
     """
     along, across, _ = gravity(u)
     for _ in range(substeps):
@@ -319,8 +319,8 @@ def advance(
 
 @compiled
 def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
-    """Fill STEER, DRIVE and BRAKE of `u` from a mean road-wheel angle [rad] and a longitudinal
-    force [N].
+    """Fill the rows STEER, DRIVE and BRAKE of the inputs `u` from a mean road-wheel angle [rad] and
+    a demanded longitudinal force [N].
 
     The steered wheels follow Ackermann geometry: their axes meet at one point on the line of the
     rear axle. If the rear wheels steer too, `steer` is the angle of a car without rear steering on
@@ -345,8 +345,8 @@ def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
 
 @compiled
 def regenerate(x: FloatArray, p: FloatArray, u: FloatArray) -> None:
-    """Replace the first part of the braking in `u` by drag torque of engine or generator, at the
-    driven wheels only.
+    """Replace a part of the brake torque in the inputs `u` by drag torque of engine or generator,
+    which acts at the driven wheels only.
     """
     total = 0.0
     for i in range(4):

@@ -223,7 +223,7 @@ def true_vehicle(vehicle: str | Vehicle | TrueVehicle) -> TrueVehicle:
 
 def matched_to_papers(vehicle: TrueVehicle) -> TrueVehicle:
     """Return the vehicle without the effects that the papers' model leaves out: drag, rolling
-    resistance, lag of the loads, degressive tyres.
+    resistance, lag of the loads, tyres whose stiffness grows less than the load.
 
     The tyre curve is a Magic Formula that is as steep as Dugoff's in its middle part.
     """

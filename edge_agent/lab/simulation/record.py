@@ -17,7 +17,7 @@ from schemas.thresholds import GRAVITY
 
 
 class RecordColumn(IntEnum):
-    """Index of a true value in a record of one sample."""
+    """Index of a quantity in the record that contains all true values of one simulated sample."""
 
     AX = 0  # [m/s^2] that an accelerometer at the centre of gravity feels, as the road lies
     AY = 1

@@ -54,8 +54,8 @@ class Wave:
 
 @dataclass(frozen=True)
 class Relief:
-    """Shape of the ground: the sum of `waves`, the `crossfall` of every lane [1], and the `banking`
-    (sideways slope of a bend) per curvature [m].
+    """Slopes of a scenario's roads: the sum of `waves`, the `crossfall` (sideways slope) of every
+    lane [1], and the `banking` (sideways slope of a bend) per curvature [m].
     """
 
     waves: tuple[Wave, ...] = ()

@@ -3,7 +3,7 @@ connectors through junctions.
 
     lane       a directed polyline, points about a metre apart, with heading and curvature
     connector  a lane through a junction, from the end of one lane to the start of another road's
-    profile    v²/q at each point [m]: the squared speed, over q, of a driver who accepts lateral
+    profile    v²/q at each point [m]: the squared speed v², over q, of a driver who accepts lateral
                accelerations of q m/s^2 and braking of BRAKING·q and knows the next turns; because
                v² is proportional to q, one profile serves all drivers
 """
@@ -62,10 +62,10 @@ class Network:
     """Lanes in one table of points, with the columns of LanePoint (points, 8). Lane k has `size[k]`
     points from row `first[k]` on.
 
-    `ways[k]` (MOST_WAYS,) are the lanes that continue from lane k, -1 in unused places;
-    `spacing[k]` [m] is the distance between its points. The first `roads` lanes are roads, the
-    others connectors. `starts` (vehicles,) are the lanes at whose beginnings vehicles start; None:
-    the vehicles are distributed over the roads.
+    `ways[k]` (MOST_WAYS,) are the numbers of the lanes that continue from the end of lane k, -1 in
+    unused places; `spacing[k]` [m] is the distance between its points. The first `roads` lanes are
+    roads, the others connectors. `starts` (vehicles,) are the lanes at whose beginnings vehicles
+    start; None: the vehicles are distributed over the roads.
     """
 
     points: FloatArray
@@ -197,8 +197,8 @@ def _distance_along(line: FloatArray) -> FloatArray:
 
 
 def _inner_points(line: FloatArray, setback: float) -> IntArray:
-    """Return the indices of those points of a line that are at least `setback` [m] from
-    both ends.
+    """Return the indices of those points of a line (n, 2) [m] that are at least `setback` [m] from
+    both ends, measured along the line.
     """
     run = _distance_along(line)
     return np.flatnonzero((run >= setback) & (run <= run[-1] - setback))
@@ -253,11 +253,11 @@ def _lane_table(lane: FloatArray) -> FloatArray:
 def _plan_speeds(
     tables: list[FloatArray], limits: list[FloatArray], ways: list[list[int]], spacing: FloatArray
 ) -> None:
-    """Compute the speed profiles of all lanes, backwards from their ends, repeatedly until nothing
-    changes.
+    """Compute the speed profiles (v²/q, see module) of all lanes: backwards from their ends,
+    repeatedly until nothing changes.
 
-    At each point, the profile brakes at most with the part of the driver's grip budget that
-    cornering leaves.
+    At each point, a driver brakes at most with the part of the accepted acceleration that cornering
+    leaves.
     """
     while True:
         before = [table[0, LanePoint.PROFILE :].copy() for table in tables]

@@ -1,5 +1,5 @@
-"""Simulation of one manoeuvre of one vehicle: a signal log with the true values, and the vehicle
-file of the vehicle.
+"""Simulation of one manoeuvre of one vehicle: it gives a signal log with the true values, and a
+vehicle file.
 """
 
 from __future__ import annotations
@@ -167,8 +167,8 @@ def _friction_field(mu: Friction) -> Callable[[float, float, float], float]:
 
 
 class ProvingGround(NamedTuple):
-    """The test track: a function for the friction at t [s] and (x, y) [m], and the table of the
-    relief.
+    """The test track: a function that returns the friction at time t [s] and place (x, y) [m], and
+    the table of the relief (slopes).
     """
 
     friction: Callable[[float, float, float], float]

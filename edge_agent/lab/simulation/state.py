@@ -81,8 +81,8 @@ PARAMETERS: Final = len(Parameter) + len(TrueParameter)
 
 
 class Control(IntEnum):
-    """Index of a row of inputs, shape (5, 4): four inputs of the wheels, and the slope of the road
-    under the vehicle.
+    """Index of a row of the simulated vehicle's inputs (5, 4): four rows with one input per wheel,
+    and a row with the slope of the road under the vehicle.
     """
 
     STEER = 0  # [rad at the road wheel]
@@ -97,7 +97,9 @@ INPUTS: Final = len(Control)
 
 
 class Wheel(IntEnum):
-    """Index of a row of the wheels' forces and motion at an instant, shape (8, 4)."""
+    """Index of a row of the array (8, 4) with forces and motion of the four wheels at one
+    instant.
+    """
 
     FX = 0  # [N] in the wheel's axes
     FY = 1

@@ -39,7 +39,7 @@ HIGHEST = 1.0
 
 @dataclass(frozen=True)
 class Habits:
-    """Parameters of the ants' behaviour.
+    """Parameters of the ant colony: weights of pheromone and visibility, evaporation, and deposits.
 
     Raises:
         InputError: a parameter is out of its range.
@@ -85,8 +85,8 @@ def transition_probabilities(
 
 
 def lowest_pheromone(reachable: BoolArray, retrace: float) -> FloatArray:
-    """Return the lower bound of the pheromone, τ_min (V, 1) for V vertices (variables), with which
-    a converged colony repeats its best path with probability `retrace`.
+    """Return τ_min (V, 1), the lower bound of the pheromone for V vertices (variables). With this
+    bound, an ant of a converged colony repeats the best path with probability `retrace`.
 
     The best position (value) of each vertex then has the probability p = retrace^(1/V) = τ_max /
     (τ_max + (K − 1)·τ_min); this is solved for τ_min.
@@ -127,7 +127,7 @@ def renew(
 
 def _walk_ant(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
     """Return the path of one ant, (V,): at each vertex (variable), the index of a position
-    (possible value) drawn with the probabilities of (31).
+    (possible value) drawn with the probabilities (V, K) of equation (31).
     """
     reached = np.cumsum(probabilities, axis=1)
     drawn = rng.random((len(probabilities), 1)) * reached[:, -1:]
@@ -136,8 +136,8 @@ def _walk_ant(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
 
 
 def _rank_weights(ants: int, habits: Habits) -> FloatArray:
-    """Return the deposits (P,) of the best ants of an iteration, by rank. Together with the deposit
-    of the best path so far they sum to ρ (evaporation per iteration).
+    """Return the amounts of pheromone (P,) that the best ants of an iteration deposit, by rank.
+    Together with the deposit of the best path so far they sum to ρ (evaporation per iteration).
     """
     count = max(1, round(habits.elite * ants))
     ranks = np.arange(count, 0, -1, dtype=np.float64)

@@ -3,8 +3,8 @@
 
 In `colony`, each vertex (variable) has a short list of positions (possible values). The corners of
 fuzzy sets are continuous quantities. Therefore this colony stores the k best vectors (archive) in
-place of pheromone. An ant chooses vector l of the archive with a weight that decreases with its
-rank. It then draws each variable from a normal distribution around that vector.
+place of pheromone. An ant chooses vector l of the archive with a probability that decreases with
+the vector's rank. It then draws each variable from a normal distribution around that vector.
 
 Legend
     l           rank in the archive, 1 is best
@@ -32,7 +32,8 @@ REDRAWS: Final = 32  # of a vector that is not admissible
 
 @dataclass(frozen=True)
 class ArchiveHabits:
-    """Constants of the colony with an archive.
+    """Constants of the ant colony for continuous variables, which stores its best vectors in an
+    archive.
 
     Raises:
         InputError: a constant is out of range.
@@ -87,7 +88,7 @@ class SearchTally:
         return value
 
     def fit(self, vector: FloatArray) -> FloatArray:
-        """Return the vector limited to the ranges of the variables."""
+        """Return a vector (V,) with each value limited to the range of its variable."""
         return np.asarray(np.clip(vector, self.lower, self.upper))
 
     def uniform(self, rng: np.random.Generator) -> FloatArray:
@@ -106,7 +107,9 @@ class SearchTally:
         )
 
     def record(self, values: list[float], progress: Progress | None) -> None:
-        """Append an iteration to the history and report it to `progress`."""
+        """Append the objective `values` of an iteration to the history, and report the iteration to
+        `progress`.
+        """
         finite = [value for value in values if np.isfinite(value)]
         mean = float(np.mean(finite)) if finite else -np.inf
         self.history.append(Iteration(len(self.history) + 1, self.value, mean, self.count))

@@ -1,4 +1,4 @@
-"""Scores of a set of memberships on simulated drives.
+"""Scores of a set of memberships (parameters of the fuzzy sets) on simulated drives.
 
 Legend
     l, u, mu    stated 5 % and 95 % quantiles of friction, and the true mean of the four wheels [1]
@@ -102,7 +102,7 @@ FELT_SHARE: Final = 0.9  # of the friction in use, from which a slippery road is
 
 @dataclass(frozen=True)
 class TuningSet:
-    """Drives of equal length in one set, in the form that a bank requires."""
+    """Drives of equal length, as arrays in the form that an estimator bank requires."""
 
     vehicles: tuple[Vehicle, ...]
     t: FloatArray  # (T, N) [s]
@@ -300,8 +300,9 @@ def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
 
 
 def choices(positions: int) -> tuple[FloatArray, ...]:
-    """Return the candidate values of every vertex (corner of a fuzzy set) and every noise scale:
-    evenly spaced within the bounds, and the default value.
+    """Return, for every vertex (corner of a fuzzy set) and every noise scale, `positions` candidate
+    values. They are evenly spaced within the bounds; the one nearest to the default value is
+    replaced with the default.
     """
     default = Memberships().to_vector()
     found = []

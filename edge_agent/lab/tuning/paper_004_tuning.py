@@ -44,8 +44,8 @@ Sets = Memberships | LowerVertices
 
 @dataclass(frozen=True)
 class LevelDrive:
-    """The tuning drive at one noise level, one copy per seed, and the filter setting whose R
-    matches this noise.
+    """The drive of the tuning at one level of measurement noise, with one copy per seed, and the
+    filter setting whose R (assumed noise variance) equals this noise.
     """
 
     batch: DriveSet
@@ -70,7 +70,9 @@ def record_levels(
 
 
 def likelihood(sets: Sets, drive: LevelDrive) -> float:
-    """Return the mean log-likelihood of the innovations [nat per sample] with the fuzzy sets."""
+    """Run paper 004's filter with the given fuzzy sets on a drive; return the mean log-likelihood
+    of its innovations [nat per sample].
+    """
     reported = _run_filter(sets, drive)
     value = np.nan_to_num(
         reported.innovation_log_likelihood[1:], nan=WORST, neginf=WORST, posinf=WORST
@@ -79,7 +81,9 @@ def likelihood(sets: Sets, drive: LevelDrive) -> float:
 
 
 def mismatch(sets: Sets, drive: LevelDrive) -> float:
-    """Return the tuning objective of equation (33) of paper 004, with the absolute mismatch |e|."""
+    """Run paper 004's filter with the given fuzzy sets on a drive; return the tuning objective of
+    the paper's equation (33), with the absolute mismatch |e| of the innovation variance.
+    """
     batch = drive.batch
     filters = make_bank(batch.vehicles, sets, drive.setting)
     differences = []
@@ -91,8 +95,8 @@ def mismatch(sets: Sets, drive: LevelDrive) -> float:
 
 
 def accuracy(sets: Sets, drive: LevelDrive) -> float:
-    """Return minus the mean, over the estimated quantities, of the RMSE divided by the printed
-    RMSE.
+    """Run paper 004's filter with the given fuzzy sets on a drive; return minus the mean, over the
+    estimated quantities, of the RMSE divided by the printed RMSE.
     """
     reported = _run_filter(sets, drive)
     batch = drive.batch

@@ -1,4 +1,5 @@
-"""Parts that the searches share: a graph of possible values, a result, a history.
+"""Parts that all search methods share: a graph of possible values, a record of evaluations, the
+result and its history.
 
 A search looks for the best vector, with one value per vertex (variable). Each vertex has its own
 short list of possible values, its positions. A search does not depend on filters: the objective is
@@ -31,7 +32,7 @@ REDRAWS = 32
 
 @dataclass(frozen=True)
 class Iteration:
-    """One entry of a search's history: values of the objective, larger is better."""
+    """One iteration in the history of a search: values of the objective (larger is better)."""
 
     iteration: int
     best: float  # best value so far
@@ -152,7 +153,9 @@ class Ledger:
         return self.values[key]
 
     def record(self, values: Sequence[float], progress: Progress | None) -> None:
-        """Append an iteration to the history and report it to `progress`."""
+        """Append the objective `values` of an iteration to the history, and report the iteration to
+        `progress`.
+        """
         finite = [value for value in values if np.isfinite(value)]
         mean = float(np.mean(finite)) if finite else -np.inf
         self.history.append(

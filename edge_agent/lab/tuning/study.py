@@ -43,8 +43,8 @@ WAYS: Final[dict[str, Callable[..., Result]]] = {
 
 
 class Condition(NamedTuple):
-    """Condition of a study: the measurement noise R of the filter divided by VARIANCE, and True if
-    the simulated noise follows the paper's schedule.
+    """Condition of a study: the filter's measurement noise R divided by VARIANCE, and True if the
+    simulated noise varies over time by the paper's schedule.
     """
 
     scale: float
@@ -60,7 +60,9 @@ CONDITIONS: Final = {
 
 
 class StudyDrive(NamedTuple):
-    """One drive of the study, on a road with friction MU."""
+    """One simulated drive of the study, given by manoeuvre, vehicle, speed and seed, on a road with
+    friction MU.
+    """
 
     manoeuvre: str
     vehicle: str

@@ -22,7 +22,7 @@ BankMaker: TypeAlias = Callable[[Sequence[Vehicle]], EstimatorBank]
 
 
 def means(batch: DriveSet, reported: Estimates) -> Values:
-    """Return all measures of an estimator, averaged over the drives."""
+    """Return all measures of an estimator's results by name, averaged over the drives."""
     return {name: float(np.mean(value)) for name, value in measures(batch, reported).items()}
 
 

@@ -1,8 +1,8 @@
 """The papers' conditions: vehicle models with the papers' tyres and without drag, and their drives.
 
-"Matched" is a simulated vehicle ("plant") that equals the filter's model. Only drives at constant
-speed have drag and rolling resistance, which the filter knows. They need them because without a
-longitudinal force the tyres give no information on friction.
+A "matched" vehicle is a simulated vehicle ("plant") that has exactly the equations of the paper's
+filter. Only drives at constant speed have drag and rolling resistance, which the filter knows. They
+need them because without a longitudinal force the tyres give no information on friction.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def with_losses(vehicle: TrueVehicle) -> TrueVehicle:
 
 
 def _in_wheel() -> tuple[TrueVehicle, TyreOption]:
-    """Return the vehicle of paper 002 with C_f, C_r and J of its table 1, and the tyre option that
-    its filter needs for this vehicle.
+    """Return the vehicle of paper 002 with the cornering stiffnesses C_f, C_r and wheel inertia J
+    of its table 1, and the tyre option that its filter needs for this vehicle.
     """
     row = parameter_row(SMALL.vehicle)
     base = row[Parameter.TO_FRONT] + row[Parameter.TO_REAR]

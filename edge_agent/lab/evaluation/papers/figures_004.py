@@ -148,8 +148,8 @@ def _lower_vertices(tuned: LowerVertices) -> PaperPlot:
 
 
 def _shoulder_values(k: int) -> FloatArray:
-    """Return the fuzzy membership (degree, 0 to 1) at the left foot, peak and right foot of the
-    first (k = 0) or last fuzzy set.
+    """Return the fuzzy membership (degree, 0 to 1) at the left foot, peak and right foot of fuzzy
+    set k. The first and last set are shoulders, whose outer foot has membership 1.
     """
     return np.array([1.0, 1.0, 0.0]) if k == 0 else np.array([0.0, 1.0, 1.0])
 

@@ -24,7 +24,7 @@ class PaperRow(NamedTuple):
         what: the number in words, with its unit in brackets.
         printed: the printed number, or NaN if the paper prints none.
         matched: result of the paper's filter under the paper's conditions.
-        own: result of the same filter on drives that the simulator's own vehicle model gives.
+        own: result of the same filter on drives simulated with the simulator's own vehicle model.
         realistic: result of the paper's estimator with ordinary sensors and a vehicle file with
             errors of a few per cent.
         default: result of the default estimator on the same drives.

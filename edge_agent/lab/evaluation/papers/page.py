@@ -55,7 +55,9 @@ def limit_text(row: PaperRow) -> str:
 
 
 def summary(done: Reproduction) -> str:
-    """Return one sentence about how many matched numbers meet their target."""
+    """Return one sentence that states how many numbers under the paper's conditions meet their
+    target.
+    """
     barred = [row for row in done.rows if row.limit is not None]
     text = f"{len(barred) - len(done.missed_rows)} of {len(barred)} matched numbers meet their bar."
     return text if not done.missed_rows else f"{text} Missed: {', '.join(done.missed_rows)}."

@@ -109,7 +109,9 @@ class CaseRuns:
 
 
 def run_case(spec: DriveSpec, filters: dict[str, UnscentedSetting]) -> CaseRuns:
-    """Simulate an experiment with error-free sensors and given motion, and run the filters."""
+    """Simulate an experiment with error-free sensors, and run the friction filters, which get the
+    true motion.
+    """
     batch = ideal(spec)
     given = given_motion(batch, spec.vehicle)
     return CaseRuns(batch, {name: estimate(given, setting) for name, setting in filters.items()})
