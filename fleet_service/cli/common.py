@@ -104,8 +104,8 @@ def add_archive(parser: argparse.ArgumentParser, *, required: bool = True) -> No
 
 
 def add_dry_run(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of a command that deletes data: one to show only what it would delete,
-    and one to skip the confirmation.
+    """Declare the options of a command that deletes data: one to show the planned changes only, and
+    one to skip the confirmation.
     """
     parser.add_argument("--dry-run", action="store_true", help="only print the planned changes")
     parser.add_argument("--yes", action="store_true", help="do not ask for confirmation")

@@ -103,8 +103,8 @@ def _store_inputs(track: InputTrack) -> None:
 
 @compiled
 def _fill_inputs(track: InputTrack, row: FloatArray, anew: bool) -> None:
-    """Fill `track.inputs` from the readings, and replace missing values. If `anew` is True, values
-    of earlier samples are not used as replacements.
+    """Fill `track.inputs` from the readings, and replace missing values. If the last argument is
+    True, values of earlier samples are not used as replacements.
     """
     now = track.now
     use = track.inputs

@@ -1,5 +1,5 @@
-"""Records of what was erased from an archive: a month, or one vehicle in a month. Their
-measurements are not accepted again.
+"""Records of the data that were erased from an archive: a month, or one vehicle's rows of a month.
+Their measurements are not accepted again.
 
     keys/2026-01.UNTIL.erased             empty; measurements of that month before UNTIL [ns]
     keys/2026-01.PSEUDONYM.UNTIL.erased   the same for the vehicle with this pseudonym; removed with
