@@ -108,7 +108,7 @@ def list_copied_files(root: Path) -> dict[str, bytes]:
     """Return the content of those files of an archive that its bucket copy must
     contain, by path.
     """
-    from fleet_service.replication.replica import FOLDERS
+    from fleet_service.replication.replica_files import FOLDERS
 
     paths = [path for name in FOLDERS for path in (root / name).rglob("*") if path.is_file()]
     return {

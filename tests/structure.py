@@ -314,12 +314,18 @@ def _is_number(node: ast.AST) -> bool:
     return plain and bool(constants) and all(type(value) in (int, float) for value in constants)
 
 
+# Beginnings of the names of methods that a base class calls: of `ast.NodeVisitor`, of Proton's
+# `MessagingHandler`, and of `http.server.BaseHTTPRequestHandler`.
+LIBRARY_CALLS: Final = ("visit_", "on_", "log_message")
+
+
 def only_tests_use(root: Path) -> Places:
     """Return the lines of product functions and classes whose name occurs only in tests.
 
     A name counts as used if any other line of product, deployment, Makefile, pages or examples
     contains it. Functions with a decorator other than `property` are left out, because the
-    decorator may register them.
+    decorator may register them. Methods that a library calls by their name (`LIBRARY_CALLS`) are
+    left out, too.
     """
     texts = {path: path.read_text(encoding="utf-8") for path in list_sources(root, *PACKAGES)}
     others = [
@@ -357,7 +363,7 @@ def only_tests_use(root: Path) -> Places:
                     words[node.name] == 1
                     and node.name in tests
                     and not exposed
-                    and not node.name.startswith("visit_")
+                    and not node.name.startswith(LIBRARY_CALLS)
                 ):
                     lines = range(node.lineno, (node.end_lineno or node.lineno) + 1)
                     found += [f"{path.relative_to(root)}:{line} {node.name}" for line in lines]
@@ -405,16 +411,16 @@ FIGURES: Final = (
         lambda root: room_arrows(root, "edge_agent/estimators/friction_mixture"),
     ),
     Figure("import circles", 0, 0, import_circles),
-    Figure("methods of the largest class", 15, 30, methods_of_largest_class),
+    Figure("methods of the largest class", 15, 29, methods_of_largest_class),
     Figure("most parameters", 6, 12, most_parameters),
-    Figure("functions with more than 6 parameters", 0, 35, functions_with_many_parameters),
+    Figure("functions with more than 6 parameters", 0, 33, functions_with_many_parameters),
     Figure("packed assignments per 1,000 lines", 2, 2, packed_assignments, per_1000=True),
     Figure("fmt: skip", 40, 0, fmt_skips),
     Figure("lines over 100 columns", 0, 0, long_lines),
-    Figure("functions with nesting over 4", 0, 2, deep_nesting),
+    Figure("functions with nesting over 4", 0, 1, deep_nesting),
     Figure("functions with more than 40 local names", 0, 0, many_locals),
     Figure("named constants between sensor and map", 230, 399, named_constants),
-    Figure("product lines that only tests use", 0, 75, only_tests_use),
+    Figure("product lines that only tests use", 0, 0, only_tests_use),
 )
 
 

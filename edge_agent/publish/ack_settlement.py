@@ -11,7 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from edge_agent.publish.outbox import Outbox, Stream
+from edge_agent.publish.held_batches import Stream
+from edge_agent.publish.outbox import Outbox
 from schemas.errors import WireError
 from schemas.thresholds import NS
 from schemas.wire import Kind, StreamAck, decode_ack

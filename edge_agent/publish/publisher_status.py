@@ -55,19 +55,19 @@ class PublisherStatus:
     @property
     def unanswered_s(self) -> float:
         """Return the time [s] for which sent batches have been unanswered."""
-        return self._outbox.unanswered_s(self._clock())
+        return self._outbox.schedule.unanswered_s(self._clock())
 
     @property
     def stranded_records(self) -> int:
         """Return the number of records in the outbox that are not sent, because they belong to
         other vehicle names than those of this agent, for example after a change of name.
         """
-        return self._outbox.count_stranded(self._names)
+        return self._outbox.held.count_stranded(self._names)
 
     @property
     def fill_share(self) -> float:
         """Return the used share of the outbox capacity [1]."""
-        return self._outbox.bytes / self._outbox.capacity_bytes
+        return self._outbox.held.bytes / self._outbox.capacity_bytes
 
     @property
     def unanswered_records(self) -> int:
@@ -95,4 +95,4 @@ class PublisherStatus:
         counts = self.counts
         kinds = Kind if kind is None else (kind,)
         coming = sum(counts.offered[k] - counts.dropped[k] - counts.published[k] for k in kinds)
-        return coming + self._outbox.count_records(self._names, kind)
+        return coming + self._outbox.held.count_records(self._names, kind)

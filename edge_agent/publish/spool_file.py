@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import sqlite3
 import zlib
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -46,6 +47,74 @@ TYPES: Final = (
 _CORRUPT: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 Row = tuple[object, ...]
+
+
+class SpoolFile:
+    """Table of batches in an outbox's file. The keys are the row numbers.
+
+    Attributes:
+        was_damaged: True if the file was found damaged when it was opened.
+
+    Raises:
+        InputError: the file belongs to another agent or is not an outbox, or the path cannot be
+            used.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._database, aside = open_file(path)
+        self.was_damaged = aside is not None
+
+    def recover_content(self) -> None:
+        """Replace a damaged file by a new one with its readable content. After an error the call
+        may be repeated.
+
+        Raises:
+            sqlite3.Error, OSError: the disk does not accept the write.
+        """
+        self._database.close()
+        self._database, _ = recover_file(self._path)
+
+    def begin_transaction(self) -> sqlite3.Connection:
+        """Return a context that commits at its end, or changes nothing after an error."""
+        return self._database
+
+    def list_batches(self) -> Iterator[tuple[int, tuple[str, int, str, int, int, int], int]]:
+        """Yield key, identifier (the columns NAME) and size [bytes] of each batch, oldest first."""
+        rows = self._database.execute(f"SELECT id, {NAME}, LENGTH(payload) FROM batch ORDER BY id")
+        for key, *name, size in rows:
+            vehicle, boot, kind, region, seq, records = name
+            yield key, (vehicle, boot, kind, region, seq, records), size
+
+    def insert_row(self, name: Row, payload: bytes) -> int:
+        """Insert a batch by its identifier (the columns NAME), and return its key."""
+        cursor = self._database.execute(
+            f"INSERT INTO batch ({NAME}, payload, checksum) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            (*name, payload, batch_checksum(name, payload)),
+        )
+        if cursor.lastrowid is None:
+            raise sqlite3.DatabaseError("an insert gave no row id")
+        return cursor.lastrowid
+
+    def delete_rows(self, keys: Sequence[int]) -> None:
+        """Delete batches by their keys."""
+        self._database.executemany("DELETE FROM batch WHERE id = ?", [(key,) for key in keys])
+
+    def read_payload(self, key: int) -> bytes | None:
+        """Return the payload of a batch; None if its row is missing or damaged."""
+        query = f"SELECT {NAME}, payload, checksum FROM batch WHERE id = ?"
+        row = self._database.execute(query, (key,)).fetchone()
+        if row is None:
+            return None
+        *name, found, checksum = row
+        payload: bytes = found
+        if checksum is not None and batch_checksum(tuple(name), payload) != checksum:
+            return None
+        return payload
+
+    def close(self) -> None:
+        """Release the file."""
+        self._database.close()
 
 
 def batch_checksum(name: Row, payload: bytes) -> int:
@@ -102,11 +171,8 @@ def recover_file(path: Path) -> tuple[sqlite3.Connection, Path]:
         for n in range(1, 10_000)
         if not (p := path.with_name(f"{path.name}.{DAMAGED}-{n}")).exists()
     )
-    for ending in (
-        "-wal",
-        "-shm",
-        "",
-    ):  # its name last: a crash in between leaves it to be found damaged again
+    # its name last: a crash in between leaves it to be found damaged again
+    for ending in ("-wal", "-shm", ""):
         with suppress(FileNotFoundError):
             path.with_name(path.name + ending).rename(aside.with_name(aside.name + ending))
     sync_directory(path.parent)

@@ -68,7 +68,7 @@ def collect_metrics(
     """Return all current metrics of a service."""
     counts = dict(engine.counts)
     report_lag_s = engine.intake.report_lag_s
-    away_s = 0.0 if engine.copy is None else engine.copy.away_s
+    away_s = 0.0 if engine.copy is None else engine.copy.backoff.away_s
     found = [
         Metric(name, "counter", text, _strip_prefix(counts, prefix), label)
         for prefix, name, label, text in _FAMILIES
@@ -161,8 +161,8 @@ def health_problems(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list
         found.append(
             f"the system clock differs by {abs(pulse.clock_lag_s):.0f} s from the service's time"
         )
-    if engine.copy is not None and engine.copy.trouble is not None:
-        found.append(engine.copy.trouble)
+    if engine.copy is not None and engine.copy.backoff.trouble is not None:
+        found.append(engine.copy.backoff.trouble)
     elif engine.settlement.failing:
         found.append("segments cannot be written")
     if not engine.holding.may_acknowledge:

@@ -52,13 +52,6 @@ class Queries:
                 state.map.mark_changed(state.public.take_published())
         return state.map.take_dirty()
 
-    def changed_tiles(self, now: int) -> list[tuple[int, bytes]]:
-        """Return the tile number and the payload of every non-empty tile that changed since the
-        last call.
-        """
-        changed = self.take_changed(now)
-        return [(tile, stream) for tile in changed if (stream := self.tile(tile, now))]
-
     def whole_map(self, now: int) -> pa.Table:
         """Return all cells that readers may see, as a table. The lock is held for a few cells at a
         time, so that ingest continues.

@@ -126,7 +126,7 @@ class Settlement:
             self._intake.batches.acknowledge(durable())
         except OSError as error:
             if isinstance(error, CopyError) and self._holding.copy is not None:
-                self._counts["copy_failures"] = self._holding.copy.failures
+                self._counts["copy_failures"] = self._holding.copy.backoff.failures
             else:
                 self._counts["segment_failures"] += 1
             self.failing = True

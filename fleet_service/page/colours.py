@@ -33,20 +33,6 @@ ALERT: Final = "#c4003a"
 DARK_ALERT: Final = "#ff6b86"
 
 
-def colour_of(mu: float, lower: float, upper: float, p_slippery: float = 0.0) -> str:
-    """Return the colour of a cell with a measured mu, its 5 % and 95 % quantiles, and its
-    probability of being slippery.
-    """
-    width = round(upper - lower, 6)  # a step of the records is .005
-    if upper < SLIPPERY_MU or width < NARROW:
-        return FOUR[sum(mu >= edge for edge in EDGES)]
-    if p_slippery > KNOWN_SLIPPERY:
-        return TWO[0]
-    if width < MIDDLING:
-        return TWO[int(mu >= SLIPPERY_MU)]
-    return LITTLE
-
-
 def as_json() -> dict[str, Any]:
     """Return the palette for the page, for light and for dark backgrounds."""
     light = {"four": FOUR, "two": TWO, "little": LITTLE, "ground": GROUND, "alert": ALERT}

@@ -17,7 +17,8 @@ from fleet_service.archive.format.files import lock_archive
 from fleet_service.archive.maintenance import compaction
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.lease import Lease, Standby, forget_holder, holder_of
-from fleet_service.replication.replica import FOLDERS, BucketReplica, open_replica
+from fleet_service.replication.replica import BucketReplica, open_replica
+from fleet_service.replication.replica_files import FOLDERS
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 
@@ -186,7 +187,7 @@ def _acquire_under_lease(
                     f"{root} is not the archive of {url}",
                     "give the service an empty folder",
                 )
-            copy.attach_lease(partial(_may_acknowledge, lease), lease.assert_not_superseded)
+            copy.bucket.attach_lease(partial(_may_acknowledge, lease), lease.assert_not_superseded)
             if _sync_folder(config, root, copy, lease, stop, say):
                 layout.write_epoch(root, lease.term.epoch)
                 return Ownership(lock_file, copy, lease)

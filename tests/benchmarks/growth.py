@@ -24,6 +24,7 @@ from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.benchmarks.ingest import make_messages
+from tests.changed_tiles import changed_tiles
 
 RATES: Final = {
     1_000: 24,
@@ -71,7 +72,7 @@ def second_s(rate: int, seconds: int) -> float:
             for at in range(0, len(sent), TURN):
                 engine.intake.ingest(sent[at : at + TURN], now)
             engine.settlement.flush()
-            engine.queries.changed_tiles(now)
+            changed_tiles(engine.queries, now)
             spent += time.process_time() - began if second >= WARM_S else 0.0
         assert engine.counts[Kind.OBSERVATION] == rate * (WARM_S + seconds), engine.counts
     return spent / seconds

@@ -18,7 +18,8 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from edge_agent.publish.batching import Draft
-from edge_agent.publish.outbox import Outbox, StoredBatch, Stream
+from edge_agent.publish.held_batches import Stream
+from edge_agent.publish.outbox import Outbox, StoredBatch
 from fleet_service.app.engine import Engine
 from fleet_service.ingest.inbox import Message
 from schemas import grid, keys, wire
@@ -146,14 +147,14 @@ def _run_outage(site: Site, engine: Engine) -> list[Figure]:
     service.up = False
     advance_seconds(away_s)
     while_away = service.messages - before
-    backlog = sum(outbox.batches for outbox in outboxes)
+    backlog = sum(len(outbox.held) for outbox in outboxes)
     service.up = True
     taken: list[int] = []
-    while sum(outbox.batches for outbox in outboxes) > QUEUED * cars and now < 4 * away_s:
+    while sum(len(outbox.held) for outbox in outboxes) > QUEUED * cars and now < 4 * away_s:
         taken.append(advance_step(driving=True))
     advance_seconds(30, driving=False)
     lost = abs(stored - engine.counts[Kind.OBSERVATION])
-    left = sum(outbox.batches for outbox in outboxes)
+    left = sum(len(outbox.held) for outbox in outboxes)
     for outbox in outboxes:
         outbox.close()
     begun = next((at for at, n in enumerate(taken) if n > cars), 0)  # the first cars have noticed

@@ -29,6 +29,7 @@ from schemas.wire import Kind
 from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fleet_service.archive.kept import ROUNDS, make, map_of, messages, now_of
+from tests.outboxes import read_batches
 
 KINDS: Final = {
     "inbox": "inbox/*.parquet",
@@ -153,7 +154,7 @@ def _damage_spool(site: Site, random_: random.Random, times: int) -> tuple[int, 
         outbox = Outbox(copy, boot=6)
         held = {
             batch.seq: batch.payload
-            for batch in outbox.held_batches()
+            for batch in read_batches(outbox)
             if batch.stream.vehicle == "car-a"
         }
         lost = payloads.keys() - held.keys()

@@ -14,6 +14,7 @@ from typing import Final
 
 from fleet_service.app import jobs, subprocess_job
 from fleet_service.cli import main
+from fleet_service.replication.file_transfer import FileTransfer
 from fleet_service.replication.replica import BucketReplica
 
 COMPACTING = "compacting"
@@ -24,7 +25,7 @@ FOLLOW_S: Final = 3.0
 
 _run = subprocess_job.run_module
 _follow = BucketReplica.sync
-_put_there = BucketReplica._upload_if_present
+_put_there = FileTransfer.upload_if_present
 _copying = threading.local()
 
 
@@ -55,17 +56,17 @@ def sync_and_report(copy: BucketReplica) -> int:
     return changed
 
 
-def put_there(copy: BucketReplica, name: str) -> bool:
+def put_there(transfer: FileTransfer, name: str) -> bool:
     """Upload one file, and print the beginning of the first upload of a sync."""
     if getattr(_copying, "at", None) is False:
         _copying.at = True
         _print_mark(BEGINS, COPYING)
-    return _put_there(copy, name)
+    return _put_there(transfer, name)
 
 
 if __name__ == "__main__":
     subprocess_job.run_module = run  # type: ignore[assignment]
     BucketReplica.sync = sync_and_report  # type: ignore[method-assign,assignment]
-    BucketReplica._upload_if_present = put_there  # type: ignore[method-assign,assignment]
+    FileTransfer.upload_if_present = put_there  # type: ignore[method-assign,assignment]
     jobs.FOLLOW_S = FOLLOW_S  # type: ignore[misc]
     sys.exit(main())

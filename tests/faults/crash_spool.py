@@ -16,8 +16,10 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from edge_agent.publish.batching import Draft
-from edge_agent.publish.outbox import Outbox, Stream
+from edge_agent.publish.held_batches import Stream
+from edge_agent.publish.outbox import Outbox
 from schemas.wire import Kind
+from tests.outboxes import read_batches
 
 PAGE: Final = 4096
 COMMITS: Final = 6
@@ -100,7 +102,7 @@ def _find_problems(path: Path, image: Files, owed: set[int], known: dict[int, by
     Path(f"{path}-wal").write_bytes(image.log)
     Path(f"{path}-shm").unlink(missing_ok=True)
     again = Outbox(path, boot=6, capacity_bytes=CAPACITY)
-    there = {batch.seq: batch.payload for batch in again.held_batches()}
+    there = {batch.seq: batch.payload for batch in read_batches(again)}
     again.close()
     found = [f"batch {seq} is lost" for seq in owed - there.keys()]
     return found + [

@@ -41,6 +41,7 @@ from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.faults.kill import begin_with_old_rows, old_days
 from tests.fleet_service.examples import batch, key
+from tests.outboxes import read_batches
 
 SIZE_MB: Final = 24
 VEHICLES: Final = 5
@@ -237,6 +238,6 @@ def _outbox_recovers(folder: Path, mounted: bool) -> bool:
             except Exception:  # noqa: BLE001 sqlite's own
                 refused = True
     took += len(outbox.store([draft], 0.0))
-    whole = len(outbox.held_batches()) == took and (refused or not mounted)
+    whole = len(read_batches(outbox)) == took and (refused or not mounted)
     outbox.close()
     return whole

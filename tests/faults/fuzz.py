@@ -26,6 +26,7 @@ from schemas.errors import InputError, WireError
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from schemas.wire.tile import decode_tile
+from tests.changed_tiles import changed_tiles
 from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.faults.mutants import Mutants
@@ -146,7 +147,7 @@ def _run_turn(site: Site, engine: Engine, messages: list[Message], now: int) -> 
         engine.intake.ingest(messages, now)
         for _, ack in engine.settlement.flush():
             wire.decode_ack(ack)
-        engine.queries.changed_tiles(now)
+        changed_tiles(engine.queries, now)
         engine.alerts.expire(now)
     except Exception:  # noqa: BLE001 whatever it is, it is a crash
         site.say(traceback.format_exc())

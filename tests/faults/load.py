@@ -25,7 +25,8 @@ import numpy as np
 from edge_agent.app.live_loop import STOPPED_DRAIN_S
 from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.publish.batching import Draft
-from edge_agent.publish.outbox import Outbox, StoredBatch, Stream
+from edge_agent.publish.held_batches import Stream
+from edge_agent.publish.outbox import Outbox, StoredBatch
 from edge_agent.publish.publisher import Publisher
 from schemas import grid, mugrid
 from schemas.config import AgentConfig, ZenohSettings

@@ -34,6 +34,7 @@ from schemas.config import ServiceConfig
 from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.figures import Figure
 from schemas.wire import Batch
+from tests.changed_tiles import changed_tiles
 from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fleet_service.examples import CELL, LATITUDE, LONGITUDE, SECOND, batch
@@ -148,7 +149,7 @@ class Town:
     def put(self, now: int) -> dict[int, tuple[pa.Table | None, pa.Table]]:
         """Publish the changed tiles. Return for each tile its table before (or None) and after."""
         out = {}
-        for tile, payload in self.engine.queries.changed_tiles(now):
+        for tile, payload in changed_tiles(self.engine.queries, now):
             table = pa.ipc.open_stream(payload).read_all()
             out[tile] = (self.held.get(tile), table)
             self.held[tile] = table

@@ -26,6 +26,7 @@ from fleet_service.ingest.inbox import Message
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
+from tests.changed_tiles import changed_tiles
 from tests.fleet_service.archive.kept import DATA
 from tests.fleet_service.examples import REGION, SECOND, batch, key
 from tests.secured import make_enrolment
@@ -165,7 +166,7 @@ SETTINGS: Final[dict[str, tuple[object, Show]]] = {
     "oldest_s": (400.0, of_engine(count_refused)),
     "public_vehicles": (
         9,
-        of_engine(lambda engine: len(engine.queries.changed_tiles(time.time_ns()))),
+        of_engine(lambda engine: len(changed_tiles(engine.queries, time.time_ns()))),
     ),
     "weather": ("{rain}", of_engine(lambda engine: engine.counts["weather"])),
     "compact_s": (10.0, of_jobs),

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_agent.publish import outbox
+from edge_agent.publish import resend_schedule
 from fleet_service.fusion import weather as fused_weather
 from fleet_service.ingest import dedup, rate_limit, validation
 from fleet_service.ingest import weather as weather_in
@@ -69,8 +69,8 @@ SHARED = (
     f"{dedup.MAX_GAPS}",
     f"segment every {SERVICE.segment_s} s",
     f"lateness ({SERVICE.lateness_s:.0f} s)",
-    f"after {outbox.FIRST_RESEND_S:.0f} s",
-    f"up to {outbox.LONGEST_RESEND_S:.0f} s",
+    f"after {resend_schedule.FIRST_RESEND_S:.0f} s",
+    f"up to {resend_schedule.LONGEST_RESEND_S:.0f} s",
     f"mu_utilised >= {thresholds.EXCITED_SHARE} mu",
     f"within {np.degrees(validation.YAW_TOLERANCE):.0f}° of",
     f"mu < {thresholds.SLIPPERY_MU}",

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -18,8 +17,6 @@ import numpy as np
 from edge_agent.inputs.doctor.findings import Diagnosis, diagnose
 from edge_agent.inputs.units import DEG, SPEED
 from edge_agent.lab.simulation import SimulatedFleet
-from edge_agent.lab.simulation.friction import ICE, SNOW, WET
-from edge_agent.lab.simulation.scenarios import scenario_named
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.signals import S
@@ -200,20 +197,6 @@ def drives(
     """
     scenario = f"winter-{seed}" if winter else "hills" if rough else "demo"
     fleet = SimulatedFleet(scenario, count, seed, RATE_HZ, rough=float(rough), winter=float(winter))
-    parts = [fleet.step(round(RATE_HZ)) for _ in range(seconds)]
-    t, signals = (np.concatenate([part[k] for part in parts]) for k in range(2))
-    return [Recorded(t[:, n], signals[:, n], fleet.vehicles[n]) for n in range(count)]
-
-
-def winter_drives(count: int, seed: int, *, seconds: int = DRIVE_S) -> list[Recorded]:
-    """Return simulated drives through the hilly demonstration town in winter: roads that are
-    usually dry are wet, usually wet roads have snow, and usually snowy roads have ice.
-    """
-    usual = scenario_named("hills")
-    worse = {WET: SNOW, SNOW: ICE}
-    patches = tuple(replace(patch, mu=worse.get(patch.mu, patch.mu)) for patch in usual.patches)
-    town = replace(usual, name="winter", background=WET, patches=patches)
-    fleet = SimulatedFleet(town, count, seed, RATE_HZ, rough=0.5)
     parts = [fleet.step(round(RATE_HZ)) for _ in range(seconds)]
     t, signals = (np.concatenate([part[k] for part in parts]) for k in range(2))
     return [Recorded(t[:, n], signals[:, n], fleet.vehicles[n]) for n in range(count)]

@@ -70,11 +70,6 @@ class DenmOutput:
         return time.monotonic() >= self._checked + CHECK_S
 
     @property
-    def unaccepted_count(self) -> int:
-        """Return the number of messages that the interchange has not accepted yet."""
-        return len(self._pending)
-
-    @property
     def open_event_count(self) -> int:
         """Return the number of events that have not ended."""
         return len(self._book.open_events)

@@ -6,12 +6,13 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from fleet_service.client.cits.amqp import AmqpLink
+from fleet_service.client.cits.amqp import AmqpLink, Parcel
 from fleet_service.client.cits.denm import compiled_denm, decode_denm, encode_denm
 from fleet_service.client.cits.output import DenmOutput
 from fleet_service.client.cits.properties import Originator
@@ -52,6 +53,11 @@ def _stretch(number: int, draw: np.random.Generator) -> StretchAlert:
     )
 
 
+def _count_and_send(parcels: list[Parcel], link: AmqpLink, parcel: Parcel) -> None:
+    parcels.append(parcel)
+    link.send(parcel)
+
+
 def measure_denm(folder: Path, quick: bool) -> list[Figure]:
     """Raise, change and end events, restart the gateway after each step, and return the figures."""
     from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
@@ -77,13 +83,16 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
             settled: list[str] = []
             link = AmqpLink(url, "deliveries", on_accepted=settled.append).open()
             until(lambda link=link: link.is_connected)  # type: ignore[misc]
-            output = DenmOutput(STATION, originator, path, link.send, lambda: now[0])
+            parcels: list[Parcel] = []
+            output = DenmOutput(
+                STATION, originator, path, partial(_count_and_send, parcels, link), lambda: now[0]
+            )
             now[0] += NS
             before = len(received)
             began = time.perf_counter()
             processor_began = time.process_time()
             output.keep_up(standing, lambda *_: True)
-            sent = output.unaccepted_count
+            sent = len(parcels)
             until(lambda settled=settled, sent=sent: len(settled) >= sent)  # type: ignore[misc]
             worked = time.process_time() - processor_began
             seconds.append((sent, time.perf_counter() - began, worked))

@@ -5,6 +5,7 @@ minute, and proposes right corrections.
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +16,16 @@ import pytest
 from edge_agent.cli import main
 from edge_agent.inputs.doctor.findings import diagnose
 from edge_agent.lab.evaluation.planted import (
+    DRIVE_S,
     PLANTED,
+    RATE_HZ,
     Recorded,
     doctor_verdict,
     drives,
-    winter_drives,
 )
-from edge_agent.lab.simulation import simulate_manoeuvre
+from edge_agent.lab.simulation import SimulatedFleet, simulate_manoeuvre
+from edge_agent.lab.simulation.friction import ICE, SNOW, WET
+from edge_agent.lab.simulation.scenarios import scenario_named
 from schemas.signals import CHANNELS, S
 from tests.edge_agent.inputs.formats import BLF, NMEA, VEHICLE
 from tests.edge_agent.service import Router, Service
@@ -35,6 +39,20 @@ def rough() -> Recorded:
     errors.
     """
     return drives(1, 23, rough=True)[0]
+
+
+def draw_winter_drive(seed: int) -> Recorded:
+    """Return a simulated drive through the hilly demonstration town in winter: roads that are
+    usually dry are wet, usually wet roads have snow, and usually snowy roads have ice.
+    """
+    usual = scenario_named("hills")
+    worse = {WET: SNOW, SNOW: ICE}
+    patches = tuple(replace(patch, mu=worse.get(patch.mu, patch.mu)) for patch in usual.patches)
+    town = replace(usual, name="winter", background=WET, patches=patches)
+    fleet = SimulatedFleet(town, 1, seed, RATE_HZ, rough=0.5)
+    parts = [fleet.step(round(RATE_HZ)) for _ in range(DRIVE_S)]
+    t, signals = (np.concatenate([part[k] for part in parts]) for k in range(2))
+    return Recorded(t[:, 0], signals[:, 0], fleet.vehicles[0])
 
 
 def write(path: Path, drive: Recorded) -> list[str]:
@@ -117,7 +135,7 @@ def test_slides_and_constant_speed_accuse_no_sensor(manoeuvre: str, mu: float | 
 @pytest.fixture(scope="module")
 def winter() -> Recorded:
     """Return a simulated drive of two and a half minutes on ice and snow."""
-    return winter_drives(1, 23)[0]
+    return draw_winter_drive(23)
 
 
 def test_a_drive_on_ice_and_snow_accuses_no_sensor(winter: Recorded) -> None:

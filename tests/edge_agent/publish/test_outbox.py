@@ -13,8 +13,10 @@ from pathlib import Path
 import pytest
 
 from edge_agent.publish.batching import Draft
-from edge_agent.publish.outbox import JITTER, Outbox, StoredBatch, Stream
+from edge_agent.publish.held_batches import Stream
+from edge_agent.publish.outbox import Outbox, StoredBatch
 from edge_agent.publish.pacing import FIRST_WINDOW, LONGEST_PROBE_S, SILENT_S
+from edge_agent.publish.resend_schedule import JITTER
 from schemas.errors import InputError
 from schemas.wire import Kind
 
@@ -89,7 +91,7 @@ def test_settled_ranges_leave_and_first_held_moves_on(path: Path) -> None:
     assert outbox.store([draft()], now=0.0)[0].payload == b"7/3"
     assert outbox.settle_ranges(stream(), [(1, 7)]) == 7
     assert outbox.store([draft()], now=0.0)[0].payload == b"8/8"
-    assert outbox.batches == 1
+    assert len(outbox.held) == 1
     outbox.close()
 
 
@@ -98,7 +100,7 @@ def test_an_acknowledgement_of_what_is_not_held_changes_nothing(path: Path) -> N
     outbox.store([draft()], now=0.0)
     assert outbox.settle_ranges(stream(boot=BOOT + 1), [(1, 1)]) == 0
     assert outbox.settle_ranges(stream(), [(2, 2**62)]) == 0
-    assert outbox.batches == 1
+    assert len(outbox.held) == 1
     outbox.close()
 
 
@@ -122,14 +124,14 @@ os.kill(os.getpid(), signal.SIGKILL)
     child = subprocess.run([sys.executable, "-c", script], check=False)
     assert child.returncode == -9
     outbox = Outbox(path, boot=BOOT + 1)
-    assert outbox.count_records({"car-a"}) == 12
+    assert outbox.held.count_records({"car-a"}) == 12
     left = outbox.due_batches(now=0.0, limit=10)
     assert [(b.stream.boot, b.seq, b.payload) for b in left] == [
         (BOOT, s, b"kept %d" % s) for s in (1, 2, 3, 4)
     ]
     assert outbox.store([draft()], now=0.0)[0].seq == 1
     assert outbox.settle_ranges(stream(), [(1, 4)]) == 12
-    assert outbox.batches == 1
+    assert len(outbox.held) == 1
     outbox.close()
 
 
@@ -191,7 +193,7 @@ def test_first_answer_releases_batches_oldest_first_and_ever_faster(path: Path) 
         now += 1.0
         outbox.settle_ranges(stream(), [(batch.seq, batch.seq) for batch in out])
         out = outbox.due_batches(now, limit=10**6)
-    assert outbox.batches == 0
+    assert len(outbox.held) == 0
     assert FIRST_WINDOW <= rounds[0] <= FIRST_WINDOW + 1
     assert max(rounds) >= 2 * FIRST_WINDOW
     assert outbox.store([draft()], now)[0].fresh
@@ -241,7 +243,7 @@ def test_batches_of_a_former_name_are_not_put_and_are_told(path: Path) -> None:
     outbox.close()
     again = Outbox(path, boot=BOOT + 1)
     assert [batch.stream.vehicle for batch in again.due_batches(0.0, 9, {"car-new"})] == ["car-new"]
-    assert again.count_stranded({"car-new"}) == 3
+    assert again.held.count_stranded({"car-new"}) == 3
     again.close()
 
 
@@ -268,7 +270,7 @@ def test_full_outbox_drops_oldest_states_then_observations_and_counts(path: Path
     assert outbox.counts.evicted == {Kind.STATE: 7, Kind.OBSERVATION: 0}
     outbox.store([draft(size=1_000), draft(size=1_000)], now=0.0)
     assert outbox.counts.evicted == {Kind.STATE: 14, Kind.OBSERVATION: 1}
-    assert outbox.bytes <= 4_500
+    assert outbox.held.bytes <= 4_500
     assert seqs(outbox.due_batches(now=2.0 * (1 + JITTER), limit=9)) == [2, 3, 4, 5]
     assert outbox.store([draft()], now=0.0)[0].payload == b"6/2"
     outbox.close()
@@ -290,7 +292,8 @@ def test_a_settled_batch_that_a_crash_brings_back_is_offered_again(path: Path) -
     script = f"""
 import os, pathlib, signal
 from edge_agent.publish.batching import Draft
-from edge_agent.publish.outbox import Outbox, Stream
+from edge_agent.publish.held_batches import Stream
+from edge_agent.publish.outbox import Outbox
 from schemas.wire import Kind
 outbox = Outbox(pathlib.Path({str(path)!r}), boot={BOOT})
 draft = Draft("car-a", Kind.STATE, {REGION}, 3, lambda s, f: b"seen")
@@ -311,7 +314,7 @@ def test_a_batch_that_cannot_be_encoded_leaves_no_gap(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT)
     with pytest.raises(ValueError, match="2 1"):
         outbox.store([draft(), Draft("car-a", Kind.OBSERVATION, REGION, 1, broken)], now=0.0)
-    assert outbox.batches == 0
+    assert len(outbox.held) == 0
     assert seqs(outbox.store([draft()], now=0.0)) == [1]
     outbox.close()
 
@@ -342,7 +345,7 @@ def test_a_file_that_is_no_outbox_is_refused_and_left_alone(path: Path) -> None:
 def test_an_unanswered_batch_is_given_up_before_it_blocks_its_stream(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("edge_agent.publish.outbox.PASSED_OVER", 40)
+    monkeypatch.setattr("edge_agent.publish.held_batches.PASSED_OVER", 40)
     outbox = Outbox(path, boot=BOOT)
     now = 0.0
     for turn in range(60):
@@ -353,7 +356,7 @@ def test_an_unanswered_batch_is_given_up_before_it_blocks_its_stream(
             if batch.seq != 3:  # which no service can read
                 outbox.settle_ranges(stream(), [(batch.seq, batch.seq)])
         assert outbox.counts.unanswered == 0 or turn >= 42
-    assert outbox.batches == 0
+    assert len(outbox.held) == 0
     assert outbox.counts.unanswered == 2
     assert outbox.store([draft()], now)[0].payload == b"61/61", "older than that never comes"
     outbox.close()
@@ -373,7 +376,7 @@ def test_waiting_batches_take_little_memory_and_leave_none_behind(path: Path) ->
     tracemalloc.start()
     try:
         again = Outbox(path, boot=BOOT + 1)
-        assert again.batches == count
+        assert len(again.held) == count
         assert tracemalloc.get_traced_memory()[0] < 320 * count
         for kind in Kind:
             again.settle_ranges(stream(kind=kind), [(1, count)])

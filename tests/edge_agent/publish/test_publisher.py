@@ -159,7 +159,7 @@ def test_without_a_router_it_exits_in_time_and_keeps_everything(tmp_path: Path) 
     assert publisher.close(within_s=0.5)
     assert publisher.count_unsettled() == len(observations.vehicle)
     again = Outbox(config.spool)
-    assert again.count_records(set(NAMES)) == len(observations.vehicle)
+    assert again.held.count_records(set(NAMES)) == len(observations.vehicle)
     again.close()
 
 
@@ -249,7 +249,7 @@ def test_a_full_disk_is_waited_for(
     """
     config = settings(router, tmp_path)
     outbox = Outbox(config.spool)
-    database = outbox._database
+    database = outbox._file.begin_transaction()
     (pages,) = database.execute("PRAGMA page_count").fetchone()
     database.execute(f"PRAGMA max_page_count = {pages}")
     publisher = Publisher(NAMES, outbox, config, "test")

@@ -161,7 +161,7 @@ def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(
         until(is_acknowledged)
         assert sorted(vehicle for vehicle, _ in acks) == sorted({one.vehicle for one in sent})
         assert engine.copy is not None
-        assert engine.copy.away_s == 0
+        assert engine.copy.backoff.away_s == 0
 
 
 @contextmanager

@@ -46,7 +46,8 @@ def drive(root):
     for start in range(0, len(messages), 40):
         engine.intake.ingest(messages[start : start + 40], time.time_ns())
     engine.settlement.flush()
-    engine.queries.changed_tiles(time.time_ns())
+    now = time.time_ns()
+    assert all(engine.queries.tile(tile, now) for tile in engine.queries.take_changed(now))
     engine.alerts.expire(time.time_ns())
     list(engine.queries.answer(MapQuery(), lambda tile: True, time.time_ns()))
     assert engine.state.fusion.size > 2100, engine.counts

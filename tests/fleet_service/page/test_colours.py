@@ -10,7 +10,7 @@ from itertools import combinations, pairwise
 
 import pytest
 
-from fleet_service.page.colours import EDGES, colour_of
+from fleet_service.page.colours import EDGES
 from schemas.runtime.palette import (
     DARK_FOUR,
     DARK_GROUND,
@@ -22,6 +22,7 @@ from schemas.runtime.palette import (
     TWO,
 )
 from tests.colour_vision import SIGHTS, colour_difference, to_lab
+from tests.fleet_service.page.cell_colours import colour_of
 from tests.structure import ROOT
 
 LEAST = 10.0

@@ -14,11 +14,11 @@ from typing import Any, Final
 import pytest
 
 from fleet_service.archive.format import snapshots
-from fleet_service.page import colours
 from schemas import grid
 from schemas.runtime import palette
 from tests.browser import Opened, open_page
 from tests.fleet_service.page import street
+from tests.fleet_service.page.cell_colours import colour_of
 from tests.fleet_service.page.conftest import Drive, RunningPage
 from tests.structure import ROOT
 from tests.waiting import until
@@ -190,9 +190,7 @@ def test_the_rule_of_colours_is_the_same_here_and_there(page: RunningPage) -> No
             "160, 150, 170) }"
         )
     names = [*palette.FOUR, *palette.TWO, palette.LITTLE]
-    assert [names[k] for k in there] == [
-        colours.colour_of(*(v / 200 for v in one)) for one in triples
-    ]
+    assert [names[k] for k in there] == [colour_of(*(v / 200 for v in one)) for one in triples]
     assert hollow == HOLLOW
     assert len(set(there)) == 7
 

@@ -58,10 +58,9 @@ def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(
     meets(one, 5)  # the frozen one wakes
     join_daily_files(one.root)
     one.copy.upload_segments([])
-    one.copy._may, one.copy._alone = (
-        lambda: True,
-        None,
-    )  # as if it had been frozen right behind its looks
+    # as if it had been frozen right behind its looks
+    one.copy.bucket.may_write = lambda: True
+    one.copy.bucket.assert_alone = None
     one.copy.sync()
     found = restore_archive(tmp_path / "new", bucket)
     held = vehicle_ids.read_numbers(found / "keys")

@@ -93,10 +93,10 @@ def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
             CopyError, match="is tried again"
         ):  # at once, and nothing was asked of the network
             log.flush()
-        assert (copy.failures, log.unsettled, log.rows) == (1, 2, 0)
-        assert copy.away_s > 0
-        assert "nothing is acknowledged" in str(copy.trouble)
-        assert SECRET not in str(copy.trouble)
+        assert (copy.backoff.failures, log.unsettled, log.rows) == (1, 2, 0)
+        assert copy.backoff.away_s > 0
+        assert "nothing is acknowledged" in str(copy.backoff.trouble)
+        assert SECRET not in str(copy.backoff.trouble)
         bucket.start()
         done: list[int] = []
 
@@ -109,7 +109,7 @@ def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
 
         until(has_settled)
         assert done == [7, 8]
-        assert copy.trouble is None
+        assert copy.backoff.trouble is None
         assert there(bucket) == list_copied_files(root)
     assert len(identities(root, Kind.OBSERVATION)) == 5 * 5
 

@@ -27,6 +27,7 @@ from fleet_service.serve.visitors import PART_NS, Visitors
 from schemas import grid, query, wire
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
+from tests.changed_tiles import changed_tiles
 from tests.fleet_service.examples import (
     CELL,
     LATITUDE,
@@ -92,11 +93,11 @@ def test_a_cell_is_public_from_k_vehicles_on_in_answers_and_tiles(start: Start) 
     hear(engine, "sim-001", "sim-002")
     for parameters in ({}, {"min_vehicles": "1"}, {"basis": "borrowed"}):
         assert not rows(engine, None, **parameters)
-    assert not engine.queries.changed_tiles(time.time_ns())
+    assert not changed_tiles(engine.queries, time.time_ns())
     hear(engine, *MORE)
     assert not rows(engine), "the next moment of publication has not come"
     assert [row["vehicles"] for row in rows(engine, later())] == [5]
-    assert len(engine.queries.changed_tiles(later())) == 1
+    assert len(changed_tiles(engine.queries, later())) == 1
     assert not rows(engine, later(), min_vehicles="7")
 
 
@@ -170,11 +171,11 @@ def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Sta
     )
     night = day + 18 * 3600 * SECOND
     hear(engine, "sim-007", now=night)
-    engine.queries.changed_tiles(day)
+    changed_tiles(engine.queries, day)
     assert not rows(engine, night)
     assert not rows(engine, night, route=route)
     assert not engine.queries.whole_map(night).num_rows
-    assert not engine.queries.changed_tiles(night)
+    assert not changed_tiles(engine.queries, night)
     hear(engine, *MORE, now=night + SECOND)
     assert not rows(engine, night + 2 * SECOND)
     (row,) = rows(engine, night + PERIOD_NS)

@@ -1,0 +1,203 @@
+"""Batches that an outbox holds, in memory and without their payloads: by key, by stream and in
+order of age. The module is pure.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from schemas.wire import Kind
+
+# A batch that no service can read is answered by none. Once so many later ones of its stream were
+# settled, a service is about to take no more (it remembers 65 536 above one that is missing), so
+# that this one must go.
+PASSED_OVER: Final = 50_000
+LEAST_OLDEST: Final = 1000  # keys that may be gone before they are looked through
+
+
+class Stream(NamedTuple):
+    """Stream of batches with its own sequence numbers, which count from 1: the batches of one
+    vehicle, one start, one kind of record and one region (z10 quadint).
+    """
+
+    vehicle: str
+    boot: int
+    kind: Kind
+    region: int
+
+
+@dataclass(slots=True)
+class HeldBatch:
+    """State of a stored batch without its payload. While the batch is in flight (sent and not
+    answered), `due` is the time [s] of its next resend.
+    """
+
+    stream: Stream
+    seq: int
+    records: int
+    size: int
+    attempts: int = 0
+    due: float | None = None
+
+
+@dataclass
+class _Sequence:
+    """Sequence numbers of one stream (vehicle, start, kind, region): the next free number, and the
+    numbers of its batches in the outbox.
+    """
+
+    stream: Stream
+    next: int = 1
+    first: int = 1
+    held: dict[int, int] = field(default_factory=dict)
+
+    def first_held(self) -> int:
+        """Return the lowest seq that is still in the outbox, or the next free seq if the outbox has
+        no batch of the stream.
+
+        The search continues where the last one ended, so each settled seq is skipped only once.
+        """
+        while self.first < self.next and self.first not in self.held:
+            self.first += 1
+        return self.first
+
+
+class HeldBatches:
+    """Batches in an outbox by their key, the row number in the file.
+
+    Attributes:
+        bytes: total size of the payloads [bytes].
+    """
+
+    def __init__(self, boot: int) -> None:
+        self.bytes = 0
+        self._boot = boot
+        self._entries: dict[int, HeldBatch] = {}
+        # keys in their order, also those of removed batches
+        self._oldest: dict[Kind, deque[int]] = {kind: deque() for kind in Kind}
+        self._streams: dict[Stream, _Sequence] = {}
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._entries
+
+    def __getitem__(self, key: int) -> HeldBatch:
+        return self._entries[key]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._entries)
+
+    def add_batch(self, key: int, batch: HeldBatch) -> None:
+        """Add a batch that is in the file."""
+        self._entries[key] = batch
+        oldest = self._oldest[batch.stream.kind]
+        oldest.append(key)
+        if len(oldest) > 2 * len(self._entries) + LEAST_OLDEST:
+            self._oldest[batch.stream.kind] = deque(one for one in oldest if one in self._entries)
+        sequence = self._streams.get(batch.stream)
+        if sequence is None:
+            sequence = self._streams[batch.stream] = _Sequence(batch.stream)
+        batch.stream = sequence.stream
+        sequence.held[batch.seq] = key
+        sequence.next = max(sequence.next, batch.seq + 1)
+        self.bytes += batch.size
+
+    def remove_batch(self, key: int) -> HeldBatch:
+        """Remove a batch and return it."""
+        batch = self._entries.pop(key)
+        sequence = self._streams[batch.stream]
+        del sequence.held[batch.seq]
+        if not sequence.held and batch.stream.boot != self._boot:
+            del self._streams[batch.stream]
+        self.bytes -= batch.size
+        return batch
+
+    def remove_all(self) -> None:
+        """Remove all batches. The streams of this start go on counting."""
+        own = {
+            stream: sequence
+            for stream, sequence in self._streams.items()
+            if stream.boot == self._boot
+        }
+        for sequence in own.values():
+            sequence.held.clear()
+        self._entries = {}
+        self._oldest = {kind: deque() for kind in Kind}
+        self._streams = own
+        self.bytes = 0
+
+    def has_stream(self, stream: Stream) -> bool:
+        """Return True if the stream belongs to this start, or has batches in the outbox."""
+        return stream in self._streams
+
+    def next_numbers(self, stream: Stream) -> tuple[int, int]:
+        """Return the next free sequence number of a stream, and the lowest one that is held."""
+        known = self._streams.get(stream) or _Sequence(stream)
+        return known.next, known.first_held()
+
+    def keys_within(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> set[int]:
+        """Return the keys of the held batches of a stream in inclusive ranges of sequence
+        numbers.
+        """
+        sequence = self._streams.get(stream)
+        if sequence is None:
+            return set()
+        held = sequence.held
+        return {key for first, last in ranges for key in _keys_within(held, first, last)}
+
+    def pop_oldest(self, kind: Kind) -> int | None:
+        """Return the key of the oldest batch of a kind, or None if there is none; the next call
+        returns the next oldest.
+        """
+        oldest = self._oldest[kind]
+        while oldest:
+            key = oldest.popleft()
+            if key in self._entries:
+                return key
+        return None
+
+    def is_passed_over(self, batch: HeldBatch) -> bool:
+        """Return True if the service seems to ignore this batch: it is the oldest of its stream
+        (same vehicle, start, kind, region) in the outbox, and PASSED_OVER later batches of the
+        stream were settled.
+        """
+        sequence = self._streams[batch.stream]
+        later = sequence.next - batch.seq - len(sequence.held)
+        return later >= PASSED_OVER and sequence.first_held() == batch.seq
+
+    def count_records(
+        self, vehicles: Collection[str] | None = None, kind: Kind | None = None
+    ) -> int:
+        """Return the number of records that belong to the given vehicles or to all, of one kind or
+        of all kinds. May be called on any thread.
+        """
+        return sum(
+            one.records
+            for one in list(self._entries.values())
+            if (vehicles is None or one.stream.vehicle in vehicles)
+            and kind in (None, one.stream.kind)
+        )
+
+    def count_stranded(self, vehicles: Collection[str]) -> int:
+        """Return the number of records that are not sent because they belong to other vehicles than
+        these, for example after a change of name. May be called on any thread.
+        """
+        return sum(
+            one.records
+            for one in list(self._entries.values())
+            if one.stream.vehicle not in vehicles
+        )
+
+
+def _keys_within(held: dict[int, int], first: int, last: int) -> list[int]:
+    """Return the keys of the batches in the outbox with a sequence number in [first, last]. The
+    work does not grow with the range, because a hostile service may send a very large one.
+    """
+    if last - first < len(held):
+        return [held[seq] for seq in range(first, last + 1) if seq in held]
+    return [key for seq, key in held.items() if first <= seq <= last]

@@ -1,0 +1,138 @@
+"""Times at which the batches of an outbox are sent again: one `Pacer` per vehicle and region, and a
+time limit for each batch in flight. The module is pure; time is monotonic [s].
+"""
+
+from __future__ import annotations
+
+import heapq
+import random
+from collections.abc import Collection, Iterator
+from typing import Final
+
+from edge_agent.publish.held_batches import HeldBatch, HeldBatches, Stream
+from edge_agent.publish.pacing import Pacer
+
+# a service writes a segment each second: an answer younger than this is on its way
+FIRST_RESEND_S: Final = 2.0
+# for an answer of a service that does answer; see `pacing` for one that does not
+LONGEST_RESEND_S: Final = 6.0
+# share of the delay, either way: agents that lost one router do not return in step
+JITTER: Final = 0.25
+
+
+class ResendSchedule:
+    """Schedule of the batches in `held`: which are in flight, and which are sent again when."""
+
+    def __init__(self, held: HeldBatches, first_resend_s: float, seed: int) -> None:
+        self.first_resend_s = first_resend_s
+        self._held = held
+        self._random = random.Random(seed)
+        self._pacers: dict[tuple[str, int], Pacer] = {}
+        self._later: list[tuple[float, int]] = []  # heap of when what flies is given up
+
+    def remove_all(self) -> None:
+        """Forget all batches."""
+        self._pacers = {}
+        self._later = []
+
+    def _pacer_of(self, batch: HeldBatch) -> Pacer:
+        return self._pacers.setdefault((batch.stream.vehicle, batch.stream.region), Pacer())
+
+    def _random_jitter(self) -> float:
+        return self._random.uniform(1 - JITTER, 1 + JITTER)
+
+    def queue_batch(self, key: int) -> None:
+        """Queue a batch, to be sent as soon as its pacer allows."""
+        self._pacer_of(self._held[key]).queue_batch(key)
+
+    def mark_in_flight(self, key: int, now: float) -> None:
+        """Mark the batch with this key as in flight (sent and not answered), and set the time of
+        its next resend.
+        """
+        batch = self._held[key]
+        delay = min(
+            max(LONGEST_RESEND_S, self.first_resend_s),
+            self.first_resend_s * 2.0 ** min(batch.attempts, 16),
+        )
+        batch.attempts += 1
+        batch.due = now + delay * self._random_jitter()
+        heapq.heappush(self._later, (batch.due, key))
+        self._pacer_of(batch).record_sent(now)
+
+    def send_or_queue(self, key: int, now: float) -> bool:
+        """Mark a new batch as in flight and return True. If the service of its region is silent,
+        queue it and return False.
+        """
+        if self._pacer_of(self._held[key]).silent:
+            self.queue_batch(key)
+            return False
+        self.mark_in_flight(key, now)
+        return True
+
+    def record_answer(self, stream: Stream) -> None:
+        """Record that an acknowledgement arrived for any batch of the stream's vehicle and
+        region.
+        """
+        pacer = self._pacers.get((stream.vehicle, stream.region))
+        if pacer is not None:
+            pacer.record_answer()
+
+    def record_removal(self, batch: HeldBatch) -> None:
+        """Record that a batch was removed from the outbox."""
+        if batch.due is not None:
+            self._pacer_of(batch).record_settled()
+
+    def reset_in_flight(self, vehicle: str, now: float) -> None:
+        """Treat all batches of a vehicle that are in flight (sent and not answered) as lost,
+        because the vehicle has just reconnected.
+        """
+        for (name, _), pacer in self._pacers.items():
+            if name == vehicle:
+                pacer.record_reconnect(now)
+        for _, key in self._later:
+            if key not in self._held:
+                continue
+            batch = self._held[key]
+            if batch.stream.vehicle == vehicle and batch.due is not None:
+                batch.due = None
+                batch.attempts = 0
+                self.queue_batch(key)
+
+    def expire_batches(self, now: float) -> Iterator[int]:
+        """Queue the batches that were not answered in time. Yield the key of each that was passed
+        over (see `HeldBatches.is_passed_over`) instead; the caller removes it before it goes on.
+        """
+        while self._later and self._later[0][0] <= now:
+            at, key = heapq.heappop(self._later)
+            if key not in self._held or self._held[key].due != at:
+                continue
+            batch = self._held[key]
+            batch.due = None
+            self._pacer_of(batch).record_timeout(now, self._random_jitter())
+            if self._held.is_passed_over(batch):
+                yield key
+            else:
+                self.queue_batch(key)
+
+    def take_due(self, now: float, limit: int, vehicles: Collection[str] | None) -> list[int]:
+        """Return the keys of at most `limit` batches to send now, oldest first, of the given
+        vehicles or of all vehicles, and mark them as in flight.
+        """
+        keys: list[int] = []
+        for (vehicle, _), pacer in self._pacers.items():
+            if vehicles is None or vehicle in vehicles:
+                taken = pacer.take_due(now, self._random_jitter(), limit - len(keys), self._held)
+                for key in taken:
+                    self.mark_in_flight(key, now)
+                keys += taken
+        self._pacers = {
+            name: pacer for name, pacer in self._pacers.items() if not pacer.is_idle or pacer.silent
+        }
+        return sorted(keys)
+
+    def unanswered_s(self, now: float) -> float:
+        """Return the time [s] for which sent batches have been unanswered, in the region with the
+        longest wait; 0 if no batch waits.
+        """
+        since = (pacer.unanswered_since for pacer in list(self._pacers.values()))
+        return max((now - one for one in since if one is not None), default=0.0)

@@ -1,0 +1,96 @@
+"""Bucket under the lease and the fence of its owner: who may write, and which objects are valid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from fleet_service.archive.format import layout
+from fleet_service.replication.bucket import ObjectBucket
+from fleet_service.replication.fence import Fence, Term, fence_of, put_fence
+
+
+class FencedBucket:
+    """Bucket of a replica, with the lease of its owner if there is one, and with the fence against
+    former owners.
+
+    Attributes:
+        objects: the bucket.
+        may_write: function that returns True if this service certainly has the lease.
+        assert_alone: function that checks in the bucket that no later lease exists; None without
+            a lease. It raises CopyError if a later lease exists or the check fails.
+    """
+
+    def __init__(self, objects: ObjectBucket) -> None:
+        self.objects = objects
+        self.may_write: Callable[[], bool] = lambda: True
+        self.assert_alone: Callable[[], None] | None = None
+        self._term = Term(0, 0)
+        self._fence = Fence(0, frozenset())
+        self._turn = 0
+
+    def attach_lease(self, may_write: Callable[[], bool], assert_alone: Callable[[], None]) -> None:
+        """From now on, write to the bucket only while this service has the lease; see the
+        attributes.
+        """
+        self.may_write = may_write
+        self.assert_alone = assert_alone
+
+    def require_lease(self) -> None:
+        """Check in the bucket that no later lease exists.
+
+        Raises:
+            CopyError: a later lease exists, or the check fails.
+        """
+        if self.assert_alone is not None:
+            self.assert_alone()
+
+    def list_valid(self) -> dict[str, int]:
+        """Return names and sizes [bytes] of the objects that are valid according to the bucket's
+        fence (list of valid objects).
+
+        Raises:
+            CopyError: the bucket cannot be read.
+        """
+        there = self.objects.list_sizes()
+        fence = fence_of(self.objects)
+        return {name: size for name, size in there.items() if fence.counts_object(name)}
+
+    def raise_fence(self, term: Term, names: Iterable[str]) -> None:
+        """Write a fence (list of valid objects) for this term of ownership: objects that appear
+        later are valid only if their names contain the epoch of the term. Delete objects that are
+        not valid.
+
+        `names` are the names of the archive's files.
+        """
+        older = [name for name in names if (layout.term_of(name) or term.epoch) < term.epoch]
+        fence = Fence(term.epoch, frozenset(older))
+        self._put_fence(term, fence)
+        self.require_lease()
+        for name in self.objects.list_sizes():
+            if not fence.counts_object(name):  # no service writes this name again
+                self.objects.delete(name)
+
+    def admit_objects(self, names: Iterable[str]) -> None:
+        """Add uploaded objects to the fence if they would not be valid without it: files that were
+        compacted by a service that started before.
+        """
+        if strays := [name for name in names if not self._fence.counts_object(name)]:
+            fence = self._fence._replace(names=self._fence.names.union(strays))
+            self._put_fence(self._term, fence)
+
+    def _put_fence(self, term: Term, fence: Fence) -> None:
+        self._turn += 1
+        put_fence(self.objects, term.number, self._turn, fence)
+        self._term = term
+        self._fence = fence
+
+    def create_key(self, name: str, content: bytes, bucket: ObjectBucket) -> None:
+        """Upload a file of keys whose name must be new. The exception is a file that a former
+        service uploaded after it had lost its lease: it belongs to rows that are not valid, and is
+        replaced.
+        """
+        if self.assert_alone is None or bucket.create(name, content):
+            bucket.put_new(name, content)
+        else:
+            self.assert_alone()
+            bucket.put(name, content)

@@ -1,0 +1,99 @@
+"""Upload and download of single files between an archive's folder and its bucket replica. The
+journal of the uploads records each file that both have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from fleet_service.archive.format.files import sync_tree
+from fleet_service.archive.format.layout import CHECKPOINTS
+from fleet_service.replication.bucket import ObjectBucket
+from fleet_service.replication.fenced_bucket import FencedBucket
+from fleet_service.replication.replica_files import KEYS, LOG, MANIFEST, ReplicaFiles, is_copied
+from fleet_service.replication.upload_journal import UploadJournal, stamp_of
+from schemas.runtime.durable import open_durably
+
+
+class FileTransfer:
+    """Transfer of files between the folder and the bucket, several at once in `pool`."""
+
+    def __init__(
+        self,
+        files: ReplicaFiles,
+        bucket: FencedBucket,
+        journal: UploadJournal,
+        pool: ThreadPoolExecutor,
+    ) -> None:
+        self._files = files
+        self._bucket = bucket
+        self._journal = journal
+        self._pool = pool
+
+    def upload_file(self, path: Path, bucket: ObjectBucket) -> None:
+        """Upload a file through `bucket`, whose requests have their own time limit.
+
+        Raises:
+            CopyError: it is unknown whether the upload succeeded.
+            FileNotFoundError: the file has been removed meanwhile.
+        """
+        name = self._files.name_of(path)
+        stamp = stamp_of(path)
+        is_new = self._journal.find_stamp(name) is None
+        if is_new and name.startswith(LOG):
+            bucket.put_new(name, path.read_bytes())
+        elif is_new and name.endswith(".key"):
+            self._bucket.create_key(name, path.read_bytes(), bucket)
+        elif name.startswith(KEYS):
+            # who the vehicles are grows meanwhile, and is then put again
+            bucket.put(name, path.read_bytes())
+        else:
+            bucket.put(name, path)
+        self._journal.add(name, stamp)
+
+    def upload_if_present(self, name: str) -> bool:
+        """Upload a file; return False if the file has been removed meanwhile."""
+        try:
+            self.upload_file(self._files.path_of(name), self._bucket.objects)
+        except FileNotFoundError:
+            return False
+        return True
+
+    def download_missing(self, there: Mapping[str, int]) -> int:
+        """Download the files that only the bucket has; return their number. Also remove from the
+        journal the entries of files that the bucket lacks.
+
+        `there` are the names and sizes of the valid objects.
+        """
+        local = self._files.list_files()
+        for name in self._journal.copy_stamps():
+            if name not in there or (name in local and local[name].size != there[name]):
+                self._journal.remove(name)
+        known = self._journal.copy_stamps()
+        whole = {name.rpartition("/")[0] for name in there if name.endswith(f"/{MANIFEST}")}
+        wanted = [
+            name
+            for name in there
+            if name not in local
+            and is_copied(name)
+            and (name not in known or self._files.set_aside_path(name).exists())
+            and (not name.startswith(CHECKPOINTS) or name.rpartition("/")[0] in whole)
+        ]
+        list(self._pool.map(self._download_file, wanted))
+        paths = [self._files.path_of(name) for name in wanted]
+        sync_tree(self._files.root, {path.parent for path in paths})
+        # only now: power loss would else make them look deleted
+        for name, path in zip(wanted, paths, strict=True):
+            self._journal.add(name, stamp_of(path))
+            self._files.set_aside_path(name).unlink(missing_ok=True)
+        return len(wanted)
+
+    def _download_file(self, name: str) -> None:
+        path = self._files.path_of(name)
+        secret = name.startswith(KEYS)
+        path.parent.mkdir(mode=0o700 if secret else 0o777, parents=True, exist_ok=True)
+        with open_durably(path, 0o600 if secret else None, named=False) as file:
+            for part in self._bucket.objects.read_parts(name):
+                file.write(part)

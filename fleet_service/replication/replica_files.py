@@ -1,0 +1,76 @@
+"""Files of an archive that belong into its bucket replica, as they are on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from fleet_service.archive.format.layout import CHECKPOINTS
+from fleet_service.archive.format.load import BAD
+from fleet_service.replication.upload_journal import Stamp, stamp_of
+
+LOG: Final = "inbox/"
+KEYS: Final = "keys/"
+# In this order they are looked through: compaction adds to the later ones before it takes from the
+# log, and retention rolls up before it takes from the observations, so that what has gone from one
+# is found in the next.
+FOLDERS: Final = (
+    "inbox",
+    "observations",
+    "states",
+    "rollup",
+    "map",
+    "weather",
+    CHECKPOINTS,
+    "keys",
+)
+MANIFEST: Final = "manifest.json"  # of a checkpoint: without it the folder is none
+_PRIVATE: Final = ("tried",)  # notes of this disk
+
+
+class ReplicaFiles:
+    """Files below the folder `root` of an archive that belong into its replica. Objects in the
+    bucket have the names of the files, relative to the folder.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def name_of(self, path: Path) -> str:
+        """Return the name of a file's object."""
+        return path.relative_to(self.root).as_posix()
+
+    def path_of(self, name: str) -> Path:
+        """Return the path of an object's file."""
+        return self.root / name
+
+    def set_aside_path(self, name: str) -> Path:
+        """Return the path to which a damaged file is renamed."""
+        return self.root / f"{name}{BAD}"
+
+    def list_files(self, folders: Iterable[str] = FOLDERS) -> dict[str, Stamp]:
+        """Return names and stamps (size and time) of the files, in the order of the folders."""
+        found: dict[str, Stamp] = {}
+        paths = (path for one in folders for path in sorted((self.root / one).rglob("*")))
+        for path in paths:
+            name = self.name_of(path)
+            if is_copied(name):
+                with suppress(FileNotFoundError):
+                    if path.is_file():
+                        found[name] = stamp_of(path)
+        return found
+
+
+def is_copied(name: str) -> bool:
+    """Return True if a file of this name belongs into the copy; drafts and damaged files do not."""
+    folder, *rest = name.split("/")
+    hidden = any(part.startswith(".") for part in rest)
+    return (
+        folder in FOLDERS
+        and bool(rest)
+        and not hidden
+        and not name.endswith(BAD)
+        and rest[-1] not in _PRIVATE
+    )
