@@ -30,7 +30,9 @@ def find_chromium() -> str | None:
 
 
 class Opened:
-    """Page that was opened in the browser, with its errors and its network requests."""
+    """Page that is open in the browser, with the errors that it reported and the network requests
+    that it made.
+    """
 
     def __init__(self, page: Page) -> None:
         self.page = page

@@ -9,7 +9,7 @@ from pathlib import Path
 
 def circles_of(modules: Mapping[Path, ast.Module]) -> list[str]:
     """Return one text per group of modules that import each other in a circle; imports inside
-    functions count.
+    functions count too.
 
     Args:
         modules: syntax trees by path below the root.
@@ -34,7 +34,9 @@ def _module_name(path: Path) -> str:
 
 
 def _run_time_nodes(tree: ast.Module) -> list[ast.AST]:
-    """Return the nodes of a syntax tree, without blocks that only the type checker reads."""
+    """Return the nodes of a syntax tree, without blocks that only the type checker reads (`if
+    TYPE_CHECKING`).
+    """
     found: list[ast.AST] = []
     waiting: list[ast.AST] = [tree]
     while waiting:

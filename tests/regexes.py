@@ -39,8 +39,8 @@ Characters = frozenset[int]
 
 
 class Part(NamedTuple):
-    """Part of a sequence in a pattern: the characters that it can match, whether it may be empty,
-    and whether it repeats without bound.
+    """Part of a sequence in a regular expression: the characters that it can match, True if it may
+    be empty, and True if it repeats without bound.
     """
 
     characters: Characters
@@ -61,8 +61,8 @@ def is_superlinear(pattern: str) -> bool:
 
 
 def _is_ambiguous(sequence: list[Any]) -> bool:
-    """Return True if an unbounded repeat contains another repeat, or meets one of the same
-    characters.
+    """Return True if a sequence of a regular expression can match a text in many ways: an unbounded
+    repeat contains another one, or is followed by one of the same characters.
     """
     parts = [_describe_part(item) for item in sequence]
     for k, part in enumerate(parts):
@@ -82,15 +82,15 @@ def _is_ambiguous(sequence: list[Any]) -> bool:
 
 
 def _never_fails(parts: list[Part], start: int) -> bool:
-    """Return True if everything after a repeat is optional, so that the matcher never backtracks
-    into the repeat.
+    """Return True if everything from the part `start` on is optional, so that the matcher never
+    fails there and never backtracks into an earlier repeat.
     """
     return all(part.is_optional for part in parts[start + 1 :])
 
 
 def _holds_repeat(item: Any) -> bool:  # noqa: ANN401 the parser's own tuples
-    """Return True if a repeated group ends with a repeat of characters with which it can begin
-    again.
+    """Return True if a repeated group ends with a repeat of characters with which the group can
+    begin again, so that the matcher can divide a text in many ways.
     """
     parts = [_describe_part(one) for one in _open_groups(item[1][2])]
     if not any(part.is_unbounded for part in parts):
@@ -109,8 +109,8 @@ def _holds_repeat(item: Any) -> bool:  # noqa: ANN401 the parser's own tuples
 
 
 def _find_sequences(parsed: Any) -> Iterator[list[Any]]:  # noqa: ANN401
-    """Yield every sequence of a parsed pattern, with the content of unrepeated groups merged into
-    it.
+    """Yield every sequence (parts that match one after the other) of a parsed regular expression;
+    the content of unrepeated groups is merged into it.
     """
     yield _open_groups(parsed)
     for name, value in parsed:

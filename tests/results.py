@@ -315,7 +315,9 @@ def keep_figures(name: str, source: Path) -> str:
 
 
 def _is_wanted(name: str, row: Row, before: dict[str, Row]) -> bool:
-    """Return True if a figure has a target, is already stored, or belongs to a table."""
+    """Return True if a measured figure must be stored: it has a target, is already stored, or
+    belongs to a table of the results page.
+    """
     shown = any(table.names.match(row["name"]) for table in TABLES if table.campaign == name)
     return row["bar"] is not None or row["name"] in before or shown
 

@@ -37,7 +37,7 @@ RETRY = {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1
 
 def make_enrolment(**changed: object) -> Enrolment:
     """Return an enrolment of two routers, a service, a reader and two vehicles; `changed` replaces
-    fields of the enrolment.
+    fields of it.
     """
     names = {
         "services": [SERVICE],
@@ -56,7 +56,9 @@ def open_registry(folder: Path) -> Registry:
 
 
 def settings(endpoint: str, folder: Path, **changed: object) -> ZenohSettings:
-    """Return the Zenoh settings of a session; `changed` are entries of its TLS section."""
+    """Return the Zenoh settings of a session with a router at `endpoint`, with certificates from
+    `folder`; `changed` replaces entries of the TLS section.
+    """
     tls = {
         "root_ca_certificate": str(folder / "trust.pem"),
         "connect_certificate": str(folder / "{name}.pem"),

@@ -58,8 +58,8 @@ def room_of(name: str) -> tuple[str, str]:
 
 
 def list_room_imports(root: Path, package: str) -> dict[tuple[str, str], str]:
-    """Return the pairs of sub-packages of a package of which the first imports the second, each
-    with one file and line.
+    """Return the pairs (first, second) of sub-packages of a package in which the first imports the
+    second, each with one file and line.
     """
     found: dict[tuple[str, str], str] = {}
     for path in list_sources(root, package):
@@ -136,8 +136,8 @@ def functions(root: Path, *packages: str) -> Iterator[tuple[str, FunctionNode]]:
 
 
 def room_arrows(root: Path, folder: str) -> Places:
-    """Return the pairs of sub-packages (or modules) of a folder of which the first imports the
-    second.
+    """Return the pairs (first, second) of sub-packages or modules of a folder in which the first
+    imports the second.
     """
     base = folder.replace("/", ".")
     found: dict[tuple[str, str], str] = {}
@@ -272,10 +272,11 @@ def many_locals(root: Path) -> Places:
 
 
 def named_constants(root: Path) -> Places:
-    """Return the named numbers in the packages that process data between sensor and map.
+    """Return the named numbers in the folders of code that process data between sensor and map
+    (`CONSTANT_ROOMS`).
 
     Counted are module constants (capital letters) and fields of classes called …Constants whose
-    value is a number or an expression of numbers, in `CONSTANT_ROOMS`.
+    value is a number or an expression of numbers.
     """
     found = []
     for path in list_sources(root, *CONSTANT_ROOMS):
@@ -320,7 +321,8 @@ LIBRARY_CALLS: Final = ("visit_", "on_", "log_message")
 
 
 def only_tests_use(root: Path) -> Places:
-    """Return the lines of product functions and classes whose name occurs only in tests.
+    """Return the places of product functions and classes whose name occurs only in tests, so that
+    the product does not need them.
 
     A name counts as used if any other line of product, deployment, Makefile, pages or examples
     contains it. Functions with a decorator other than `property` are left out, because the

@@ -351,8 +351,8 @@ def test_demo_and_plain_commands_load_without_optional_packages(modules: str) ->
 
 
 def test_demo_extra_brings_what_its_processes_need(tmp_path: Path) -> None:
-    """The extra `demo` must install the packages for the demo's metrics and page. If a process
-    cannot start, the error must contain the reason that the process printed.
+    """The extra `demo` must install the packages for the demo's metrics and page. If a process of
+    the demo cannot start, the demo's error must contain the reason that the process printed.
     """
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     names = {re.split(r"[<>=]", one)[0] for one in extras["optional-dependencies"]["demo"]}

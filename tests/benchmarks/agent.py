@@ -55,7 +55,7 @@ def agent() -> list[Figure]:
 
 
 def simulate_drive(folder: Path, name: str, seed: int, seconds: float) -> tuple[Path, Path]:
-    """Simulate a drive, and return the paths of its log and its vehicle file."""
+    """Simulate a drive, and return the paths of its signal log and its vehicle file."""
     log = folder / f"{name}.parquet"
     vehicle = folder / f"{name}.json"
     files = [

@@ -62,7 +62,7 @@ def print_progress(line: str) -> None:
 
 
 def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
-    """Return the median duration [s] of several calls of a function."""
+    """Return the median duration [s] of `rounds` calls of a function."""
     spent = []
     for _ in range(rounds):
         began = time.perf_counter()
@@ -72,7 +72,7 @@ def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
 
 
 def write_stations(folder: Path) -> Path:
-    """Write hourly readings of five weather stations, and return the path of the file."""
+    """Write a file with made-up hourly readings of five weather stations, and return its path."""
     hours = np.arange(DAYS * 24)
     names = np.repeat([f"station-{k}" for k in range(5)], len(hours))
     place = np.repeat(np.arange(5), len(hours))
@@ -166,8 +166,8 @@ def write_small_archive(root: Path) -> dict[int, pa.Table]:
 
 
 def measure_agreement(root: Path, readings: Path) -> list[Figure]:
-    """Count files that a validator refuses, programs that cannot read the archive, and questions
-    with different answers from two engines.
+    """Count files that a validator refuses, programs that cannot read the archive, and questions to
+    which the two query engines give different answers. Return the counts.
     """
     invalid = sum(bool(_find_refusals(path)) for path in _geo_files(root))
     expected = sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["seq"]))
@@ -238,7 +238,7 @@ def _count_differences(root: Path, readings: Path) -> int:
 
 @contextmanager
 def open_folder() -> Iterator[Path]:
-    """Yield an empty folder for the archives. It is removed afterwards, but the figures are not."""
+    """Yield an empty folder for the archives of the benchmark, which is removed afterwards."""
     FOLDER.mkdir(exist_ok=True)
     work = FOLDER / "work"
     shutil.rmtree(work, ignore_errors=True)

@@ -1,5 +1,5 @@
-"""Benchmark of a second copy: acknowledgement times of a service with a bucket copy and of one
-without, measured in turn.
+"""Benchmark of a second copy: acknowledgement times of a service whose archive has a copy in a
+bucket (object storage), and of one without. They are measured in turn.
 
 The bucket is on a real S3 server in a separate process of this machine. A bucket over a network
 adds its network delay.
@@ -27,7 +27,9 @@ BAR = 2.0
 
 
 def delays_s(folder: Path, archive: dict[str, Any]) -> list[float]:
-    """Return the acknowledgement times [s] of a new service with these archive settings."""
+    """Start a service with these archive settings, send it reports, and return the times [s] until
+    their acknowledgements.
+    """
     with ExitStack() as stack:
         router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
         stack.enter_context(router)

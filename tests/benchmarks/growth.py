@@ -2,9 +2,10 @@
 second.
 
 A message has ten observations, and each vehicle sends one message per second, so a higher rate
-means more vehicles. The engine ingests one second of messages in turns, and then does the other
-work of a second: segment (file of new rows), acknowledgements, tiles. The clock is simulated, so
-that rates above the machine's capacity can be measured. There is no network.
+means more vehicles. The engine (service without network) ingests one second of messages in
+portions. It then does the other work of a second: segment (file of new rows), acknowledgements,
+tiles. The clock is simulated, so that rates above the machine's capacity can be measured. There is
+no network.
 """
 
 from __future__ import annotations

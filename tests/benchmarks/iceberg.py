@@ -32,8 +32,8 @@ def table_of(uri: str, kind: Kind) -> Table:
 
 
 def rows_different(root: Path, uri: str) -> int:
-    """Return the number of rows that occur in the compacted files and in the tables a different
-    number of times, compared in all columns.
+    """Return the number of rows, compared in all columns, that occur more often in the archive's
+    compacted files than in the Iceberg tables, or less often.
     """
     different = 0
     for kind in Kind:

@@ -77,7 +77,8 @@ def setting_row(memberships: Memberships) -> FloatArray:
 
 
 def first_memory(first: FloatArray, speed: float) -> FloatArray:
-    """Return the initial filters as rows (N, doubles) in the layout of the kernels' C structures.
+    """Return the memory of N filters in their initial state, as rows (N, doubles) in the layout of
+    the C kernels' structures.
 
     Args:
         first: first readings (N, 11): ax, ay, yaw rate, steering angles delta and wheel speeds
@@ -125,8 +126,8 @@ class Limit:
         self._memory = first_memory(first, speed)
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
-        """Run all filters over the readings (T, N, 11), which are `gone` seconds apart. Return the
-        mean of each filter's state after each reading, (T, N, 6).
+        """Run all filters over T successive readings (T, N, 11) of the sensors, which are `gone`
+        seconds apart. Return the mean of each filter's state after each reading, (T, N, 6).
         """
         samples, vehicles, _ = readings.shape
         out = np.empty((samples, vehicles, STATES))
@@ -161,8 +162,8 @@ class VectorLimit:
         )
 
     def side_by_side(self, values: FloatArray) -> FloatArray:
-        """Rearrange values (..., N, numbers) of N vehicles to (..., N/lanes, numbers, lanes),
-        aligned to a SIMD vector.
+        """Rearrange values (..., N, numbers) of N vehicles to (..., N/lanes, numbers, lanes), so
+        that `lanes` vehicles lie side by side in a SIMD vector; the array is aligned to a vector.
         """
         *rest, vehicles, numbers = values.shape
         turned = values.reshape(*rest, vehicles // self._lanes, self._lanes, numbers).swapaxes(

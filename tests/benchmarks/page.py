@@ -262,8 +262,9 @@ def bytes_per_cell(on: Stage) -> float:
 
 
 async def _measure_pushes(on: Stage, count: int) -> float:
-    """Return the 95 % quantile of the time [s] from a publication until each watcher has received
-    it, or infinity if a watcher missed one.
+    """Let `count` watchers (event streams of browsers) receive changes of the page. Return the 95 %
+    quantile of the time [s] from a publication until each has received it; infinity if a watcher
+    missed one.
     """
     host, _, port = on.address.removeprefix("http://").rstrip("/").partition(":")
     heard = [dict[int, float]() for _ in range(count)]
@@ -308,8 +309,8 @@ def _fetch_page(address: str) -> bytes:
 
 
 def count_watchers(on: Stage) -> float:
-    """Return the number of watchers that get 95 % of the updates within a second from a page on one
-    core, or 0 if already the smallest tested number is too large.
+    """Return the largest tested number of watchers (event streams of browsers) that get 95 % of the
+    updates within a second from a page on one core; 0 if the smallest tested number is too large.
     """
     pin_to_core(on.process, 0)
     for count in WATCHERS:

@@ -93,8 +93,9 @@ def is_valid() -> Callable[[bytes], bool] | None:
 
 
 def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
-    """Make STEPS DATEX II publications of simulated alerts. Return two numbers: invalid
-    publications, and situations that were not ended although their alert was over.
+    """Make STEPS DATEX II publications of simulated alerts; `valid` validates each. Return the
+    number of invalid publications, and the number of situations that were not ended although their
+    alert was over.
 
     The alerts of cells on a road begin and end at random. A count is NaN if the schema is not
     installed, or if hardly any alert ended.
@@ -153,9 +154,9 @@ def measure_publication() -> dict[str, float]:
     """Return figures by name of the page's DATEX II publication and features, from a service and
     six cars on ice that melts.
 
-    `leaked`: cells of situations that the map does not call measured. `unended`: situations that
-    are still open when their alert is over. `readers_failed`: failures among GDAL, geopandas and,
-    if installed, ogrinfo.
+    `leaked`: number of cells in published situations for which the map has only a lower bound or an
+    estimate, and no measurement. `unended`: situations that are still open when their alert is
+    over. `readers_failed`: failures among GDAL, geopandas and, if installed, ogrinfo.
     """
     street.PARTS["melted"] = street.PARTS["ice"]._replace(mu=0.85)
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
@@ -269,8 +270,9 @@ def ogrinfo_opens(address: str) -> bool:
 
 
 def join_right() -> float:
-    """Return the share of positions joined to the right road link (`roads.join_right`), from an
-    earlier `make roads-bench` of this commit or measured now.
+    """Return the share of positions that are assigned to the right road link (figure
+    `roads.join_right`). It is taken from an earlier `make roads-bench` of this commit, or measured
+    now.
     """
     path = roads.FOLDER / "figures.json"
     rows = json.loads(path.read_text()) if path.exists() else [{}]

@@ -51,7 +51,8 @@ class Town:
 
     def local_marker(self, tile: int) -> int:
         """Return the index of a tile's marker cell. The number of each publication is stored as the
-        vehicle count of this cell, so that a reader can recognise the publication.
+        vehicle count of this cell, so that a test that reads the tile can recognise the
+        publication.
         """
         return int(self.tiles[tile]["cell"][0]) & 0x3FFF
 
@@ -110,7 +111,9 @@ class Town:
 
 
 class Stage(NamedTuple):
-    """Address of the page, a Zenoh session, the town, and the process of the page."""
+    """Test set-up of the page benchmark: address of the page, a Zenoh session, the simulated town,
+    and the process of the page.
+    """
 
     address: str
     session: zenoh.Session
@@ -121,7 +124,9 @@ class Stage(NamedTuple):
 
 @contextmanager
 def open_stage(seed: int) -> Iterator[Stage]:
-    """Yield the running set-up; the page runs in a separate process."""
+    """Yield the running test set-up: router, simulated service, and the page, which runs in a
+    separate process.
+    """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     settings = ZenohSettings(connect=endpoints)
     town = Town(seed)

@@ -18,8 +18,8 @@ PYTHON_STEPS = 300  # enough for a median: these are slow
 
 
 class Problem(NamedTuple):
-    """Input of the compared filters: vehicle parameters, sensor readings, speed at the first
-    reading, and time between readings.
+    """Input of the compared filters: vehicle parameters (12,), sensor readings (T, 11), speed at
+    the first reading [m/s], and time between readings [s].
     """
 
     row: FloatArray  # (12,) of the vehicle
@@ -38,7 +38,9 @@ class Problem(NamedTuple):
 
 
 class Peer(NamedTuple):
-    """Filter of a library, and the required ratio of our bank's speed to that of the library."""
+    """Filter made with another library, and the smallest accepted ratio of our bank's speed to its
+    speed.
+    """
 
     drive: Callable[[Problem], object]
     bar: float

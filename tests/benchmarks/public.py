@@ -1,5 +1,5 @@
-"""Benchmark of privacy: cost for cells that a lone vehicle visited, compared with a map that shows
-every visit.
+"""Benchmark of the privacy rules (a cell is shown only after visits of several vehicles): their
+cost per cell and visit, compared with a map that shows every visit.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def public() -> list[Figure]:
 
 
 class _Map:
-    """Map of CELLS cells that readers may see. Each cell was visited by one more vehicle since
-    readers last received it.
+    """Map of CELLS cells that readers may see. Since readers last received it, each cell was
+    visited by one more vehicle, so that every cell has unpublished data.
     """
 
     def __init__(self, least: int) -> None:

@@ -113,7 +113,9 @@ def load(endpoint: str) -> None:
 
 
 def bare(endpoint: str, folder: str) -> None:
-    """Answer every query with the bytes of one of two files, until this process is ended."""
+    """Run a bare Zenoh queryable, for comparison: answer every query with the bytes of one of two
+    files in `folder`, until this process is ended.
+    """
     session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None
 
@@ -159,8 +161,8 @@ def poll_until(something: Callable[[], object]) -> None:
 
 
 def durations_ms(*works: Callable[[], object]) -> list[list[float]]:
-    """Return for each function its durations [ms] in QUERIES rounds; in each round the functions
-    run in turn.
+    """Call the given functions one after the other in each of QUERIES rounds; return, for each
+    function, its durations [ms].
     """
     out: list[list[float]] = [[] for _ in works]
     for _ in range(QUERIES):

@@ -66,8 +66,8 @@ def shards() -> list[Figure]:
 
 
 def engines_s(bursts: Sequence[Sequence[Message]], processes: int) -> list[float]:
-    """Return the time [s] from the start signal to the last acknowledgement of every burst except
-    the first.
+    """Let engines in `processes` processes ingest bursts of messages. Return, for every burst
+    except the first, the time [s] from the start signal to its last acknowledgement.
     """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -138,8 +138,8 @@ def list_regions(burst: Sequence[Message]) -> list[str]:
 
 
 def services_s(bursts: Sequence[Sequence[Message]], services: int) -> list[float]:
-    """Return the time [s] from the first message to the last acknowledgement of every burst except
-    the first.
+    """Send bursts of messages to `services` services over Zenoh. Return, for every burst except the
+    first, the time [s] from its first message to its last acknowledgement.
     """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))

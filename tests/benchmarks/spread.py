@@ -100,8 +100,8 @@ def rebuild_difference(folder: Path) -> float:
 
 
 def replay_scaling(logs: Sequence[Path], folder: Path) -> float:
-    """Return drives per second on two local cores divided by that on one core, the median of
-    alternating rounds with warm workers.
+    """Return the speed-up by a second core: drives per second on Spark with two local cores,
+    divided by those with one core. It is the median of alternating rounds with warm workers.
     """
     tasks = [
         Task(log, log.with_suffix(".json"), folder / f"{log.stem}-{copy}.parquet")

@@ -2,8 +2,8 @@
 the later rows.
 
 The checkpoint is requested by a background thread, as in the service, while a worker ingests
-messages. The restart is a separate process: imports, checkpoint, later rows, kernels, session,
-ready.
+messages. The restart runs in a separate process; its time covers imports, the checkpoint, the later
+rows, loading of compiled code, and the Zenoh session, until the service is ready.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def state() -> list[Figure]:
 
 
 def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> tuple[float, float]:
-    """Return the time [s] from the request until the checkpoint is on disk, and the worker's
-    longest turn meanwhile [s].
+    """Return two times [s]: from the request until the checkpoint is on disk, and the longest pass
+    of the worker's loop meanwhile.
 
     All messages of `sent` are ingested, half of them after the checkpoint.
     """

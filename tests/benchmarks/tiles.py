@@ -89,7 +89,9 @@ def make_visit(vehicle: int, turn: int) -> Batch:
 
 
 class Acks:
-    """Record of when each batch was sent, and how long it waited for its acknowledgement."""
+    """Record of the time at which each batch was sent, and of its waiting time for the
+    acknowledgement.
+    """
 
     def __init__(self, session: zenoh.Session) -> None:
         self.put: dict[tuple[str, int], float] = {}
@@ -161,7 +163,9 @@ def drive(endpoint: str) -> None:
 
 
 def read(endpoint: str) -> None:
-    """Query the whole map again and again, and print a line for each complete answer."""
+    """Query the whole map repeatedly until the process is ended, and print a line for each complete
+    answer.
+    """
     session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None
     while True:

@@ -1,5 +1,5 @@
-"""The clients in other languages in `deploy/examples/clients`: built if their tools are installed,
-and run with a router and a service.
+"""The clients in other languages in `deploy/examples/clients`: functions that build each client if
+its tools are installed, and run it with a router and a service.
 """
 
 from __future__ import annotations
@@ -92,7 +92,9 @@ def _run(words: list[str], folder: Path) -> str:
 
 @contextmanager
 def served_map(folder: Path) -> Iterator[str]:
-    """Yield the endpoint of a router with a service, both in separate processes."""
+    """Yield the endpoint of a router to which a service is connected; both run in separate
+    processes.
+    """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     config = folder / "service.json"
     config.write_text(json.dumps({"zenoh": {"connect": endpoints}, "segment_s": 0.1, "put_s": 0.1}))

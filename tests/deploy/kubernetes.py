@@ -178,7 +178,9 @@ class Cluster:
         return text.replace('"metrics_host": "0.0.0.0"', '"metrics_host": "127.0.0.1"')
 
     def _localize_paths(self, pod: Pod, container: Manifest, text: str) -> str:
-        """Return a text with container mounts replaced by paths below the pod's folder."""
+        """Return a text with the mount paths of a container replaced by paths below the pod's
+        folder.
+        """
         for mount in sorted(
             container.get("volumeMounts", []), key=lambda one: -len(one["mountPath"])
         ):
@@ -191,7 +193,9 @@ class Cluster:
         return pod.root / str(mount["name"])
 
     def _fill_volumes(self, pod: Pod) -> None:
-        """Write the files of a pod's volumes into the mounted folders."""
+        """Write the files that a pod's volumes (configuration maps, secrets) contain into the
+        folders that stand for the mounts.
+        """
         volumes = {one["name"]: one for one in pod.template["spec"]["volumes"]}
         for container in [*pod.template["spec"].get("initContainers", []), *pod.containers]:
             for mount in container.get("volumeMounts", []):
@@ -207,7 +211,9 @@ class Cluster:
                     self._unpack_certificates(pod, container, folder)
 
     def _unpack_certificates(self, pod: Pod, container: Manifest, folder: Path) -> None:
-        """Write the files that the documented command puts into a secret of certificates."""
+        """Write the certificates that the documentation's command puts into a secret, as files into
+        the folder of the mount.
+        """
         of = pod.name.rpartition("-")[0]
         for path in [*self.certificates.glob(f"{of}-*.*"), self.certificates / "trust.pem"]:
             (folder / path.name).write_text(self._localize_paths(pod, container, path.read_text()))
@@ -357,7 +363,9 @@ def _bucket_environment(bucket: BucketServer) -> dict[str, str]:
 
 @contextmanager
 def open_cluster(overlay: str, root: Path) -> Iterator[Cluster]:
-    """Yield a running overlay, with a bucket if its pods need one."""
+    """Yield a simulated cluster in which the pods of an overlay run, with a bucket if the pods need
+    one.
+    """
     made = Cluster(overlay, root)
     wanted = any("envFrom" in container for pod in made.pods for container in pod.containers)
     with ExitStack() as stack:

@@ -34,7 +34,9 @@ START_NS = 1_767_225_600_000_000_000  # 2026-01-01
 
 @dataclass(frozen=True)
 class MadeUp:
-    """Synthetic output of an estimator bank. It does not depend on the vehicles' signals."""
+    """Synthetic output of an estimator bank, prepared by a test; it does not depend on the
+    vehicles' signals.
+    """
 
     vx: FloatArray
     vy: FloatArray
@@ -94,8 +96,8 @@ def ground(
 
 
 def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
-    """Return a block (signals of some samples) of vehicles that turn at random and lose their
-    positions now and then; some have no yaw.
+    """Return a block (signals of some samples) of vehicles that turn at random and now and then
+    receive no position; some vehicles have no yaw signal.
     """
     rng = np.random.default_rng(seed)
     yaw = np.cumsum(rng.normal(0.0, 0.1, (samples, vehicles)), axis=0)
@@ -112,8 +114,8 @@ def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
 
 @dataclass
 class Watch:
-    """State of the vehicles of a test between blocks of samples: their tracks (recent positions)
-    and their open visits (cells that they have not left yet).
+    """State of the vehicles of a test that is kept between blocks of samples: their tracks (recent
+    positions) and their open visits (passes through cells that they have not left yet).
     """
 
     tracks: RecordArray

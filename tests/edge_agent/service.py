@@ -58,8 +58,8 @@ class Router:
 
 @dataclass
 class Service:
-    """Simulated service that stores received messages. It acknowledges them while `answer` is set;
-    `refuse(batch)` may return a reason to reject a batch.
+    """Simulated service that stores received messages. It acknowledges them while the event
+    `answer` is set; the function `refuse(batch)` may return a reason to reject a batch.
     """
 
     router: Router

@@ -251,8 +251,8 @@ def test_every_option_of_every_command_is_in_a_table() -> None:
 
 
 def test_the_tests_that_show_an_option_give_it_to_the_command() -> None:
-    """Tests in other modules that are listed for an option must use this option. This test reads
-    their source.
+    """The tables name, for some options, a test in another module. Each named test must use its
+    option. This test reads the source of the named tests.
     """
     texts = [
         path.read_text()
@@ -401,7 +401,9 @@ def test_replay_depends_on_log_vehicle_estimator_and_configuration(tmp_path: Pat
 def record_blocks(
     scenario: str = "test", seed: int = 4, rate: float = 50.0, seconds: float = 12.0
 ) -> tuple[Block, SimulatedFleet]:
-    """Simulate a small fleet. Return its blocks of samples joined into one block, and the fleet."""
+    """Simulate a small fleet for `seconds`. Return its blocks of samples, joined into one block,
+    and the simulated fleet.
+    """
     fleet = SimulatedFleet(scenario, vehicles=2, seed=seed, rate_hz=rate)
     source = blocks(fleet, rate)
     parts = [next(source) for _ in range(round(10 * seconds))]

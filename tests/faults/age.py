@@ -92,8 +92,8 @@ def run(site: Site) -> list[Figure]:
 
 
 def _measure_smaller(site: Site, millions: float) -> tuple[dict[str, float], dict[str, float]]:
-    """Generate an archive of `millions` million observations, and return the figures of a start
-    from a checkpoint and of a query about the past.
+    """Generate an archive of `millions` million observations, and return the figures of a service's
+    start from a checkpoint and of a query about the past on it.
     """
     root = _ensure_archive(site, site.folder / f"age-{millions:g}", round(millions * 1e6))
     ready, past = _measure_archive(root)
@@ -183,7 +183,9 @@ def _encode_past_query(root: Path) -> bytes:
 
 
 def _measure_process(what: str, root: Path, asked: bytes = b"") -> dict[str, float]:
-    """Run `age_process` on an archive, and return the figures that it prints."""
+    """Run the operation `what` of the program `age_process` on an archive, and return the figures
+    that it prints.
+    """
     command = [sys.executable, "-m", "tests.faults.age_process", what, str(root)]
     done = subprocess.run(command, input=asked, stdout=subprocess.PIPE, check=True)
     found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])

@@ -106,8 +106,8 @@ def _record_alert(heard: dict[Place, float], sample: zenoh.Sample) -> None:
 
 
 def _make_ice_batches(turn: int, places: int) -> list[Batch]:
-    """Return batches that report ice in `places` new cells, each cell reported by every vehicle
-    that is needed for an alert.
+    """Return batches that report ice in `places` new cells. Each cell is reported by as many
+    vehicles as an alert needs.
     """
     latitude = LATITUDE + APART * turn
     longitudes = [LONGITUDE + APART * place for place in range(places)]

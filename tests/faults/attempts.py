@@ -163,7 +163,9 @@ def false_router_with_the_certificate_of_a_vehicle(ground: Ground) -> bool:
 
 
 def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
-    """Publish a message on each key. Return True if any listener receives one of these messages."""
+    """Publish a message on each of the given Zenoh keys through the attacker's session. Return True
+    if any listener receives one of these messages.
+    """
     for expression in expressions:
         session.put(expression, SECRET + expression.encode())
     ground.await_effects(session)
@@ -363,7 +365,9 @@ def who_is_alive_is_told_to_a_vehicle(ground: Ground) -> bool:
 
 
 def as_router(ground: Ground, mode: str) -> bool:
-    """Connect as a router or peer, so that messages of others might pass the attacker."""
+    """Connect to the fleet's router as a router or peer, so that messages of others might pass
+    through the attacker. Return True if this succeeds.
+    """
     given = settings(ground.network.endpoints[ROUTERS[1]], ground.folder)
     given = given.model_copy(
         update={"config": {**given.config, "mode": mode, "listen/endpoints": []}}
@@ -504,7 +508,9 @@ def administration_of_the_routers(ground: Ground) -> bool:
 
 @register_attempt
 def revoked_vehicle(ground: Ground) -> bool:
-    """Connect with the certificate of a name that was removed from the access list."""
+    """Connect with the certificate of a name that was removed from the access list. Return True if
+    this succeeds.
+    """
     network = ground.network
     lost = {
         f"connect_{part}": str(ground.folder / f"lost.{end}")

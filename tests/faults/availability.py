@@ -146,7 +146,7 @@ def _ask_service_past(target: Target) -> bool:
 
 @contextmanager
 def _loops(work: Callable[[], object]) -> Iterator[None]:
-    """Repeat `work` in LOOPS threads for the duration of the `with` block."""
+    """Call `work` again and again in LOOPS threads for the duration of the `with` block."""
     stop = threading.Event()
 
     def go_on() -> None:
@@ -183,8 +183,8 @@ def _loop_service_past(target: Target) -> Attack:
 
 @contextmanager
 def _loop_service(target: Target, query: str) -> Iterator[None]:
-    """Send a query to the service again and again, in LOOPS threads of one session, during the
-    block.
+    """Send a query to the service again and again during the `with` block, in LOOPS threads that
+    share one session.
     """
     session = open_session(ZenohSettings(connect=[target.endpoint]))
     assert session is not None

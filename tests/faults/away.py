@@ -78,7 +78,9 @@ def _make_message(one: StoredBatch) -> Message:
 
 
 def _make_draft(car: int, now: float) -> tuple[Draft, int]:
-    """Return the reports of a car for half a second, and their cell. Each car has its own road."""
+    """Return a batch (not yet stored) with a car's reports of half a second, and the cell of these
+    reports. Each car has its own road.
+    """
     latitude = PLACE[0] + 2 * CELL_DEG * car
     longitude = PLACE[1] + CELL_DEG * int(now)
     cell = int(grid.cell_of(latitude, longitude))

@@ -202,6 +202,8 @@ BARS: Final = {
 
 
 def make_figure(name: str, value: float) -> Figure:
-    """Return a figure with unit and target from BARS. Raise KeyError for an unknown name."""
+    """Return the figure called `name` with its value, and with unit and target from the table BARS.
+    Raise KeyError for an unknown name.
+    """
     unit, bar, better = BARS[name]
     return Figure(name, value, unit, bar, better)

@@ -52,8 +52,9 @@ class Told(NamedTuple):
     settled: dict[Name, float]
 
     def longest_wait(self, since: float) -> float:
-        """Return the time [s] from `since` until all batches that were stored before `since` are
-        settled. The result is infinite if one of these batches was never settled.
+        """Return the time [s] from `since` until all batches that an outbox had stored before
+        `since` were settled (finally answered). The result is infinite if one of these batches was
+        never settled.
         """
         waits = [
             self.settled.get(name, float("inf")) - since
@@ -101,8 +102,8 @@ def compare_with_archive(journals: Iterable[Path], archive: Path) -> Census:
 
 
 def _doubled_outside(archive: Path) -> int:
-    """Return the number of rows that appear twice for a program that reads the compacted files
-    directly, without the rules of the archive format.
+    """Return the number of rows that appear twice for a foreign program: one that reads all
+    compacted files directly and ignores the rules of the archive format.
     """
     paths = list(layout.compacted_files(archive, Kind.OBSERVATION))
     whole = [pq.read_table(path, columns=ROW, partitioning=None) for path in paths]

@@ -105,8 +105,8 @@ def _run_case(root: Path, case: Case, found: Found, seconds: int) -> None:
     seq = 0
 
     def drive(engine: Engine, clock: SteadyClock, steps: int) -> None:
-        """For `steps` seconds, let all vehicles report and send their previous batches once more,
-        and then run the service's jobs.
+        """Simulate `steps` seconds: let all vehicles report and send their previous batches once
+        more, and then run the service's jobs.
         """
         nonlocal seq
         for _ in range(steps):
@@ -178,7 +178,7 @@ def _make_message(vehicle: int, seq: int, at: int) -> Message:
 
 
 def _count_rows(root: Path) -> Counter[tuple[int, int]]:
-    """Return the number of archived rows per (boot, seq). The vehicle is left out because its
+    """Return the number of archived rows per (boot, seq). The vehicle is not used, because its
     pseudonym differs from month to month.
     """
     tables = list(reading.read_tables(root, Kind.OBSERVATION, ["boot", "seq"]))

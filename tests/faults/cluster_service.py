@@ -36,8 +36,8 @@ def _print_mark(sign: str, what: str) -> None:
 def run(
     what: str, module: str, words: Sequence[str], stop: threading.Event, told: str | None = None
 ) -> str | None:
-    """Run a module in a subprocess as the service does, and print when the subprocess begins and
-    ends.
+    """Run a module in a subprocess as the service does, and print a line when the subprocess begins
+    and when it ends.
     """
     _print_mark(BEGINS, COMPACTING)
     output = _run(what, module, words, stop, told)
@@ -46,8 +46,8 @@ def run(
 
 
 def sync_and_report(copy: BucketReplica) -> int:
-    """Run one sync of the bucket copy, and print its end if it uploaded anything. Return the number
-    of changes.
+    """Run one sync of the archive's bucket copy, and print a line at its end if it uploaded
+    anything. Return the number of changed objects.
     """
     _copying.at = False
     changed = _follow(copy)
@@ -57,7 +57,9 @@ def sync_and_report(copy: BucketReplica) -> int:
 
 
 def put_there(transfer: FileTransfer, name: str) -> bool:
-    """Upload one file, and print the beginning of the first upload of a sync."""
+    """Upload one file to the bucket copy. At the first upload of a sync, print a line first, so
+    that a campaign can interrupt the sync.
+    """
     if getattr(_copying, "at", None) is False:
         _copying.at = True
         _print_mark(BEGINS, COPYING)

@@ -66,7 +66,9 @@ def write_town_archive(root: Path) -> str:
 
 
 class Journals:
-    """Batches that were acknowledged to the load generators, updated as acknowledgements arrive."""
+    """Reader of the load generators' journals: times of acknowledged batches, updated as
+    acknowledgements arrive.
+    """
 
     def __init__(self, paths: Iterable[Path]) -> None:
         self._paths = list(paths)
@@ -189,7 +191,9 @@ Go = Callable[[Host, random.Random, float], None]
 
 
 class Way(NamedTuple):
-    """Kind of failure of a service, and the lease time [s] of this service."""
+    """One way in which a campaign lets a service fail: a function that causes the failure (`go`;
+    its last argument is the lease time [s]), and a function that ends it.
+    """
 
     go: Go
     end: Callable[[Host, random.Random], None] = lambda host, _: host.part.kill()
@@ -255,8 +259,8 @@ WAYS: Final = {
 
 
 class Failover(NamedTuple):
-    """Result of a failure: its actual kind, and the time [s] until the next acknowledgement to a
-    vehicle.
+    """Result of one failover: the actual kind of failure, and the time [s] until a vehicle received
+    the next acknowledgement.
     """
 
     way: str
@@ -345,8 +349,8 @@ class Machines:
         return former
 
     def pause_s(self, router: ZenohSettings) -> float:
-        """Hand the region over under load, and return the longest time [s] without any
-        acknowledgement.
+        """Hand the region over to the standby under load, and return the longest time [s] without
+        any acknowledgement.
         """
         began = self._journals.first_after(time.time())
         self.hand_over(router)
@@ -354,8 +358,8 @@ class Machines:
         return self._journals.longest_pause(began)
 
     def map_difference(self, router: ZenohSettings, parts: list[Part]) -> float:
-        """Hand the region over without load, and return the largest difference between the states
-        of both services, read from their checkpoints.
+        """Stop the load and hand the region over. Return the largest difference between the states
+        of the old and the new service, which are read from their checkpoints.
         """
         for part in parts:
             part.send_signal(signal.SIGSTOP)

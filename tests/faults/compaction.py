@@ -37,8 +37,8 @@ UNTIL_KILL_S: Final = (0.0, 0.6)  # since it began: a round takes a tenth of a s
 
 
 class Writing:
-    """Thread that writes batches to the log until it is closed. Every seq up to `acknowledged` is
-    durable.
+    """Thread that writes numbered batches to the segment log until it is closed. Every batch with a
+    number up to `acknowledged` is durable.
     """
 
     def __init__(self, root: Path) -> None:
@@ -97,7 +97,7 @@ def read_compacted(root: Path) -> Iterable[pa.Table]:
 
 
 def is_complete(tables: Iterable[pa.Table], owed: int) -> bool:
-    """Return True if every row of batches 1 to `owed` is present, and no row occurs twice."""
+    """Return True if the tables contain every row of the batches 1 to `owed`, and no row twice."""
     rows = Counter(
         p for t in tables for p in zip(t["seq"].to_pylist(), t["row"].to_pylist(), strict=True)
     )

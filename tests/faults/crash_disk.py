@@ -33,7 +33,7 @@ class PowerLoss(BaseException):
 
 
 class CrashDisk:
-    """Durable content of a folder.
+    """Simulated disk: the content of a folder that would survive a power loss.
 
     Args:
         live: the folder; empty, or an image that `write_image` made.
@@ -76,7 +76,7 @@ class CrashDisk:
         return self._numbers
 
     def _keep_content(self, path: Path) -> None:
-        """Record the durable content of a file that is about to lose its name."""
+        """Record the durable content of a file that is about to be renamed, removed or replaced."""
         if path.is_file():
             self._written[self._number[path.stat().st_ino]] = path.read_bytes()
 

@@ -1,5 +1,6 @@
-"""Histories of an archive on a disk with power loss. A history has a few lives: each except the
-last ends by power loss at a random operation, and the next life starts from the surviving files.
+"""Histories of an archive on a disk with power loss. A history consists of a few lives (runs of the
+program). Each life except the last ends by power loss at a random operation, and the next life
+starts from the surviving files.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ class Lives(ABC, Generic[BatchType]):
         full_after: upper limit of the number of operations until the disk may be full for a
             short time.
         acknowledged: batches that were acknowledged.
-        at_stake: number of batches that were acknowledged before a power loss.
+        at_stake: number of batches that were acknowledged before a power loss and might therefore
+            have been lost.
     """
 
     lives: ClassVar[int]
@@ -38,7 +40,9 @@ class Lives(ABC, Generic[BatchType]):
         self.at_stake = 0
 
     def find_violations(self) -> list[str]:
-        """Run the history and return the errors found in it."""
+        """Run the history, and return a message for each broken promise, such as a lost
+        acknowledged row.
+        """
         live = self.folder / "life-0"
         live.mkdir()
         found: list[str] = []
@@ -64,7 +68,9 @@ class Lives(ABC, Generic[BatchType]):
 
     @abstractmethod
     def _find_problems(self, root: Path, last: bool) -> list[str]:
-        """Read the archive as the next life finds it, and return its errors."""
+        """Read the archive as the next life (run of the program) finds it, and return a message for
+        each error in it.
+        """
 
     def _pass_time(self) -> None:
         """Change the archive between two lives, as the passing of time or an operator would."""

@@ -184,8 +184,8 @@ def _run_log(number: int) -> tuple[list[str], int]:
 
 
 def _run_outbox(number: int) -> tuple[list[str], int]:
-    """Return the violations found in one history of the outbox, and 0 because nothing is
-    acknowledged.
+    """Return the violations found in one history of the outbox, and 0 for the number of
+    acknowledged batches, which an outbox does not have.
     """
     return spool_history(number), 0
 

@@ -268,8 +268,9 @@ class ServiceHistory(Lives[Sent]):
         return found
 
     def _find_lost(self, rows: Counter[int], last: bool) -> list[str]:
-        """Return one message per acknowledged batch with missing rows. In the last life this also
-        covers unacknowledged batches, because every vehicle has sent its batches again.
+        """Return one message per acknowledged batch of which rows are missing. In the last life,
+        unacknowledged batches are checked too, because by then every vehicle has sent its batches
+        again.
         """
         owed = [
             one for one in self.sent if one in self.acknowledged or (last and self._may_come(one))
@@ -336,7 +337,9 @@ class ServiceHistory(Lives[Sent]):
 
 
 def _compute_boot(vehicle: str) -> int:
-    """Return the boot number that `examples.batch` gives to a vehicle's batches."""
+    """Return the boot number (identifier of the vehicle's start) that `examples.batch` gives to a
+    vehicle's batches.
+    """
     return 1 + sum(vehicle.encode())
 
 

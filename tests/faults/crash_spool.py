@@ -82,7 +82,9 @@ def _run_history(random_: random.Random, folder: Path) -> list[str]:
 
 
 def _tear_write(random_: random.Random, before: Files, after: Files) -> Files:
-    """Return a possible content of the files after power loss during a commit."""
+    """Return a random possible content of SQLite's files after power loss during a commit that
+    changes them from `before` to `after`.
+    """
     if before.database != after.database and random_.random() < 0.5:
         pages = range(0, max(len(before.database), len(after.database)), PAGE)
         chosen = (

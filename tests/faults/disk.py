@@ -158,8 +158,8 @@ def run(site: Site) -> list[Figure]:
 
 
 def _drive(engine: Engine, since: int, steps: int) -> int:
-    """Run load on the service for `steps` seconds, and return the number of acknowledged
-    batches.
+    """Let simulated vehicles report to the service for `steps` seconds, and return the number of
+    acknowledged batches.
     """
     got = 0
     for seq in range(since + 1, since + steps + 1):
@@ -193,8 +193,8 @@ def _until_settled(engine: Engine) -> int:
 
 
 def _until_done(engine: Engine) -> int:
-    """Wait, with free space again, until each job has succeeded once. Return the number of rows
-    acknowledged meanwhile.
+    """After space on the disk has become free, wait until each background job has succeeded once.
+    Return the number of rows acknowledged meanwhile.
     """
     got = 0
     deadline = time.monotonic() + STUCK_S
@@ -224,8 +224,8 @@ def _room_made(engine: Engine, folder: Path) -> int:
 
 
 def _outbox_recovers(folder: Path, mounted: bool) -> bool:
-    """Return True if an outbox refuses messages on a full disk, keeps the accepted ones, and
-    continues with free space.
+    """Return True if an outbox refuses batches on a full disk, keeps those that it accepted before,
+    and continues when there is space again.
     """
     outbox = Outbox(folder / "spool.sqlite", boot=5)
     draft = Draft("car-a", Kind.OBSERVATION, 77, 1, lambda seq, first: bytes(60_000))

@@ -163,7 +163,7 @@ def run(site: Site) -> list[Figure]:
 
 
 def _start_service(folder: Path, running: Network) -> subprocess.Popen[bytes]:
-    """Start the service as a separate process, and return when it accepts messages."""
+    """Start the service as a separate process, and return it when it accepts messages."""
     config = ServiceConfig(
         zenoh=settings(running.endpoints[ROUTERS[0]], running.folder), name=SERVICE
     )

@@ -49,13 +49,15 @@ class Listener:
         self.heard.append((str(sample.key_expr), put, sample.payload.to_bytes()))
 
     def has_payload(self, payload: bytes) -> bool:
-        """Return True if the listener received a message that contains this payload."""
+        """Return True if the listener (subscriber that observes the effects of an attack) received
+        a message that contains this payload.
+        """
         return any(payload in told for _, _, told in list(self.heard))
 
 
 class Ground:
-    """Environment of an attack. The attacker is enrolled as a vehicle and connected to the second
-    router.
+    """Environment of an attack: running routers, service and listeners. The attacker is enrolled as
+    a vehicle and connected to the second router.
     """
 
     def __init__(self, network: Network, service: Service, stack: ExitStack) -> None:
@@ -117,7 +119,9 @@ class Ground:
         return False
 
     def await_judgement(self) -> None:
-        """Wait until the service has processed and counted every message that reached it before."""
+        """Wait until the service has processed and counted every message that reached it before
+        this call.
+        """
         self.drive()
 
     def await_effects(self, session: zenoh.Session, *listeners: Listener) -> None:

@@ -221,8 +221,8 @@ def _run_round(
 
 
 def _choose_victims(there: Stage, random_: random.Random) -> list[Part]:
-    """Return the processes to kill, one or several at random. Router or service are chosen as often
-    as agents alone.
+    """Return one or several random processes to kill. Router and service are each among them in 45
+    % of the cases; the others are agents.
     """
     chosen = [part for part in (there.router, there.service) if random_.random() < 0.45]
     return chosen + random_.sample(

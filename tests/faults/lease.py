@@ -17,8 +17,8 @@ from tests.faults.lease_histories import ServiceHistory, judge_history
 
 
 class Judged(NamedTuple):
-    """Sums over all simulated lease histories: violations, failovers, acknowledgements and
-    refusals.
+    """Sums over all simulated lease histories: violations (broken promises), failovers,
+    acknowledgements, and refused starts.
     """
 
     acknowledged_by_two: int

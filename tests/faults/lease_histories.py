@@ -39,9 +39,9 @@ _SILENT: Final = logging.Logger("silent", logging.CRITICAL + 1)
 
 
 class Event(NamedTuple):
-    """Event of a history: a service with a lease number begins to serve and knows some batches
-    (`serves`), or acknowledges batches (`acknowledges`); at the end a reader finds the batches that
-    count (`reads`).
+    """Event of a history, of one of three kinds. `serves`: a service with a lease number begins to
+    serve and knows some batches. `acknowledges`: it acknowledges batches. `reads`: at the end, a
+    reader finds the batches that count.
     """
 
     kind: str
@@ -131,8 +131,8 @@ class VirtualTime:
         return actor
 
     def sleep(self, seconds: float) -> None:
-        """Let the running thread sleep for `seconds` of true time, and longer while its process is
-        frozen.
+        """Let the running thread sleep for `seconds` of simulated true time; it sleeps longer if
+        its process is frozen meanwhile.
         """
         actor = self._actor
         assert actor is not None
@@ -184,8 +184,8 @@ class VirtualTime:
 
 
 class VirtualStop:
-    """Event like `threading.Event`, whose wait takes virtual time by the clock of the running
-    process.
+    """Event like `threading.Event` for threads in virtual time: waiting takes virtual time,
+    measured by the clock of the waiting process.
     """
 
     def __init__(self, world: VirtualTime) -> None:
@@ -365,7 +365,9 @@ class ServiceHistory:
         return set(batches)
 
     def _accept_batch(self, lease: Lease, known: set[int]) -> None:
-        """Upload a batch that a vehicle offers, and acknowledge it if the lease allows it."""
+        """Upload a batch that a simulated vehicle offers to the bucket, and acknowledge it if the
+        service's lease allows this.
+        """
         self._world.sleep(self._random.uniform(0.0, 0.3))
         offered = range(int(self._world.now * BATCHES_PER_S) + 1)
         waiting = [batch for batch in offered if batch not in self._acknowledged]

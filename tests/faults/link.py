@@ -105,8 +105,8 @@ class Namespaces:
     def start_process(
         self, namespace: str, module: str, given: dict[str, Any]
     ) -> subprocess.Popen[str]:
-        """Start a process of the campaign in a namespace. It is ended with the campaign at the
-        latest.
+        """Start a process of the campaign in a network namespace. If it still runs at the end of
+        the campaign, it is ended then.
         """
         inside = ["ip", "netns", "exec", namespace] if namespace else []
         return self._open_process([*inside, sys.executable, "-m", module, json.dumps(given)])
@@ -193,7 +193,9 @@ def read_line(process: subprocess.Popen[str]) -> str:
 
 
 def finish_end(process: subprocess.Popen[str]) -> dict[str, Any]:
-    """Close the stdin of an endpoint, and return the result that it then prints."""
+    """Close the stdin of an endpoint's process (see `link_ends.py`), which ends it, and return the
+    result that it then prints.
+    """
     assert process.stdin is not None
     process.stdin.close()
     found: dict[str, Any] = json.loads(read_line(process))
@@ -319,7 +321,7 @@ def return_with_tls(site: Site, outages_s: Sequence[float]) -> float:
 
 def measure_flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, float]:
     """Return two figures: the p99 delay of honest messages with a flooding car, divided by that
-    without, and the rate of flood messages that passed [1/s].
+    without, and the rate of messages of the flooding car that passed the router [1/s].
     """
     with open_namespaces(site.folder / f"flood-{capped}") as there:
         there.start_router(capped=capped)

@@ -146,7 +146,9 @@ def _load_agents(there: Stage, processes: int) -> None:
 
 
 def _is_settled(there: Stage) -> bool:
-    """Return True if every batch stored by now is settled within DRAIN_S."""
+    """Return True if every batch that the agents have stored by now is settled (finally answered)
+    within DRAIN_S seconds.
+    """
     since = time.time()
     deadline = time.monotonic() + DRAIN_S
     while time.monotonic() < deadline:

@@ -98,8 +98,8 @@ def _make_messages(batches: Sequence[Batch]) -> list[Message]:
 
 
 def _drive_teleports(site: Site, count: int) -> tuple[int, int]:
-    """Return the number of teleports that were fused, and the number of honest rows that were not
-    fused.
+    """Let `count` cars drive honestly and each report one distant place too (a teleport). Return
+    the number of teleports that were fused, and the number of honest rows that were not fused.
     """
     rng = np.random.default_rng(site.seed)
     start = time.time_ns() - 7200 * SECOND
@@ -142,7 +142,9 @@ def _drive_teleports(site: Site, count: int) -> tuple[int, int]:
 
 
 def _far_away(kind: str, name: str, start: int, rng: np.random.Generator) -> list[Batch]:
-    """Return batches that report a place far from the car's path, at about the same time."""
+    """Return batches of the car `name` that report a place far from its path at about the time of
+    its true reports. `kind` is the way in which the false report is sent (see module).
+    """
     far = rng.uniform(FAR_M, 4e5) * np.exp(1j * rng.uniform(0, 2 * np.pi))
     second = {"before": -5, "between": 14.5}.get(kind, 31.0)
     if (

@@ -55,7 +55,9 @@ ICE: Final = 0.12
 
 
 class Trip(NamedTuple):
-    """Cells and sectors of a trip as the agent publishes it, one visit a second."""
+    """Cells and heading sectors of a trip in the order in which the agent publishes them, one visit
+    a second.
+    """
 
     cell: IntArray
     sector: IntArray
@@ -157,8 +159,8 @@ class Town:
 
 
 def _suspects(before: pa.Table | None, after: pa.Table) -> Iterator[tuple[float, int]]:
-    """Yield (size of change, cell) for each cell that changed in a way that ageing does not
-    explain.
+    """Yield (size of change, cell) for each cell whose published values changed by more than ageing
+    explains; these cells betray a passing vehicle.
     """
     known = {}
     if before is not None:
@@ -277,8 +279,8 @@ def run(site: Site) -> list[Figure]:
 
 
 def _control(folder: Path) -> float:
-    """Return how much more often than by chance the reader finds the place if every visit is shown
-    at once.
+    """Return how much more often than by chance the reader finds the car's place if the map shows
+    every visit at once, as a control of the method.
     """
     with patch.object(TileCache, "source", property(lambda tiles: tiles.state.fusion)):
         town = Town(folder, 0)

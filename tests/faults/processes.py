@@ -115,7 +115,9 @@ class Part:
 
 
 class Stage:
-    """Router and service, and the load generators added to them."""
+    """Test system of a campaign: router and service, and the load generators that are added to
+    them, as processes.
+    """
 
     def __init__(self, folder: Path, **service: object) -> None:
         self.folder = folder

@@ -36,7 +36,9 @@ NOT_YET: Final = -1
 
 
 class Rules(NamedTuple):
-    """Rules of the protocol, and the lease times [ticks] of both services."""
+    """Rules of the modelled protocol that are switched on, and the lease times [ticks] of both
+    services.
+    """
 
     lease: tuple[int, int] = (4, 4)
     compares_lease: bool = True
@@ -131,8 +133,8 @@ class Checked(NamedTuple):
 
 
 def explore_states(rules: Rules, most_number: int = 2, most_turn: int = 3) -> Checked:
-    """Visit all states with at most `most_number` lease numbers and `most_turn` turns. Stop at the
-    first violation.
+    """Visit all reachable states of the model with at most `most_number` lease numbers and
+    `most_turn` renewals per lease. Stop at the first violation.
     """
     start = World((Service(), Service()))
     came: dict[World, tuple[World, str] | None] = {start: None}
@@ -158,7 +160,9 @@ def _steps_to(world: World, came: dict[World, tuple[World, str] | None]) -> tupl
 
 
 def list_counted(world: World) -> list[int]:
-    """Return the batches that count for a reader of the bucket; a batch may occur twice."""
+    """Return the batches that a reader of the bucket must count in a state of the model; a batch
+    occurs twice if it is stored twice.
+    """
     number, before = world.fence
     return [batch for batch, epoch in world.objects if epoch >= number or (batch, epoch) in before]
 
@@ -181,7 +185,9 @@ def find_problem(world: World) -> str:
 def list_steps(
     world: World, rules: Rules, most_number: int, most_turn: int
 ) -> Iterator[tuple[str, World]]:
-    """Yield the name of each possible step and the state after it."""
+    """Yield, for each step that the model can take from the state `world`, its name and the state
+    after it.
+    """
     for slow in (NOT_YET, *NAMES):
         if slow == NOT_YET or (
             not world.services[slow].slow and world.services[slow].role == "serving"

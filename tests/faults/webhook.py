@@ -129,7 +129,7 @@ def _read_request(client: socket.socket) -> tuple[bytes, bytes]:
 
 
 def make_stretch(number: int) -> StretchAlert:
-    """Return a road-section alert with a number as its id."""
+    """Return an alert of a road stretch whose id is `number`."""
     return StretchAlert(
         id=f"id-{number}",
         state="raised",

@@ -28,7 +28,9 @@ Numbers: TypeAlias = Sequence[float] | NDArray[np.floating[Any]] | NDArray[np.in
 
 
 def value(mu: Numbers, std: float = STD) -> FloatArray:
-    """Return log-likelihoods (n, 32) of visits that measured the friction `mu`."""
+    """Return log-likelihoods (n, 32) of visits that measured the friction `mu` (n,) with standard
+    deviation `std`.
+    """
     return np.asarray(-0.5 * np.square((mugrid.CENTRES - np.asarray(mu, float)[:, None]) / std))
 
 
@@ -46,7 +48,9 @@ def observations(
     cell: int | Numbers = CELL,
     second: int = -1,
 ) -> Observations:
-    """Return observations of visits at the times START + seconds, numbered in this order."""
+    """Return observations of visits (n,) to a cell at the times START + `seconds`; their sequence
+    numbers follow this order.
+    """
     n = len(seconds)
     whole = np.zeros(n, np.int64)
     time = START + (np.asarray(seconds, float) * SECOND).astype(np.int64)

@@ -414,7 +414,9 @@ FAR: Final = (LATITUDE, LONGITUDE + 0.05)
 
 
 def there(name: str, mu: float) -> wire.Batch:
-    """Return a batch whose visits lie in another tile of the same region."""
+    """Return a batch of the vehicle `name` with friction `mu` whose visits lie in another tile of
+    the same region.
+    """
     cell = int(grid.cell_of(*FAR))
     return batch(
         name, 2, time.time_ns() - SECOND, [mu], latitude=[FAR[0]], longitude=[FAR[1]], cell=[cell]

@@ -36,8 +36,8 @@ Show = Callable[[ServiceConfig, Path], object]
 
 
 def open_engine(config: ServiceConfig, root: Path) -> Iterator[Engine]:
-    """Yield an engine that has ingested reports of three cars: of now and of minutes ago, of ten
-    minutes ago, and of a minute ahead.
+    """Yield an engine with the setting under test that has ingested reports of three cars: with the
+    present time and minutes old, ten minutes old, and dated a minute ahead.
     """
     with closing(Engine(config, root)) as engine:
         now = time.time_ns()
@@ -84,8 +84,8 @@ def of_service(look: Callable[[Service], object]) -> Show:
 
 
 def let_in(made: Service) -> list[bool]:
-    """Let two vehicles each send 60 messages of 40 kB. Return, for each message, True if the rate
-    limit admits it.
+    """Let two vehicles each send 60 messages of 40 kB to a service with the setting under test.
+    Return, for each message, True if the rate limit admits it.
     """
     return [
         made.inbox._limits.allows(key(name), 40_000)
@@ -101,8 +101,8 @@ def count_queued(made: Service) -> int:
 
 
 def turns(made: Service) -> tuple[int, int]:
-    """Return two numbers from ten simulated worker turns of .3 s each: segments written, and rounds
-    in which tiles are published.
+    """Return two numbers from ten simulated passes of the service's worker loop, .3 s each:
+    segments (files of new rows) written, and rounds in which tiles are published.
     """
     clock = [time.monotonic()]
     calls = {"begin_flush": 0, "take_dirty": 0}
@@ -128,8 +128,8 @@ def turns(made: Service) -> tuple[int, int]:
 
 
 def count_far_moves(config: ServiceConfig, root: Path) -> int:
-    """Return the number of implausible moves that are refused when one sender reports two distant
-    places at once.
+    """Return the number of reports that are excluded as implausible moves if one sender reports two
+    distant places at once.
     """
     now = time.time_ns()
     with closing(Engine(config, root)) as engine:

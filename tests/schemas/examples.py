@@ -48,7 +48,7 @@ def batch(kind: Kind, rows: int = 3) -> Batch:
 
 
 def batch_of_version_1(kind: Kind) -> Batch:
-    """Return the batch of `batch` without the columns that later versions added."""
+    """Return the same batch as `batch`, but without the columns that versions after 1 added."""
     whole = batch(kind)
     return replace(
         whole, columns={name: c for name, c in whole.columns.items() if name not in LATER}

@@ -54,7 +54,7 @@ DAY: Final = ("--from", "2026-01-27", "--to", "2026-01-28")
 
 
 class House:
-    """Folder with an archive, shared by all measurements, and the printed notes."""
+    """Working folder that all measurements share: it contains a synthetic archive."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -120,8 +120,8 @@ def pages_with_errors(house: House) -> float:
 
 
 def live_page(house: House) -> tuple[str, list[str], list[str]] | None:
-    """Return the faults (errors and requests to other hosts) of the live page with a service and
-    cars on ice, or None if there are none.
+    """Open the live page with a service and cars on ice. Return (name, errors, requests to other
+    hosts), or None if there are none.
     """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     connection = ZenohSettings(connect=endpoints)
@@ -160,8 +160,8 @@ def service_ready_s(house: House) -> float:
 
 
 def bound_painted(house: House) -> float:
-    """Return the number of outputs in which a cell with only a lower bound has a number that could
-    be shown as a colour.
+    """Return the number of outputs in which a cell with only a lower bound has a value of friction
+    that could be shown as a colour.
     """
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "tests/test_bounds_unpainted.py"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -264,8 +264,8 @@ def install_packages(house: House) -> float:
 
 
 def silent_reasons(house: House) -> float:
-    """Return the number of causes for which an agent publishes nothing and that it names within
-    five seconds.
+    """Return the number of tested causes of an agent's silence (it publishes nothing) that the
+    agent names within five seconds.
     """
     path = "tests/edge_agent/app/test_publishing_reasons.py"
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "-k", "planted_cause", path]

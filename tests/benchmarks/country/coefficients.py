@@ -1,5 +1,5 @@
 """Memory cost of a service per vehicle, per cell, and per pair of cell and vehicle, measured with
-an engine in a separate process.
+an engine (service without network) in a separate process.
 
 Each run ingests the same number of observations, in messages that differ only in the varied
 quantity. Therefore the window of late observations has the same size in all runs.

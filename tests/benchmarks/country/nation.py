@@ -45,9 +45,9 @@ class Look(NamedTuple):
     """Sample of the run at one moment.
 
     `time` is the time since the beginning [s]. `memory` is the memory of each process except the
-    sender [MB], the minimum since the previous sample, because a segment temporarily needs 20 MB.
-    `spent` is the processor time of each process [s]. `cells`, `rows` (admitted) and `queued`
-    (waiting messages) are numbers per service.
+    sender [MB]: the minimum since the previous sample, because writing a segment (file of new rows)
+    temporarily needs 20 MB. `spent` is the processor time of each process [s]. `cells`, `rows`
+    (admitted) and `queued` (waiting messages) are numbers per service.
     """
 
     time: float
@@ -219,8 +219,8 @@ def _watch_parts(parts: Sequence[Part], services: Sequence[Service], sender: Par
 
 
 def _update_least(before: list[float], parts: Sequence[Part]) -> list[float]:
-    """Return for each process except the last (the sender) the smaller of two values [MB]: its
-    earlier memory and its memory now.
+    """Return the smallest memory [MB] seen so far of each process except the last (the sender): the
+    smaller of its value in `before` and its memory now.
     """
     return [min(then, memory_mb(part)) for then, part in zip(before, parts[:-1], strict=True)]
 
@@ -248,8 +248,8 @@ def _save_course(folder: Path, looks: Sequence[Look]) -> None:
 
 
 def _make_wait_figures(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure]:
-    """Return figures of the waiting times of all batches sent in the measured ten minutes, and of
-    the batches of the slowest regions.
+    """Return figures of the time from sending to acknowledgement: of all batches sent in the
+    measured ten minutes, and of those in the slowest regions.
     """
     measured = (put >= WARM_S) & (put < WARM_S + MEASURED_S)
     waits = np.where(np.isnan(wait), np.inf, wait)

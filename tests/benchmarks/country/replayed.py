@@ -2,7 +2,7 @@
 
     regions    17, 17 and 16 in three zones side by side, one service per zone
     towns      four in a region; regions have different sizes, proportional to 1/sqrt(rank)
-    vehicles   each repeats a part of the drive of one vehicle of the city, moved by whole tiles;
+    vehicles   each repeats a part of the drive of one vehicle of the city, shifted by whole tiles;
                vehicles of one town with the same drive are spread evenly over it
     reports    each vehicle sends ROWS visits every PERIOD_S, and these visits last PERIOD_S, as in
                slow traffic
@@ -40,7 +40,7 @@ _CELLS: Final = 1 << (grid.CELL_ZOOM - grid.TILE_ZOOM)  # of a tile's side
 
 
 class Chunk(NamedTuple):
-    """ROWS visits that one vehicle made one after the other.
+    """ROWS successive visits of one vehicle (passes through cells), which are sent as one batch.
 
     Attributes:
         message: the batch without vehicle, place and time.
@@ -96,7 +96,7 @@ class Country:
                 self.begin[same] = np.arange(len(same)) * len(self.drives[one]) // len(same)
 
     def _locate_region(self, zone: int, k: int) -> tuple[int, int]:
-        """Return column and row of region k of a zone in the grid of all regions."""
+        """Return column and row, in the world's grid of regions, of region k of a zone."""
         zone_x, zone_y = (int(side[0]) for side in self._home)
         return (zone_x + zone - 1) * _REGIONS + k % _REGIONS, zone_y * _REGIONS + 2 + k // _REGIONS
 

@@ -26,8 +26,8 @@ _BLOCK: Final = zenoh.CongestionControl.BLOCK
 
 
 class Waits:
-    """Times [s] at which each vehicle's batches were sent and acknowledged, two arrays of shape
-    (turns, vehicles). NaN means not yet.
+    """Times [s] at which each vehicle's batches were sent and acknowledged: two arrays of shape
+    (turns, vehicles), where a turn is one batch per vehicle. NaN means not yet.
     """
 
     def __init__(self, session: zenoh.Session, vehicles: int, turns: int) -> None:

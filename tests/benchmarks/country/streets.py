@@ -37,8 +37,8 @@ ICE_PATCHES = 24
 
 
 class Drive(NamedTuple):
-    """One vehicle's path: points a metre apart (n, 2) [m], and its speed at each point
-    (n,) [m/s].
+    """One vehicle's path in SUMO's traffic: points a metre apart (n, 2) [m], and its speed at each
+    point (n,) [m/s].
     """
 
     line: FloatArray

@@ -115,7 +115,9 @@ def _time(engine: routes.Valhalla, shape: np.ndarray[Any, Any]) -> float:
 
 
 def _meets(shape: np.ndarray[Any, Any], middles: np.ndarray[Any, Any]) -> bool:
-    """Return True if a route passes the middle of an icy street."""
+    """Return True if a route `shape` (points [deg]) passes the middle of an icy street; `middles`
+    are these middles [deg].
+    """
     scale = np.array([1.0, np.cos(np.radians(routes.ORIGIN[0]))])
     first = shape[:-1] * scale
     last = shape[1:] * scale

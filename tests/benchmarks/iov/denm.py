@@ -157,8 +157,8 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
 
 
 def _encode_speedup(bodies: list[bytes]) -> float:
-    """Return the processor time of asn1tools divided by that of our encoder, for the
-    same messages.
+    """Return the processor time in which the library asn1tools encodes these DENM, divided by that
+    of our encoder.
     """
     general = compiled_denm()
     contents = [general.decode("DENM", body) for body in bodies]
@@ -173,8 +173,8 @@ def _encode_speedup(bodies: list[bytes]) -> float:
 
 
 def _selected_wrongly(received: list[tuple[bytes, dict[str, object]]]) -> int:
-    """Return the number of cases in which the filter `quadTree LIKE '%,DIGITS%'` and the position
-    of an event disagree.
+    """Return the number of wrong results of the interchange's filter `quadTree LIKE '%,DIGITS%'`:
+    events that it selects outside the square with these digits, or leaves out inside.
     """
     wrong = 0
     squares = set[tuple[int, int]]()

@@ -45,8 +45,8 @@ KUKSA: Final = (
 
 
 def measure_foreign(_folder: Path, quick: bool) -> list[Figure]:
-    """Let one foreign publisher report ice: alone, where own vehicles measure grip, and where one
-    own vehicle measures ice too.
+    """Let one foreign publisher report ice in three situations: alone, where enrolled vehicles
+    measure grip, and where one enrolled vehicle measures ice too.
 
     The last case is the control, because a publisher that is never believed would also raise no
     false alert.

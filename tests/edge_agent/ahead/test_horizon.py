@@ -66,8 +66,8 @@ def test_a_route_goes_on_where_the_car_is_and_is_none_for_who_left_it() -> None:
 def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
     ahead: float, turned: float, spacing: float
 ) -> None:
-    """The route has a right angle to the left after 120 m. A car that cuts or overshoots this
-    corner must still count as on the route.
+    """The route has a right angle to the left after 120 m. A car that cuts this corner or drives on
+    straight for some metres must still count as on the route.
     """
     way = np.arange(0.0, 120.0 + spacing / 2, spacing)
     x = np.concatenate([way, np.full(len(way) - 1, 120.0)])

@@ -1,6 +1,6 @@
-"""Tests of cars that look ahead, that is, receive the map of the road ahead over real sessions:
-warnings from alerts and from the map, also after a lost router, and no warning from forged
-messages.
+"""Tests of cars that look ahead, that is, receive the map of the road ahead over real Zenoh
+sessions. They must give warnings from alerts and from the map, also after a lost router, and none
+from forged messages.
 """
 
 from __future__ import annotations
@@ -52,14 +52,16 @@ class Driving:
         self.lookout.start()
 
     def report_pose(self, *, later_s: float = 0.0) -> None:
-        """Report the car's pose to the lookout, dated `later_s` after the present."""
+        """Report the car's pose (position, heading, speed) to the lookout, the thread that looks
+        ahead; the pose is dated `later_s` seconds after the present.
+        """
         latitude, longitude = line(self.metre + 2.0, start=self.metre)
         now = time.time_ns() + round(later_s * NS)
         self.lookout.see([Pose(float(latitude[0]), float(longitude[0]), HOME.yaw, 14.0, now)])
 
     def drive_until(self, condition: Callable[[Outlook], object]) -> Outlook:
-        """Report the car's pose repeatedly until the outlook meets the condition, and return this
-        outlook.
+        """Report the car's pose repeatedly until its outlook (warnings and friction of the road
+        ahead) meets the condition, and return this outlook.
         """
 
         def has_outlook() -> bool:
@@ -352,8 +354,8 @@ def test_bytes_that_are_no_tile_are_refused(payload: bytes) -> None:
 
 
 class Liar(MadeUpService):
-    """Simulated service that answers map queries with different invalid tiles, one after the other,
-    and then with an empty tile.
+    """Simulated malicious service that answers map queries with different invalid tiles, one after
+    the other, and then with an empty tile.
     """
 
     said = 0

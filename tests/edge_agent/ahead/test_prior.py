@@ -25,7 +25,7 @@ FLAT = np.zeros((1, mugrid.BINS))
 
 def sharp(mu: float, std: float = 0.06) -> FloatArray:
     """Return the map's belief about a cell, (32,), with median `mu` and a 90 % interval of `mu` ±
-    1.6 `std`.
+    1.6·`std`.
     """
     said = (np.array([value]) for value in (mu - 1.6 * std, mu, mu + 1.6 * std, float(mu < 0.4)))
     return np.asarray(belief_of(*said)[0])
@@ -95,8 +95,9 @@ def test_a_wrong_map_is_abandoned_quickly_and_trusted_less_in_next_cells() -> No
 
 
 def test_a_map_says_nothing_twice() -> None:
-    """Many cells with the same map belief must not make the friction interval narrower than the
-    second such cell does.
+    """A car drives through many cells for which the map has the same belief. After the second such
+    cell, the combined friction interval must not become narrower, because the map's belief must not
+    count repeatedly.
     """
     prior = MapPrior(1)
     widths = []

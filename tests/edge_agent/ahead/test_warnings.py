@@ -115,8 +115,8 @@ def test_one_vehicle_alone_warns_nobody() -> None:
 
 
 def test_alert_over_a_mere_bound_is_exported_with_its_own_grip() -> None:
-    """The map's belief of ice may age to a lower bound while the alert is still active. The warning
-    must then have the friction of the alert.
+    """The map's knowledge of ice may fade until only a lower bound of friction is left, while the
+    alert is still active. The warning must then have the friction stated by the alert.
     """
     cache = make_local_map([cells(icy(), 0.1, basis=BOUND)])
     for key in icy():

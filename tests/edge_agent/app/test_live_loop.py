@@ -1,5 +1,5 @@
-"""Tests of the pipeline and the live loop: visits are closed at the end, delay behind real time is
-counted, and the loop stops on request.
+"""Tests of the pipeline and the live loop: visits (passes through map cells) are closed at the end,
+delay behind real time is counted, and the loop stops on request.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ RATE = 50.0
 
 
 class Basket:
-    """Simulated publisher that stores all records that the loop offers."""
+    """Simulated publisher that stores all records that the live loop offers for publication."""
 
     is_broken = False
 
@@ -131,8 +131,8 @@ def run(
 def test_a_simulated_source_hands_its_context_to_the_observations(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """Observations must contain the ABS flag of a car that brakes with ABS now and then. The flag
-    must be unknown for a car whose flag is always on, and for a car without a flag.
+    """The published observations must contain the ABS flag of a car that brakes with ABS now and
+    then. The flag must be unknown for a car whose flag is always on, and for a car without a flag.
     """
     fleet, parts = fleet_blocks(300)
     for place, block in enumerate(parts):

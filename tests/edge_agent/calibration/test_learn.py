@@ -105,8 +105,8 @@ def test_what_is_hardly_known_is_drawn_to_what_cars_usually_have(smooth: Recorde
 
 def test_the_driven_axle_is_not_taken_for_a_smaller_one() -> None:
     """The slip of driven wheels looks like a smaller radius. If the vehicle file names the driven
-    axle, the radius errors must be smaller than without the name; otherwise the stated uncertainty
-    must be larger.
+    axle, the radius errors must be smaller than without this entry. Without it, the stated
+    uncertainty must be larger.
     """
     drive = drives(3, 32, rough=False, seconds=300)[2]  # a van: its rear wheels drive
     assert drive.vehicle.drive_split_front == 0.0

@@ -1,5 +1,6 @@
-"""Tests of properties that every estimator of the bank must have: causality, equal bits for any
-division into calls, wide intervals without excitation, no NaN.
+"""Tests of properties that every estimator of the bank must have: outputs depend on past samples
+only, are bit-equal for any division of the samples into calls, have wide intervals without
+excitation, and contain no NaN.
 """
 
 from __future__ import annotations

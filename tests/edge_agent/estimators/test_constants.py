@@ -37,8 +37,8 @@ SHORT: dict[str, float | None] = {
 
 
 class Move(NamedTuple):
-    """Expected change of a figure of a drive (mean interval width, for example) when a constant is
-    multiplied by `times`.
+    """Expected direction in which a figure of a drive (mean interval width, for example) changes
+    when a constant of the estimator is multiplied by `times`.
     """
 
     figure: str
@@ -248,8 +248,8 @@ def made_up(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
 
 @cache
 def figures(place: str, name: str | None, times: float) -> dict[str, float]:
-    """Return the figures of one drive (means of outputs and of internal states), with the constant
-    `name` multiplied by `times`.
+    """Run the default estimator on the drive `place` with its constant `name` multiplied by
+    `times`. Return figures of this run: means of outputs and of internal states, by name.
     """
     t, signals, vehicle = make_drive(place)
     constants = Constants()

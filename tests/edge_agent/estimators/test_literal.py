@@ -1,5 +1,5 @@
-"""Tests of the friction filters of papers 000 and 003 as printed: printed errors, numerical
-precision, and the tyre model that they need.
+"""Tests of the friction filters of papers 000 and 003 as printed: they reach the printed errors;
+the effects of numerical precision and of the tyre model are checked.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ def turn() -> tuple[GivenMotion, FloatArray]:
 
 
 def one_sample(speed: float) -> GivenMotion:
-    """Return a given motion of one sample, with slip at all wheels."""
+    """Return the motion of one sample at `speed` [m/s], with slip at all wheels, as input of the
+    papers' filters.
+    """
     signals = np.zeros((1, len(CHANNELS)))
     signals[0, [S.AX, S.AY, S.YAW_RATE]] = 1.0, 2.0, 0.2
     signals[0, S.DELTA : S.DELTA + 2] = 0.05

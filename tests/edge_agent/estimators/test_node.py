@@ -1,5 +1,5 @@
-"""Tests that compare parts of a friction node with textbook formulas: sequential update and tyre
-curve.
+"""Tests that compare parts of a node (filter of one friction hypothesis) with textbook formulas:
+sequential update and tyre curve.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests of identities of the friction mixture: prior, road change, quantiles, evidence."""
+"""Tests of mathematical identities of the friction mixture (grid of friction hypotheses): prior,
+road change, quantiles, evidence.
+"""
 
 from __future__ import annotations
 

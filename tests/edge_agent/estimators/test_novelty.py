@@ -30,7 +30,9 @@ class Bend:
     """
 
     def __init__(self) -> None:
-        """Create a car that has driven on a road with grip until its slip is the usual value."""
+        """Create a car that has driven on a road with grip for so long that the filter regards its
+        slip as usual.
+        """
         context = records(MixtureContext, 1)
         put_record(context["design"][0], design_of(Memberships(), adaptive=True))
         self.mu = context["design"]["mu"][0]
@@ -44,14 +46,17 @@ class Bend:
         self.drive_block(BEND, seconds=20.0)
 
     def believe_in(self, mu: float) -> None:
-        """Give all probability to the friction node nearest to `mu`."""
+        """Set the filter's belief: all probability is on the node (friction hypothesis) nearest to
+        `mu`.
+        """
         self.memory["weight"][0] = 0.0
         self.memory["weight"][0, np.argmin(np.abs(self.mu - mu))] = 1.0
         self.memory["friction"]["median"] = mu
 
     def drive_block(self, slip: float, *, force: float = BEND, seconds: float = BLOCK_S) -> float:
-        """Drive for `seconds` with a lateral slip and a lateral force (as a share of the load).
-        Return, for the last block of samples, its degree of membership in the fuzzy set "new".
+        """Drive for `seconds` with a lateral slip and a lateral force, both over load. Return the
+        degree (0 to 1) to which the last block of samples belongs to the fuzzy set "new", that is,
+        differs from the usual.
         """
         slope = self.memory["row"][0, Parameter.SLOPE_Y]
         across = -slip / slope * SPEED_M_S
@@ -69,7 +74,9 @@ class Bend:
 
     @property
     def ice_ended(self) -> float:
-        """Return the degree of membership in the fuzzy set "the ice has ended"."""
+        """Return the degree (0 to 1) of membership in the fuzzy set "the ice has ended" after the
+        last block of samples.
+        """
         return float(self.memory["slip"]["axle_ended"][0])
 
 

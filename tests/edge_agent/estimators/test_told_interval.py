@@ -51,7 +51,7 @@ def find_told_interval(
     Args:
         weight: probabilities of the friction nodes.
         patch: probability of an ice patch.
-        likeness: degree to which the car agrees with its vehicle file.
+        likeness: degree (0 to 1) to which the car agrees with its vehicle file.
     """
     contexts = records(MixtureContext, 1)
     put_record(contexts["design"][0], DESIGN)
@@ -65,7 +65,9 @@ def find_told_interval(
 
 
 def about(mu: float, width: float) -> FloatArray:
-    """Return probabilities of the friction nodes that are centred on the friction `mu`."""
+    """Return probabilities of the nodes (friction hypotheses) as a bell curve of width `width`
+    around the friction `mu`.
+    """
     weight = DESIGN.prior * np.exp(-0.5 * ((DESIGN.mu - mu) / width) ** 2)
     return np.asarray(weight / weight.sum())
 

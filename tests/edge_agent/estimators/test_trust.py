@@ -1,6 +1,6 @@
-"""Tests of trust in the vehicle model: strain (misfit of model and measurements) separates cars
-that match their vehicle file from others; contradictions between model and measurements are found
-per axle, and ice does not cause any.
+"""Tests of trust in the vehicle model: strain (deviation of the estimated vehicle states from their
+prior) separates cars that match their vehicle file from others. Contradictions between model and
+measurements are found per axle, and ice causes none.
 """
 
 from __future__ import annotations

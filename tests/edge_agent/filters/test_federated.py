@@ -239,8 +239,8 @@ def test_downdate_filter_is_the_textbook_filter_on_a_linear_system() -> None:
 
 
 def test_where_the_downdate_refuses_the_orthogonal_update_does_the_work() -> None:
-    """The downdate must be refused, and the orthogonal update must give the result, if the noise is
-    so small that rounding leaves no variance in the measured direction.
+    """If the noise is so small that rounding leaves no variance in the measured direction, the
+    downdate of the covariance must be refused. The orthogonal update must then give the result.
     """
     (mean, other, cov, other_cov), told = _make_update(12, 1e-9)
     assert told[3]

@@ -67,7 +67,9 @@ SLOW = {"FATC11", "CGW1", "Kombi_02", "Gateway_72"}  # once a second
 
 
 def told_at(t: float) -> dict[str, float]:
-    """Return the true values of the context signals at a time."""
+    """Return the true values of the context signals (controllers, temperature, wipers) at the time
+    t [s].
+    """
     flags = {name: float(first <= t < last) for name, (first, last) in FLAGS_AT.items()}
     return flags | {"air_temperature": AIR, "wiper": WIPES}
 
@@ -104,7 +106,9 @@ def frames_of(name: str) -> list[can.Message]:
 
 
 def import_log(path: Path, profile: Profile, out: Path) -> SignalLog:
-    """Import a source as a log, without checking that signals needed by an estimator exist."""
+    """Import a recording as a signal log, without checking that the signals that an estimator needs
+    exist.
+    """
     database = None if profile.dbc is None else read_dbc(FOLDER / profile.dbc)
     merged = merge_recordings(
         [read_source(path, profile, database)], profile, wheel_radius=0.3, steering_ratio=16.0

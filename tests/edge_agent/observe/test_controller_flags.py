@@ -23,8 +23,8 @@ RATE = 100
 def drive(
     on: FloatArray, omega: FloatArray | float = 50.0
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return times (T, 1) [s], signals and context signals of one car whose ABS flag is
-    `on` (T,).
+    """Return times (T, 1) [s], signals (T, 1, 18) and context signals (controllers, surroundings)
+    of one car whose ABS flag is `on` (T,).
     """
     t = np.arange(len(on))[:, None] / RATE
     signals = np.full((len(on), 1, len(CHANNELS)), np.nan)
@@ -36,8 +36,8 @@ def drive(
 
 
 def seconds(*parts: tuple[float, float]) -> FloatArray:
-    """Return a flag (T,) from pairs (duration [s], value): it has each value for the given
-    duration.
+    """Return the values (T,) of a controller flag over time from pairs (duration [s], value): the
+    flag has each value for this duration.
     """
     return np.concatenate([np.full(round(length * RATE), value) for length, value in parts])
 

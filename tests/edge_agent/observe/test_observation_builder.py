@@ -1,5 +1,5 @@
-"""Tests of the observation builder: one observation per visit and states in their time slots, for
-any division of the drive into blocks of samples.
+"""Tests of the observation builder: it makes one observation per visit (pass through a cell), and
+one state per reporting interval, for any division of the drive into blocks of samples.
 """
 
 from __future__ import annotations
@@ -135,8 +135,9 @@ def test_a_visit_that_the_bank_could_not_follow_is_flat() -> None:
     ids=["upper bound slippery", "only the median", "median with excitation", "dry"],
 )
 def test_only_slippery_visits_are_urgent(mu: float, used: float, urgent: bool) -> None:
-    """A visit must be urgent only if the upper end of its interval lies below 0.4, or if its median
-    does and enough grip was used. The reported interval is mu ± 0.05.
+    """The observation of a visit must be urgent (sent at once) only if the upper end of its
+    interval lies below 0.4, or if its median does and enough grip was used. The reported interval
+    is mu ± 0.05.
     """
     _, observations, states = Watch.of(3).step(
         wanderers(150, 3), estimates(150, 3, mu=mu, used=used)

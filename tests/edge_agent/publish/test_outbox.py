@@ -1,5 +1,5 @@
-"""Tests of the outbox: consecutive numbers, storage on disk first, settlement by ranges, retries
-with back-off, a size limit, and one agent only.
+"""Tests of the outbox: consecutive numbers, storage on disk first, settlement (removal after an
+answer) by ranges, retries at growing intervals, a size limit, and use by one agent only.
 """
 
 from __future__ import annotations
@@ -148,8 +148,8 @@ def test_unsettled_batches_are_resent_oldest_first_at_growing_intervals(path: Pa
 
 
 def silence_route(outbox: Outbox, now: float = 0.0) -> float:
-    """Store batches without any answer until the route counts as silent, and return the simulated
-    time [s] at that moment.
+    """Store batches that no service answers, until the outbox regards the route as silent; return
+    the simulated time [s] at that moment.
     """
     outbox.store([draft()], now)
     while outbox.store([draft()], now)[0].fresh:

@@ -31,7 +31,9 @@ Make = Callable[..., Publisher]
 
 
 def drive(seed: int = 0, samples: int = 200) -> tuple[RecordBlock, RecordBlock]:
-    """Return the observations and states of a random drive by three vehicles."""
+    """Return the records (observations and states) of a random simulated drive by three
+    vehicles.
+    """
     _, observations, states = Watch.of(3).step(
         wanderers(samples, 3, seed), estimates(samples, 3, seed, mu=0.8)
     )

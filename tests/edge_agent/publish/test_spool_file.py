@@ -1,4 +1,4 @@
-"""Tests of a damaged outbox file: it is set aside and counted, its readable rows are recovered, and
+"""Tests of a damaged outbox file: it is renamed and counted, its readable rows are recovered, and
 the agent continues.
 """
 

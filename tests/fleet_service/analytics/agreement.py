@@ -23,8 +23,8 @@ Order: TypeAlias = list[tuple[str, Literal["ascending", "descending"]]]
 
 
 def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
-    """Return a description of the difference between the answers of two engines, or None if they
-    agree.
+    """Return a description of the first difference between the answers of two query engines to a
+    question, or None if they agree.
     """
     if one.schema.names != other.schema.names or one.num_rows != other.num_rows:
         return (
@@ -65,7 +65,7 @@ def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
 
 def roads_along(cells: IntArray) -> pa.Table:
     """Return a road network with links of forty cells along every row of cells, and one link that
-    no vehicle visited, in the columns of `fleet-service roads`.
+    no vehicle visited, as a table with the columns that `fleet-service roads` writes.
     """
     x, y = grid.deinterleave(cells)
     found = []

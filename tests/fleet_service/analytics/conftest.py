@@ -37,7 +37,7 @@ HOUR_NS = 3600 * 10**9
 
 
 def find_visited(fusion: Fusion) -> IntArray:
-    """Return the rows (slots) in the fusion's memory of those cells and sectors that a vehicle
+    """Return the row numbers (slots) of those cells and sectors in a fusion that a vehicle
     visited.
     """
     return np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)

@@ -1,6 +1,6 @@
 """Tests of the question `change-rates`, which fits how often and how fast the friction of roads
-changes: the fit finds the rates of a known process, its interval is calibrated, and pairs of
-successive values of a cell are counted correctly.
+changes: the fit finds the rates of a simulated process, its 90 % interval contains the true rate as
+often as stated, and pairs of successive values of a cell are counted correctly.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ PI = 0.3  # slippery share of roads
 
 
 def pairs_of_a_day(rng: np.random.Generator, rate: float, count: int) -> FloatArray:
-    """Return counts (bins, 4) of simulated pairs of readings of a road that changes at a rate
-    `rate` [1/s].
+    """Return counts (bins of elapsed time, 4), as `fit` takes them, of simulated pairs of readings
+    of a road that changes at the rate `rate` [1/s].
     """
     apart = np.exp(rng.uniform(0.0, np.log(LONGEST_S), count))
     first = rng.random(count) < PI

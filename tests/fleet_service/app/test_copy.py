@@ -61,7 +61,9 @@ def take(engine: Engine, sent: list[Batch]) -> None:
 
 
 def read_image(engine: Engine) -> dict[str, pa.Table]:
-    """Return the whole state that a service restores: map, trust, batches and alerts."""
+    """Return the whole state of an engine that a service restores after a restart: map, trust in
+    vehicles, known batches and alerts.
+    """
     return dict(engine._image().tables)
 
 
@@ -203,8 +205,8 @@ def health(address: str) -> str:
 
 
 def drive(fleet: Fleet, sent: list[Batch]) -> bool:
-    """Send unacknowledged batches again, as outboxes do. Return True if all batches are
-    acknowledged.
+    """Send those of the batches `sent` again that are not acknowledged yet, as a vehicle's outbox
+    does. Return True if all batches are acknowledged.
     """
     for one in fleet.list_unsettled(sent)[:20]:
         fleet.publish(one)

@@ -147,8 +147,8 @@ def fill_engine(root: Path, *names: str) -> Engine:
 
 
 def answer_requests(engine: Engine, root: Path) -> None:
-    """Carry out the requests to erase a vehicle in a thread, while the service's worker
-    continues.
+    """Carry out the waiting requests to erase a vehicle in a background thread, while this thread
+    plays the service's worker.
     """
     thread = threading.Thread(
         target=erasing.handle_requests, args=(engine, ServiceConfig(), root, threading.Event())

@@ -81,7 +81,9 @@ def test_killed_service_keeps_acknowledged_reports_and_doubles_none(
 
 
 def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
-    """Return the identity (boot as archived, seq, row) of every acknowledged row."""
+    """Return the identity (boot in its archived form, seq of the batch, row in it) of every
+    acknowledged row.
+    """
     pseudonyms = Pseudonyms(folder / "archive" / "keys")
     now = time.time_ns()
     boots = {

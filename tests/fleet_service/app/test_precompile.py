@@ -1,5 +1,5 @@
-"""Tests that no kernel is compiled after the service is ready, because vehicles would
-have to wait.
+"""Tests that the service compiles no function after it has reported that it is ready, because
+vehicles would have to wait.
 """
 
 from __future__ import annotations

@@ -233,8 +233,8 @@ def test_what_is_not_ours_is_counted_and_the_service_goes_on(
 
 
 def seconds() -> Iterator[int]:
-    """Return times [ns] one second apart, for vehicles that follow each other. The last time is not
-    in the future.
+    """Return an iterator of times [ns], one second apart, for the reports of vehicles that follow
+    each other. The last time is not in the future.
     """
     return iter(range(now() - 30 * SECOND, now(), SECOND))
 

@@ -66,8 +66,8 @@ def now_of(turn: int) -> int:
 
 
 def make_observations(turn: int, vehicle: int) -> Batch:
-    """Return the observations of a vehicle in a round: ice in every second cell, and only lower
-    bounds from every third vehicle.
+    """Return the observations that a vehicle sends in a round (step of the simulated drive): ice in
+    every second cell, and only lower bounds from every third vehicle.
     """
     rng = np.random.default_rng([turn, vehicle])
     latitude, longitude = PLACES[vehicle % 2]
@@ -91,7 +91,9 @@ def make_observations(turn: int, vehicle: int) -> Batch:
 
 
 def make_state(turn: int, vehicle: int) -> Batch:
-    """Return the state that a vehicle sends in a round."""
+    """Return the state (position and motion) that a vehicle sends in a round (step of the simulated
+    drive).
+    """
     latitude, longitude = PLACES[vehicle % 2]
     values = {
         "time": now_of(turn) - SECOND,

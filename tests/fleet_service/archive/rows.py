@@ -19,7 +19,7 @@ PLACES = ((57.7, 11.97), (48.1, 11.6))  # in two zones
 
 def rows_of(kind: Kind, count: int, seed: int = 0, vehicles: int = 5) -> Rows:
     """Return `count` rows of observations or states within twenty minutes around midnight, in cells
-    of two zones (map squares of zoom 7). For one seed, (vehicle, seq, row) is unique.
+    of two zones (map squares of zoom 7). Among the rows of one seed, (vehicle, seq, row) is unique.
     """
     rng = np.random.default_rng(seed)
     place = np.array(PLACES)[rng.integers(0, 2, count)] + rng.normal(0.0, 1e-4, (count, 2))

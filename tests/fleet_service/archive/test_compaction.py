@@ -41,7 +41,9 @@ class DiedError(BaseException):
 
 
 def public(root: Path, kind: Kind) -> list[tuple[int, int]]:
-    """Return (boot, seq) of the rows that another program finds in the compacted files."""
+    """Return (boot, seq) of the rows that a foreign program, which reads only the compacted files,
+    finds.
+    """
     paths = list((root / layout.TABLES[kind]).rglob("*.parquet"))
     found = [pq.read_table(path, columns=["boot", "seq"], partitioning=None) for path in paths]
     return sorted((row["boot"], row["seq"]) for table in found for row in table.to_pylist())
@@ -102,8 +104,8 @@ def test_files_lie_by_date_and_zone_and_are_sorted_by_cell_and_time(tmp_path: Pa
 
 
 def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
-    """Record the operations that change the disk in a list, and simulate the death of the process
-    before the operation number `die_at`.
+    """Return a list in which all following operations that change the disk are recorded. Before
+    operation number `die_at`, an exception simulates the death of the process.
     """
     seen: list[str] = []
 

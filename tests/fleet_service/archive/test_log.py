@@ -89,8 +89,9 @@ def test_segment_order_does_not_depend_on_the_number_of_digits() -> None:
 
 
 def test_a_power_loss_after_the_first_key_was_given_never_takes_it_back(tmp_path: Path) -> None:
-    """A new key must survive a power loss right after its creation. Otherwise rows acknowledged
-    under it could not be recognised, and would be accepted again under a new key.
+    """A new key must survive a power loss right after its creation. Otherwise the service could not
+    recognise batches that it acknowledged under this key, and would accept them again under a new
+    key.
     """
     for seed in range(20):
         live = tmp_path / f"live-{seed}"

@@ -56,8 +56,8 @@ def same(found: dict[str, Any], made: dict[str, Any]) -> None:
     """Assert that a map equals the stored one, except for rounding errors of single precision and
     of another machine's logarithm.
 
-    The stored beliefs are those that the present fusion computes from the archive. A change of the
-    fusion must write them again and give the reason.
+    The stored beliefs were computed by the fusion as it is now. A commit that changes the fusion's
+    results must store them again and give the reason.
     """
     assert found["at"] == made["at"]
     np.testing.assert_allclose(found["beliefs"], made["beliefs"], rtol=0.0, atol=1e-6)
@@ -145,8 +145,8 @@ def _identities(root: Path, kind: Kind) -> list[tuple[str, int, int]]:
 def rewrite_file(
     path: Path, change: Callable[[pa.Table], pa.Table], said: str, encoding: Encoding = SEGMENT
 ) -> None:
-    """Rewrite an archive file as one of another format version, with its table changed by
-    `change`.
+    """Rewrite an archive file as a file of another format version: `change` is applied to its
+    table, and `said` replaces entries of its footer.
     """
     found = read_content(path)
     assert found is not None

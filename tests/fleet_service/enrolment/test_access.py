@@ -126,7 +126,9 @@ def test_a_vehicle_may_exactly_what_the_design_says() -> None:
 
 
 def is_heard(vehicle: zenoh.Session, name: str, listener: zenoh.Session) -> bool:
-    """Return True if a vehicle's message on its own key reaches a service."""
+    """Return True if a message that the session `vehicle` publishes on the key of the vehicle
+    `name` reaches the service's `listener`.
+    """
     received: list[bytes] = []
     with listener.declare_subscriber(
         f"{keys.ROOT}/obs/**", lambda sample: received.append(sample.payload.to_bytes())

@@ -1,5 +1,5 @@
-"""Tests of theorems about the belief about one cell: how time and votes (effects of single visits)
-may change the belief.
+"""Tests of mathematical properties of the belief about one cell: how time and votes (effects of
+single visits) may change it.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of errors that all vehicles in one cell share: more vehicles do not average them out,
-different manoeuvres do.
+"""Tests of errors that all vehicles in one cell have in common: reports of more vehicles do not
+average them out, different manoeuvres do.
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ def test_what_bounds_share_never_lowers_the_upper_end_of_a_rising_belief(p: np.n
 
 
 def width(used: float, manoeuvres: np.ndarray, mu: float = 0.6) -> float:
-    """Return the width of a cell's friction interval after agreeing values of thirty vehicles."""
+    """Return the width of a cell's friction interval after thirty vehicles have reported the
+    friction `mu`, using the grip `used` in the given manoeuvres.
+    """
     fusion = Fusion(120.0)
     n = len(manoeuvres)
     o = observations(np.arange(n) * 1.0, np.arange(n), value(np.full(n, mu)))

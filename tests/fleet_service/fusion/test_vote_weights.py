@@ -23,8 +23,10 @@ VEHICLES = 30
 def make_acquainted(
     slope: float = 0.0, gain_std: float = 0.06, *, gain_in_use: bool = False
 ) -> Fusion:
-    """Return a fusion that has received forty minutes of reports about ten cells, from a fleet with
-    gain errors (relative errors). A value is too low by `slope` times the unused part of μ.
+    """Return a fusion that has received forty minutes of reports about ten cells, from a fleet
+    whose vehicles have constant relative errors of standard deviation `gain_std`. Each value is too
+    low by `slope` times the unused part of μ. `gain_in_use` is True if the error also affects the
+    used grip.
     """
     rng = np.random.default_rng(5)
     fusion = Fusion(120.0)
@@ -62,15 +64,15 @@ def test_shape_of_nobody_is_the_prior() -> None:
 @pytest.mark.parametrize("gain_std", [0.05, 0.1])
 def test_gain_error_common_to_value_and_use_is_no_shape(gain_std: float) -> None:
     """A gain error that changes a vehicle's values and its used grip alike must not be learned as a
-    slope. Between vehicles it looks like a slope cov(value, use)/var(use) ≥ .3; within one vehicle
-    it cancels.
+    slope. In a comparison between vehicles it looks like a slope cov(value, use)/var(use) ≥ .3; in
+    a comparison of one vehicle's visits it cancels.
     """
     assert learned_slope(make_acquainted(0.0, gain_std, gain_in_use=True)) < 0.12
 
 
 def road_after(slope: float, used: float) -> FloatArray:
-    """Return the belief of a new cell after three values of .5 that used a grip of `used`, in a
-    fleet with this slope.
+    """Return the belief about a new cell after three reported values of .5 from visits that used a
+    grip of `used`, in a fleet whose values are too low by `slope` per unit of unused μ.
     """
     fusion = make_acquainted(slope)
     o = observations(2500.0 + np.arange(3.0), np.arange(3), value(np.full(3, 0.5)), cell=70)

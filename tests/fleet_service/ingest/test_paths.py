@@ -20,7 +20,7 @@ CAR = 7
 def find(
     known: VehiclePaths, seconds: Iterable[float], east_m: Iterable[float], vehicle: int = CAR
 ) -> list[bool]:
-    """Return for each report on the equator whether its position is implausible.
+    """Return, for each report of a vehicle on the equator, True if its position is implausible.
 
     Args:
         known: paths of the vehicles so far.

@@ -77,7 +77,7 @@ FAR = int(grid.cell_of(LATITUDE, 12.02))
 
 
 def one(column: str, values: list[float]) -> dict[str, Any]:
-    """Return a change for `batch` that replaces the values of one column."""
+    """Return keyword arguments for `batch` by which it replaces the values of one column."""
     return {column: values}
 
 

@@ -1,5 +1,5 @@
-"""Tests of errors resampled from drives: each is of the same vehicle, on a similar road, and scaled
-to the friction of the town.
+"""Tests of errors resampled from drives: all reports of a town's vehicle come from one vehicle of
+the drives, are from a similar road, and are scaled to the friction of the town.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ MINUTES = 6
 
 
 def visits_on(mu: FloatArray, vehicle: IntArray, low: FloatArray) -> DrivenVisits:
-    """Return visits that alternately use little grip and enough to measure μ. Vehicle k reads
-    `low[k]` times the true friction.
+    """Return made-up visits of drives on roads with friction `mu`. They alternately use little
+    grip, and enough to measure μ; vehicle k then reports `low[k]` times the true friction.
     """
     excited = np.arange(len(mu)) % 2 == 1
     reading = mu * low[vehicle]

@@ -1,5 +1,5 @@
-"""Tests of the simulated fleet of another maker: its error model is as stated, and its figures
-match the answers of a map.
+"""Tests of the simulated fleet of another maker: its errors are as stated, and its figures are
+right for maps with known answers.
 """
 
 from __future__ import annotations

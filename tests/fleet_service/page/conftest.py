@@ -71,8 +71,8 @@ Drive = Callable[..., None]
 
 @pytest.fixture
 def drive(session: zenoh.Session, page: RunningPage) -> Drive:
-    """Return a function that lets the cars drive over parts of the crossing, and returns when the
-    service has their reports.
+    """Return a function that lets the cars drive over named parts of the crossing; the function
+    returns when the service has acknowledged their reports.
     """
     seq = 1
 

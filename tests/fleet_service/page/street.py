@@ -124,5 +124,7 @@ def _drive(parts: Sequence[Part]) -> tuple[IntArray, IntArray, FloatArray]:
 
 
 def count_known(*parts: str) -> int:
-    """Return the number of (cell, heading) pairs on the map after the named parts were driven."""
+    """Return the number of (cell, heading) pairs that the map has after cars drove over the named
+    parts of the crossing.
+    """
     return sum(len(cells(PARTS[name])) * len(PARTS[name].headings) for name in parts or PARTS)

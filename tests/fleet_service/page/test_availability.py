@@ -115,7 +115,9 @@ class Transport:
 def accept(
     open_ones: set[Any], timers: list[Any], host: str = ""
 ) -> tuple[BoundedProtocol, Transport]:
-    """Return a new connection of a server, and the simulated transport of this connection."""
+    """Return a new simulated connection of a browser to the server, and its transport, which
+    records whether it was closed.
+    """
     protocol = BoundedProtocol.__new__(BoundedProtocol)
 
     def call_later(seconds: float, call: Any, *args: Any) -> Any:  # noqa: ANN401 as asyncio has it

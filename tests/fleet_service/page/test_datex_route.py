@@ -37,8 +37,8 @@ CELLS = [(TILE << 14) + k for k in range(3)]
 
 @contextmanager
 def made_up_service(session: zenoh.Session) -> Iterator[None]:
-    """Act as a service: answer map queries for one cell of the region, so that the page regards the
-    region as served.
+    """Act as a service for the `with` block: answer map queries for one cell of the region, so that
+    the page regards the region as served.
     """
     fusion = Fusion(120.0)
     fusion.update(observations([0.0], [1], value([0.3])))

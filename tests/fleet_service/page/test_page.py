@@ -63,7 +63,7 @@ def kinds(seen: Opened) -> list[int]:
 
 
 def near(seen: Opened, cell: int, zoom: float = 18.0) -> None:
-    """Zoom in on a cell, so far that its headings are shown separately."""
+    """Zoom the page's map in on a cell, until its heading sectors are drawn separately."""
     latitude, longitude = (float(v) for v in grid.centre(cell))
     seen.page.evaluate(
         "([x, y, z]) => { gripmap.goTo(x, y); gripmap.view.go(gripmap.view.x, gripmap.view.y, z) }",
@@ -72,7 +72,7 @@ def near(seen: Opened, cell: int, zoom: float = 18.0) -> None:
 
 
 def waits(seen: Opened, script: str) -> None:
-    """Wait until a script that runs in the page returns true."""
+    """Wait until a JavaScript expression that is evaluated in the page is true."""
     until(
         lambda: seen.page.evaluate(script)
     )  # the page's own policy forbids Playwright to poll inside it
@@ -83,7 +83,9 @@ def cell_of(part: str, index: int = 1) -> int:
 
 
 def read(seen: Opened, sector: int) -> dict[str, str]:
-    """Return the panel's texts for one heading, by name of the value."""
+    """Return the texts that the page's panel shows for one heading sector of the selected cell, by
+    name of the value.
+    """
     found: dict[str, str] = seen.page.evaluate(
         "s => Object.fromEntries([...document.querySelectorAll(`[data-sector='${s}'] dd`)]"
         ".map(one => [one.dataset.value, one.textContent]))",

@@ -83,8 +83,8 @@ def test_neighbours_meet_without_a_gap_wherever_they_lie(page: RunningPage) -> N
 def test_a_guess_is_framed_by_a_thin_line_whatever_was_painted_before(
     page: RunningPage, drive: Drive
 ) -> None:
-    """Inferred values must have a thin dashed frame, also in a tile that has changed since it was
-    first received.
+    """Cells whose values are estimated from neighbours must have a thin dashed frame, also in a
+    tile that has changed since it was first received.
     """
     drive("dry")
     with open_map(page) as seen:

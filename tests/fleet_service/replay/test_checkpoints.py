@@ -47,8 +47,8 @@ def message(one: Batch) -> Message:
 
 
 def keep(engine: Engine, root: Path) -> Path:
-    """Write a checkpoint as the service does: one thread requests it, and the worker writes it.
-    Return its folder.
+    """Write a checkpoint as the service does: a background thread requests it, and the worker
+    thread makes it between two segments (files of new rows). Return its folder.
     """
     taken: list[checkpoints.Taken | None] = []
     stop = threading.Event()

@@ -58,7 +58,7 @@ def there(bucket: BucketServer) -> dict[str, bytes]:
 
 def fill_log(root: Path, copy: BucketReplica | None, seeds: range = range(3)) -> SegmentLog[int]:
     """Return a segment log that has written segments (files of new rows) of both kinds,
-    observations and states, to disk, and to the bucket if a copy is given.
+    observations and states, to disk, and to the bucket if the bucket copy `copy` is given.
     """
     log: SegmentLog[int] = SegmentLog(root, NAME, None if copy is None else copy.upload_segments)
     Pseudonyms(root / "keys").of("sim-001", 0)

@@ -42,7 +42,9 @@ def borrow_beliefs(visited: dict[int, float], route: IntArray | None = ROUTE) ->
 
 
 def widths(cells: CellView) -> dict[int, float]:
-    """Return the width of the friction interval by index of the cell in the row."""
+    """Return the width of the friction interval of each cell in a view, by index of the cell in the
+    row of thirty cells.
+    """
     lower, upper = (mugrid.quantiles(cells.belief, q) for q in (0.05, 0.95))
     return {
         int(np.flatnonzero(c == EAST)[0]): w for c, w in zip(cells.cell, upper - lower, strict=True)

@@ -63,7 +63,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 
 def hear(engine: Engine, *names: str, now: int | None = None) -> None:
-    """Let the engine ingest one visit of each named vehicle."""
+    """Let the engine ingest one visit of each named vehicle, at the time `now` [ns]."""
     now = time.time_ns() if now is None else now
     sent = [
         Message(Kind.OBSERVATION, key(n), wire.encode(batch(n, 1, now - SECOND, [0.8])), "")
@@ -74,7 +74,7 @@ def hear(engine: Engine, *names: str, now: int | None = None) -> None:
 
 
 def later() -> int:
-    """Return a time [ns] that is late enough for visits made now to be published."""
+    """Return a time [ns] in the near future by which visits made now are visible to readers."""
     return time.time_ns() + PERIOD_NS
 
 
@@ -117,8 +117,8 @@ def test_a_route_tells_the_deceleration_that_is_safe_at_95_percent(start: Start)
 
 
 def test_no_single_passage_shows_where_persons_are_kept_private(start: Start) -> None:
-    """One more pass must not change the times and counts that a public cell shows, which are coarse
-    for this purpose.
+    """If a vehicle passes a public cell once more, the times and counts that readers see must not
+    change; they are rounded for this purpose.
     """
     engine = start(3)
     hear(engine, *(f"sim-{k:03}" for k in range(6)))
@@ -154,8 +154,9 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
 
 
 def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Start) -> None:
-    """Only vehicles of the last hours may make a cell public, in answers, routes, snapshots and
-    tiles.
+    """A vehicle that passes alone at night must not be visible in answers, routes, snapshots and
+    tiles, although many vehicles passed by day: only vehicles of the last hours may make a cell
+    public.
     """
     engine = start(3)
     day = (time.time_ns() // (2 * PART_NS) - 2) * 2 * PART_NS + 8 * 3600 * SECOND

@@ -33,8 +33,8 @@ class Map:
             self.fusion.update(o)
 
     def seen(self, second: float, cell: int = CELL) -> list[float]:
-        """Return the published lower end, upper end and P(slippery) of a cell, or an empty list if
-        the cell is not public.
+        """Return lower end, upper end and P(slippery) of a cell as readers see them at the time
+        `second`, or an empty list if the cell is not public.
         """
         now = START + int(second * SECOND)
         slot = self.public.select(self.slots(cell), now)

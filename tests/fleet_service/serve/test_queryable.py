@@ -147,8 +147,8 @@ COSTS = {2: MOST, 3: 2 * LIGHT, 4: LIGHT}  # by what is asked for; a question of
 
 
 class Half:
-    """Queryable that answers with two tiles. A query of the most expensive kind gets further
-    replies until `go` is set.
+    """Queryable for tests of scheduling: it answers a query with two tiles. A query of the most
+    expensive kind gets further replies until the event `go` is set.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
@@ -172,8 +172,8 @@ class Half:
         yield TILE, b"last"
 
     def ask(self, kind: int) -> list[str]:
-        """Send a query and return its replies as texts. All replies have the same key, and Zenoh
-        passes on only the last reply with a key, so the list usually has one item.
+        """Send a query of a kind and return the replies as texts. Zenoh passes on only the last
+        reply with the same key, so the list usually has one item.
         """
         return texts(self.session, f"{self.key}?min_vehicles={kind}")
 

@@ -1,5 +1,5 @@
-"""Tests of the rounds in which tiles are published: regular, each tile in turn, and never more than
-a fixed share of a worker turn.
+"""Tests of the rounds in which tiles are published: they begin at regular times, each tile has its
+turn, and they never take more than a fixed share of a pass of the worker's loop.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ COST_S = SHARE_S / 2.0  # that a tile takes
 
 
 class Made:
-    """Simulated tiles that change, a clock, and a list of the publications with their times."""
+    """Simulated surroundings of the rounds: tiles that change, a clock, and a list of the
+    publications with their times.
+    """
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -31,7 +33,7 @@ class Made:
         self.now += COST_S
 
     def turn(self, seconds: float = 0.0) -> int:
-        """Simulate one turn of the service's worker: other work for `seconds`, and then the
+        """Simulate one pass of the service's worker loop: other work for `seconds`, and then the
         publication of tiles. Return the number of published tiles.
         """
         self.now += seconds

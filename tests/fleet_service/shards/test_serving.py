@@ -1,5 +1,5 @@
-"""Tests of the presence of regions: every client knows which regions are served. Three services
-run, and one of them stops.
+"""Tests of the presence of regions: every client learns from liveliness tokens which regions are
+served. Three services run, and one of them stops.
 """
 
 from __future__ import annotations
@@ -274,7 +274,9 @@ def test_who_is_found_after_it_was_asked_is_asked_again(
 
 
 def drive_one(session: zenoh.Session, service: Running) -> None:
-    """Send a car's batches of the middle region, and wait until the service has them."""
+    """Publish a car's batches for the middle region, and wait until the service has acknowledged
+    them.
+    """
     own = [made for made in visits("sim-000") if made.region == REGIONS[1]]
     for made in own:
         send(session, made, keys.observation_key(made.region, made.vehicle))

@@ -78,7 +78,9 @@ ASKED = {
 
 
 def fake(mu: float, lower: float, upper: float, like: DriveSet) -> Estimates:
-    """Return estimates of a drive with the true motion and a constant friction."""
+    """Return made-up estimates for a drive `like`: its true motion, and a constant friction
+    interval.
+    """
     output = np.zeros((*like.t.shape, ONE_FRICTION))
     truth = like.truth
     output[..., Column.VX], output[..., Column.VY], output[..., Column.YAW_RATE] = (

@@ -34,8 +34,9 @@ def judge(
     health: int = 0,
     used: float = 0.0,
 ) -> LogFigures:
-    """Return the evaluation figures of ten seconds at 20 m/s with a reported friction interval from
-    .4 to .8 (wider at the first sample). With `friction` NaN the true friction is not measured.
+    """Return the evaluation figures of a made-up log: ten seconds at 20 m/s, with a reported
+    friction interval from .4 to .8 (wider at the first sample). With `friction` NaN the true
+    friction is not measured.
     """
     t = np.arange(0.0, 10.0, 0.01)
     signals = np.full((len(t), len(CHANNELS)), np.nan)

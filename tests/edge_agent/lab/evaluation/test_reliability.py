@@ -84,8 +84,8 @@ def test_watching_a_drive_changes_nothing_that_is_said_of_it(
 def test_posterior_of_the_default_has_its_reported_quantiles(
     turning: DriveSet,
 ) -> None:
-    """The reported ends of the interval must lie at the calibrated quantile levels of the
-    posterior. The lower end may lie lower, because ice patches lower it.
+    """The ends of the reported friction interval must be the posterior's quantiles at the
+    calibrated levels. The lower end may lie lower, because ice patches lower it.
     """
     reported, _ = estimate_with_ranks(bank_of("aco-fckf", turning.vehicles), turning)
     for least, most, output in (

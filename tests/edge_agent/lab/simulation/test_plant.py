@@ -31,7 +31,9 @@ ROUNDING = 1e-9
 def some_instant(
     rng: np.random.Generator, mu: float = 0.6
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return state, parameters, inputs and wheels of a vehicle in a violent manoeuvre."""
+    """Return the arrays of a simulated vehicle in a violent manoeuvre drawn at random: state,
+    parameters, inputs, and forces of the wheels.
+    """
     p = PRESETS["sedan"].row()
     x = np.zeros(STATES)
     u = np.zeros((len(Control), 4))
@@ -53,7 +55,9 @@ def some_instant(
 def rolling(
     speed: float, mu: float, vehicle: TrueVehicle | None = None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return state, parameters and inputs of a vehicle that rolls straight ahead."""
+    """Return the arrays of a simulated vehicle that rolls straight ahead at `speed` [m/s]: state,
+    parameters and inputs.
+    """
     p = (vehicle or PRESETS["sedan"]).row()
     x = np.zeros(STATES)
     u = np.zeros((len(Control), 4))
@@ -147,8 +151,8 @@ def test_steering_left_turns_left_and_loads_the_right_wheels() -> None:
 
 @pytest.mark.parametrize("share", [-0.4, 0.3])
 def test_rear_wheels_that_steer_keep_the_circle_and_swing_the_tail(share: float) -> None:
-    """At walking pace the yaw rate must be the one that follows from the directions of the wheels,
-    for every share of rear steering.
+    """At walking pace the yaw rate must be the one that follows geometrically from the directions
+    of the wheels, for every ratio of rear to front steering.
     """
     circles = []
     for rear in (0.0, share):

@@ -55,7 +55,9 @@ def sine(slope: float) -> float:
 def still(
     slope: float, bank: float = 0.0, mu: float = 0.85
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return state, parameters, inputs and wheels of a standing sedan."""
+    """Return the arrays of a simulated sedan that stands on a road with this slope and bank: state,
+    parameters, inputs, and forces of the wheels.
+    """
     p = PRESETS["sedan"].row()
     x = np.zeros(STATES)
     u = np.zeros((INPUTS, 4))

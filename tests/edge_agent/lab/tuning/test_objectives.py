@@ -93,8 +93,8 @@ def test_interval_score_pays_for_width_and_twenty_times_for_a_miss() -> None:
 
 
 def test_interval_score_is_least_at_the_true_quantiles() -> None:
-    """The interval score must be least at the true quantiles: on draws from a known distribution, a
-    wider and a narrower interval must both score worse.
+    """The interval score must be least (best) for the interval between the true quantiles: on draws
+    from a known distribution, a wider and a narrower interval must both score worse.
     """
     draws = np.random.default_rng(1).normal(size=200_000)
     scores = {
@@ -247,7 +247,8 @@ def test_another_drive_of_the_set_gives_another_worth(drives: TuningSet) -> None
 
 def test_drives_of_one_s_own_are_searched_on(tmp_path: Path) -> None:
     """A user's recorded drives, in which the true friction is unknown, must be usable for tuning.
-    Their score is the prediction of the next measurement, on the last third of the recordings.
+    The fuzzy sets are then scored by how well the filter predicts the next measurement, on the last
+    third of the recordings.
     """
     logs = []
     found = []

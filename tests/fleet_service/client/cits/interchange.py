@@ -100,5 +100,7 @@ def _serve(url: str, requests: Connection) -> None:
 
 
 def _plain(given: dict[str, Any]) -> dict[str, Any]:
-    """Return application properties with Python types instead of AMQP types."""
+    """Return the application properties of a received message with Python types instead of AMQP
+    types.
+    """
     return {name: int(value) if isinstance(value, int) else value for name, value in given.items()}

@@ -359,7 +359,7 @@ def test_foreign_denm_alone_raise_no_alert(tmp_path: Path) -> None:
 
 
 def _yaws(denm: Denm) -> list[float]:
-    """Return the yaw angles [deg] of the reports made from a DENM, each once."""
+    """Return the yaw angles [deg] of the reports that the gateway makes from a DENM, each once."""
     batches = [json.loads(body) for _, body in encode_reports(denm, "cits-se", 5, 1, START)]
     return sorted({round(math.degrees(yaw)) % 360 for batch in batches for yaw in batch["yaw"]})
 
