@@ -1,4 +1,4 @@
-"""Parameters of a map query: `get gripmap/v1/map/**?…`."""
+"""Parameters of a map query, that is, of the Zenoh query `get gripmap/v1/map/**?…`."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class Part(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Suspicious pattern with its file and line."""
+    """Suspicious regular expression with its file and line."""
 
     place: str
     pattern: str

@@ -215,7 +215,7 @@ TABLES: Final = (
 
 
 class Line(NamedTuple):
-    """Row of the results block of the root README."""
+    """Row of the results block of the root README: text, and the figure that it shows."""
 
     text: str
     campaign: str

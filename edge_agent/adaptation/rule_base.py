@@ -57,7 +57,7 @@ class RuleBase(NamedTuple):
 
 
 def rule_base(memberships: Memberships) -> RuleBase:
-    """Return the fuzzy rules with the vertices of `memberships`."""
+    """Return the fuzzy rules with the corners and consequents given in `memberships`."""
     m = memberships
     ln_noise, pace = m.consequents
     return RuleBase(

@@ -87,7 +87,7 @@ class AgentPart(Protocol):
     """Interface of an additional part that uses the vehicles' Zenoh sessions."""
 
     def attach_session(self, name: str, session: zenoh.Session) -> None:
-        """Use the opened Zenoh session of a vehicle."""
+        """Give this part of the agent the opened Zenoh session of the vehicle `name`."""
 
     def start_part(self) -> None:
         """Start the part, before the agent processes the first block."""

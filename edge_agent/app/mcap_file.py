@@ -54,7 +54,7 @@ class McapTableWriter:
         self._writer.finish()  # type: ignore[no-untyped-call]
 
     def write_table(self, table: pa.Table) -> None:
-        """Add the samples of a table."""
+        """Write the samples of a table of estimates as messages."""
         for row in table.to_pylist():
             told = {
                 name: value

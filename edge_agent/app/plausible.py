@@ -101,7 +101,7 @@ class Plausibility:
         return [words for words, bad in found.items() if bad]
 
     def summary_line(self) -> str:
-        """Return the summary of the replay as one line."""
+        """Return one line that summarises the plausibility of the replayed log's estimates."""
         n = max(self.samples, 1)
         summary = (
             f"{self.samples} samples, {self.seconds:.1f} s; speed {self.median_speed_error:.1%} "

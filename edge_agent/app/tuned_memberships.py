@@ -90,7 +90,7 @@ class Provenance(Record):
 
 
 class Document(Record):
-    """Content of a file of tuned memberships."""
+    """Content of a file of tuned memberships (parameters of fuzzy sets)."""
 
     estimator: str
     memberships: dict[str, list[Finite]]

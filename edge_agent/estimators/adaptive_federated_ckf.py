@@ -52,7 +52,7 @@ ORDINARY = 1.0  # c of (32): gamma up to here is no sign of trouble; the paper's
 
 
 class AdaptiveMemory(FederatedMemory):
-    """Memory of paper 001's filter for one vehicle."""
+    """State of paper 001's filter for one vehicle that is kept between samples."""
 
     actual: Annotated[FloatArray, 2, ROWS]  # windowed squared innovations
     expected: Annotated[FloatArray, 2, ROWS]  # windowed innovation variances

@@ -88,7 +88,9 @@ class DriveWheelState(IntEnum):
 
 
 class CompensatedMemory(PaperMemory):
-    """Memory of paper 002's filters, WCKF-A and WCKF-B, for one vehicle."""
+    """State of paper 002's filters, WCKF-A and WCKF-B, for one vehicle that is kept between
+    samples.
+    """
 
     mean: Annotated[FloatArray, A_STATES]
     root: Annotated[FloatArray, A_STATES, A_STATES]

@@ -80,7 +80,7 @@ AY_SHARE = 0.05  # of a_y that the tyre model may miss
 
 
 class JointMemory(FederatedMemory):
-    """Memory of paper 000's joint filter for one vehicle."""
+    """State of paper 000's joint filter for one vehicle that is kept between samples."""
 
     mean: Annotated[FloatArray, WHEELS]  # friction
     root: Annotated[FloatArray, WHEELS, WHEELS]

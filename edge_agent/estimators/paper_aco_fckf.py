@@ -101,7 +101,7 @@ printed tables.
 
 
 class FuzzyMemory(PaperMemory):
-    """Memory of paper 004's filter for one vehicle."""
+    """State of paper 004's filter for one vehicle that is kept between samples."""
 
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]

@@ -110,7 +110,7 @@ class WheelFrictionState(IntEnum):
 
 
 class UnscentedMemory(PaperMemory):
-    """Memory of the filter `sr-ukf` for one vehicle."""
+    """State of the filter `sr-ukf` for one vehicle that is kept between samples."""
 
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]
@@ -118,7 +118,7 @@ class UnscentedMemory(PaperMemory):
 
 
 def make_bank(vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> EstimatorBank:
-    """Return a bank of filters, one per vehicle."""
+    """Return a bank of `sr-ukf` filters, one per vehicle; `tyre` selects the tyre model."""
     return EstimatorBank(
         new_filters(UnscentedMemory, vehicles, tyre),
         records(EmptyRecord, 1),

@@ -86,13 +86,15 @@ class Pacer:
         heapq.heappush(self._waiting, key)
 
     def record_sent(self, now: float) -> None:
-        """Record that a batch was sent."""
+        """Record that a batch was sent at time `now` [s] and waits for its answer."""
         self.flying += 1
         if self._unanswered_since is None:
             self._unanswered_since = now
 
     def record_settled(self) -> None:
-        """Record that a batch in flight was answered."""
+        """Record that a batch in flight (sent, not answered) was answered; the window may then
+        grow.
+        """
         self.flying -= 1
         grown = self._window + (1.0 if self._window < self._sure else 1.0 / self._window)
         self._window = min(grown, LARGEST_WINDOW)

@@ -56,7 +56,7 @@ class SignalProvider(Protocol):
         """Accept signals [%] and their time [ns UTC] for sending, without waiting."""
 
     def close(self) -> None:
-        """Deliver the waiting signals, and stop."""
+        """Deliver the signals that still wait, and stop the provider."""
 
 
 class RoadFrictionOutput:

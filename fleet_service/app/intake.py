@@ -160,7 +160,9 @@ class Intake:
         return beyond
 
     def update_weather(self, now: int) -> None:
-        """Apply the weather that arrived since the last call."""
+        """Archive the weather reports that arrived since the last call, and apply them to the
+        fusion.
+        """
         self._apply_weather(self.weather.take(now))
 
     def _apply_weather(self, reports: Reports | None) -> None:

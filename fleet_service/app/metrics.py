@@ -65,7 +65,7 @@ class Pulse(NamedTuple):
 def collect_metrics(
     engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path
 ) -> list[Metric]:
-    """Return all current metrics of a service."""
+    """Return all metrics of a service with their current values."""
     counts = dict(engine.counts)
     report_lag_s = engine.intake.report_lag_s
     away_s = 0.0 if engine.copy is None else engine.copy.backoff.away_s
@@ -139,7 +139,7 @@ def collect_metrics(
 
 
 def standby_metrics(config: ServiceConfig) -> list[Metric]:
-    """Return all metrics of a waiting (standby) service."""
+    """Return all metrics of a standby (a service that waits for the lease)."""
     return [_serves_metric(config, 0.0)]
 
 

@@ -49,7 +49,7 @@ class Tasks:
                 raise OSError("no segment could be written within the time limit")
 
     def do(self) -> None:
-        """Do all queued work; called by the worker."""
+        """Run all queued functions; the worker thread calls this."""
         while self:
             done, work = self._queue.get()
             if done.set_running_or_notify_cancel():

@@ -154,7 +154,7 @@ class Webhook:
         ]
 
     def send(self, alert: StretchAlert) -> None:
-        """Add an alert to the queue."""
+        """Add an alert to the queue of messages that are sent to the webhook's receiver."""
         try:
             dropped = self._queue.append(json.dumps(alert_message(alert)))
         except sqlite3.Error as error:

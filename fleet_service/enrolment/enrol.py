@@ -200,7 +200,9 @@ class Registry:
         return found is not None and any(ca.is_signed_by(found, signer) for signer in signers)
 
     def _revoke(self, gone: list[str]) -> list[str]:
-        """Move certificates and keys of removed names to `revoked/`."""
+        """Move certificates and keys of names that were removed from the enrolment file to
+        `revoked/`.
+        """
         for name in gone:
             for ending in (
                 ".key",

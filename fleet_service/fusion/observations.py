@@ -67,7 +67,7 @@ class Observations:
     other_share: Float32Array
 
     def take(self, rows: IntArray | BoolArray | slice) -> Observations:
-        """Return the observations that `rows` selects."""
+        """Return the observations that the indices or mask `rows` selects."""
         return Observations(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
 

@@ -101,7 +101,7 @@ class _Fields(NamedTuple):
         return self.walked.sizes
 
     def present_columns(self) -> PresentColumns:
-        """Return, for each column, which messages contain it."""
+        """Return, for each column, a mask (k,) of the messages that contain it."""
         given = self.walked.counts > 0
         return PresentColumns(
             self.kind,

@@ -57,7 +57,7 @@ class AttackedDrive:
 
 
 def drive_of(rng: Generator) -> AttackedDrive:
-    """Simulate the drive of the honest fleet."""
+    """Return a simulated drive of the honest fleet through a random town."""
     place = town.draw_town(rng, MINUTES, 0.0)
     visits = town.drive_fleet(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
     return AttackedDrive(place, visits, excited_vehicles(visits, place, BEGIN, VEHICLES) >= ENOUGH)

@@ -200,7 +200,7 @@ def false_alert(rng: Generator) -> bool:
 
 
 def measure(seeds: range) -> dict[str, float]:
-    """Run all situations and return their figures."""
+    """Run all situations of this module, and return their figures by name."""
     few = seeds[:4]
     return {
         "fusion.bounds.lower_excess": lower_excess(),

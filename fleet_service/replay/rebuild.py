@@ -441,7 +441,7 @@ class _Held:
                 self._taken.append((k, stop - start, sink.getvalue()))
 
     def keep(self) -> None:
-        """Keep the provisionally added rows."""
+        """Confirm the provisionally added rows, because their file was read completely."""
         for k, rows, packed in self._taken:
             self._kept[k].append(packed)
             self.rows += rows

@@ -114,7 +114,7 @@ class LeaseRecord(NamedTuple):
 
     @property
     def content(self) -> bytes:
-        """Return the content of the lease object as JSON."""
+        """Return the JSON content that the lease object in the bucket gets."""
         return json.dumps(
             {name: value for name, value in self._asdict().items() if name != "number"}
         ).encode()

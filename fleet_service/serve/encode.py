@@ -98,7 +98,7 @@ def _encode_rows(rows: Iterable[dict[str, Any]]) -> str:
 
 
 def arrow_stream(cells: pa.RecordBatch) -> bytes:
-    """Return cells as an Arrow stream with one batch."""
+    """Return a record batch of map cells as the bytes of an Arrow stream."""
     return b"".join([_SCHEMA, cells.serialize(), _END])
 
 

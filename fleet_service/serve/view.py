@@ -58,7 +58,7 @@ class Readable(Protocol):
 
     @property
     def live(self) -> Cells:
-        """Return the present state of the cells as columns."""
+        """Return the present state of all cells as columns, one row per slot (cell and sector)."""
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
         """Return the belief about the road (32 probabilities of μ) for each slot (cell and sector),

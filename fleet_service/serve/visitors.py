@@ -40,7 +40,7 @@ class Visitors:
         self._part = 0  # the newest that was heard of
 
     def add(self, o: Observations) -> None:
-        """Record which vehicles the observations report in which cells."""
+        """Record, for each cell that the observations `o` report, the vehicles that report it."""
         self._grow()
         part = o.time // PART_NS
         self._move_on(int(part.max(initial=self._part)))

@@ -78,7 +78,7 @@ def sweep_drafts(folder: Path) -> None:
 
 
 def sync_directory(folder: Path) -> None:
-    """Make renames and new names in `folder` durable."""
+    """Sync `folder` to disk (fsync), so that renames and new files in it survive power loss."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)

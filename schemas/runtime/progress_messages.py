@@ -123,5 +123,5 @@ def _show_status() -> None:
 
 
 def _load_drawing() -> None:
-    """Import the drawing library before it is needed."""
+    """Import the library that draws the spinner, before it is needed."""
     importlib.import_module("rich.progress")

@@ -72,7 +72,7 @@ class _Map:
         self._tiles.seen(self._slots, _NOW)
 
     def drive(self) -> None:
-        """Let one vehicle visit all cells once more."""
+        """Let one further vehicle visit all cells of the map."""
         self._turn += 1
         self._visit(100 + self._turn, 2 * PERIOD_NS / SECOND + self._turn)
 

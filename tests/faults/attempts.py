@@ -163,9 +163,7 @@ def false_router_with_the_certificate_of_a_vehicle(ground: Ground) -> bool:
 
 
 def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
-    """Publish a message on each of the given Zenoh keys through the attacker's session. Return True
-    if any listener receives one of these messages.
-    """
+    """Send to each key by the attacker. Return True if a listener receives one of the messages."""
     for expression in expressions:
         session.put(expression, SECRET + expression.encode())
     ground.await_effects(session)
@@ -365,8 +363,8 @@ def who_is_alive_is_told_to_a_vehicle(ground: Ground) -> bool:
 
 
 def as_router(ground: Ground, mode: str) -> bool:
-    """Connect to the fleet's router as a router or peer, so that messages of others might pass
-    through the attacker. Return True if this succeeds.
+    """Connect as router or peer, through which others' messages might pass; return True on
+    success.
     """
     given = settings(ground.network.endpoints[ROUTERS[1]], ground.folder)
     given = given.model_copy(
@@ -508,9 +506,7 @@ def administration_of_the_routers(ground: Ground) -> bool:
 
 @register_attempt
 def revoked_vehicle(ground: Ground) -> bool:
-    """Connect with the certificate of a name that was removed from the access list. Return True if
-    this succeeds.
-    """
+    """Connect with the certificate of a name off the access list. Return True if it succeeds."""
     network = ground.network
     lost = {
         f"connect_{part}": str(ground.folder / f"lost.{end}")

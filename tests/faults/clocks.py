@@ -56,7 +56,9 @@ class Machine:
     off: int = 0
 
     def clock(self, seen: int) -> SteadyClock:
-        """Return a service's clock that reads these simulated clocks."""
+        """Return a new service clock (`SteadyClock`) that reads these simulated clocks of the
+        machine.
+        """
         return SteadyClock(seen, lambda: self.true + self.off, lambda: self.true)
 
     def has_jumped(self, clock: SteadyClock) -> bool:
@@ -68,7 +70,7 @@ class Machine:
 
 @dataclass
 class Found:
-    """Numbers of failures by kind, summed over the cases."""
+    """Numbers of failures by kind (refused batches, lost alerts …), summed over the cases."""
 
     sent: int = 0
     rejected: int = 0

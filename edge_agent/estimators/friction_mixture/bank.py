@@ -1,4 +1,6 @@
-"""Bank kernel and output of the friction mixture."""
+"""Friction mixture (grid of friction hypotheses): compiled kernel for many vehicles, and output of
+the estimates.
+"""
 
 from __future__ import annotations
 

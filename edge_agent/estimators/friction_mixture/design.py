@@ -34,7 +34,9 @@ class Nominal(NamedTuple):
 
 
 class MixtureDesign(NamedTuple):
-    """All tables of one variant of the friction mixture."""
+    """All constant tables that a variant of the friction mixture (grid of friction hypotheses)
+    reads.
+    """
 
     constants: Constants
     mu: Annotated[FloatArray, NODES]  # nodes of one friction

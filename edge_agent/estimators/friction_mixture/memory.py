@@ -85,7 +85,7 @@ class GripInUse:
 
 
 class RollingMotion:
-    """Motion derived from the wheels without a tyre model."""
+    """Velocity derived from the speeds of rolling wheels without a tyre model."""
 
     moved_time: float  # at which a wheel last turned [s]
     disagreed_time: float  # at which wheels last disagreed [s]
@@ -127,7 +127,7 @@ class Trust:
 
 
 class Quantiles:
-    """Median and ends of the friction interval."""
+    """Median, lower and upper end (5 % and 95 % quantile) of friction."""
 
     median: float
     lower: float  # 5 %
@@ -136,7 +136,9 @@ class Quantiles:
 
 
 class MixtureMemory:
-    """Memory of the friction mixture of one vehicle."""
+    """State of the default estimator (friction mixture) for one vehicle that is kept between
+    samples.
+    """
 
     row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
     nominal: Nominal  # prior of its states, by what its file knows of them

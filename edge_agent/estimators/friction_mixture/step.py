@@ -194,7 +194,7 @@ def _find_side(
 
 @compiled
 def mean_velocity(memory: MixtureMemory) -> tuple[float, float]:
-    """Return the current (v_x, v_y) [m/s] of the mixture."""
+    """Return the current velocity (v_x, v_y) [m/s], the mean over all friction hypotheses."""
     block = memory.block
     return turned_velocity(memory, block.gain, math.cos(block.angle), math.sin(block.angle))
 

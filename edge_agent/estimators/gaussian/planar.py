@@ -47,7 +47,7 @@ class PlanarState(IntEnum):
 
 
 class HeunInputs(NamedTuple):
-    """Inputs of one integration step of Heun's rule."""
+    """Inputs of the vehicle model at both ends of one integration step of Heun's rule."""
 
     begin: WheelInputs
     end: WheelInputs

@@ -81,7 +81,7 @@ class DetectionTally:
     seconds: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, name: str, values: NDArray[np.generic]) -> None:
-        """Add values to the mean called `name`."""
+        """Add values to the sum and the count from which the mean called `name` is computed."""
         self.total[name] = self.total.get(name, 0.0) + float(np.sum(values, dtype=np.float64))
         self.count[name] = self.count.get(name, 0) + int(np.size(values))
 
@@ -378,7 +378,9 @@ class DetectionResults:
     towns: dict[tuple[str, str], list[TownTally]] = field(default_factory=dict)
 
     def add(self, length: str, kind: str, town: TownTally) -> None:
-        """Add the tally of a town."""
+        """Add the tally (sums and counts) of a town, by length of its drives and kind of its
+        cars.
+        """
         self.towns.setdefault((length, kind), []).append(town)
 
     def pool_towns(

@@ -113,7 +113,7 @@ def judge_folder(
 
 
 def judge_log(path: Path) -> LogFigures:
-    """Replay one log and evaluate its estimates."""
+    """Estimate one recorded log, and return the evaluation figures of the estimates."""
     adopted = prepare_log(read_log(path), load_vehicle(path.with_suffix(".json")))
     values, urgent = replay_log(adopted.log, adopted.vehicle)
     truth = read_truth(path, adopted.log.t)

@@ -35,7 +35,7 @@ KeyArray: TypeAlias = NDArray[np.uint64]
 
 
 class Driver(IntEnum):
-    """Index of a state variable of one driver (float64)."""
+    """Index of a state variable of one simulated driver (an array of float64)."""
 
     STEER = 0  # [rad] mean road-wheel angle, as the arms have followed so far
     FORCE = 1  # [N] longitudinal, as the foot has followed so far

@@ -50,7 +50,7 @@ class TimedFriction(NamedTuple):
     at_s: float
 
     def value(self, t: float) -> float:
-        """Return the friction at time `t` [s]."""
+        """Return the friction under all wheels at time `t` [s]."""
         return self.before if t < self.at_s else self.after
 
 

@@ -38,7 +38,7 @@ Q_SUM = 3
 
 
 class Pmsm(NamedTuple):
-    """Constants of one motor, and of the speed control."""
+    """Constants of one permanent-magnet synchronous motor, and of its speed control."""
 
     resistance: float = 0.10  # R [ohm]
     inductance_d: float = 3.0e-4  # L_d [H]

@@ -89,7 +89,7 @@ def read_tables(
 def read_wanted(
     root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged
 ) -> Iterator[pa.Table]:
-    """Yield tables like `read_tables`, for a selection `wanted`."""
+    """Yield tables like `read_tables`, with the rows, columns and files that `wanted` selects."""
     listing = Listing(root, kind, wanted, damaged)
     yield from listing.inbox()
     for path in listing.files:

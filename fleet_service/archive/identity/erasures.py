@@ -99,7 +99,7 @@ class ErasedData(NamedTuple):
 
 
 def read_erasures(folder: Path) -> ErasedData:
-    """Return the erased data recorded in the key folder."""
+    """Return which data have been erased, as recorded in the folder of keys."""
     months = list[Span]()
     vehicles = dict[int, int]()
     for path in sorted(folder.glob("*.erased")):

@@ -62,7 +62,7 @@ def rows_of_lines(rows: int, kind: np.dtype[Any], *shape: int) -> NDArray[Any]:
 
 
 def no_beliefs(rows: int) -> PackedArray:
-    """Return zeroed memory for packed beliefs, (rows, 32)."""
+    """Return an array (rows, 32) of zeros for beliefs packed in 16 bits."""
     return rows_of_lines(rows, np.dtype(np.uint16), mugrid.BINS)
 
 

@@ -104,7 +104,7 @@ class Store:
 
     @property
     def waiting(self) -> int:
-        """Number of entries (observations) in the lateness window."""
+        """Number of entries (observations) in the lateness windows (recent past) of all cells."""
         return len(self.state.free_entries) - int(self.state.used[FREE_ENTRIES])
 
     def due_windows(self, before: int) -> tuple[IntArray, IntArray]:

@@ -107,7 +107,7 @@ class Country:
         return ["/".join((*part[:2], "*")) for part in parts]
 
     def region_id(self, k: int) -> int:
-        """Return the quadint of region k of the country."""
+        """Return the quadint (number of a grid square) of region k of the country."""
         x, y = self.regions[k]
         return int(grid.interleave(np.array([x]), np.array([y]))[0])
 

@@ -61,7 +61,7 @@ def pseudonyms_of(root: Path) -> list[str]:
 
 
 def count_shown(session: zenoh.Session) -> dict[int, int]:
-    """Return the number of observations of each published cell."""
+    """Query the map, and return the number of observations of each cell."""
     found: dict[int, int] = {}
     for reply in session.get(keys.map_key(TILE)):
         if reply.ok is not None:

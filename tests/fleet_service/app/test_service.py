@@ -133,7 +133,7 @@ def ask(
 
 
 def alive(session: zenoh.Session) -> list[str]:
-    """Return the liveliness tokens of the services."""
+    """Return the liveliness tokens by which running services show that they are alive."""
     return [
         str(reply.ok.key_expr)
         for reply in session.liveliness().get(f"{keys.ROOT}/shard/*")

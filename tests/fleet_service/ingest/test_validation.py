@@ -36,7 +36,9 @@ def test_ranges_hold_exactly_their_numbers(numbers: set[int]) -> None:
 
 
 class Desk:
-    """Intake of messages that works without a running service."""
+    """Intake of messages as a service has it, with its counters and acknowledgements, but without a
+    running service.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.counts: Counter[str] = Counter()

@@ -36,7 +36,7 @@ READERS = {
 
 
 def opened_by(reader: str, address: str, folder: Path) -> Any:  # noqa: ANN401 geopandas is untyped
-    """Return the map's features as another program reads them."""
+    """Return the map's features as the program `reader` reads them from the page at `address`."""
     out = folder / f"{reader}.parquet"
     script = f"{READERS[reader].format(address=address)}; found.to_parquet({str(out)!r})"
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)

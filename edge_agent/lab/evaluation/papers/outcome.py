@@ -70,7 +70,9 @@ class PaperRow(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """One curve in a panel."""
+    """One curve in a panel of a plot: its name, points (x, y), and the kind that selects its
+    colour.
+    """
 
     name: str
     x: FloatArray
