@@ -163,7 +163,7 @@ def false_router_with_the_certificate_of_a_vehicle(ground: Ground) -> bool:
 
 
 def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
-    """Send to each key by the attacker. Return True if a listener receives one of the messages."""
+    """Publish on each key as the attacker; return True if a listener receives any message."""
     for expression in expressions:
         session.put(expression, SECRET + expression.encode())
     ground.await_effects(session)
@@ -363,9 +363,7 @@ def who_is_alive_is_told_to_a_vehicle(ground: Ground) -> bool:
 
 
 def as_router(ground: Ground, mode: str) -> bool:
-    """Connect as router or peer, through which others' messages might pass; return True on
-    success.
-    """
+    """Return True if the attacker can connect as a router or peer, which may forward messages."""
     given = settings(ground.network.endpoints[ROUTERS[1]], ground.folder)
     given = given.model_copy(
         update={"config": {**given.config, "mode": mode, "listen/endpoints": []}}
@@ -506,7 +504,7 @@ def administration_of_the_routers(ground: Ground) -> bool:
 
 @register_attempt
 def revoked_vehicle(ground: Ground) -> bool:
-    """Connect with the certificate of a name off the access list. Return True if it succeeds."""
+    """Return True if a certificate with a name removed from the access list still connects."""
     network = ground.network
     lost = {
         f"connect_{part}": str(ground.folder / f"lost.{end}")
