@@ -10,34 +10,32 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
 
 import zenoh
 
 from fleet_service.app.clock import SteadyClock
+from fleet_service.app.endpoints import Endpoints
 from fleet_service.app.engine import Engine
 from fleet_service.app.jobs import BackgroundJobs, archive_jobs
 from fleet_service.app.metrics import Pulse, collect_metrics, health_problems
+from fleet_service.app.publications import publish_acks, publish_alerts, publish_tile
+from fleet_service.app.status_line import StatusLine
 from fleet_service.enrolment.fleet import Enrolment
 from fleet_service.ingest.inbox import Inbox, Message
 from fleet_service.ingest.rate_limit import RateLimiter
-from fleet_service.ingest.weather import WeatherMessage
 from fleet_service.replication.ownership import Ownership
 from fleet_service.serve.queryable import Answering, MapQueryable
 from fleet_service.serve.tile_rounds import SHARE_S, TileRounds
-from fleet_service.shards import handover
 from fleet_service.shards.serving import announce_regions as serving_regions
 from fleet_service.shards.serving import claim_regions, watch_successors
-from schemas import grid, keys, wire
 from schemas.config import ServiceConfig, load
-from schemas.query import MapQuery
 from schemas.runtime import watchdog, zenoh_session
 from schemas.runtime.metrics import serve_metrics
-from schemas.runtime.process import LogLine
-from schemas.wire import Alert, Kind
+from schemas.wire import Alert
 
 IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or a tile can be
 # between two puts of alerts that stand: who comes back waits less than 5 s for them
@@ -46,11 +44,9 @@ REPEATED: Final = 1000  # alerts in such a turn, 150 kB; more go in turn
 # of a segment or a tile of an answer that is being made: systemd is to start anew
 HANGS_S: Final = 60.0
 STUCK_S: Final = 10.0  # a worker that does nothing for so long is to be followed by another service
-STATUS_S: Final = 5.0
 LEAVE_S: Final = 1.5  # of the three seconds in which a service is gone
 SURVIVED_S: Final = 20.0  # a service that is still there has not died of its checkpoint
 BEHIND: Final = 1000  # messages that wait; a worker that is so far behind puts one tile a turn
-LAG_S: Final = 1.0  # of the system's clock that is worth telling
 
 
 class Service:
@@ -83,9 +79,16 @@ class Service:
             config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts
         )
         self._replies = MapQueryable(
-            Answering(self.engine.queries.measure_answer, self._answer), self.engine.counts
+            Answering(
+                self.engine.queries.measure_answer,
+                lambda wanted, near, only: self.engine.queries.answer(
+                    wanted, near, self._clock.now(), only
+                ),
+            ),
+            self.engine.counts,
         )
         self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
+        self._endpoints = Endpoints(config, self.engine, self.inbox, self._replies)
         jobs = archive_jobs(self.engine, config, root, self._clock.moment)
         self._upkeep = BackgroundJobs(jobs, self.engine.counts, log_line)
         # of the worker; leaving the session after it may hang
@@ -98,10 +101,8 @@ class Service:
             self.engine.counts,
             time.monotonic,
         )
-        self._stepped_at = self._flushed_at = self._reported_at = self._repeated_at = (
-            time.monotonic()
-        )
-        self._reported = 0
+        self._stepped_at = self._flushed_at = self._repeated_at = time.monotonic()
+        self._status_line = StatusLine(self.engine, self.inbox, self._clock, log_line)
         self._began = self._stepped_at
         self._survived = False
         self._followed = False  # by a service that has the lease now
@@ -140,7 +141,7 @@ class Service:
             ) as mine,
             watch_successors(session, mine) as came,
             self._upkeep,
-            self._declare_inputs(session),
+            self._endpoints.declare_all(session),
             serving_regions(session, mine),
         ):
             self._session = session
@@ -211,91 +212,25 @@ class Service:
             lambda: health_problems(engine, pulse(), config) + self._upkeep.health_problems(),
         )
 
-    @contextmanager
-    def _declare_inputs(self, session: zenoh.Session) -> Iterator[None]:
-        regions = self._config.regions
-        own = keys.shard_key(self._config.name)
-        inputs = [
-            session.declare_subscriber(f"{keys.ROOT}/{kind}/{region}/*", self.inbox.callback(kind))
-            for kind in Kind
-            for region in regions
-        ]
-        inputs += [
-            session.declare_subscriber(f"{keys.ROOT}/weather/{region}", self._weather)
-            for region in regions
-        ]
-        queryables = [
-            session.declare_queryable(f"{keys.ROOT}/map/{region}/*", self._replies, complete=True)
-            for region in regions
-        ]
-        queryables += [
-            session.declare_queryable(
-                f"{keys.ROOT}/alert/{region}/*", self._standing, complete=True
-            )
-            for region in regions
-        ]
-        if self.engine.holding.lease is not None:
-            queryables.append(
-                session.declare_queryable(own, lambda query: self._hand_over(query, session))
-            )
-        token = session.liveliness().declare_token(own)  # last: who sees it may ask
-        try:
-            yield
-        finally:
-            token.undeclare()
-            for subscriber in inputs:
-                subscriber.undeclare()
-            for queryable in queryables:
-                queryable.undeclare()
-
-    def _hand_over(self, query: zenoh.Query, session: zenoh.Session) -> None:
-        """Answer a hand-over request: shut the service down regularly, so that the named standby
-        takes over.
-        """
-        self.engine.holding.to = (
-            handover.answer_request(query, session, self._config.regions) or self.engine.holding.to
-        )
-
-    def _standing(self, asked: zenoh.Query) -> None:
-        """Answer a query for the active ("standing") alerts. Clients send it when they start,
-        because earlier messages do not reach them.
-        """
-        expression = asked.key_expr
-        with asked:
-            for tile, alerts in self.engine.alerts.encode_tiles(
-                lambda tile: expression.intersects(zenoh.KeyExpr(keys.alert_key(tile)))
-            ):
-                asked.reply(keys.alert_key(tile), alerts, encoding=wire.STANDING_ENCODING)
-
-    def _weather(self, sample: zenoh.Sample) -> None:
-        if sample.kind != zenoh.SampleKind.PUT:
-            return
-        fits = (
-            len(sample.payload) <= wire.MAX_BYTES
-        )  # else it is refused as an empty one, where refusals are counted
-        payload = sample.payload.to_bytes() if fits else b""
-        message = WeatherMessage(str(sample.key_expr), payload, str(sample.encoding))
-        self.engine.intake.weather.enqueue(message)
-
     def _step(self, session: zenoh.Session, stop: threading.Event) -> None:
         if self.engine.settlement.is_full:
             stop.wait(IDLE_S)
         else:
             self._take(session, self.inbox.drain(0.0 if self._rounds.waiting else IDLE_S))
         now = self._stepped_at = time.monotonic()
-        self._acknowledge(session, self.engine.settlement.end_flush())
+        publish_acks(session, self.engine.settlement.end_flush())
         if now - self._flushed_at >= self._config.segment_s:
             self._flushed_at = now
-            self._acknowledge(session, self.engine.settlement.begin_flush())
+            publish_acks(session, self.engine.settlement.begin_flush())
             self.engine.intake.update_weather(self._clock.now())
         if self._rounds.begin() and (at := self._clock.moment()).sure:
-            self._put_alerts(session, self.engine.alerts.expire(at.now))
+            publish_alerts(session, self.engine.alerts.expire(at.now))
         self._rounds.go_on(SHARE_S if len(self.inbox) < BEHIND else 0.0)
         if now - self._repeated_at >= REPEAT_S:
             self._repeated_at = now
-            self._put_alerts(session, self.engine.alerts.next_to_repeat(REPEATED))
-        if now - self._reported_at >= STATUS_S:
-            self._status(now)
+            publish_alerts(session, self.engine.alerts.next_to_repeat(REPEATED))
+        if self._status_line.is_due(now):
+            self._status_line.write_line(now)
             if hanging := self._hanging():
                 self._log_line(f"watchdog signal withheld: {hanging}")
             else:
@@ -324,68 +259,19 @@ class Service:
             if not messages:
                 break
             self._take(session, messages)
-        self._acknowledge(session, self.engine.settlement.flush())
+        publish_acks(session, self.engine.settlement.flush())
         if not leaves:  # else they are put by who comes, which puts all tiles
             self._rounds.finish(max(deadline - time.monotonic(), 0.0))
-        self._status(time.monotonic())
+        self._status_line.write_line(time.monotonic())
 
     def _take(self, session: zenoh.Session, messages: list[Message]) -> None:
         if messages:
-            self._put_alerts(session, ingest_messages(self.engine, self._clock, messages))
-
-    def _acknowledge(self, session: zenoh.Session, acks: list[tuple[str, bytes]]) -> None:
-        for vehicle, ack in acks:
-            publish_message(session, keys.ack_key(vehicle), ack, wire.ACK_ENCODING)
+            publish_alerts(session, ingest_messages(self.engine, self._clock, messages))
 
     def _put_tile(self, tile: int) -> None:
         stream = self.engine.queries.tile(tile, self._clock.now())
         if stream and self._session is not None:
-            publish_message(self._session, keys.map_key(tile), stream, wire.ARROW)
-
-    def _put_alerts(self, session: zenoh.Session, alerts: list[Alert]) -> None:
-        for alert in alerts:
-            publish_message(
-                session,
-                keys.alert_key(int(grid.tile_of(alert.cell))),
-                wire.encode_alert(alert),
-                wire.ALERT_ENCODING,
-            )
-
-    def _status(self, now: float) -> None:
-        counts = self.engine.counts
-        rate = (counts[Kind.OBSERVATION] - self._reported) / max(now - self._reported_at, 1e-9)
-        self._reported_at = now
-        self._reported = counts[Kind.OBSERVATION]
-        behind = self._clock.lag() * 1e-9
-        rest = ", ".join(
-            f"{name} {n}" for name, n in sorted(counts.items()) if n and name not in set(Kind)
-        )
-        text = (
-            f"status: {counts[Kind.OBSERVATION]} observations ({rate:.0f}/s), {counts[Kind.STATE]} "
-            "states, "
-            f"{self.engine.state.fusion.size} cells, {self.engine.alerts.count} alerts, queue "
-            f"{len(self.inbox)}"
-            + (f"; {rest}" if rest else "")
-            + (f"; the system clock is {behind:.0f} s behind" if behind >= LAG_S else "")
-            + (
-                f"; the system clock jumped {-behind:.0f} s ahead, and no report confirms this"
-                if behind <= -LAG_S
-                else ""
-            )
-        )
-        self._log_line(
-            LogLine(
-                text,
-                cells=self.engine.state.fusion.size,
-                queue=len(self.inbox),
-                counts=dict(counts),
-            )
-        )
-
-    def _answer(
-        self, wanted: MapQuery, near: Callable[[int], bool], only: int | None
-    ) -> Iterator[tuple[int, bytes]]:
-        return self.engine.queries.answer(wanted, near, self._clock.now(), only)
+            publish_tile(self._session, tile, stream)
 
 
 def ingest_messages(engine: Engine, clock: SteadyClock, messages: list[Message]) -> list[Alert]:
@@ -395,8 +281,3 @@ def ingest_messages(engine: Engine, clock: SteadyClock, messages: list[Message])
     alerts = engine.intake.ingest(messages, clock.moment())
     clock.record_reports(engine.intake.times)
     return alerts
-
-
-def publish_message(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> None:
-    """Publish a message with the quality of service of its key's topic."""
-    session.put(key, payload, encoding=encoding, **zenoh_session.quality_of(keys.parse(key).topic))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet_service.app import service
+from fleet_service.app import service, status_line
 from schemas.config import ZenohSettings
 from tests.fleet_service.conftest import running
 from tests.waiting import until
@@ -26,7 +26,7 @@ def test_signs_of_life_end_with_a_reason_when_an_answer_hangs(
     with closing(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)) as manager:
         manager.bind(str(tmp_path / "notify"))
         monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-        monkeypatch.setattr(service, "STATUS_S", 0.02)
+        monkeypatch.setattr(status_line, "STATUS_S", 0.02)
         with running(router, tmp_path / "archive") as run:
             assert [manager.recv(64) for _ in range(3)] == [LIFE] * 3
             run.service._replies._busy_since = time.monotonic() - 2 * service.HANGS_S

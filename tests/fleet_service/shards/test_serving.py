@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from fleet_service.app.service import Service
+from fleet_service.app.endpoints import Endpoints
 from fleet_service.cli import main
 from fleet_service.client import map_client, watching
 from fleet_service.shards.serving import announce_regions, claim_regions, rival_tokens
@@ -207,17 +207,17 @@ def test_region_is_announced_only_while_queries_are_answered(
     router: ZenohSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = []
-    answering = Service._declare_inputs
+    answering = Endpoints.declare_all
 
     @contextmanager
-    def record_tokens(service: Service, session: zenoh.Session) -> Iterator[None]:
-        with answering(service, session):
+    def record_tokens(endpoints: Endpoints, session: zenoh.Session) -> Iterator[None]:
+        with answering(endpoints, session):
             seen.append(presence.active_tokens(session))
             yield
             until(lambda: not presence.active_tokens(session))
             seen.append(set())
 
-    monkeypatch.setattr(Service, "_declare_inputs", record_tokens)
+    monkeypatch.setattr(Endpoints, "declare_all", record_tokens)
     with (
         running(router, tmp_path / "one", name="first", regions=NAMES[:1]),
         zenoh_session(router) as other,

@@ -1,0 +1,66 @@
+"""Status line that a service writes to its log every few seconds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from fleet_service.app.clock import SteadyClock
+from fleet_service.app.engine import Engine
+from fleet_service.ingest.inbox import Inbox
+from schemas.runtime.process import LogLine
+from schemas.wire import Kind
+
+STATUS_S: Final = 5.0
+LAG_S: Final = 1.0  # of the system's clock that is worth telling
+
+
+class StatusLine:
+    """Status of a service as a line of text: observations, cells, alerts, queue and clock."""
+
+    def __init__(
+        self, engine: Engine, inbox: Inbox, clock: SteadyClock, log_line: Callable[[str], None]
+    ) -> None:
+        self._engine = engine
+        self._inbox = inbox
+        self._clock = clock
+        self._log_line = log_line
+        self._reported_at = time.monotonic()
+        self._reported = 0
+
+    def is_due(self, now: float) -> bool:
+        """Return True if the last line is STATUS_S old; `now` is the monotonic time [s]."""
+        return now - self._reported_at >= STATUS_S
+
+    def write_line(self, now: float) -> None:
+        """Write the line; `now` is the monotonic time [s]."""
+        counts = self._engine.counts
+        rate = (counts[Kind.OBSERVATION] - self._reported) / max(now - self._reported_at, 1e-9)
+        self._reported_at = now
+        self._reported = counts[Kind.OBSERVATION]
+        behind = self._clock.lag() * 1e-9
+        rest = ", ".join(
+            f"{name} {n}" for name, n in sorted(counts.items()) if n and name not in set(Kind)
+        )
+        text = (
+            f"status: {counts[Kind.OBSERVATION]} observations ({rate:.0f}/s), {counts[Kind.STATE]} "
+            "states, "
+            f"{self._engine.state.fusion.size} cells, {self._engine.alerts.count} alerts, queue "
+            f"{len(self._inbox)}"
+            + (f"; {rest}" if rest else "")
+            + (f"; the system clock is {behind:.0f} s behind" if behind >= LAG_S else "")
+            + (
+                f"; the system clock jumped {-behind:.0f} s ahead, and no report confirms this"
+                if behind <= -LAG_S
+                else ""
+            )
+        )
+        self._log_line(
+            LogLine(
+                text,
+                cells=self._engine.state.fusion.size,
+                queue=len(self._inbox),
+                counts=dict(counts),
+            )
+        )
