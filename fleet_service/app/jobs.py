@@ -32,6 +32,9 @@ from schemas.wire import Kind
 
 log = logging.getLogger(__name__)
 ROUND_ROWS: Final = 250_000  # of one round of compaction: a second of work, 150 MB
+# Segments that may wait for compaction. A question to the archive reads each of them, in a
+# millisecond.
+SEGMENTS_MOST: Final = 10_000
 INVENTORY_S: Final = 300.0  # thousands of files are looked through in a tenth of a second
 # after which the archive's copy has what compaction, checkpoints and snapshots made
 FOLLOW_S: Final = 30.0
@@ -73,6 +76,10 @@ def archive_jobs(
         words += ["--to", config.put_to] if config.put_to else []
         output = subprocess_job.run_module("compact", "fleet_service.cli", words, stop)
         return output and f"compacted: {output}"
+
+    def early_compaction(stop: threading.Event) -> str | None:
+        waiting = sum(len(segments.list_segments(root, kind)) for kind in Kind)
+        return compaction(stop) if waiting > SEGMENTS_MOST else None
 
     def snapshot(_: threading.Event) -> str | None:
         now = moment().now
@@ -140,6 +147,11 @@ def archive_jobs(
 
     return [
         Job("compaction", config.compact_s, with_disk_space(compaction)),
+        Job(
+            "early_compaction",
+            SOON_S if config.compact_s else 0.0,
+            with_disk_space(early_compaction),
+        ),
         Job("checkpoint", config.checkpoint_s, checkpoint),
         Job("snapshot", config.snapshot_s, snapshot),
         Job("retention", DAY_S if config.raw_days else 0.0, with_disk_space(retention)),

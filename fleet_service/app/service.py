@@ -89,6 +89,7 @@ class Service:
         )
         self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
         self._endpoints = Endpoints(config, self.engine, self.inbox, self._replies)
+        self.engine.settlement.call_when_written(self.inbox.wake)
         jobs = archive_jobs(self.engine, config, root, self._clock.moment)
         self._upkeep = BackgroundJobs(jobs, self.engine.counts, log_line)
         # of the worker; leaving the session after it may hang
@@ -216,10 +217,14 @@ class Service:
         if self.engine.settlement.is_full:
             stop.wait(IDLE_S)
         else:
-            self._take(session, self.inbox.drain(0.0 if self._rounds.waiting else IDLE_S))
+            wait_s = min(IDLE_S, self.engine.settlement.until_early_s(time.monotonic()))
+            self._take(session, self.inbox.drain(0.0 if self._rounds.waiting else wait_s))
         now = self._stepped_at = time.monotonic()
         publish_acks(session, self.engine.settlement.end_flush())
-        if now - self._flushed_at >= self._config.segment_s:
+        if (
+            now - self._flushed_at >= self._config.segment_s
+            or self.engine.settlement.until_early_s(now) <= 0.0
+        ):
             self._flushed_at = now
             publish_acks(session, self.engine.settlement.begin_flush())
             self.engine.intake.update_weather(self._clock.now())

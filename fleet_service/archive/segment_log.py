@@ -7,6 +7,7 @@ acknowledged.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -73,6 +74,11 @@ class SegmentLog(Generic[Batch]):
             only when it is in both places.
         epoch: smallest number that may be used as the epoch (number of the start) in segment names;
             the lease determines it.
+
+    Attributes:
+        on_written: called in the internal thread when a write has ended, successfully or not.
+        begun_s: monotonic time [s] at which the last write with rows began.
+        write_s: duration of this write [s]; if it is still running, of the one before.
     """
 
     def __init__(
@@ -83,8 +89,11 @@ class SegmentLog(Generic[Batch]):
         self._next: _Load[Batch] = _Load()
         self._load: _Load[Batch] = _Load()  # what was handed over
         self._written: Future[None] | None = None
-        self._begun = 0.0
+        self._began = 0.0
+        self.begun_s = -math.inf
+        self.write_s = 0.0
         self._thread = ThreadPoolExecutor(1, "segments")
+        self.on_written: Callable[[], None] = lambda: None
 
     @property
     def newest(self) -> Cut:
@@ -97,7 +106,7 @@ class SegmentLog(Generic[Batch]):
     def hangs_s(self) -> float:
         """Return the time [s] since the current write began; 0 if no write is running."""
         return (
-            0.0 if self._written is None or self._written.done() else time.monotonic() - self._begun
+            0.0 if self._written is None or self._written.done() else time.monotonic() - self._began
         )
 
     @property
@@ -109,6 +118,13 @@ class SegmentLog(Generic[Batch]):
     def unsettled(self) -> int:
         """Return the number of batches that are not durable yet."""
         return len(self._next.batches) + len(self._load.batches)
+
+    @property
+    def can_begin(self) -> bool:
+        """Return True if batches wait, and no earlier write still has to be collected with
+        `end`.
+        """
+        return self._written is None and bool(self._next.batches)
 
     @property
     def ended(self) -> bool:
@@ -127,8 +143,18 @@ class SegmentLog(Generic[Batch]):
         if self._written is None:
             self._load.take(self._next)
             self._next = _Load()
-            self._begun = time.monotonic()
-            self._written = self._thread.submit(self._load.write, self._writer, self._upload)
+            self._began = time.monotonic()
+            if self._load.batches:
+                self.begun_s = self._began
+            self._written = self._thread.submit(self._write, self._load)
+            self._written.add_done_callback(lambda _: self.on_written())
+
+    def _write(self, load: _Load[Batch]) -> None:
+        try:
+            load.write(self._writer, self._upload)
+        finally:
+            if load.batches:
+                self.write_s = time.monotonic() - self._began
 
     def end(self) -> list[Batch]:
         """Wait for the current write; return the batches (messages) that it made durable. Each

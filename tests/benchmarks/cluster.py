@@ -19,7 +19,7 @@ from schemas import keys
 from schemas.config import ZenohSettings
 from schemas.runtime.figures import Figure
 from schemas.runtime.zenoh_session import open_session
-from tests.benchmarks.service import ack_delays_s, poll_until, run_process
+from tests.benchmarks.service import ACKS, ack_delays_s, poll_until, run_process
 from tests.buckets import bucket_server
 
 TURNS = 3  # of each, so that what else the machine does hits both
@@ -42,7 +42,7 @@ def delays_s(folder: Path, archive: dict[str, Any]) -> list[float]:
         poll_until(
             lambda: [reply for reply in client.liveliness().get(keys.shard_key("*")) if reply.ok]
         )
-        return ack_delays_s(client)
+        return ack_delays_s(client, "acked-0", (0.0, 0.3), ACKS)
 
 
 def cluster() -> list[Figure]:

@@ -36,6 +36,7 @@ LINES = 50
 QUERIES = 200
 ALERTS = 60
 ACKS = 60
+IDLE_ACKS = 25
 APART = 4  # cells between two that freeze: further than a position's error reaches
 BARE = "gripmap-bare/tile"
 BARE_BOX = "gripmap-bare/box"
@@ -203,9 +204,11 @@ def alert_delays_ms(session: zenoh.Session) -> list[float]:
     return out
 
 
-def ack_delays_s(session: zenoh.Session) -> list[float]:
-    """Return the times [s] from a vehicle's publication to its acknowledgement, for batches sent at
-    random times.
+def ack_delays_s(
+    session: zenoh.Session, vehicle: str, apart_s: tuple[float, float], count: int
+) -> list[float]:
+    """Return the times [s] from a vehicle's publication to its acknowledgement, for `count` batches
+    sent at random times; the time between two batches is within `apart_s` [s].
 
     Raises:
         TimeoutError: a batch was not acknowledged.
@@ -219,18 +222,16 @@ def ack_delays_s(session: zenoh.Session) -> list[float]:
                 for seq in range(first, last + 1):
                     heard.put((seq, now))
 
-    session.declare_subscriber(keys.ack_key("acked-0"), record_ack)
+    session.declare_subscriber(keys.ack_key(vehicle), record_ack)
     rng = np.random.default_rng(0)
     sent = {}
-    for seq in range(1, ACKS + 1):
+    for seq in range(1, count + 1):
         sent[seq] = time.perf_counter()
         put_batch(
             session,
-            make_batch(
-                "acked-0", seq, rng.integers(0, COLUMNS, 1), rng.integers(0, LINES, 1), False
-            ),
+            make_batch(vehicle, seq, rng.integers(0, COLUMNS, 1), rng.integers(0, LINES, 1), False),
         )
-        time.sleep(rng.uniform(0.0, 0.3))
+        time.sleep(rng.uniform(*apart_s))
     out = []
     for _ in sent:
         seq, when = heard.get(timeout=30.0)
@@ -270,6 +271,9 @@ def service() -> list[Figure]:
         client = open_session(ZenohSettings(connect=[endpoint]))
         assert client is not None
         stack.enter_context(client)
+        put_batch(client, make_batch("first", 1, np.zeros(1, int), np.zeros(1, int), False))
+        poll_until(lambda: len(fetch_reply(client, f"{keys.ROOT}/map/**")))
+        idle = ack_delays_s(client, "acked-1", (0.5, 1.5), IDLE_ACKS)
         stack.enter_context(
             run_process("-c", f"from tests.benchmarks.service import load; load({endpoint!r})")
         )
@@ -291,7 +295,7 @@ def service() -> list[Figure]:
             )
         )
         alerts = alert_delays_ms(client)
-        acks = ack_delays_s(client)
+        acks = ack_delays_s(client, "acked-0", (0.0, 0.3), ACKS)
     limits = [statistics.median(times) for times in least]
     vs = [f"of {limit:.1f} ms, {number} cells" for limit, number in zip(limits, cells, strict=True)]
     return [
@@ -314,7 +318,13 @@ def service() -> list[Figure]:
             "bench.ack.p50_s",
             statistics.median(acks),
             "s, publish to acknowledgement, under load",
-            1.2,
+            0.3,
+        ),
+        Figure(
+            "bench.ack.idle_p50_s",
+            statistics.median(idle),
+            "s, publish to acknowledgement, a single vehicle without other load",
+            0.05,
         ),
         Figure("bench.ack.p99_s", float(np.quantile(acks, 0.99)), "s", 2.5),
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
@@ -104,3 +105,16 @@ def test_active_senders_stay_cached_and_past_days_are_dropped(tmp_path: Path) ->
         (later,) = list_known(3, NOW + 3 * 86_400 * SECOND)
         assert later == (*first[:3], first[3] + 3)
         assert engine.counts[Kind.OBSERVATION] == 3
+
+
+def test_a_waiting_worker_is_woken_without_a_message() -> None:
+    queue, _ = inbox(10)
+    taken: list[list[Message]] = []
+    worker = threading.Thread(target=lambda: taken.append(queue.drain(3600.0)), daemon=True)
+    worker.start()
+    queue.wake()
+    worker.join(60.0)
+    assert taken == [[]]
+    queue.wake()
+    queue.put(of_bytes(1))
+    assert queue.drain(0.0) == [of_bytes(1)]
