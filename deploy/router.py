@@ -74,7 +74,7 @@ def open_router(
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `gripmap router`."""
     parser.add_argument(
         "--config", type=Path, default=CONFIG, help="Zenoh configuration file (JSON5)"
     )

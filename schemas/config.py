@@ -279,7 +279,7 @@ def moment(text: str, field: str) -> int:
 
 
 def nanoseconds(time: datetime) -> int:
-    """Return a time in ns since 1970, without rounding; a time without a zone is UTC."""
+    """Return a datetime as ns since 1970, without rounding; a datetime without a zone is UTC."""
     since = (time if time.tzinfo else time.replace(tzinfo=UTC)) - _EPOCH
     return (since.days * 86_400 + since.seconds) * NS + since.microseconds * 1_000
 

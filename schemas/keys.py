@@ -93,12 +93,12 @@ def ack_key(vehicle: str) -> str:
 
 
 def map_key(tile: int) -> str:
-    """Return the key of a map tile."""
+    """Return the Zenoh key under which a map tile is published."""
     return f"{ROOT}/map/{chunks(tile, grid.TILE_ZOOM)}"
 
 
 def alert_key(tile: int) -> str:
-    """Return the key of the alerts in a tile."""
+    """Return the Zenoh key under which the alerts of a map tile are published."""
     return f"{ROOT}/alert/{chunks(tile, grid.TILE_ZOOM)}"
 
 
@@ -122,7 +122,7 @@ def private_keys(vehicle: str) -> list[str]:
 
 
 def weather_key(region: int) -> str:
-    """Return the key under which the weather of a region is published."""
+    """Return the Zenoh key under which the weather of a region is published."""
     return f"{ROOT}/weather/{chunks(region, grid.REGION_ZOOM)}"
 
 

@@ -34,7 +34,7 @@ class Link:
         threading.Thread(target=self._accept_connections, daemon=True).start()
 
     def cut(self) -> None:
-        """Stop forwarding traffic."""
+        """Cut the link: forward nothing until `restore` is called."""
         self._open.clear()
 
     @property

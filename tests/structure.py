@@ -37,7 +37,7 @@ def list_sources(root: Path, *folders: str) -> list[Path]:
 
 @cache
 def parse(path: Path) -> ast.Module:
-    """Return the syntax tree of a file; each file is parsed once."""
+    """Return the syntax tree of a Python file; each file is parsed only once per process."""
     return ast.parse(path.read_text(encoding="utf-8"))
 
 

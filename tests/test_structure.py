@@ -193,7 +193,9 @@ TRIED = "try"  # where the README's commands write; git ignores it
 
 
 def all_sources(*folders: str) -> list[Path]:
-    """Return the paths of all handwritten Python files below the folders."""
+    """Return the paths of all handwritten Python files below the given folders of the
+    repository.
+    """
     return [
         path
         for name in folders

@@ -47,7 +47,7 @@ class Listener:
                 self.alerts.append((time.time_ns(), alert))
 
     def close(self) -> None:
-        """End the session; a session that stays open would keep the process from ending."""
+        """Close the Zenoh session; an open session would prevent the process from ending."""
         self.session.close()
 
     def progress(self) -> str:

@@ -242,7 +242,7 @@ def _touches_tile(points: Sequence[tuple[int, int]]) -> bool:
 
 
 def _clip_line(points: list[tuple[int, int]]) -> Iterable[list[tuple[int, int]]]:
-    """Yield the parts of a line that lie within a tile or its margin."""
+    """Yield the parts of a line (street of the town) that lie within a tile or its margin."""
     part: list[tuple[int, int]] = []
     for first, second in itertools.pairwise(points):
         if _touches_tile((first, second)):

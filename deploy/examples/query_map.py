@@ -13,7 +13,9 @@ import fleet_service
 
 
 def main(endpoint: str) -> int:
-    """Print the known cells, those with the lowest friction first; return their number."""
+    """Query the map, print its cells, those with the lowest friction first, and return their
+    number.
+    """
     cells = fleet_service.ask_map(endpoint, min_vehicles=1).to_pandas()
     measured = cells[
         cells["basis"] == "measured"

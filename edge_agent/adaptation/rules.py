@@ -78,8 +78,8 @@ def infer_two(
 
 @compiled
 def bracket_peaks(value: float, peaks: FloatArray) -> tuple[int, float]:
-    """Return (k, share) such that value = (1 - share)*peaks[k] + share*peaks[k + 1]. Beyond the
-    outer peaks the share is 0 or 1.
+    """Return the interval between two peaks of fuzzy sets that contains a value, as (k, share):
+    value = (1 - share)*peaks[k] + share*peaks[k + 1]. Beyond the outer peaks the share is 0 or 1.
     """
     last = peaks.shape[0] - 2
     k = 0

@@ -69,7 +69,9 @@ class MapSubscriber:
         self.counts: Counter[str] = Counter()
 
     def map_lock(self) -> threading.Lock:
-        """Return the lock that must be held while `local_map` is read."""
+        """Return the lock that a thread must hold while it reads the local copy of the map
+        (`local_map`).
+        """
         return self._lock
 
     @property

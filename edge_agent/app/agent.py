@@ -225,7 +225,9 @@ class Agent:
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Yield an event that is set by SIGTERM or Ctrl-C; a second signal ends the process at once."""
+    """Provide a context with an event that SIGTERM or Ctrl-C sets; a second signal ends the process
+    at once.
+    """
     stop = threading.Event()
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 

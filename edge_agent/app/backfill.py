@@ -66,7 +66,9 @@ def tasks_of(logs: Sequence[Path], vehicle: Path | None, folder: Path) -> list[T
 
 
 def vehicle_file_of(log: Path) -> Path:
-    """Return the path of a log's vehicle file: the same name with the suffix .json."""
+    """Return the path of the vehicle file that belongs to a signal log: the same name with the
+    suffix .json.
+    """
     return log.with_suffix(".json")
 
 

@@ -97,8 +97,8 @@ def write_report(drive: RecordedDrive, path: Path) -> None:
 def curve_of(
     table: pa.Table, panel: Panel
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return time, value, lower and upper end of the interval of a quantity, (n,) each. The ends
-    are NaN for a quantity without interval.
+    """Return, for a plot of one estimated quantity, its time, value, and lower and upper end of its
+    interval, (n,) each. The ends are NaN for a quantity without interval.
     """
     t, value = (table[name].to_numpy().astype(np.float64) for name in ("t", panel.column))
     if len(panel.band) == 2:

@@ -23,8 +23,7 @@ _NUMBER: Final = re.compile(r"\d+(\.\d+)?")
 
 
 class PublisherState(Protocol):
-    """Interface of a publisher as far as it is needed here: values that show whether its records
-    arrive."""
+    """Interface of a publisher with the values that show if its records arrive at the service."""
 
     @property
     def links(self) -> int:

@@ -82,7 +82,9 @@ class VssPart:
             self._output.report_grip(pipeline.grip)
 
     def close_part(self) -> Mapping[str, float]:
-        """Close the output. It has no counts, so the result is empty."""
+        """Close the output of friction signals. Return an empty dictionary, because it has no
+        counts.
+        """
         self._output.close()
         return {}
 

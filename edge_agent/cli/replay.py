@@ -212,8 +212,8 @@ def _check_engine(engine: str, jobs: int, *, several: bool) -> None:
 
 
 def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
-    """Print the progress of the estimation on stderr; return 2 if a log could not be
-    read, else 0.
+    """Print on stderr the progress of estimating `count` recorded logs, and an error for each log
+    that could not be read; return 2 if there was one, else 0.
     """
     bad = 0
     samples = 0
@@ -275,8 +275,8 @@ def _publish_log(
 
 
 def _start_time(given: str | None, log: SignalLog) -> int:
-    """Return the time of t = 0 [ns UTC]: as given, else from the log, else so that the log ends
-    now.
+    """Return the time [ns UTC] of t = 0 in a recorded log: the given time, else the time stated in
+    the log, else a time by which the log ends now.
     """
     from schemas.config import moment
 

@@ -128,5 +128,7 @@ Four: TypeAlias = tuple[float, float, float, float]
 
 @inlined
 def as_four(values: FloatArray) -> Four:
-    """Return the values (4,) as a tuple of four scalars."""
+    """Return an array (4,) of values per wheel as a tuple of four scalars, because compiled code
+    handles scalars faster.
+    """
     return values[0], values[1], values[2], values[3]

@@ -29,7 +29,9 @@ class Block:
 
 
 def to_utc_ns(t: FloatArray, start_ns: int) -> IntArray:
-    """Return times t [s] since the start as [ns UTC], rounded to 1 ns; same shape as t."""
+    """Convert times t [s] since the start of a source to [ns UTC], rounded to 1 ns; `start_ns` is
+    the start. The shape stays the same.
+    """
     whole = t.astype(np.int64)
     time: IntArray = start_ns + whole * NS + np.rint((t - whole) * NS).astype(np.int64)
     return time

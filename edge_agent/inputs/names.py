@@ -76,13 +76,13 @@ COURSE: Final = re.compile(r"heading|course|track")
 
 
 def split_words(name: str) -> str:
-    """Return a name as lower-case words separated by blanks."""
+    """Return the name of a signal as lower-case words separated by blanks."""
     return " ".join(_WORDS.findall(name)).lower()
 
 
 def place_of(plain: str) -> str | None:
-    """Return the wheel ("fl", "fr", "rl" or "rr") that the words of a name denote; None if they
-    denote no wheel.
+    """Return the wheel ("fl", "fr", "rl" or "rr") that the words of a signal's name denote; None if
+    they denote no wheel.
     """
     tokens = plain.split()
     for wheel, spellings in PLACES.items():

@@ -135,7 +135,9 @@ def _float_column(table: pa.Table, name: str) -> FloatArray:
 
 
 def _read_time(table: pa.Table) -> tuple[FloatArray, int | None]:
-    """Return t [s] and the [ns UTC] of t = 0; the latter is None for a log that has only `t`."""
+    """Return the times t [s] of a signal log, and the time of t = 0 [ns UTC]; the latter is None
+    for a log that has only the column `t`.
+    """
     name = next((name for name in ("t", "timestamp") if name in table.column_names), None)
     if name is None:
         raise InputError(
@@ -157,8 +159,8 @@ def _read_time(table: pa.Table) -> tuple[FloatArray, int | None]:
 
 # pyarrow's column types are not generic
 def _seconds_from_first(column: Any) -> tuple[FloatArray, int | None]:  # noqa: ANN401
-    """Return the seconds since the first sample, and the [ns UTC] of that sample (None if the time
-    of that sample is not finite).
+    """Convert the column `timestamp` of a signal log. Return the seconds since the first sample,
+    and the time of that sample [ns UTC], or None if it is not finite.
     """
     if column.null_count:
         row = int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])

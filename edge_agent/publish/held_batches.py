@@ -93,7 +93,7 @@ class HeldBatches:
         return iter(self._entries)
 
     def add_batch(self, key: int, batch: HeldBatch) -> None:
-        """Add a batch that is in the file."""
+        """Add a batch (message with records) that the outbox's file contains."""
         self._entries[key] = batch
         oldest = self._oldest[batch.stream.kind]
         oldest.append(key)
@@ -108,7 +108,7 @@ class HeldBatches:
         self.bytes += batch.size
 
     def remove_batch(self, key: int) -> HeldBatch:
-        """Remove a batch and return it."""
+        """Remove the batch with this key from the held batches and return it."""
         batch = self._entries.pop(key)
         sequence = self._streams[batch.stream]
         del sequence.held[batch.seq]

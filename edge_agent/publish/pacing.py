@@ -71,7 +71,9 @@ class Pacer:
 
     @property
     def is_idle(self) -> bool:
-        """Return True if no batch is in flight and no batch waits."""
+        """Return True if no batch of this vehicle and region is in flight (sent, not answered) and
+        none waits.
+        """
         return not self.flying and not self._waiting
 
     @property
@@ -82,7 +84,7 @@ class Pacer:
         return self._unanswered_since
 
     def queue_batch(self, key: int) -> None:
-        """Queue a batch by its key; lower keys are older and are sent first."""
+        """Queue a stored batch for sending, by its key; lower keys are older and are sent first."""
         heapq.heappush(self._waiting, key)
 
     def record_sent(self, now: float) -> None:

@@ -76,7 +76,9 @@ class SpoolFile:
         self._database, _ = recover_file(self._path)
 
     def begin_transaction(self) -> sqlite3.Connection:
-        """Return a context that commits at its end, or changes nothing after an error."""
+        """Provide a database transaction as a context: it is committed at its end, and changes
+        nothing after an error.
+        """
         return self._database
 
     def list_batches(self) -> Iterator[tuple[int, tuple[str, int, str, int, int, int], int]]:
@@ -87,7 +89,9 @@ class SpoolFile:
             yield key, (vehicle, boot, kind, region, seq, records), size
 
     def insert_row(self, name: Row, payload: bytes) -> int:
-        """Insert a batch by its identifier (the columns NAME), and return its key."""
+        """Insert a batch into the outbox's file with its identifier (the columns NAME) and payload;
+        return the key (row number) that it gets.
+        """
         cursor = self._database.execute(
             f"INSERT INTO batch ({NAME}, payload, checksum) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
             (*name, payload, batch_checksum(name, payload)),
@@ -113,7 +117,7 @@ class SpoolFile:
         return payload
 
     def close(self) -> None:
-        """Release the file."""
+        """Close the file of the outbox and release its lock."""
         self._database.close()
 
 

@@ -85,8 +85,8 @@ def _json_value(name: str, value: object) -> object:
 
 
 def order_rows(table: pa.Table, question: Question) -> pa.Table:
-    """Return the rows in the question's order; rows with equal values are ordered by the other
-    columns.
+    """Return the rows of an answer in the order that the question defines; rows with equal values
+    are ordered by the other columns.
     """
     name = question.order.removeprefix("-")
     others = [f.name for f in table.schema if f.name != name and not pa.types.is_nested(f.type)]
@@ -181,7 +181,7 @@ def add_geometry(table: pa.Table, question: Question) -> pa.Table:
 
 
 def _row_cells(table: pa.Table) -> list[list[int]]:
-    """Return the list of cells of each row."""
+    """Return the list of map cells that each row of an answer consists of."""
     found: list[Any] = table[PARTS].to_pylist()
     return found
 

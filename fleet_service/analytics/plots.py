@@ -62,8 +62,8 @@ def cell_shapes(cell: IntArray, sector: IntArray | None = None) -> FloatArray:
 def paint(
     axes: Axes, shapes: FloatArray, values: FloatArray, limits: tuple[float, float] = GRIP_RANGE
 ) -> PolyCollection:
-    """Draw shapes in colours that show the friction. Shapes without a value are hatched and have no
-    colour.
+    """Draw shapes of map cells in colours that show their friction. Shapes without a value are
+    hatched and have no colour.
     """
     known = np.isfinite(values)
     if not known.all():
@@ -143,7 +143,7 @@ def _draw_worst(figure: Figure, table: pa.Table) -> None:
 
 
 def _make_panels(figure: Figure, count: int) -> list[Axes]:
-    """Return `count` axes of a figure, three per row."""
+    """Return `count` axes (panels) of a matplotlib figure, three per row."""
     columns = min(count, 3) or 1
     rows = -(-count // 3) or 1
     if count > 1:

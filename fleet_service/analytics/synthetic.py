@@ -179,7 +179,9 @@ def _draw_positions(
 
 
 def night_factor(seconds: FloatArray) -> FloatArray:
-    """Return a factor between 0 by day and 1 at four in the morning."""
+    """Return how much a time of day [s] belongs to the night: a factor from 0 by day to 1 at four
+    in the morning.
+    """
     return np.clip(np.cos(2 * np.pi * (seconds / DAY_S - 4 / 24)), 0.0, 1.0)
 
 

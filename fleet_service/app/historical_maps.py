@@ -160,7 +160,7 @@ class _Process:
         return head
 
     def end(self) -> None:
-        """Kill the subprocess and close its pipes."""
+        """Kill the process that rebuilds past maps, and close its pipes."""
         self._child.kill()
         with suppress(BrokenPipeError):
             self._in.close()
@@ -211,7 +211,7 @@ def replies_to(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
 
 
 def encode_question(question: PastQuery) -> bytes:
-    """Return a query as a line of JSON for `answer_line`."""
+    """Return a query about a past map as a line of JSON, which `answer_line` reads."""
     return (
         json.dumps({**question._asdict(), "query": question.query.model_dump_json()}).encode()
         + b"\n"

@@ -37,7 +37,7 @@ USUAL_VEHICLES: Final = 2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service analyze`."""
     parser.description = "; ".join(
         f"{question.name}: {question.about}" for question in known_questions().values()
     )

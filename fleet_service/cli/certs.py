@@ -18,7 +18,7 @@ SHOWN = 8  # names of a kind
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service certs`."""
     parser.add_argument(
         "--fleet",
         metavar="FILE",

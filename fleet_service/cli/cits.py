@@ -15,7 +15,7 @@ from schemas.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service cits`."""
     add_connection(parser)
     parser.add_argument(
         "--amqp", metavar="URL", required=True, help="interchange, e.g. amqps://host:5671"

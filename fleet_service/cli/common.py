@@ -112,8 +112,8 @@ def add_dry_run(parser: argparse.ArgumentParser) -> None:
 
 
 def confirm(arguments: argparse.Namespace, what: str) -> bool:
-    """Ask the user for confirmation; return True if the user agrees, or if there is no terminal to
-    ask on.
+    """Ask the user to confirm the deletion that `what` describes; return True if the user agrees,
+    or if there is no terminal to ask on.
     """
     if arguments.yes or not sys.stdin.isatty():
         return True

@@ -11,7 +11,7 @@ from schemas.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service compact`."""
     add_archive(parser)
     parser.add_argument(
         "--put-to",

@@ -8,7 +8,7 @@ from schemas.runtime import commandline
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service completion`."""
     parser.add_argument("shell", metavar="|".join(commandline.SHELLS), help="shell to complete for")
 
 

@@ -25,7 +25,7 @@ PARTS: Final = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service evaluate`."""
     parser.add_argument(
         "--out", metavar="DIR", type=Path, required=True, help="folder for figures, table and plots"
     )

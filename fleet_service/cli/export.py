@@ -54,7 +54,7 @@ _NEEDS: Final = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service export`."""
     add_archive(parser, required=False)
     parser.add_argument(
         "what",

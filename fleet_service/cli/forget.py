@@ -23,7 +23,7 @@ LOOK_S: Final = 5.0  # ... and whether it is still there
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service forget`."""
     add_archive(parser)
     parser.add_argument("--period", metavar="MONTH", required=True, help="e.g. 2026-01")
     parser.add_argument("--vehicle", metavar="NAME", help="remove only this vehicle's rows")

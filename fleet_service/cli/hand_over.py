@@ -9,7 +9,7 @@ from fleet_service.cli.common import add_connection
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service hand-over`."""
     parser.add_argument("region", metavar="REGION", help="region key expression, e.g. 1202/310/*")
     parser.add_argument(
         "--to", metavar="NAME", required=True, help="name of the standby that takes over"

@@ -23,7 +23,7 @@ NOBODY: Final = 1  # exit code where nobody serves what was asked for, or some o
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service query`."""
     parser.add_argument("--bbox", metavar="W,S,E,N", help="box in degrees (default: everything)")
     parser.add_argument(
         "--route",

@@ -14,7 +14,7 @@ from schemas.runtime import progress_messages
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service rebuild`."""
     add_archive(parser)
     parser.add_argument(
         "--out",

@@ -9,7 +9,7 @@ from fleet_service.cli.common import ArchiveReport, add_archive, add_dry_run, co
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service retention`."""
     add_archive(parser)
     parser.add_argument(
         "--raw-days",

@@ -11,7 +11,7 @@ from schemas.runtime import commandline, progress_messages
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service roads`."""
     parser.add_argument(
         "extract",
         metavar="EXTRACT",

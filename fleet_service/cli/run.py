@@ -31,7 +31,7 @@ FREEING_S = 0.4  # of them, for a bucket to take a word
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service run`."""
     parser.add_argument(
         "--config", metavar="FILE", help="configuration file (JSON); every setting has a default"
     )

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `fleet-service watch`."""
     parser.add_argument("--bbox", metavar="W,S,E,N", help="only tiles that touch this box")
     parser.add_argument(
         "--alerts",

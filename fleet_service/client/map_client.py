@@ -76,8 +76,8 @@ class Answer:
 
 
 def connection_settings(connect: str | None, config: Path | str | None) -> ZenohSettings:
-    """Return the connection settings from a configuration file; if `connect` is given, it replaces
-    the endpoints.
+    """Return the Zenoh connection settings from a configuration file; if `connect` is given, it
+    replaces the endpoints.
     """
     found = load(config, ServiceConfig).zenoh
     return found if connect is None else found.model_copy(update={"connect": [connect]})
@@ -205,7 +205,7 @@ def is_place_served(session: zenoh.Session, latitude: float, longitude: float) -
 
 
 def open_connected(connection: ZenohSettings) -> zenoh.Session:
-    """Return a session that is connected to a router.
+    """Return a Zenoh session that is connected to a router.
 
     Raises:
         UnreachableError: no router answers.
@@ -253,7 +253,7 @@ def _tile_rank(rank: regions.Rank) -> Callable[[dict[str, Any]], int]:
 
 
 def write_answer(answer: Answer, path: Path) -> None:
-    """Write an answer as an Arrow stream or JSON.
+    """Write the answer to a map query to a file, as an Arrow stream or as JSON.
 
     Raises:
         InputError: the file cannot be written.
@@ -270,7 +270,7 @@ def write_answer(answer: Answer, path: Path) -> None:
 
 
 def format_answer(answer: Answer) -> str:
-    """Return an answer as text for the terminal."""
+    """Return the answer to a map query as text for the terminal."""
     if answer.table is None:
         return json.dumps(answer.document, indent=1)
     lines = ["  ".join(f"{name:>12}" for name in SHOWN)]

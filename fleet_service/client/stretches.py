@@ -291,8 +291,8 @@ def _span_tree(places: FloatArray) -> list[list[tuple[int, float]]]:
 
 
 def _walk_tree(tree: list[list[tuple[int, float]]], start: int) -> tuple[FloatArray, list[int]]:
-    """Return the distance of each place from `start` along the tree, -1 if the place is not
-    connected, and the previous place on the path.
+    """Return, for each place in a spanning tree of cells, its distance from `start` along the tree
+    (-1 if it is not connected) and the previous place on the path.
     """
     length = np.full(len(tree), -1.0)
     before = [start] * len(tree)

@@ -170,7 +170,7 @@ def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 
 @refcount_free_inlined
 def _to_parts(number: float | np.floating[Any]) -> np.uint16:
-    """Return a number as an integer in units of 1/FINE."""
+    """Convert a number to an integer in units of 1/FINE, as records store it."""
     return np.uint16(
         min(max(number * np.float32(FINE) + np.float32(0.5), np.float32(0.0)), np.float32(65535.0))
     )
@@ -178,7 +178,7 @@ def _to_parts(number: float | np.floating[Any]) -> np.uint16:
 
 @refcount_free_inlined
 def _from_parts(parts: int) -> np.float32:
-    """Return the number that an integer in units of 1/FINE represents."""
+    """Convert a stored integer in units of 1/FINE to the number that it represents."""
     return np.float32(parts) * np.float32(1.0 / FINE)
 
 
@@ -292,7 +292,9 @@ def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
 
 @refcount_free_inlined
 def _remembered_parts(seconds: float) -> np.uint16:
-    """Return a time [s], limited to FORGET_S, as an integer in units of 1/AGED s."""
+    """Convert a time [s], limited to FORGET_S, to an integer in units of 1/AGED s, as cell records
+    store it.
+    """
     return np.uint16(min(seconds, c.FORGET_S) * AGED + 0.5)
 
 

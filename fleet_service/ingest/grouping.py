@@ -45,7 +45,9 @@ def group_rows(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntAr
 
 @compiled
 def largest_of(values: IntArray, group: Int32Array, groups: int) -> IntArray:
-    """Return the largest value of each group, (groups,); every group must have a value."""
+    """Return the largest of the `values` (n,) in each group of rows, (groups,); every group must
+    have a value.
+    """
     out = np.full(groups, np.iinfo(np.int64).min, np.int64)
     for i in range(len(values)):
         if values[i] > out[group[i]]:

@@ -40,8 +40,8 @@ _TOPIC: Final = {Kind.OBSERVATION: "obs", Kind.STATE: "state"}
 
 
 class Range(NamedTuple):
-    """Rule: a column must lie in [least, most]. If `optional`, NaN is allowed too and means
-    'absent'.
+    """Validation rule: the values of a report's column must lie in [least, most]. If `optional`,
+    NaN is allowed too and means 'absent'.
     """
 
     column: str
@@ -164,7 +164,7 @@ def _is_estimator(name: str) -> bool:
 
 @lru_cache(KEYS_REMEMBERED)
 def owner_of(key: str) -> keys.Parsed | None:
-    """Return the vehicle and region that a key names; None if it is not a concrete key of a
+    """Return the vehicle and region that a Zenoh key names; None if it is not a concrete key of a
     vehicle.
     """
     try:

@@ -73,7 +73,7 @@ class WeatherInbox:
         self._last = 0
 
     def enqueue(self, message: WeatherMessage) -> None:
-        """Queue a message for the next `take`; thread-safe."""
+        """Queue a received weather message for the next `take`; thread-safe."""
         if len(message.payload) > MOST_BYTES:
             self._counts["refused.weather"] += 1
         else:
@@ -236,7 +236,7 @@ def retire_files(root: Path, until_day: int) -> int:
 
 
 def _written_day(path: Path) -> int:
-    """Return the day on which a file was written (days since 1970)."""
+    """Return the day on which a weather file was written (days since 1970), from its name."""
     return int(path.stem[-_DIGITS:]) // DAY_NS
 
 

@@ -131,7 +131,7 @@ def drive_honest(rng: Generator, gain_std: float) -> tuple[ForeignDrive, FloatAr
 
 
 def select_visits(v: Visits, rows: IntArray) -> Visits:
-    """Return the visits at the given indices."""
+    """Return those of the simulated visits that have the given indices."""
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
     return Visits(
         v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports

@@ -178,7 +178,7 @@ def drive_fleet(
 
 
 def select_visits(v: Visits, rows: IntArray | BoolArray) -> Visits:
-    """Return the visits at the given indices."""
+    """Return those of the simulated visits that have the given indices."""
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
     return Visits(
         v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports

@@ -119,5 +119,5 @@ def limit_messages() -> None:
 
 
 def report_loop_error(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Log an error of the event loop as one line."""
+    """Log an error of the web server's event loop as one line."""
     log.warning("web server: %s", context.get("exception") or context.get("message"))

@@ -147,7 +147,7 @@ def feature_schema(base: str) -> dict[str, Any]:
 
 
 def api_definition(base: str) -> dict[str, Any]:
-    """Return the definition of the interface in OpenAPI 3.0."""
+    """Return the definition of the OGC API in the format OpenAPI 3.0."""
 
     def describe_route(summary: str, *parameters: dict[str, Any]) -> dict[str, Any]:
         answers = {
@@ -249,7 +249,9 @@ def with_identity(features: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]
 
 
 def extent_of(tiles: Iterable[int]) -> Box | None:
-    """Return the box [deg] that encloses the given tiles; None if there are no tiles."""
+    """Return the box (west, south, east, north [deg]) that encloses the given map tiles; None if
+    there are no tiles.
+    """
     sides = [grid.bounds(tile, grid.TILE_ZOOM) for tile in tiles]
     if not sides:
         return None

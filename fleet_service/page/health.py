@@ -80,8 +80,8 @@ class ServiceHealth:
 
 
 def parse_metrics(text: str) -> dict[str, dict[str, float]]:
-    """Return the values in an OpenMetrics text: for each name, the values by label. The label of a
-    value that has none is "".
+    """Parse an OpenMetrics text; return, for each metric, its values by label. The label of a value
+    without a label is "".
     """
     found: dict[str, dict[str, float]] = {}
     for line in text.splitlines():

@@ -61,11 +61,13 @@ class FeatureRoutes:
         )
 
     async def conformance(self, _: Request) -> Response:
-        """Return the list of conformance classes of the interface."""
+        """Return the list of conformance classes of the OGC API."""
         return JSONResponse(features.conformance_document())
 
     async def collections(self, request: Request) -> Response:
-        """Return the list of collections, which contains only `grip`."""
+        """Return the list of the OGC API's collections, which contains only `grip` (the cells of
+        the map).
+        """
         return JSONResponse(features.collections_document(_base_address(request), self._extent()))
 
     async def collection(self, request: Request) -> Response:
@@ -79,7 +81,7 @@ class FeatureRoutes:
         )
 
     async def api(self, request: Request) -> Response:
-        """Return the definition of the interface in OpenAPI."""
+        """Return the definition of the OGC API in the format OpenAPI."""
         return JSONResponse(
             features.api_definition(_base_address(request)), media_type=features.OPENAPI
         )

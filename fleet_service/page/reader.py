@@ -95,7 +95,7 @@ class Reader:
 
     @property
     def is_served(self) -> bool:
-        """Return True if any service answers."""
+        """Return True if a fleet service answers for any region."""
         return self._served and self.is_connected
 
     def is_heard(self, latitude: float, longitude: float) -> bool:

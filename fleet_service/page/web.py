@@ -381,8 +381,8 @@ def _host_name(scope: Scope) -> str:
 
 
 def origin_of(address: str) -> str:
-    """Return scheme, host and port of an address; empty if the address has no host and so refers to
-    this server.
+    """Return scheme, host and port of a web address as text; "" if the address has no host and so
+    refers to this server.
     """
     parts = urlsplit(address)
     return f"{parts.scheme}://{parts.netloc}" if parts.netloc else ""

@@ -131,7 +131,9 @@ def mark_survived(root: Path) -> None:
 
 
 def file_digest(path: Path) -> str:
-    """Return the hash of a file; if the file does not exist, the hash of empty content."""
+    """Return the hash of a file of a checkpoint; if the file does not exist, the hash of empty
+    content.
+    """
     state = blake2b(digest_size=16)
     with suppress(FileNotFoundError), path.open("rb") as file:
         while chunk := file.read(_CHUNK):

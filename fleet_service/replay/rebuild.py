@@ -176,7 +176,7 @@ def ignore_observations(_: Observations) -> AbstractContextManager[None]:
 
 
 def too_much() -> InputError:
-    """Return the error for a past map that needs too many rows."""
+    """Return the InputError for a query about a past map that would have to read too many rows."""
     return InputError("at", "the query would read too much of the archive", "use a smaller bbox")
 
 
@@ -292,8 +292,8 @@ def _recorded_result(rows: segments.Rows) -> RecordedResult:
 def _join_parts(
     parts: list[tuple[Observations, RecordedResult]],
 ) -> tuple[Observations, RecordedResult]:
-    """Return several parts of the observations, with their recorded results, joined into one, in
-    order.
+    """Return several parts of archived observations, each with its recorded results, joined in the
+    given order.
     """
     of = Observations(
         **{
@@ -469,8 +469,8 @@ def _time_borders(low: int, high: int, rows: int, most: int) -> list[int]:
 
 
 def _with_numbers(table: pa.Table) -> pa.Table:
-    """Return the table with numbers in place of the vehicles' pseudonyms. It takes less than half
-    the memory.
+    """Return a table of archived rows with numbers in place of the vehicles' pseudonyms (texts),
+    which takes less than half the memory.
     """
     at = table.column_names.index("vehicle")
     return table.set_column(at, "vehicle", pa.array(pseudonym_numbers(table["vehicle"])))

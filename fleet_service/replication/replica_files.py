@@ -47,7 +47,9 @@ class ReplicaFiles:
         return self.root / name
 
     def set_aside_path(self, name: str) -> Path:
-        """Return the path to which a damaged file is renamed."""
+        """Return the path to which the damaged file `name` is renamed, so that it is not read
+        again.
+        """
         return self.root / f"{name}{BAD}"
 
     def list_files(self, folders: Iterable[str] = FOLDERS) -> dict[str, Stamp]:

@@ -94,7 +94,7 @@ class UploadJournal:
             self._stamps.pop(name, None)
 
     def sync(self) -> None:
-        """Make the recorded lines durable (fsync)."""
+        """Write the recorded lines of the journal durably to disk (fsync)."""
         os.fsync(self._file.fileno())
 
     def close(self) -> None:

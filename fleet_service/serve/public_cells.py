@@ -198,7 +198,7 @@ class PublicCells:
         return {WAITING: {"rows": np.concatenate(parts, axis=1).reshape(-1)}, PRESENT: present}
 
     def _restore(self, tables: Mapping[str, dict[str, IntArray]]) -> None:
-        """Restore the state from the result of `columns`."""
+        """Restore the public copy of the cells from the tables that `columns` returned."""
         belief = mugrid.BINS * FULL.itemsize // 8
         numbers = tables[WAITING]["rows"].reshape(-1, 3 + belief + CELL.itemsize // 8)
         slots = numbers[:, 0]

@@ -101,7 +101,9 @@ def coarsen_cells(cells: CellView) -> CellView:
 
 
 def coarse_counts(counts: IntArray) -> IntArray:
-    """Return counts rounded down to 0, 1, 2, 3, 5, 10, 20, 50, 100 and so on."""
+    """Return counts of vehicles or observations (n,), rounded down to 0, 1, 2, 3, 5, 10, 20, 50,
+    100 and so on.
+    """
     return COUNT_STEPS[np.maximum(np.searchsorted(COUNT_STEPS, counts, "right") - 1, 0)]
 
 

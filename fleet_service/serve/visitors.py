@@ -75,7 +75,9 @@ class Visitors:
         self._bits = longer[stay]
 
     def columns(self) -> dict[str, IntArray]:
-        """Return the state as columns, from which `of` restores this object."""
+        """Return the counted visitors as columns for a checkpoint, from which `of` restores this
+        object.
+        """
         self._grow()
         return {
             "bits": self._bits[: self._fusion.size].reshape(-1).view(np.int64),

@@ -60,7 +60,7 @@ def header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:
 
 
 def _find_versions() -> dict[str, str]:
-    """Return the version of each installed package of PACKAGES, by package name."""
+    """Return, by name, the installed version of each package in the list PACKAGES."""
     found = {}
     for name in PACKAGES:
         with suppress(metadata.PackageNotFoundError):

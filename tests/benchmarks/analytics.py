@@ -57,7 +57,7 @@ HALF = START_NS + DAY_S * 10**9
 
 
 def print_progress(line: str) -> None:
-    """Print a line of progress."""
+    """Print a line about the progress of the benchmark."""
     print(f"  {line}", flush=True)
 
 

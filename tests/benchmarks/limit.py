@@ -101,7 +101,7 @@ def first_memory(first: FloatArray, speed: float) -> FloatArray:
 
 
 def pointer_to(array: FloatArray) -> ctypes.c_void_p:
-    """Return the address of an array's data."""
+    """Return the memory address of an array's data as a C pointer."""
     return ctypes.c_void_p(array.ctypes.data)
 
 
@@ -194,7 +194,7 @@ class VectorLimit:
 
 
 def allocate_aligned(*shape: int, to: int = 64) -> FloatArray:
-    """Return an empty array whose data is aligned to `to` bytes."""
+    """Return an uninitialised array whose data begins at a multiple of `to` bytes in memory."""
     count = math.prod(shape)
     raw = np.empty(8 * count + to, np.uint8)
     begin = -raw.ctypes.data % to

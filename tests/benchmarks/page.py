@@ -205,7 +205,7 @@ def serve_maplibre(on: Stage) -> Iterator[str | None]:
 
 class _Quiet(http.server.SimpleHTTPRequestHandler):
     def log_message(self, *_: object) -> None:
-        """Suppress the server's log."""
+        """Suppress the log of the HTTP server that delivers the MapLibre page."""
 
 
 def pushed_ms(on: Stage) -> float:

@@ -153,7 +153,9 @@ def fetch_reply(session: zenoh.Session, selector: str) -> bytes:
 
 
 def poll_until(something: Callable[[], object]) -> None:
-    """Repeat a map query until its answer is not empty. Raise TimeoutError after two minutes."""
+    """Call a function repeatedly until its result is not empty. Raise TimeoutError after two
+    minutes.
+    """
     deadline = time.monotonic() + 120.0
     while not something():
         if time.monotonic() > deadline:

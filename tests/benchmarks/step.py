@@ -150,8 +150,8 @@ def call_s(bank: EstimatorBank, t: FloatArray, signals: FloatArray) -> float:
 
 
 def bank() -> list[Figure]:
-    """Compare many vehicles on two threads with C on the same number of threads, and measure the
-    cost per vehicle as their number grows.
+    """Compare a filter bank of many vehicles on two threads with C on the same number of threads,
+    and measure its cost per vehicle as their number grows.
     """
     drive = Drive()
     speed = same_filter(drive)

@@ -50,7 +50,9 @@ Manifest = dict[str, Any]
 
 
 def build_overlay(overlay: str) -> list[Manifest]:
-    """Return the objects that `kubectl apply -k` would send."""
+    """Return the Kubernetes objects of an overlay that `kubectl apply -k` would send to a
+    cluster.
+    """
     words = ["kubectl", "kustomize", str(FOLDER / overlay)]
     done = subprocess.run(words, check=True, capture_output=True, text=True)
     return [dict(one) for one in YAML(typ="safe").load_all(done.stdout) if one]
@@ -333,7 +335,7 @@ def _has_ended_or(process: subprocess.Popen[bytes], holds: Callable[[], bool]) -
 
 
 def has_answered(pod: Pod, container: Manifest, probe: Manifest) -> bool:
-    """Return True if a probe of a container succeeds."""
+    """Send a health probe to a container of a simulated pod; return True if it succeeds."""
     if "tcpSocket" in probe:
         with socket.socket() as one:
             one.settimeout(1.0)

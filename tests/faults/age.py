@@ -103,7 +103,9 @@ def _measure_smaller(site: Site, millions: float) -> tuple[dict[str, float], dic
 
 
 def _measure_archive(root: Path) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the figures of a start from a checkpoint, and those of a query about the past."""
+    """Measure a service's start from a checkpoint of this archive, and a query about the past;
+    return the figures.
+    """
     _measure_process("checkpoint", root)
     synthetic.write_archive(
         root, SyntheticFleet(SINCE, 1, vehicles=50, seed=int(time.time())), SEGMENT

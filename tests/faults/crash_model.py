@@ -50,7 +50,9 @@ CELLS: Final = grid.cell_of(np.array([57.7, 57.7]), np.array([11.97, 15.97]))
 
 
 class Batch(NamedTuple):
-    """Batch of a history, given by its kind and its sequence number."""
+    """Batch that is written in a history, identified by its kind (observations or states) and
+    sequence number.
+    """
 
     kind: Kind
     seq: int

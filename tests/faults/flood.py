@@ -61,7 +61,7 @@ def make_visit(name: str, seq: int, now: int) -> Batch:
 
 
 def hash_of(name: str) -> int:
-    """Return a number computed from a name, the same in every run."""
+    """Return a number computed from a vehicle's name, the same in every run."""
     return sum(name.encode())
 
 

@@ -79,7 +79,7 @@ class Ground:
 
     @property
     def admitted_count(self) -> int:
-        """Return the number of observations that the service accepted."""
+        """Return the number of observations that the attacked service has accepted so far."""
         return self.service.engine.counts[wire.Kind.OBSERVATION]
 
     def drive(self, session: zenoh.Session | None = None, name: str = HONEST) -> None:

@@ -122,7 +122,9 @@ def run(site: Site) -> list[Figure]:
 
 
 def _make_figure(site: Site, name: str, value: float, quick: float) -> Figure:
-    """Return a figure with its target; a quick run uses the weaker target `quick`."""
+    """Return the figure called `name` of this campaign with its target; a quick run uses the weaker
+    target `quick`.
+    """
     found = make_figure(name, value)
     return replace(found, bar=quick) if site.quick else found
 

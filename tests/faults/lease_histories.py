@@ -79,7 +79,9 @@ def judge_history(events: list[Event]) -> Verdict:
 
 
 class _EndError(BaseException):
-    """Exception that ends a thread when its process or the history has ended."""
+    """Exception that ends a simulated thread when its process was killed or the history has
+    ended.
+    """
 
 
 class _Process:
@@ -193,7 +195,7 @@ class VirtualStop:
         self._is_set = False
 
     def is_set(self) -> bool:
-        """Return True after `set`."""
+        """Return True if the event has been set."""
         return self._is_set
 
     def set(self) -> None:

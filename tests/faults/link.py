@@ -170,12 +170,12 @@ class Namespaces:
 
 
 def run_command(*command: str) -> None:
-    """Run a command of iproute2."""
+    """Run a command of iproute2, which configures network namespaces and devices."""
     subprocess.run(command, check=True, capture_output=True)
 
 
 def stop_process(process: subprocess.Popen[str]) -> None:
-    """Kill a process and close its pipes."""
+    """Kill a process of the link campaign and close its pipes."""
     process.kill()
     process.wait()
     for pipe in (process.stdin, process.stdout):
@@ -185,7 +185,7 @@ def stop_process(process: subprocess.Popen[str]) -> None:
 
 
 def read_line(process: subprocess.Popen[str]) -> str:
-    """Return the next line that a process prints."""
+    """Return the next line that a process of the link campaign prints."""
     assert process.stdout is not None
     line = process.stdout.readline()
     assert line, f"{process.args!r} ended early"
@@ -203,7 +203,7 @@ def finish_end(process: subprocess.Popen[str]) -> dict[str, Any]:
 
 
 def write_line(process: subprocess.Popen[str], line: str) -> None:
-    """Write a line to the stdin of a process."""
+    """Write a line to the stdin of a process of the link campaign."""
     assert process.stdin is not None
     process.stdin.write(line + "\n")
     process.stdin.flush()

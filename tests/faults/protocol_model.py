@@ -119,7 +119,7 @@ class World(NamedTuple):
 
 
 class Violation(NamedTuple):
-    """Broken invariant, and the steps that lead to it."""
+    """Broken invariant that the exploration of the model found, with the steps that lead to it."""
 
     problem: str
     steps: tuple[str, ...]

@@ -38,7 +38,7 @@ OWES: Final = (
 
 
 def memory_mb(part: Part) -> float:
-    """Return the resident memory of a process [MB]."""
+    """Return the resident memory [MB] of a process under test."""
     lines = Path(f"/proc/{part.pid}/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) / 1024
 

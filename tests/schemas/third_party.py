@@ -112,7 +112,9 @@ def open_session(endpoint: str) -> zenoh.Session:
 
 
 class Heard:
-    """Messages decoded by subscribers, by topic. For an unreadable message the error is stored."""
+    """Messages that the third party's subscribers received and decoded, by topic. For an unreadable
+    message the error is stored.
+    """
 
     def __init__(self, session: zenoh.Session) -> None:
         self.acks: dict[str, list[wire.StreamAck]] = {}

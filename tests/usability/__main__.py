@@ -137,7 +137,7 @@ def live_page(house: House) -> tuple[str, list[str], list[str]] | None:
 
 def service_ready_s(house: House) -> float:
     """Return the time [s] from the command to `ready:` of a service on an empty archive, with the
-    kernels of `make setup`.
+    functions that `make setup` has compiled.
     """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     (house.folder / "ready.json").write_text(json.dumps({"zenoh": {"connect": endpoints}}))
@@ -303,7 +303,7 @@ def install_to_first_map_s(house: House) -> float:
 
 
 def options_undocumented(house: House) -> float:
-    """Return the number of options without a help text."""
+    """Return the number of command-line options without a help text."""
     found = reference_pages.undocumented_options()
     house.print_measured("undocumented", found)
     return float(len(found))

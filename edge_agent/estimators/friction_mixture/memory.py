@@ -74,8 +74,8 @@ class LastInputs:
 
 
 class GripInUse:
-    """Grip in use according to the accelerometers, that is, horizontal acceleration over g [1],
-    smoothed.
+    """Record of the grip in use according to the accelerometers, that is, smoothed horizontal
+    acceleration over g [1].
     """
 
     slow: float  # smoothed, for the nodes
@@ -85,7 +85,9 @@ class GripInUse:
 
 
 class RollingMotion:
-    """Velocity derived from the speeds of rolling wheels without a tyre model."""
+    """Record of the velocity that follows from the speeds of rolling wheels, without a tyre
+    model.
+    """
 
     moved_time: float  # at which a wheel last turned [s]
     disagreed_time: float  # at which wheels last disagreed [s]
@@ -98,7 +100,7 @@ class RollingMotion:
 
 
 class WheelSlip:
-    """Indicators of sliding wheels that are derived from the wheel speeds alone."""
+    """Record of indicators of sliding wheels that are derived from the wheel speeds alone."""
 
     held: float  # membership of the last second in "a wheel slides" [1]
     begins: float  # what this block adds to it [1]

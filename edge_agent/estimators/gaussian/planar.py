@@ -211,7 +211,9 @@ def _motor_forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
 
 @inlined
 def _half_axle_force(row: FloatArray, track: InputTrack, first: int, dt: float) -> float:
-    """Return half of the longitudinal force [N] of the axle whose left wheel has index `first`."""
+    """Return half of the longitudinal tyre force [N] of an axle with one motor; its left wheel has
+    index `first`.
+    """
     use = track.inputs
     before = track.inputs_before
     omega = S.OMEGA + first

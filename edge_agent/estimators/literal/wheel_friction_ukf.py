@@ -138,8 +138,8 @@ class _Model:
 
 
 def _root_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the singular vectors U and values s of `columns`, so that columns*columns' = U*s^2*U'.
-    The values are never negative.
+    """Return a square root of the covariance columns*columns' as the singular vectors U and values
+    s of `columns`: columns*columns' = U*s^2*U'. The values are never negative.
     """
     axes, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return axes, sizes
@@ -173,7 +173,9 @@ def _square_root_step(
 
 
 def _cholesky_or_last(covariance: FloatArray, last: FloatArray) -> tuple[FloatArray, bool]:
-    """Return (Cholesky factor of `covariance`, False), or (`last`, True) if it has none."""
+    """Return (Cholesky factor of `covariance`, False). If rounding has left no factor, return
+    (`last`, True), the last valid factor.
+    """
     try:
         return np.asarray(np.linalg.cholesky(covariance)), False
     except np.linalg.LinAlgError:

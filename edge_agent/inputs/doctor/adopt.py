@@ -130,8 +130,8 @@ def align_devices(t: FloatArray, signals: FloatArray, delays: Mapping[str, float
 
 
 def _shift_channel(t: FloatArray, values: FloatArray, seconds: float, *, angle: bool) -> FloatArray:
-    """Return values (T,) moved earlier by `seconds`. Missing readings stay missing; an angle is not
-    interpolated.
+    """Return the readings (T,) of one channel moved earlier by `seconds`. Missing readings stay
+    missing; an `angle` is not interpolated.
     """
     at = t + seconds
     after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)

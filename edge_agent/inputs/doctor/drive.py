@@ -84,8 +84,8 @@ def smooth_twice(x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
 
 
 def interpolate_near(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray:
-    """Return readings interpolated linearly at the times `at`; NaN between readings that are more
-    than JOINED_S apart.
+    """Return the readings x of a signal interpolated linearly at the times `at`; NaN between
+    readings that are more than JOINED_S apart.
     """
     good = np.isfinite(x)
     if good.sum() < 2:

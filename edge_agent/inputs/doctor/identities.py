@@ -329,7 +329,9 @@ def fit_robustly(table: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def shift_series(x: FloatArray, seconds: float) -> FloatArray:
-    """Return x delayed by `seconds`; a positive value corrects a signal that is early."""
+    """Return an evenly sampled signal x (n,) delayed by `seconds`; a positive value corrects a
+    signal that is early.
+    """
     n = np.arange(len(x))
     good = np.isfinite(x)
     if good.sum() < 2:

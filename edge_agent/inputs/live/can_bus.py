@@ -74,7 +74,7 @@ class CanFeed(Feed):
         self._options = dict(options)
 
     def listen(self) -> None:
-        """Receive frames until the bus fails."""
+        """Receive frames from the CAN bus until the bus fails or the source is stopped."""
         filters = [
             {
                 "can_id": identifier,

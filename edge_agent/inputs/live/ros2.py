@@ -114,7 +114,9 @@ class Ros2Feed(Feed):
                 subscriber.undeclare()
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the received values by signal name. CAN frames are decoded with the database."""
+        """Return the values in received ROS messages by signal name. CAN frames are decoded with
+        the CAN database.
+        """
         frames = [(time, what) for time, what in heard if isinstance(what, tuple)]
         found = self._decoder.series(frames) if self._decoder and frames else {}
         times: dict[str, list[float]] = {}
@@ -176,8 +178,8 @@ class Ros2Feed(Feed):
 
 
 def type_of(key: str) -> str:
-    """Return the message type in a key, for example sensor_msgs/msg/Imu for
-    `sensor_msgs::msg::dds_::Imu_`.
+    """Return the ROS message type that a Zenoh key of rmw_zenoh contains, for example
+    sensor_msgs/msg/Imu for `sensor_msgs::msg::dds_::Imu_`.
 
     Raises:
         ValueError: the key contains no type.

@@ -241,8 +241,8 @@ class LiveRows:
         fill_steering(signals, [name not in self._profile.channels for name in STEERING])
 
     def _start_ns(self) -> int:
-        """Return the date of the start [ns UTC], corrected by the clock of a position receiver. The
-        first position fix determines the correction permanently.
+        """Return the date [ns UTC] at which the host's clock started, corrected by the clock of a
+        position receiver. The first position fix determines the correction permanently.
         """
         if self._date_ns is None and self._used["latitude"] > -math.inf:
             leads = [

@@ -133,7 +133,9 @@ def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
 
 
 def bus_of(channel: Any) -> int:  # noqa: ANN401 python-can gives a number, a name or None
-    """Return the number of a bus: 1 for "can1" and for 1, 0 for a name without a number."""
+    """Return the number of a CAN bus from its channel in a log: 1 for "can1" and for 1, 0 for a
+    name without a number.
+    """
     if isinstance(channel, int):
         return channel
     digits = "".join(c for c in str(channel or "") if c.isdigit())

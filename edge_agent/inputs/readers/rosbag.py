@@ -71,8 +71,8 @@ def has_frames(reader: Any) -> bool:  # noqa: ANN401
 
 
 def bag_frames(reader: Any, path: Path, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
-    """Return the frames with the wanted identifiers, and the time of the first frame [s since 1970
-    UTC]. Each topic is a bus.
+    """Return the CAN frames in a ROS bag with the wanted identifiers, and the time of the first
+    frame [s since 1970 UTC]. Each topic counts as a bus.
     """
     log: Log = {}
     first = np.inf
@@ -87,7 +87,7 @@ def bag_frames(reader: Any, path: Path, wanted: set[int]) -> tuple[Log, float]: 
 
 
 def read_bag(reader: Any, path: Path, wanted: set[str] | None) -> Recording:  # noqa: ANN401
-    """Return the signals of a bag by name; all signals if `wanted` is None."""
+    """Return the signals of a ROS bag by name; all signals if `wanted` is None."""
     topics = [
         c
         for c in reader.connections
@@ -120,7 +120,7 @@ def _read_messages(
     connections: list[Any],
 ) -> Iterator[tuple[Any, int, int, Any]]:
     """Yield (connection, time of the recorder [ns], time of the message [ns], message) for each
-    message of the connections.
+    message in a ROS bag; a connection is a recorded topic.
     """
     if not connections:
         return
@@ -130,7 +130,7 @@ def _read_messages(
 
 
 def stamp_of(message: Any) -> int:  # noqa: ANN401
-    """Return the time stamp in the message's header [ns]; 0 if it has none."""
+    """Return the time stamp [ns] in the header of a ROS message; 0 if it has none."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     return 0 if stamp is None else int(stamp.sec) * NS + int(stamp.nanosec)
 

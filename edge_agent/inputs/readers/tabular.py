@@ -143,7 +143,7 @@ def _read_racechrono(path: Path, lines: list[str]) -> pa.Table:
 
 
 def _make_distinct(names: list[str]) -> list[str]:
-    """Return the names, with a number appended to each repeated name."""
+    """Return the column names of a table, with a number appended to each repeated name."""
     return [name if name not in names[:k] else f"{name} {k}" for k, name in enumerate(names)]
 
 
@@ -191,8 +191,8 @@ def _parse_seconds(
     name: str,
     unit: str | None,
 ) -> tuple[FloatArray, int | None]:
-    """Return the seconds since the first row, and the [ns UTC] of that row if the time is a date,
-    else None.
+    """Convert the time column of a table. Return the seconds since the first row, and the time of
+    that row [ns UTC], or None if the column has no dates.
     """
     if pa.types.is_timestamp(column.type):
         ns = pc.cast(pc.cast(column, pa.timestamp("ns", tz=column.type.tz)), pa.int64())

@@ -98,7 +98,9 @@ class DetectionTally:
             self.seconds.setdefault(name, []).extend(times)
 
     def mean(self, name: str) -> float:
-        """Return the mean of the values called `name`; NaN without values."""
+        """Return the mean of those values of the tally that have the name `name`; NaN without
+        values.
+        """
         return self.total[name] / self.count[name] if self.count.get(name) else float("nan")
 
     def rate(self, over: str, under: str) -> float:
@@ -120,13 +122,17 @@ class DetectionTally:
 
 
 def runs_of(on: NDArray[np.bool_]) -> Stretches:
-    """Return (first index, last index + 1) of each stretch where `on` (T,) is True."""
+    """Return (first index, last index + 1) of each stretch of samples where the mask `on` (T,) is
+    True.
+    """
     edge = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in zip(edge[::2], edge[1::2], strict=True)]
 
 
 def bridge_gaps(on: NDArray[np.bool_], seconds: float) -> NDArray[np.bool_]:
-    """Return `on` (T,) with gaps (stretches of False) of at most `seconds` filled."""
+    """Return the mask `on` (T,) of samples with gaps (stretches of False) of at most `seconds`
+    filled.
+    """
     out = on.copy()
     most = round(seconds * RATE_HZ)
     for first, end in runs_of(~on):

@@ -150,7 +150,7 @@ def import_s(folder: Path) -> float:
 
 
 def estimates_of(log: Path, drive: Recorded) -> FloatArray:
-    """Return all outputs of the default estimator for a log."""
+    """Return all outputs of the default estimator for a signal log that was imported."""
     read = read_log(log)
     return np.asarray(
         bank_of("aco-fckf", [drive.vehicle]).advance(read.t[:, None], read.signals[:, None]).values

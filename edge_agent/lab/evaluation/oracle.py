@@ -175,7 +175,9 @@ def _theta(force: FloatArray, shape: float, curvature: float) -> FloatArray:
 
 @cache
 def _curve(shape: float, curvature: float) -> FloatArray:
-    """Return the tyre's force over peak force at the normalised slips THETA, up to the peak."""
+    """Return the tyre's force curve: force over peak force at the normalised slips THETA, up to the
+    peak.
+    """
     curve = np.array([magic_formula(x, shape, curvature) for x in THETA])
     return curve[: int(np.argmax(curve)) + 1]
 

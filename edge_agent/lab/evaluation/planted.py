@@ -125,7 +125,7 @@ def other_tyre(drive: Recorded) -> Recorded:
 
 
 def rim_speed_factor(unit: str) -> Callable[[float], float]:
-    """Return a function of the wheel radius. It returns the factor that converts a wheel speed
+    """Return a function of the wheel radius [m]; it returns the factor that converts a wheel speed
     [rad/s] to a speed at the rim in `unit`.
     """
     return lambda radius: radius / SPEED[unit]

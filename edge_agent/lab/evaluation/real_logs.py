@@ -237,8 +237,8 @@ def known_friction(
 
 
 def share_of(what: BoolArray, among: BoolArray) -> float:
-    """Return, of the samples where `among` (T,) is True, the share in which `what` (T,) is True
-    too; NaN if there are none.
+    """Return the share of the samples selected by the mask `among` (T,) in which the mask `what`
+    (T,) is True; NaN if no sample is selected.
     """
     return float(np.mean(what[among])) if among.any() else math.nan
 

@@ -150,8 +150,8 @@ def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def number(values: dict[str, float], name: str, *, spread: bool = True) -> str:
-    """Return a mean as text, with ± standard deviation if `spread` is True and it is known; a dash
-    if it was not measured.
+    """Return a figure's mean as text for the report, with ± standard deviation if `spread` is True
+    and it is known; a dash if it was not measured.
     """
     value = values.get(name, math.nan)
     sd = values.get(f"{name}.sd")
@@ -283,8 +283,8 @@ def faults(values: dict[str, float]) -> str:
 
 
 def verdict(shares: Sequence[float]) -> str:
-    """Return "yes" if all shares (of drives that passed a check) are 1, else "NO" with the smallest
-    share; a dash without shares.
+    """Return the cell of the report for a check of several drives: "yes" if all `shares` (of drives
+    that passed) are 1, else "NO" with the smallest share; a dash without shares.
     """
     return "–" if not shares else "yes" if min(shares) == 1.0 else f"NO ({min(shares):.2g})"
 

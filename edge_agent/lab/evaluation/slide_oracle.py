@@ -43,8 +43,8 @@ STIFFNESS_STD: Final = 0.12  # of ln k, as well as the vehicle file is known
 
 
 def tyres_drawn() -> FloatArray:
-    """Return the same sample of tyres (TYRES, 3) at each call: shape c, curvature e and stiffness
-    factor k.
+    """Return a random sample of tyres (TYRES, 3), the same at each call: shape c, curvature e and
+    stiffness factor k.
     """
     rng = np.random.default_rng(0)
     shape = np.clip(rng.normal(*SHAPE, TYRES), 1.2, 1.8)

@@ -103,7 +103,7 @@ STOP_DRAW: Final = (
 
 @compiled
 def ways_of(ways: IntArray, lane: int) -> int:
-    """Return the number of lanes that continue from the end of a lane."""
+    """Return the number of lanes of the road network that continue from the end of a lane."""
     count = 0
     while count < ways.shape[1] and ways[lane, count] >= 0:
         count += 1
@@ -303,8 +303,8 @@ def wished_acceleration(
 def wished_force(
     p: FloatArray, d: FloatArray, vx: float, acceleration: float, along: float
 ) -> float:
-    """Return the longitudinal force [N] that gives an acceleration while gravity acts with `along`
-    [m/s^2] along the road, limited by tyres and engine.
+    """Return the longitudinal force [N] that the driver demands for an acceleration [m/s^2] while
+    gravity acts with `along` [m/s^2] along the road. It is limited by tyres and engine.
     """
     driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
     most = min(

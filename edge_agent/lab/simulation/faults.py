@@ -55,24 +55,32 @@ in place; `when` (T,), which is True during the fault; and the size of the fault
 
 
 def drop_readings(values: FloatArray, when: BoolArray, _size: float) -> None:
-    """Replace the readings where `when` (T,) is True with NaN."""
+    """Apply the fault "no reading": replace a channel's readings with NaN where `when` (T,) is
+    True.
+    """
     values[when] = np.nan
 
 
 def hold_reading(values: FloatArray, when: BoolArray, _size: float) -> None:
-    """Replace the readings where `when` (T,) is True with the last reading before the fault."""
+    """Apply the fault "frozen": replace a channel's readings where `when` (T,) is True with the
+    last reading before the fault.
+    """
     if when.any():
         first = int(np.argmax(when))
         values[when] = values[max(first - 1, 0)]
 
 
 def add_spikes(values: FloatArray, when: BoolArray, size: float) -> None:
-    """Add `size` to every tenth reading where `when` (T,) is True."""
+    """Apply the fault "spikes": add `size` to every tenth reading of a channel where `when` (T,) is
+    True.
+    """
     values[np.flatnonzero(when)[::10]] += size
 
 
 def add_bias(values: FloatArray, when: BoolArray, size: float) -> None:
-    """Add the constant `size` to the readings where `when` (T,) is True."""
+    """Apply the fault "offset": add the constant `size` to a channel's readings where `when` (T,)
+    is True.
+    """
     values[when] += size
 
 

@@ -113,7 +113,7 @@ def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> flo
 def look_up_many(
     table: FloatArray, column: int, t: FloatArray, x: FloatArray, y: FloatArray
 ) -> FloatArray:
-    """Return the values of `look_up` for arrays t, x, y of equal length."""
+    """Return the road friction, as `look_up` does, for arrays t [s], x, y [m] of equal length."""
     values = np.empty(x.size)
     for i in range(x.size):
         values[i] = look_up(table, column, t[i], x[i], y[i])

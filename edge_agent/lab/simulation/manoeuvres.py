@@ -115,7 +115,9 @@ def preview(now: Moment) -> float:
 
 
 def smooth_step(u: float) -> float:
-    """Return 0 for u < 0, 1 for u > 1, and 3u² − 2u³ between, a transition without a kink."""
+    """Return a smooth step from 0 to 1 for paths and steering: 0 for u < 0, 1 for u > 1, and 3u² −
+    2u³ between.
+    """
     u = min(max(u, 0.0), 1.0)
     return u * u * (3.0 - 2.0 * u)
 

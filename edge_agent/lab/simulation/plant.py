@@ -363,8 +363,8 @@ def regenerate(x: FloatArray, p: FloatArray, u: FloatArray) -> None:
 
 @compiled
 def start_at(x: FloatArray, p: FloatArray, place: tuple[float, float, float], speed: float) -> None:
-    """Set the state `x` to straight rolling at `speed` [m/s], starting at the pose `place` (x [m],
-    y [m], yaw [rad]).
+    """Set the state `x` of a simulated vehicle to straight rolling at `speed` [m/s], starting at
+    the pose `place` (x [m], y [m], yaw [rad]).
     """
     x[:] = 0.0
     x[Motion.VX] = speed
@@ -373,8 +373,8 @@ def start_at(x: FloatArray, p: FloatArray, place: tuple[float, float, float], sp
 
 
 def substeps_of(rate_hz: float) -> int:
-    """Return the number of equal integration steps, of at most LONGEST_SUBSTEP each, in
-    one sample.
+    """Return the number of equal integration steps, of at most LONGEST_SUBSTEP [s] each, in one
+    sample at the rate `rate_hz` [Hz].
     """
     return max(1, math.ceil(round(1.0 / (rate_hz * LONGEST_SUBSTEP), 9)))
 

@@ -83,7 +83,9 @@ class Relief:
 
 
 class WaveColumn(IntEnum):
-    """Index of a column in the table row of a wave."""
+    """Index of a column in the relief table's row of a wave (slope that varies along a
+    direction).
+    """
 
     PEAK = 0
     EAST = 1
@@ -130,8 +132,8 @@ def gradient(
 
 @compiled
 def slope_in_body(east: float, north: float, yaw: float) -> tuple[float, float]:
-    """Return the rise per metre ahead of a vehicle with the heading `yaw` [rad], and to
-    its left.
+    """Return the slope of the road, given as rise per metre east and north, in a vehicle's axes:
+    rise per metre ahead and to the left for the heading `yaw` [rad].
     """
     c = math.cos(yaw)
     s = math.sin(yaw)

@@ -250,7 +250,9 @@ def _sense_records(
 
 
 def _log_table(t: FloatArray, signals: FloatArray, records: FloatArray) -> pa.Table:
-    """Return the log as a table; NaN readings become null, and true values are never null."""
+    """Return a simulated drive as the table of a signal log, with true values. NaN readings become
+    null; true values are never null.
+    """
     columns = {"t": pa.array(t)}
     columns |= {name: pa.array(signals[:, i], from_pandas=True) for i, name in enumerate(CHANNELS)}
     return pa.table(columns | {name: pa.array(records[:, column]) for name, column in TRUTH})

@@ -19,8 +19,8 @@ Admissible = Callable[[FloatArray], bool]
 
 
 def is_always_allowed(_vector: FloatArray) -> bool:
-    """Return True for any vector: the default for `Problem.admissible`, which excludes no
-    vector.
+    """Return True for any vector of a search. This is the default of `Problem.admissible`, so no
+    vector is excluded.
     """
     return True
 

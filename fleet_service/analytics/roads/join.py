@@ -240,8 +240,8 @@ def _end_points(links: list[DirectedLink]) -> FloatArray:
 
 
 def _to_mercator(latitude: FloatArray, longitude: FloatArray) -> FloatArray:
-    """Return points in the plane of the Mercator projection, (n, 2) [m]. A true metre is 1 /
-    cos(latitude) long in this plane.
+    """Return positions [deg] as points in the plane of the Mercator projection, (n, 2) [m]. A true
+    metre is 1 / cos(latitude) long in this plane.
     """
     radius = np.degrees(METRES_PER_DEGREE)
     y = np.arcsinh(np.tan(np.radians(latitude)))

@@ -189,7 +189,7 @@ def _write_geojson(table: pa.Table, path: Path) -> None:
 
 
 def iso_text(us: int) -> str:
-    """Return a time [us since 1970] as ISO 8601, UTC."""
+    """Return a time [µs since 1970] as ISO 8601 text, UTC."""
     return str(np.datetime_as_string(np.datetime64(us, "us"), "ms", "UTC"))
 
 

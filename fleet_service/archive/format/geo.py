@@ -132,7 +132,9 @@ def _bounding_sides(
 
 
 def _wkb_polygons(x: FloatArray, y: FloatArray) -> np.ndarray[Any, Any]:
-    """Return WKB polygons from the corners x, y (n, k), each as a closed ring."""
+    """Return polygons as well-known binary (WKB), each a closed ring with the corners x, y (n,
+    k).
+    """
     wkb = np.zeros(len(x), _ring_dtype(x.shape[1] + 1))
     wkb["order"], wkb["type"], wkb["rings"], wkb["points"] = (
         _LITTLE_ENDIAN,

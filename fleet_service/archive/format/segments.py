@@ -139,7 +139,7 @@ def round_to_steps(rows: Rows) -> Rows:
 
 
 def to_nanoseconds(times: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
-    """Return the times of a stored table in ns, (n,)."""
+    """Return a time column of a stored table (µs) as integers in ns, (n,)."""
     return np.asarray(times.cast(tables.NS).cast(pa.int64()))
 
 
@@ -190,8 +190,8 @@ def rows_of(table: pa.Table) -> Rows:
 
 
 def _without_null(f: pa.Field[Any], column: pa.Array[Any]) -> pa.Array[Any]:
-    """Return a column without nulls, which occur in files of older versions. Floats get NaN, other
-    types the column's default.
+    """Return a stored column in which nulls are replaced; nulls occur in files of older versions.
+    Floats get NaN, other types the column's default.
     """
     if not column.null_count or pa.types.is_floating(f.type):
         return column

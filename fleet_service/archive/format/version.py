@@ -57,7 +57,7 @@ FIRST: Final = frozenset(
 
 
 class DamagedError(Exception):
-    """Error for a file whose content differs from the content that was written."""
+    """Error for a damaged archive file: its content differs from the content that was written."""
 
 
 def make_footer(schema: pa.Schema, entries: Mapping[str, str] | None = None) -> dict[str, str]:

@@ -33,7 +33,7 @@ _EPOCH: Final = date(1970, 1, 1)
 
 
 class Span(NamedTuple):
-    """Time range [ns]: `begin` is included, `until` is excluded."""
+    """Time range [ns] whose measurements were erased: `begin` is included, `until` is excluded."""
 
     begin: int
     until: int
@@ -118,7 +118,7 @@ def read_erasures(folder: Path) -> ErasedData:
 
 
 def in_spans(spans: Sequence[Span], time: IntArray) -> BoolArray:
-    """Return a mask of times (n,) [ns]: True if the time lies in one of the ranges."""
+    """Return a mask of times (n,) [ns]: True if the time lies in one of the erased time ranges."""
     out = np.zeros(len(time), bool)
     for begin, until in spans:
         out |= (time >= begin) & (time < until)

@@ -273,7 +273,9 @@ def _read_message(message: Mapping[str, Any]) -> Denm:
 
 
 def _heading(location: Mapping[str, Any]) -> float | None:
-    """Return the heading of the event [deg from north]; None if it is unknown."""
+    """Return the heading of the hazard event in a decoded DENM [deg from north]; None if it is
+    unknown.
+    """
     tenths = location.get("eventPositionHeading", {}).get("headingValue", UNAVAILABLE["heading"])
     return None if tenths == UNAVAILABLE["heading"] else tenths / 10.0
 

@@ -196,8 +196,8 @@ class EventBook:
 
 
 def _reported_state(alert: StretchAlert) -> tuple[float, ...]:
-    """Return the properties whose change is reported to receivers: size, whether it is ice, and
-    number of vehicles.
+    """Return the properties of an alert whose change is reported to receivers: size, True for ice,
+    and number of vehicles.
     """
     return (
         float(alert.cells),

@@ -310,8 +310,8 @@ def no_peers(vehicles: int) -> RecordArray:
 
 
 def distinct_values(values: IntArray) -> IntArray:
-    """Return the distinct values in ascending order. Sorting is several times faster than a set
-    here.
+    """Return the distinct values of an array in ascending order. Sorting is several times faster
+    than a set here.
     """
     ordered = np.sort(values)
     return np.asarray(

@@ -82,13 +82,17 @@ def locate_key(table: IntArray, rows: RecordArray, key: int) -> int:
 
 @refcount_free_inlined
 def find_row(table: IntArray, rows: RecordArray, key: int) -> int:
-    """Return the row of a key; NONE if the key is unknown."""
+    """Return the row of `rows` with a given key, found by the hash table `table`; NONE if the key
+    is unknown.
+    """
     return _row_at(table[locate_key(table, rows, key)])
 
 
 @compiled
 def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
-    """Return the row of each key, (n,); NONE if the key is unknown."""
+    """Return, for each key in `wanted` (n,), the row of `rows` with this key, found by the hash
+    table `table`; NONE if the key is unknown.
+    """
     out = np.empty(len(wanted), np.int64)
     for group in range(0, len(wanted), AHEAD):
         end = min(group + AHEAD, len(wanted))

@@ -204,7 +204,9 @@ def _textbook(
 
 
 def swing(x: FloatArray) -> FloatArray:
-    """Return the states (n, 2), angle and rate, of a damped pendulum after 50 ms."""
+    """Return the states (n, 2), angle and rate, of a damped pendulum 50 ms after the states x (n,
+    2).
+    """
     return np.stack([x[:, 0] + 0.05 * x[:, 1], 0.99 * x[:, 1] - 0.5 * np.sin(x[:, 0])], axis=1)
 
 

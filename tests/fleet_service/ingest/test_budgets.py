@@ -45,8 +45,8 @@ def engine(tmp_path: Path) -> Iterator[Engine]:
 
 
 def months(now: int) -> tuple[int, int]:
-    """Return two times [ns] around the last border of a month before `now`: one second before the
-    border, and two seconds after it.
+    """Return two times [ns] around the beginning of the month of `now`: one second before it, and
+    two seconds after it.
     """
     first = datetime.fromtimestamp(now / SECOND, UTC).replace(
         day=1, hour=0, minute=0, second=0, microsecond=0

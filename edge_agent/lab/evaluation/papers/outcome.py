@@ -54,7 +54,7 @@ class PaperRow(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """Return the unit of the row's numbers."""
+        """Return the unit of the numbers in this row of a paper's table."""
         _, _, unit = self.what.rpartition("[")
         return unit.removesuffix("]") if "[" in self.what else "1"
 
@@ -65,7 +65,9 @@ class PaperRow(NamedTuple):
         return self.limit is None or self.figure("papers").holds
 
     def figure(self, prefix: str) -> Figure:
-        """Return the matched number as a figure with its target."""
+        """Return the number under the paper's conditions (`matched`) as a figure with its
+        target.
+        """
         return Figure(f"{prefix}.{self.name}", self.matched, self.unit, self.limit, self.better)
 
 

@@ -34,13 +34,13 @@ LEGEND: Final = (
 
 
 def number(value: float) -> str:
-    """Return a number as text with three digits; a dash for NaN."""
+    """Return a number as text for the report, with three digits; a dash for NaN."""
     return "–" if math.isnan(value) else f"{value:.3g}"
 
 
 def cells(row: PaperRow) -> list[str]:
-    """Return the cells of a row as text: printed number, matched conditions, own vehicle model,
-    realistic sensors, default estimator.
+    """Return the cells of a table row of the report as text: printed number, matched conditions,
+    own vehicle model, realistic sensors, default estimator.
     """
     shown = row.shown or number(row.printed)
     return [shown, *(number(value) for value in (row.matched, row.own, row.realistic, row.default))]
