@@ -51,9 +51,7 @@ def register_attempt(function: Attempt) -> Attempt:
 
 
 def can_open(ground: Ground, name: str, router: str = ROUTERS[1], **changed: object) -> bool:
-    """Return True if the router accepts the attacker's session with this name and these TLS
-    settings.
-    """
+    """Return True if the router accepts a session of this name with these TLS settings."""
     try:
         with ground.network.open_session(name, router, **changed):
             return True
@@ -78,9 +76,7 @@ def issue_certificate(
 
 
 def make_stranger(ground: Ground) -> Path:
-    """Create a foreign certificate authority that issues certificates for the same names; return
-    its folder.
-    """
+    """Create a foreign certificate authority with the same names, and return its folder."""
     folder = ground.folder / "stranger"
     open_registry(folder).enrol(make_enrolment())
     return folder
