@@ -65,7 +65,9 @@ def drive_fleet(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Column
 
 
 def write_drive(fleet: SimulatedFleet, duration_s: float, folder: Path) -> None:
-    """Simulate the drive, and write both files into an existing folder."""
+    """Simulate the drive, and write the observations and the true friction as two files into an
+    existing folder.
+    """
     columns = drive_fleet(fleet, duration_s, folder / "truth.parquet")
     arrays = {
         name: pa.array(list(map(bytes, c)) if c.ndim == 2 else c) for name, c in columns.items()
@@ -75,7 +77,9 @@ def write_drive(fleet: SimulatedFleet, duration_s: float, folder: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line: simulate the drive and write both files."""
+    """Run the command line: simulate the drive, and write the observations and the true
+    friction.
+    """
     parser = argparse.ArgumentParser(
         prog="deploy.end_to_end", description=(__doc__ or "").splitlines()[0]
     )

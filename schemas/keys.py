@@ -88,7 +88,7 @@ def state_key(region: int, vehicle: str) -> str:
 
 
 def ack_key(vehicle: str) -> str:
-    """Return the key of the acknowledgements that a vehicle receives."""
+    """Return the Zenoh key under which a vehicle receives its acknowledgements."""
     return f"{ROOT}/ack/{vehicle}"
 
 

@@ -43,7 +43,7 @@ class Report:
 
 
 def encode(report: Report) -> bytes:
-    """Return the protobuf bytes of a report."""
+    """Return the protobuf bytes of a weather report."""
     known = {name: getattr(report, name) for name in RANGES if not np.isnan(getattr(report, name))}
     prior = [] if report.prior is None else np.asarray(report.prior).tolist()
     return pb.Weather(time=report.time, prior=prior, **known).SerializeToString()

@@ -42,14 +42,14 @@ class BucketServer:
         return {"copy": self.url, "store": self.store}
 
     def start(self) -> None:
-        """Start the server, and return when it accepts connections."""
+        """Start the S3 server, and return when it accepts connections."""
         words = ["-m", "localbucket", str(self._folder), "--port", str(self._port)]
         quiet = subprocess.DEVNULL
         self._process = subprocess.Popen([sys.executable, *words], stdout=quiet, stderr=quiet)
         until(self._is_up)
 
     def stop(self) -> None:
-        """Stop the server, so that connections are refused."""
+        """Stop the S3 server, so that connections are refused."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()

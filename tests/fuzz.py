@@ -113,7 +113,7 @@ class _OneFence:
         self._content = content
 
     def list_names(self, _: str) -> list[str]:
-        """Return the name of the only object."""
+        """Return the name of the only object in this bucket."""
         return ["fence/0000000001-000001.json.gz"]
 
     def get(self, _: str) -> bytes:
@@ -239,12 +239,14 @@ class Fuzzer:
 
 
 def seeds_of(name: str) -> list[bytes]:
-    """Return the committed seeds of a parser."""
+    """Return the committed seed inputs for fuzzing a parser."""
     return [path.read_bytes() for path in sorted((SEEDS / name).glob("*"))]
 
 
 def make_keeper(folder: Path) -> Callable[[str, bytes], None]:
-    """Return a function that writes each distinct input once into a folder."""
+    """Return a function that writes inputs of the fuzzer into a folder, each distinct input
+    once.
+    """
 
     def write_input(kind: str, data: bytes) -> None:
         path = folder / kind / hashlib.sha256(data).hexdigest()[:16]

@@ -85,14 +85,14 @@ DUNDER: Final = re.compile(r"__\w+__")
 
 
 class Docstring(NamedTuple):
-    """Docstring with its file and line."""
+    """Docstring of the code, with its file and line."""
 
     place: str
     text: str
 
 
 class Named(NamedTuple):
-    """Function name with its file and line."""
+    """Name of a function of the code, with its file and line."""
 
     place: str
     name: str

@@ -86,7 +86,7 @@ def _action_name(action: argparse.Action) -> str:
 
 
 def undocumented_options() -> list[str]:
-    """Return the options and arguments without a help text."""
+    """Return the commands' options and arguments that have no help text."""
     return [
         f"{program} {command.name} {_action_name(action)}"
         for program in COMMAND_LINES

@@ -219,7 +219,9 @@ def find_all() -> list[Found]:
 
 
 def main() -> int:
-    """Print all suspicious patterns. Return 1 if there are any, otherwise 0."""
+    """Print all regular expressions that may take more than linear time. Return 1 if there are any,
+    otherwise 0.
+    """
     found = find_all()
     for one in found:
         print(f"{one.place}: {one.pattern}")

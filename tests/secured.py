@@ -138,7 +138,7 @@ class Network:
         self.between[router] = heard["tls"]
 
     def stop(self, router: str) -> None:
-        """Stop a router."""
+        """Stop one of the two routers."""
         with self.routers.pop(router) as process:
             process.terminate()
 

@@ -43,7 +43,7 @@ class Link:
         return not self._open.is_set()
 
     def restore(self) -> None:
-        """Forward the waiting and all later traffic."""
+        """Restore the link: forward the waiting and all later traffic."""
         self._open.set()
 
     def close(self) -> None:

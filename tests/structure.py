@@ -77,7 +77,7 @@ def loose_modules(root: Path, package: str) -> list[str]:
 
 
 def too_wide(root: Path) -> list[str]:
-    """Return the functions with too many positional parameters."""
+    """Return the product's functions with too many positional parameters."""
     found = []
     for path in list_sources(root, *PACKAGES):
         for node in ast.walk(parse(path)):

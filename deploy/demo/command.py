@@ -13,7 +13,7 @@ from schemas.runtime.installing import install_command
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Declare the options of `gripmap demo`."""
     parser.add_argument("--vehicles", type=int, default=36, help="simulated vehicles (default 36)")
     parser.add_argument(
         "--duration",

@@ -122,7 +122,7 @@ def write_truth(visits: pa.Table, changed_ns: int, path: Path) -> None:
 
 
 def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison:
-    """Join the map with the true friction by (cell, sector)."""
+    """Join the map's cells with the true friction by (cell, sector); return one row per pair."""
     truth = final_truth(visits, changed_ns)
     found = np.array([truth.get(key, np.nan) for key in _cell_keys(cells)])
     known = np.isfinite(found)

@@ -37,7 +37,7 @@ class ManagedProcess:
             self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
 
     def lines(self) -> list[str]:
-        """Return the lines that the process has printed so far."""
+        """Return the lines that this process of the demo has printed so far."""
         return self.log.read_text().splitlines()
 
     def line_with(self, start: str, patience_s: float = START_S) -> str:
@@ -68,7 +68,7 @@ class ManagedProcess:
                 tick()
 
     def stop(self) -> None:
-        """Ask the process to end; if it does not, kill it."""
+        """Send SIGTERM to the process; if it does not end in time, kill it."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
             try:

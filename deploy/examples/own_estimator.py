@@ -67,7 +67,7 @@ class AtLeast:
 
 
 def main() -> None:
-    """Try the estimator on a simulated drive."""
+    """Run the example's estimator on a simulated drive and print its estimates."""
     log, vehicle = edge_agent.simulate_manoeuvre("double-lane-change", mu=0.5, seed=1)
     signals = np.stack([log[name].to_numpy() for name in edge_agent.CHANNELS], axis=-1)[:, None]
     t = log["t"].to_numpy()[:, None]

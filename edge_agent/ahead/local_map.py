@@ -112,7 +112,7 @@ class LocalMap:
 
     @property
     def cells(self) -> int:
-        """Return the number of cells in the cache."""
+        """Return the number of cells in the car's local copy of the map."""
         return sum(len(cells.key) for cells in self._tiles.values())
 
     @property
@@ -161,7 +161,7 @@ class LocalMap:
         return news + [key for key, alert in stand.items() if self.store_alert(alert, now)]
 
     def drop_old(self, now: int) -> None:
-        """Remove cells and alerts from the cache that are too old."""
+        """Remove those cells and alerts from the local map that are too old at `now` [ns]."""
         for tile in [
             tile
             for tile, cells in self._tiles.items()
@@ -241,7 +241,7 @@ class LocalMap:
         return np.asarray((1.0 - share) * belief[0] + share * mugrid.PRIOR)
 
     def keys(self) -> IntArray:
-        """Return the keys (cell·4 + sector) of all known places, sorted."""
+        """Return the keys (cell·4 + sector) of all places in the local map, sorted."""
         return self._all_cells().key
 
     def _all_cells(self) -> ReceivedCells:

@@ -87,7 +87,7 @@ class MapSubscriber:
 
     @property
     def is_connected(self) -> bool:
-        """Return True if a router was connected at the last check."""
+        """Return True if the vehicle's session was connected to a router at the last check."""
         return bool(self._routers)
 
     def follow_paths(self, paths: list[Path], pose: Pose, within: float) -> None:

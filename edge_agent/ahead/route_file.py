@@ -104,7 +104,7 @@ def _parse_geojson(data: bytes) -> list[tuple[float, float]]:
 
 
 def _find_line(document: Any) -> list[Any]:  # noqa: ANN401 whatever JSON holds
-    """Return the coordinates of the first line in a GeoJSON document."""
+    """Return the coordinates of the first LineString in a GeoJSON document."""
     kind = document["type"]
     if kind == "LineString":
         return list(document["coordinates"])

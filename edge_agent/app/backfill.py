@@ -125,7 +125,9 @@ def estimate_atomically(task: Task, estimator: str, memberships: Memberships | N
 
 
 def estimate_drive(task: Task, estimator: str, memberships: Memberships | None = None) -> Outcome:
-    """Estimate one drive and write its estimates to `task.out`; return the outcome."""
+    """Estimate one drive and write its estimates to `task.out`; return the outcome (number of
+    samples, or the error).
+    """
     try:
         vehicle = load_vehicle(task.vehicle)
         log, vehicle, *_ = prepare_log(read_log(task.log), vehicle)

@@ -19,7 +19,7 @@ _NAMES: Final = {Kind.OBSERVATION: "observation", Kind.STATE: "state"}
 
 
 def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
-    """Return all metrics with their current values; records are counted by kind."""
+    """Return all metrics of an agent with their current values; records are counted by kind."""
     counts = publisher.counts
     status = publisher.status
     return [

@@ -14,7 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the completion script; return 0."""
+    """Print the completion script for the given shell; return 0."""
     from edge_agent.cli import COMMANDS, LINE
 
     parser = commandline.parser_of(*LINE, *(command.name for command in COMMANDS))

@@ -41,7 +41,7 @@ class LookoutPart:
         self._lookout.attach(name, session)
 
     def start_part(self) -> None:
-        """Start the thread that looks ahead."""
+        """Start the lookout, the thread that looks ahead in the map."""
         self._lookout.start()
 
     # `admitted` is unused: warnings need no admission

@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate a manoeuvre, or list the manoeuvres; return 0."""
+    """Simulate a manoeuvre and write its log, or list the manoeuvres; return 0."""
     from edge_agent.app.estimates_file import prepare_path, write_table
     from edge_agent.lab.simulation import MANOEUVRES, Fault, simulate_manoeuvre
     from schemas.errors import InputError

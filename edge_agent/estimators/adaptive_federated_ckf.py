@@ -70,7 +70,7 @@ class AdaptiveDesign:
 
 
 class AdaptiveSetting(NamedTuple):
-    """Options of the filter of paper 001."""
+    """Options of paper 001's filter: motion filter and fuzzy rules."""
 
     adaptive: bool = True  # False: R and shares stay as they are, which is the comparator FKF
     tyre: TyreOption = TyreOption()

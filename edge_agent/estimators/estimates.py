@@ -97,7 +97,7 @@ class Estimates:
 
     @property
     def health(self) -> FlagArray:
-        """Return the health flags (`schemas.signals.Health`), (T, N)."""
+        """Return the health flags (`schemas.signals.Health`) of each sample and vehicle, (T, N)."""
         return self.values[..., Column.HEALTH].astype(np.int64)
 
     @property

@@ -101,7 +101,7 @@ OMEGA_STD = 0.03
 
 
 class WheelFrictionState(IntEnum):
-    """Index of a state of the filter `sr-ukf`."""
+    """Index of a state in the state vector of the filter `sr-ukf`."""
 
     VX = 0
     VY = 1

@@ -66,7 +66,7 @@ class SigmaRule:
 
     @property
     def dimension(self) -> int:
-        """Return the dimension n of the state."""
+        """Return the dimension n of the states for which the rule is made."""
         return int(self.xi.shape[1])
 
 

@@ -108,7 +108,7 @@ class Channel(Part):
         return name if self.message is None else f"{self.message}.{name}"
 
     def needed_signals(self) -> list[str]:
-        """Return the names of all signals that the channel reads."""
+        """Return the names of all recorded signals that this channel needs."""
         return [
             *self.signals,
             *self.gates,
@@ -150,7 +150,7 @@ class Profile(Part):
         return self
 
     def needed_signals(self) -> set[str]:
-        """Return the names of all signals that the profile reads."""
+        """Return the names of all recorded signals that the profile's channels need."""
         return {name for channel in self.channels.values() for name in channel.needed_signals()}
 
     def to_json(self) -> str:

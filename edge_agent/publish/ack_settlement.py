@@ -59,7 +59,9 @@ class AckSettlement:
         self.clock_behind_s = 0.0
 
     def receive_ack(self, vehicle: str, payload: bytes) -> None:
-        """Queue an acknowledgement. This method is called on a thread of Zenoh."""
+        """Queue a received acknowledgement for the vehicle. This method is called on a thread of
+        Zenoh.
+        """
         self._acks.put((vehicle, payload))
 
     def settle_received(self) -> None:

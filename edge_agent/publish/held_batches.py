@@ -93,7 +93,7 @@ class HeldBatches:
         return iter(self._entries)
 
     def add_batch(self, key: int, batch: HeldBatch) -> None:
-        """Add a batch (message with records) that the outbox's file contains."""
+        """Add a batch (message with records) that the outbox's file already contains."""
         self._entries[key] = batch
         oldest = self._oldest[batch.stream.kind]
         oldest.append(key)
@@ -118,7 +118,7 @@ class HeldBatches:
         return batch
 
     def remove_all(self) -> None:
-        """Remove all batches. The streams of this start go on counting."""
+        """Remove all held batches. The sequence numbers of this start's streams continue."""
         own = {
             stream: sequence
             for stream, sequence in self._streams.items()

@@ -92,7 +92,9 @@ class Outbox:
         self._load_batches()
 
     def _load_batches(self) -> None:
-        """Load the batches of an earlier start; all are due at once."""
+        """Load the batches that the outbox's file contains from an earlier start; all are due at
+        once.
+        """
         for key, (vehicle, boot, kind, region, seq, records), size in self._file.list_batches():
             stream = Stream(vehicle, boot, Kind(kind), region)
             self.held.add_batch(key, HeldBatch(stream, seq, records, size))
@@ -116,7 +118,7 @@ class Outbox:
         self.counts.damaged += max(before - self.held.count_records(), 0)
 
     def _drop_batch(self, key: int) -> int:
-        """Remove a batch, and return the number of its records."""
+        """Remove a batch from the outbox, and return the number of its records."""
         batch = self.held.remove_batch(key)
         self.schedule.record_removal(batch)
         self._deletable.append(key)

@@ -78,7 +78,7 @@ class Publisher:
         self._sender = threading.Thread(target=self._send_loop, name="sender", daemon=True)
 
     def start(self) -> None:
-        """Start two threads: one opens the Zenoh sessions, the other sends."""
+        """Start two threads: one opens the Zenoh sessions, the other stores and sends batches."""
         self._links.start()
         self._sender.start()
 

@@ -34,7 +34,7 @@ class PublisherStatus:
 
     @property
     def links(self) -> int:
-        """Return the number of open sessions."""
+        """Return the number of open Zenoh sessions."""
         return self._sessions.session_count
 
     @property
@@ -44,7 +44,7 @@ class PublisherStatus:
 
     @property
     def cut_off(self) -> bool:
-        """Return True if an open session has no router."""
+        """Return True if an open Zenoh session is not connected to a router."""
         return self._sessions.is_cut_off
 
     @property

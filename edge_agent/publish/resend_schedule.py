@@ -31,7 +31,7 @@ class ResendSchedule:
         self._later: list[tuple[float, int]] = []  # heap of when what flies is given up
 
     def remove_all(self) -> None:
-        """Forget all batches."""
+        """Remove all batches from the schedule."""
         self._pacers = {}
         self._later = []
 
@@ -42,7 +42,9 @@ class ResendSchedule:
         return self._random.uniform(1 - JITTER, 1 + JITTER)
 
     def queue_batch(self, key: int) -> None:
-        """Queue a batch, to be sent as soon as its pacer allows."""
+        """Queue a batch, which is sent as soon as its pacer (limit of unanswered batches)
+        allows.
+        """
         self._pacer_of(self._held[key]).queue_batch(key)
 
     def mark_in_flight(self, key: int, now: float) -> None:

@@ -45,19 +45,19 @@ class SessionLinks:
         self._opener.start()
 
     def close(self) -> None:
-        """Close all sessions. Set the event `stop` before this call."""
+        """Close all Zenoh sessions. Set the event `stop` before this call."""
         self._opener.join()
         for link in self._links.values():
             link.close()
 
     @property
     def session_count(self) -> int:
-        """Return the number of open sessions."""
+        """Return the number of open Zenoh sessions."""
         return len(self._links)
 
     @property
     def link_watches(self) -> list[LinkWatch]:
-        """Return the watch of each session's link to its router."""
+        """Return, for each session, the object that watches its link to the router."""
         return [link.watch for link in list(self._links.values())]
 
     @property

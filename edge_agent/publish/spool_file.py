@@ -101,7 +101,7 @@ class SpoolFile:
         return cursor.lastrowid
 
     def delete_rows(self, keys: Sequence[int]) -> None:
-        """Delete batches by their keys."""
+        """Delete the batches with these keys from the outbox's file."""
         self._database.executemany("DELETE FROM batch WHERE id = ?", [(key,) for key in keys])
 
     def read_payload(self, key: int) -> bytes | None:

@@ -72,7 +72,7 @@ class Link:
 
     @property
     def is_connected(self) -> bool:
-        """Return True if a router is connected now."""
+        """Return True if the vehicle's session is connected to a router now."""
         return self.watch.is_connected
 
     def put(self, batch: StoredBatch) -> bool:

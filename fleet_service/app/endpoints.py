@@ -34,7 +34,9 @@ class Endpoints:
 
     @contextmanager
     def declare_all(self, session: zenoh.Session) -> Iterator[None]:
-        """Subscribe, answer queries and show a liveliness token in this context."""
+        """Provide a context in which the service subscribes to reports, answers queries, and has a
+        liveliness token in Zenoh.
+        """
         regions = self._config.regions
         own = keys.shard_key(self._config.name)
         inputs = [

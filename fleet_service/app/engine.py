@@ -138,7 +138,7 @@ class Engine:
         checkpoints.mark_survived(self._root)
 
     def close(self) -> None:
-        """Close all parts and release the archive."""
+        """Close all parts of the service and release the archive."""
         self.queries.close()
         self.mark_survived()
         self.settlement.close()

@@ -10,7 +10,7 @@ from schemas.wire import Alert
 
 
 def publish_acks(session: zenoh.Session, acks: list[tuple[str, bytes]]) -> None:
-    """Publish acknowledgements, (vehicle, payload) each."""
+    """Publish acknowledgements, each a pair (vehicle, payload), to their vehicles."""
     for vehicle, ack in acks:
         _publish_message(session, keys.ack_key(vehicle), ack, wire.ACK_ENCODING)
 
@@ -27,7 +27,7 @@ def publish_alerts(session: zenoh.Session, alerts: list[Alert]) -> None:
 
 
 def publish_tile(session: zenoh.Session, tile: int, stream: bytes) -> None:
-    """Publish the encoded cells of a tile."""
+    """Publish the encoded cells of a map tile."""
     _publish_message(session, keys.map_key(tile), stream, wire.ARROW)
 
 

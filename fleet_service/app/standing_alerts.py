@@ -44,7 +44,7 @@ class StandingAlerts:
 
     @property
     def all(self) -> list[Alert]:
-        """Return the active alerts."""
+        """Return all active alerts of the service."""
         return self._shared.state.alerts.standing_alerts
 
     def encode_tiles(self, is_wanted: Callable[[int], bool]) -> list[tuple[int, bytes]]:

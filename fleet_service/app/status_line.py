@@ -34,7 +34,7 @@ class StatusLine:
         return now - self._reported_at >= STATUS_S
 
     def write_line(self, now: float) -> None:
-        """Write the line; `now` is the monotonic time [s]."""
+        """Write the service's status line to the log; `now` is the monotonic time [s]."""
         counts = self._engine.counts
         rate = (counts[Kind.OBSERVATION] - self._reported) / max(now - self._reported_at, 1e-9)
         self._reported_at = now

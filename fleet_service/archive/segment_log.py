@@ -36,7 +36,7 @@ class _Load(Generic[Batch]):
 
     @property
     def rows(self) -> int:
-        """Return the number of rows that have not been written yet."""
+        """Return the number of this load's rows that have not been written to disk yet."""
         return sum(len(part["row"]) for waiting in list(self.waiting.values()) for part in waiting)
 
     def take(self, other: _Load[Batch]) -> None:
@@ -111,12 +111,12 @@ class SegmentLog(Generic[Batch]):
 
     @property
     def rows(self) -> int:
-        """Return the number of rows that are not yet durable."""
+        """Return the number of accepted rows that are not yet durable on disk."""
         return self._next.rows + self._load.rows
 
     @property
     def unsettled(self) -> int:
-        """Return the number of batches that are not durable yet."""
+        """Return the number of accepted batches that are not yet durable on disk."""
         return len(self._next.batches) + len(self._load.batches)
 
     @property

@@ -13,7 +13,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the completion script."""
+    """Print the completion script for the given shell."""
     from fleet_service.cli import COMMANDS, LINE
 
     parser = commandline.parser_of(*LINE, *(command.name for command in COMMANDS))

@@ -62,7 +62,7 @@ class Supplier:
     status: Literal["real", "test", "technicalExercise", "securityExercise"] = "test"
 
     def __post_init__(self) -> None:
-        """Check country and name; raise InputError if one is not valid."""
+        """Check the supplier's country and name; raise InputError if one is not valid."""
         if not re.fullmatch("[a-z]{2}", self.country):
             raise InputError(
                 "country", f"{self.country!r} is not a country code", "give two letters, e.g. se"
@@ -131,7 +131,7 @@ def make_publication(
 
 
 def same_but_for_time(one: bytes, other: bytes) -> bool:
-    """Return True if two publications are equal except for their publication time."""
+    """Return True if two DATEX II publications are equal except for their publication time."""
     cut = re.compile(rb"<com:publicationTime>[^<]*</com:publicationTime>")
     return cut.sub(b"", one) == cut.sub(b"", other)
 
@@ -288,7 +288,7 @@ def _cell_coordinates(record: ET.Element) -> set[str]:
 
 
 def _parse_records(document: bytes) -> dict[str, ET.Element]:
-    """Return the situation records of a publication by id."""
+    """Return the situation records of a DATEX II publication by id."""
     problem = InputError("out", "is not a publication of this command", "name another file")
     try:
         root = ET.fromstring(document)

@@ -70,7 +70,7 @@ class StretchAlert:
         return asdict(self) | {"since": format_time(self.since), "time": format_time(self.time)}
 
     def to_line(self) -> str:
-        """Return the alert as one line of text."""
+        """Return the alert of the road stretch as one line of text."""
         word = {"raised": "RAISED", "changed": "now", "cleared": "cleared"}[self.state]
         return (
             f"alert {word} at {self.latitude:.6f}, {self.longitude:.6f}: {self.length_m:.0f} m "

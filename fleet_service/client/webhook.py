@@ -41,7 +41,7 @@ _OPEN: Final = "0001-01-01T00:00:00Z"  # Alertmanager's end of what has not ende
 
 
 def alert_message(alert: StretchAlert) -> dict[str, Any]:
-    """Return one alert as a webhook message."""
+    """Return the alert of a road stretch as a webhook message in Alertmanager's format."""
     status = "resolved" if alert.state == "cleared" else "firing"
     labels = {
         "alertname": "SlipperyRoad",
@@ -120,7 +120,9 @@ class Webhook:
 
     @property
     def lost_count(self) -> int:
-        """Return the number of alerts that can no longer be delivered."""
+        """Return the number of alerts that were lost, because they can no longer be delivered to
+        the receiver.
+        """
         return sum(self.counts[name] for name in LOSSES)
 
     @property
@@ -140,7 +142,7 @@ class Webhook:
         return [*out, f"webhook: {self.lost_count} alerts were lost"] if self.lost_count else out
 
     def metrics(self) -> list[Metric]:
-        """Return counters of alerts and the length of the queue, as metrics."""
+        """Return the webhook's counters of alerts and the length of its queue, as metrics."""
         alerts = {name: float(self.counts[name]) for name in ("delivered", *LOSSES)}
         return [
             Metric("webhook_alerts", "counter", "Alerts by outcome", alerts, "outcome"),

@@ -70,7 +70,7 @@ class Router(Settings):
 
     @property
     def listens(self) -> list[str]:
-        """Return the addresses on which the router listens."""
+        """Return the addresses (endpoints) on which the Zenoh router listens."""
         return [_format_endpoint(protocol, self.listen, self.port) for protocol in self.protocols]
 
     @property

@@ -111,7 +111,9 @@ class Fusion:
 
     @property
     def epoch(self) -> int:
-        """Epoch (minute) of the latest observation; -1 before the first observation."""
+        """Epoch (minute since 1970) of the latest fused observation; -1 before the first
+        observation.
+        """
         return -1 if self._epoch is None else self._epoch
 
     @property

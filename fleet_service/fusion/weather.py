@@ -63,7 +63,7 @@ class Reports:
     prior: FloatArray
 
     def take(self, rows: IntArray | BoolArray) -> Reports:
-        """Return the weather reports that `rows` selects."""
+        """Return the weather reports that the indices or mask `rows` selects."""
         return Reports(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 

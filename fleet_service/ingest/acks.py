@@ -32,7 +32,7 @@ class Acks:
         )
 
     def record_durable(self, batches: Iterable[BatchId]) -> None:
-        """Record that batches are durable on disk."""
+        """Record that batches are durable on disk, so that their senders get an acknowledgement."""
         durable = self._durable
         for stream, seq in batches:
             durable[stream].append(seq)

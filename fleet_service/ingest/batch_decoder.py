@@ -97,7 +97,7 @@ class _Fields(NamedTuple):
 
     @property
     def sizes(self) -> IntArray:
-        """Return the number of records of each message, (k,)."""
+        """Return the number of records in each of the k messages, (k,)."""
         return self.walked.sizes
 
     def present_columns(self) -> PresentColumns:

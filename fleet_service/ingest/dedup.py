@@ -55,7 +55,7 @@ class SequenceTracker:
         self.seen: set[int] | frozenset[int] = _NONE
 
     def accepted(self, seq: int) -> bool:
-        """Return True if the batch with this sequence number was accepted before."""
+        """Return True if the stream's batch with this sequence number was accepted before."""
         return seq <= self.low or seq in self.seen
 
     def accept(self, seq: int, time: int = 0) -> bool:
@@ -76,7 +76,7 @@ class SequenceTracker:
         return True
 
     def add(self, seqs: list[int]) -> None:
-        """Record accepted sequence numbers, given in ascending order."""
+        """Record sequence numbers of accepted batches of the stream, given in ascending order."""
         if (
             seqs[0] == self.low + 1 and seqs[-1] - seqs[0] == len(seqs) - 1
         ):  # as most often: a run that goes on

@@ -95,7 +95,7 @@ class Errors:
 
     @staticmethod
     def draw(rng: Generator, vehicles: int, model: ErrorModel = CLEAN) -> Errors:
-        """Draw the persistent errors of the vehicles of a fleet at random."""
+        """Return random persistent errors for the vehicles of a fleet, drawn by the error model."""
         relative = model.bias * rng.normal(size=vehicles)
         return Errors(
             relative + model.tyres + np.where(np.arange(vehicles) % 2, model.half, 0.0),

@@ -121,7 +121,7 @@ class AlertWatch:
     late: int = 0
 
     def snapshot(self, minute: int) -> None:
-        """Read and store the map's beliefs and alerts at a minute."""
+        """Read the map's beliefs and alerts at a minute of the drive, and store them."""
         now = START + minute * 60 * NS
         slots = self.fusion.slots_of(CELL, np.zeros(CELLS, np.int64))
         known = slots >= 0

@@ -31,7 +31,7 @@ def name_of(vehicle: int) -> str:
 
 
 def clock_of(seconds: float) -> int:
-    """Return the service's time [ns] at `seconds` after the start."""
+    """Return the simulated service's time [ns] at `seconds` after the start of the drive."""
     return START + int(seconds * NS) + NS
 
 

@@ -49,7 +49,7 @@ class Scores:
     crps: FloatArray
 
     def taken(self, rows: BoolArray) -> Scores:
-        """Return the scores of the answers that `rows` selects."""
+        """Return the scores of those answers of the map that `rows` selects."""
         return Scores(*(column[rows] for column in vars(self).values()))
 
 
@@ -76,7 +76,9 @@ def excited_vehicles(v: Visits, town: Town, minute: int, vehicles: int) -> IntAr
 
 
 def earlier_visits(v: Visits, until_s: float, vehicles: int) -> IntArray:
-    """Return the number of visits of each vehicle before `until_s`, (vehicles,)."""
+    """Return the number of visits that each vehicle made before the time `until_s` [s],
+    (vehicles,).
+    """
     return np.bincount(v.vehicle[v.seconds < until_s], minlength=vehicles)
 
 

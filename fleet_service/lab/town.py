@@ -78,7 +78,7 @@ class Town:
     usual: IntArray
 
     def at(self, seconds: FloatArray, place: IntArray) -> FloatArray:
-        """Return the friction at the given times [s] and places, (n,)."""
+        """Return the true friction of the town's cells at the given times [s] and places, (n,)."""
         return np.asarray(
             self.mu[np.minimum((seconds // 60.0).astype(np.int64), len(self.mu) - 1), place]
         )

@@ -71,7 +71,7 @@ class BoundedProtocol(H11Protocol):
 
     @property
     def is_silent(self) -> bool:
-        """Return True while no request of the connection is being answered."""
+        """Return True while the browser's connection has no request that is being answered."""
         return bool(self.cycle is None or self.cycle.response_complete)
 
     def _await_request(self) -> None:
@@ -100,7 +100,9 @@ class RareMessages(logging.Filter):
         self._more: Counter[str] = Counter()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return True if the message may be logged."""
+        """Return True if a log message may be logged now, because no equal one was logged within
+        LOG_S.
+        """
         text = str(record.msg)
         if time.monotonic() - self._passed.get(text, -LOG_S) < LOG_S:
             self._more[text] += 1

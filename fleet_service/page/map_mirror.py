@@ -100,7 +100,7 @@ class MapMirror:
             )
 
     def places(self) -> tuple[IntArray, IntArray]:
-        """Return cell and sector of all records, two arrays (n,)."""
+        """Return cell and sector of all records in the mirror, as two arrays (n,)."""
         with self._lock:
             held = [
                 (tile, one.cells["place"].astype(np.int64)) for tile, one in self._tiles.items()
@@ -205,5 +205,5 @@ def block_at(level: int, tile: int, cells: Records, version: int, moment: float)
 
 
 def box_of(tile: int, zoom: int = grid.TILE_ZOOM) -> list[float]:
-    """Return west, south, east, north [deg] of a tile."""
+    """Return the box of a map tile: west, south, east, north [deg]."""
     return [float(side) for side in grid.bounds(tile, zoom)]

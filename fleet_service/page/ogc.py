@@ -43,7 +43,7 @@ class FeatureRoutes:
         self._turns = PastTurns()
 
     def paths(self) -> dict[str, Callable[[Request], Awaitable[Response]]]:
-        """Return the request handlers by URL path."""
+        """Return the request handlers of the OGC API by URL path."""
         return {
             "/conformance": self.conformance,
             "/collections": self.collections,
@@ -75,7 +75,7 @@ class FeatureRoutes:
         return JSONResponse(features.collection_document(_base_address(request), self._extent()))
 
     async def schema(self, request: Request) -> Response:
-        """Return the properties of a feature as a JSON Schema."""
+        """Return a JSON Schema of the properties of a feature (one heading sector of a cell)."""
         return JSONResponse(
             features.feature_schema(_base_address(request)), media_type=features.SCHEMA_JSON
         )
@@ -169,7 +169,7 @@ class FeatureRoutes:
         return pa.concat_tables(found).slice(0, question.limit + 1)
 
     def _tiles(self, question: FeatureQuestion) -> Iterator[pa.Table]:
-        """Yield the cells one tile at a time, ordered by tile."""
+        """Yield the requested map cells as tables, one tile at a time, ordered by tile."""
         parameters = {}
         if question.bbox is not None:
             parameters["bbox"] = ",".join(f"{side:.9f}" for side in question.bbox)

@@ -59,7 +59,7 @@ class Reader:
         self._tried = -AGAIN_S
 
     def run(self, stop: threading.Event) -> None:
-        """Receive tiles and alerts until `stop` is set."""
+        """Receive map tiles and alerts over Zenoh until `stop` is set."""
         session = zenoh_session.open_session(self._connection, stop)
         if session is None:
             return
@@ -89,7 +89,7 @@ class Reader:
 
     @property
     def is_connected(self) -> bool:
-        """Return True if a router is connected."""
+        """Return True if the page's Zenoh session is connected to a router."""
         session = self._session
         return session is not None and bool(list(session.info.routers_zid()))
 

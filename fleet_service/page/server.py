@@ -171,7 +171,7 @@ async def _serve_app(
 
 
 class _Server(uvicorn.Server):
-    """Web server that leaves signal handling to the command."""
+    """Web server of the page that leaves the handling of signals to the command."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:

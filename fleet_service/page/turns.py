@@ -50,7 +50,7 @@ class RequestTurns:
 
 
 class PastTurns:
-    """Queue of queries about the past; for use in one event loop."""
+    """Queue of browsers' queries about past maps; for use in one event loop."""
 
     def __init__(self) -> None:
         self._lock = asyncio.Lock()

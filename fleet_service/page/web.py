@@ -114,7 +114,7 @@ class Routes:
         return found
 
     async def file(self, request: Request) -> Response:
-        """Return one of the page's static files."""
+        """Return the static file of the page that a request names."""
         found = self._files.answer(request.path_params["name"], request)
         return PlainTextResponse("no such file\n", 404) if found is None else found
 
@@ -177,7 +177,7 @@ class Routes:
         )
 
     async def tiles(self, request: Request) -> Response:
-        """Return the tiles that have cells, now or at the time `at`."""
+        """Return the numbers of the tiles that have cells, now or at the time `at`."""
         at = request_params.parse_moment(request)
         found = (
             self._of.world.tiles()
@@ -230,7 +230,7 @@ class Routes:
         return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
     async def cell(self, request: Request) -> Response:
-        """Return the present values of one cell and heading."""
+        """Return the present values of the cell and heading sector that a request names."""
         cell, sector = request_params.parse_place(request)
         return JSONResponse(await run_in_threadpool(self._cell, cell, sector))
 
@@ -275,7 +275,7 @@ class Routes:
         )
 
     async def health(self, _: Request) -> Response:
-        """Return the health of services and of this page."""
+        """Return the health of the fleet services and of this page as JSON."""
         services = await run_in_threadpool(self._of.health.services)
         reader = self._of.reader
         watchers = self._of.watchers

@@ -86,7 +86,7 @@ def save_checkpoint(root: Path, taken: Taken) -> Path:
 
 
 def list_checkpoints(root: Path) -> list[Path]:
-    """Return the folders of the checkpoints, newest first."""
+    """Return the folders of an archive's checkpoints, newest first."""
     return _checkpoint_folders(root)[::-1]
 
 

@@ -156,7 +156,7 @@ class Since(NamedTuple):
         )
 
     def where(self) -> list[ValueRange] | None:
-        """Return the filters that select the rows; None for all rows."""
+        """Return the filters on columns that select the rows of a replay; None for all rows."""
         found = (
             [] if self.until is None else [ValueRange("received_at", most=self.until // US_STEP)]
         )
@@ -448,7 +448,7 @@ class _Held:
         self._taken.clear()
 
     def forget(self) -> None:
-        """Drop the provisionally added rows, because their file is damaged."""
+        """Drop the rows that were added provisionally, because their file is damaged."""
         self._taken.clear()
 
     def chunks(self) -> Iterator[pa.Table]:

@@ -54,7 +54,9 @@ class FileTransfer:
         self._journal.add(name, stamp)
 
     def upload_if_present(self, name: str) -> bool:
-        """Upload a file; return False if the file has been removed meanwhile."""
+        """Upload a file of the archive to the bucket; return False if the file has been removed
+        meanwhile.
+        """
         try:
             self.upload_file(self._files.path_of(name), self._bucket.objects)
         except FileNotFoundError:

@@ -84,7 +84,9 @@ class Ownership:
             self.lease.lost = True
 
     def release(self) -> None:
-        """Release the lease, if any; nothing may be acknowledged afterwards."""
+        """Release the lease of the archive's copy, if any; the service may acknowledge nothing
+        afterwards.
+        """
         if self.lease is not None:
             self.lease.release(self.to if self.leaves else "")
 

@@ -39,11 +39,11 @@ class ReplicaFiles:
         self.root = root
 
     def name_of(self, path: Path) -> str:
-        """Return the name of a file's object."""
+        """Return the name of the bucket object that corresponds to a file of the archive."""
         return path.relative_to(self.root).as_posix()
 
     def path_of(self, name: str) -> Path:
-        """Return the path of an object's file."""
+        """Return the path of the archive's file that corresponds to a bucket object."""
         return self.root / name
 
     def set_aside_path(self, name: str) -> Path:

@@ -82,7 +82,7 @@ class UploadJournal:
         return self._stamps.get(name)
 
     def add(self, name: str, stamp: Stamp) -> None:
-        """Record that a file was uploaded."""
+        """Record that the file `name` was uploaded to the bucket copy in the version `stamp`."""
         with self._guard:
             self._file.write(f"{json.dumps([name, *stamp])}\n".encode())
             self._stamps[name] = stamp
@@ -98,7 +98,7 @@ class UploadJournal:
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Close the file of the journal."""
+        """Close the file of the upload journal."""
         self._file.close()
 
 

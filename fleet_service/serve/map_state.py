@@ -49,13 +49,13 @@ class MapState:
         return self._changed.get(tile, 0)
 
     def take_dirty(self) -> list[int]:
-        """Return the tiles that changed since the last call."""
+        """Return the numbers of the map tiles that changed since the last call."""
         dirty = sorted(self._dirty)
         self._dirty = set()
         return dirty
 
     def tiles(self) -> list[int]:
-        """Return all tiles that contain at least one cell."""
+        """Return the numbers of all map tiles that contain at least one cell."""
         self._index()
         return sorted(self._slots)
 

@@ -77,7 +77,7 @@ def size_asked(
 def _select_tiles(
     cache: TileCache, query: MapQuery, route: IntArray | None, only: int | None
 ) -> list[int]:
-    """Return the tiles that may contain cells of the answer."""
+    """Return the numbers of the tiles that may contain cells of the answer to a query."""
     if route is not None:
         tiles = np.unique(grid.tile_of(route // grid.SECTORS))
     elif only is not None:

@@ -150,7 +150,7 @@ class MapQueryable:
         return 0.0 if since is None else time.monotonic() - since
 
     def __call__(self, request: zenoh.Query) -> None:
-        """Answer one query at once, or queue or refuse it."""
+        """Handle one map query: answer it at once, queue it, or refuse it."""
         self._counts["queries"] += 1
         try:
             # the stub does not declare it as iterable

@@ -37,7 +37,7 @@ class Figure:
 
     @property
     def holds(self) -> bool:
-        """True if the value meets its target; False for NaN (not measured)."""
+        """True if the figure's value meets its target; False for NaN (not measured)."""
         if self.bar is None:
             return not math.isnan(self.value)
         if isinstance(self.bar, tuple):
@@ -87,7 +87,7 @@ def commit(source: Path) -> str:
 
 
 def write(path: Path, campaign: str, seeds: Sequence[int], figures: Sequence[Figure]) -> None:
-    """Write the header record and the figures as one JSON list."""
+    """Write the header of a campaign and its figures to a file as one JSON list."""
     rows = [{**asdict(figure), "holds": figure.holds} for figure in figures]
     for row in rows:
         row["value"] = row["value"] if math.isfinite(row["value"]) else None

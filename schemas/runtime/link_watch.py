@@ -55,17 +55,17 @@ class LinkWatch:
 
     @property
     def is_connected(self) -> bool:
-        """True if a router is connected."""
+        """True if the watched session is connected to a router."""
         return bool(self._routers)
 
     @property
     def protocols(self) -> list[str]:
-        """Transport protocols of the current links: quic, tls or tcp."""
+        """Transport protocols of the watched session's current links: quic, tls or tcp."""
         with self._lock:
             return sorted(self._links.values())
 
     def close(self) -> None:
-        """Stop watching the session."""
+        """Stop watching the links of the session."""
         for listener in self._listeners:
             listener.undeclare()  # type: ignore[no-untyped-call]
 
@@ -101,7 +101,7 @@ class LinkWatch:
 
 
 def link_metrics(watches: Sequence[LinkWatch]) -> list[Metric]:
-    """Return metrics about the links of several sessions."""
+    """Return metrics about the links (router connections) of several Zenoh sessions."""
     found = Counter(protocol for watch in watches for protocol in watch.protocols)
     return [
         Metric("links", "gauge", "links to routers, by transport", _by_protocol(found), "protocol"),

@@ -29,7 +29,7 @@ QUESTIONS: Final = "gripmap.questions"
 
 @cache
 def entry_points_of(group: str) -> dict[str, EntryPoint]:
-    """Return the entry points of a group by name."""
+    """Return, by name, the entry points of a plug-in group that installed distributions declare."""
     return {point.name: point for point in entry_points(group=group)}
 
 

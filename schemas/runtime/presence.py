@@ -43,19 +43,19 @@ class PresenceTracker:
 
     @property
     def active(self) -> set[ServiceToken]:
-        """Return the liveliness tokens that are active now."""
+        """Return the liveliness tokens of services that are active now."""
         with self._guard:
             return set(self._here)
 
     @property
     def lost_tokens(self) -> set[ServiceToken]:
-        """Return the tokens that were active earlier and are no longer active."""
+        """Return the services' tokens that were active earlier and are no longer active."""
         with self._guard:
             return set(self._withdrawn)
 
     @property
     def ever_lost(self) -> set[ServiceToken]:
-        """Return all tokens that were ever lost; they may be active again."""
+        """Return all services' tokens that were ever lost; some may be active again."""
         with self._guard:
             return set(self._fell)
 

@@ -46,13 +46,13 @@ def enable_messages(*, quiet: bool = False) -> None:
 
 
 def report(line: str) -> None:
-    """Print a line about the progress, if messages are enabled."""
+    """Print a line about the progress of the command, if progress messages are enabled."""
     if _voice.on:
         print_line(line, sys.stderr)
 
 
 def report_once(line: str) -> None:
-    """Print a message unless the process has printed it before."""
+    """Print a progress message unless this process has printed it before."""
     if line not in _voice.said_once:
         _voice.said_once.add(line)
         report(line)

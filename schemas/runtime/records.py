@@ -57,11 +57,11 @@ class Records(Protocol[R_co]):
     """
 
     def __getitem__(self, index: int | tuple[int, int], /) -> R_co:
-        """Return a row, which is a view into the array."""
+        """Return a row of the record array as a view."""
         ...
 
     def __setitem__(self, index: int | tuple[int, int], row: object, /) -> None:
-        """Copy another row into the row at `index`."""
+        """Copy another row into the row of the record array at `index`."""
         ...
 
 

@@ -111,7 +111,7 @@ class Batch:
 
     @property
     def rows(self) -> int:
-        """Return the number of records in the batch."""
+        """Return the number of records (reports of a vehicle) in the batch."""
         return len(self.columns["latitude"])
 
 

@@ -152,7 +152,7 @@ class VectorLimit:
     def __init__(
         self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
     ) -> None:
-        """Create the filters. The arguments are those of `Limit`."""
+        """Create the N filters in C. The arguments are those of `Limit`."""
         self._library = compile_library("kernel_simd.c", *VECTORS)
         self._lanes = int(self._library.lanes())
         self._setting = setting_row(memberships)

@@ -155,7 +155,7 @@ def open_stage(seed: int) -> Iterator[Stage]:
 
 
 def tiles_of(address: str) -> int:
-    """Return the number of tiles that the page has received."""
+    """Return the number of map tiles that the page has received from the simulated service."""
     import json
     import urllib.request
 

@@ -125,7 +125,9 @@ def make_pods(objects: list[Manifest], root: Path) -> list[Pod]:
 
 
 class Cluster:
-    """Pods of an overlay, simulated on this machine."""
+    """Pods of a Kubernetes overlay (variant of the manifests), simulated by processes on this
+    machine.
+    """
 
     def __init__(self, overlay: str, root: Path) -> None:
         self.overlay = overlay

@@ -124,7 +124,7 @@ class RemoteClient:
         self._subscribers: dict[int, zenoh.Subscriber[None]] = {}
 
     def run(self) -> None:
-        """Answer the client's messages until it disconnects."""
+        """Carry out the messages that the client sends over WebSocket until it disconnects."""
         for message in self._link:
             assert isinstance(message, bytes)
             reader = SerializedReader(message)

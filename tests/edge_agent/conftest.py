@@ -11,7 +11,7 @@ from tests.edge_agent.service import Router, Service
 
 @pytest.fixture
 def router() -> Iterator[Router]:
-    """Yield a router for this test."""
+    """Yield a Zenoh router that runs for this test."""
     router = Router()
     yield router
     router.stop()

@@ -52,7 +52,7 @@ class MadeUp:
     jumps: NDArray[np.bool_] | None = None
 
     def part(self, rows: slice) -> MadeUp:
-        """Return the estimates of those samples that a slice selects."""
+        """Return the synthetic estimates of those samples that a slice selects."""
         cut = {f.name: v[rows] for f in fields(self) if (v := getattr(self, f.name)) is not None}
         return replace(self, **cut)
 

@@ -42,7 +42,7 @@ Attack = AbstractContextManager[None]
 
 
 class Target(NamedTuple):
-    """Addresses of the attacked page and service."""
+    """Addresses of the page and the service that are attacked, and of the router."""
 
     host: str
     port: int
@@ -98,7 +98,7 @@ def _await_page(target: Target) -> None:
 
 
 def _get(target: Target, path: str, source: str = "127.0.0.1") -> int:
-    """Return the HTTP status of a request, or 0 without an answer."""
+    """Send an HTTP request to the attacked page; return the status, or 0 without an answer."""
     connection = HTTPConnection(target.host, target.port, PATIENCE_S, (source, 0))
     try:
         connection.request("GET", path)

@@ -64,12 +64,12 @@ class Told(NamedTuple):
         return max(waits, default=0.0)
 
     def stored_between(self, begin: float, end: float) -> int:
-        """Return the number of batches that were stored between two times [s]."""
+        """Return the number of batches that the outboxes stored between two times [s]."""
         return sum(begin <= at <= end for _, at in self.stored.values())
 
 
 def read_journals(journals: Iterable[Path]) -> Told:
-    """Read the journals of all load generators, and return their content."""
+    """Return the content of the journals of all load generators."""
     out = Told({}, {})
     for journal in journals:
         for line in journal.read_text().splitlines():

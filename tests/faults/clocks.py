@@ -167,7 +167,7 @@ def _run_case(root: Path, case: Case, found: Found, seconds: int) -> None:
 
 
 def _apply_retention(root: Path, engine: Engine, clock: SteadyClock) -> None:
-    """Run the retention job as the service does."""
+    """Run the job that removes old rows (retention), as the service does, by the given clock."""
     jobs = archive_jobs(engine, CONFIG, root, clock.moment)
     next(job for job in jobs if job.name == "retention").work(threading.Event())
 

@@ -170,7 +170,9 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
 
 
 def rows_of(root: Path) -> int:
-    """Return the number of observations in an archive."""
+    """Return the number of observation rows in an archive, from its inbox and its compacted
+    files.
+    """
     return sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["row"]))
 
 

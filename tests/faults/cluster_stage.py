@@ -76,7 +76,9 @@ class Journals:
         self._times: list[float] = []
 
     def read_new_times(self) -> list[float]:
-        """Return the times [s] of the acknowledgements since the last call."""
+        """Return the times [s] of the acknowledgements to the load generators since the last
+        call.
+        """
         found: list[float] = []
         for path in self._paths:
             with path.open("rb") as file:
@@ -88,7 +90,9 @@ class Journals:
         return found
 
     def longest_pause(self, since: float) -> float:
-        """Return the longest time [s] between successive acknowledgements since a moment."""
+        """Return the longest time [s] between successive acknowledgements to the load generators
+        since a moment [s].
+        """
         return float(np.diff(sorted(at for at in self._times if at >= since)).max())
 
     def first_after(self, moment: float) -> float:

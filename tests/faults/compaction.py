@@ -56,7 +56,7 @@ class Writing:
             self.acknowledged += len(self._log.flush())
 
     def close(self) -> None:
-        """Stop the thread that writes."""
+        """Stop the thread that writes batches to the log."""
         self._stop.set()
         self._thread.join()
 
@@ -83,7 +83,7 @@ class Reading:
             self.reads += 2
 
     def close(self) -> None:
-        """Stop the thread that reads."""
+        """Stop the thread that reads the archive."""
         self._stop.set()
         self._thread.join()
 

@@ -27,7 +27,7 @@ CAPACITY: Final = 10**9
 
 
 class Files(NamedTuple):
-    """Bytes of the database file and of its write-ahead log."""
+    """Bytes of the outbox's SQLite file and of its write-ahead log."""
 
     database: bytes
     log: bytes

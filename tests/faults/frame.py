@@ -49,7 +49,7 @@ class Site:
     say: Callable[[str], None]
 
     def choose_amount(self, full: int, quick: int) -> int:
-        """Return `quick` in a quick run, otherwise `full`."""
+        """Return an amount for the campaign: `quick` in a quick run, otherwise `full`."""
         return quick if self.quick else full
 
 

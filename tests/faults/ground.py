@@ -33,7 +33,9 @@ MARKER = f"{keys.ROOT}/map/0000/000/000/0000"
 
 @dataclass
 class Listener:
-    """Session that records all messages on some key expressions."""
+    """Zenoh session that records all messages on some key expressions, by which the effects of an
+    attack are seen.
+    """
 
     session: zenoh.Session
     expressions: tuple[str, ...]
@@ -74,7 +76,9 @@ class Ground:
         self._marks = self._seq = 0
 
     def open_session(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
-        """Open a session that is closed together with this environment."""
+        """Open a Zenoh session with the certificate of `name`; it is closed together with this
+        environment.
+        """
         return self._stack.enter_context(self.network.open_session(name, router, **changed))
 
     @property

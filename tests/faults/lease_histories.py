@@ -85,7 +85,7 @@ class _EndError(BaseException):
 
 
 class _Process:
-    """State of a simulated process."""
+    """State of a simulated service process: its clocks, and True if it is frozen or cut off."""
 
     def __init__(self, name: str, random_: random.Random, lease_s: float) -> None:
         self.name = name
@@ -226,7 +226,7 @@ class VirtualBucket:
         return cast("bytes | None", self._request(lambda: self.objects.get(name)))
 
     def put(self, name: str, content: bytes) -> None:
-        """Write an object into the bucket."""
+        """Write an object into the simulated bucket; the request may be slow or lost."""
         self._request(lambda: self.objects.__setitem__(name, content))
 
     def create(self, name: str, content: bytes) -> bool:

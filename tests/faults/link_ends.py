@@ -31,7 +31,7 @@ HEAD: Final = struct.Struct("<Id")  # number of the message, time at which it wa
 
 
 def open_end(given: dict[str, Any]) -> zenoh.Session:
-    """Open a Zenoh session with the certificate of the given name."""
+    """Open the Zenoh session of this endpoint, with the certificate of the given name."""
     one = settings(given["connect"][0], Path(given["certificates"]))
     config = {key: value for key, value in one.config.items() if key != "connect/retry"}
     session = open_session(
@@ -155,7 +155,7 @@ ROLES: Final = {"receive": receive, "send": send, "open": measure_opening, "watc
 
 
 def main() -> int:
-    """Run the role that the command line names."""
+    """Run the endpoint in the role (receive, send, open or watch) that the command line names."""
     given = json.loads(sys.argv[1])
     ROLES[given["role"]](given)
     return 0

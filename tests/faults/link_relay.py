@@ -67,7 +67,7 @@ class Direction:
     def accept_packet(
         self, packet: bytes, now: float, terms: LinkTerms, draw: random.Random
     ) -> None:
-        """Queue a packet for delivery, or drop it as the link would."""
+        """Queue a packet for delivery at the other end, or drop it as the simulated link would."""
         if terms.drop_udp and len(packet) > 9 and packet[9] == UDP:
             return
         if draw.random() < terms.loss:

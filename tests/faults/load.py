@@ -64,7 +64,7 @@ def print_events(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
 
 
 class WatchedOutbox(Outbox):
-    """Outbox of an agent that also prints a journal."""
+    """Outbox of an agent that also prints a line when a batch is stored or settled."""
 
     def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
         held = super().store(drafts, now)

@@ -52,7 +52,7 @@ class Part:
 
     @property
     def pid(self) -> int:
-        """Return the process id of the present run."""
+        """Return the process id of the present run of this process."""
         assert self._process is not None, f"{self.name} was never started"
         return self._process.pid
 
@@ -62,7 +62,7 @@ class Part:
         return self._process is not None and self._process.poll() is None
 
     def read_lines(self) -> list[str]:
-        """Return the lines printed since the last start."""
+        """Return the lines that the process has printed since its last start."""
         return self.log.read_bytes()[self._since :].decode(errors="replace").splitlines()
 
     def line_with(self, start: str) -> str:
@@ -163,7 +163,7 @@ class Stage:
 
     @property
     def parts(self) -> list[Part]:
-        """Return all processes that can be killed."""
+        """Return all processes of the test system: router, service and load generators."""
         return [self.router, self.service, *self.loads]
 
     @property

@@ -126,7 +126,9 @@ class Violation(NamedTuple):
 
 
 class Checked(NamedTuple):
-    """Result of exploring all states of the model."""
+    """Result of exploring all states of the protocol model: number of states, and the violation
+    found, if any.
+    """
 
     states: int
     violation: Violation | None

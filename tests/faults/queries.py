@@ -117,7 +117,7 @@ def _await_tile(session: zenoh.Session) -> None:
 
 
 def _time_light_queries(session: zenoh.Session, seconds: float) -> list[float]:
-    """Return the answer time [s] of each query for one tile."""
+    """Query one tile repeatedly for `seconds`; return the time [s] to each answer."""
     waits = []
     end = time.monotonic() + seconds
     pause = threading.Event()

@@ -92,7 +92,7 @@ class Receiver:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the server."""
+        """Stop the HTTP server."""
         self._server.shutdown(socket.SHUT_RDWR)
         self._server.close()
         self._thread.join()

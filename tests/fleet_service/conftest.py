@@ -50,7 +50,7 @@ def router() -> Iterator[ZenohSettings]:
 
 @pytest.fixture
 def session(router: ZenohSettings) -> Iterator[zenoh.Session]:
-    """Yield a client's session."""
+    """Yield the Zenoh session of a client."""
     opened = open_session(router)
     assert opened is not None
     with opened:

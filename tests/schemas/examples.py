@@ -27,7 +27,7 @@ LATER = (
 
 
 def batch(kind: Kind, rows: int = 3) -> Batch:
-    """Return a batch in which every column has distinct values."""
+    """Return an example batch in which every column has distinct values."""
     rng = np.random.default_rng(7)
     columns: dict[str, NDArray[Any]] = {}
     for name, dtype in wire.column_types(kind).items():

@@ -16,7 +16,7 @@ from schemas.runtime.records import RecordArray, records
 
 
 class PlanarVector:
-    """A vector in the plane of the road."""
+    """Record of a vector in the plane of the road: x forward, y left."""
 
     x: float  # ahead
     y: float  # left
@@ -53,7 +53,7 @@ class BlockSums:
 
 
 class LastInputs:
-    """Latest value of each input signal that the next sample needs."""
+    """Record of the latest value of each input signal that the next sample needs."""
 
     time: float  # of the last sample [s]
     position_time: float  # of the last position [s]
@@ -113,7 +113,7 @@ class WheelSlip:
 
 
 class Trust:
-    """State of the consistency test: does any friction explain the measurements?"""
+    """Record of the state of the consistency test: does any friction explain the measurements?"""
 
     # squared innovations of the axles over their stated variance, smoothed, as far as unexplained
     # [1]

@@ -70,7 +70,9 @@ class MotionSetting(NamedTuple):
 
 
 class FederatedMotion:
-    """Setting, master state, information shares and latest innovations of one motion filter."""
+    """Setting, master state, information shares and latest innovations of the motion filter of one
+    vehicle.
+    """
 
     process: Annotated[FloatArray, STATES]  # standard deviations per STEP_S
     start: Annotated[FloatArray, STATES]  # standard deviations

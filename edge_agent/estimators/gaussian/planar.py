@@ -35,7 +35,7 @@ ABREAST = 8
 
 
 class PlanarState(IntEnum):
-    """Index of a state of the papers' planar filters."""
+    """Index of a state in the state vector of the papers' planar motion filters."""
 
     VX = 0
     VY = 1

@@ -39,7 +39,7 @@ class GivenMotion:
 
     @property
     def step(self) -> float:
-        """Return the sampling interval of the drive [s]."""
+        """Return the interval [s] between two samples of the drive."""
         return float(self.t[1] - self.t[0])
 
     @property

@@ -31,7 +31,7 @@ COMPASS: Final[dict[str, Callable[[FloatArray], FloatArray]]] = {
 
 
 def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
-    """Return the faults found in the yaw angle."""
+    """Return findings (reported faults) about the signal of the yaw angle."""
     findings = []
     if np.isfinite(signals[:, S.LATITUDE]).sum() < 10:
         return []

@@ -80,14 +80,14 @@ class DatabrokerFeed(Feed):
                 self._call.cancel()
 
     def close(self) -> None:
-        """Stop listening, and cancel the subscription."""
+        """Stop listening to the databroker, and cancel the subscription."""
         self.stopping.set()
         if self._call is not None:
             self._call.cancel()
         super().close()
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the received values by path."""
+        """Return the values that the databroker has sent, by signal path."""
         times: dict[str, list[float]] = {}
         values: dict[str, list[float]] = {}
         for time, (path, value) in heard:

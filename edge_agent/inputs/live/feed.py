@@ -46,7 +46,7 @@ class HostClock:
     steady_s: float = field(default_factory=time.monotonic)
 
     def now(self) -> float:
-        """Return the seconds since the start of the clock."""
+        """Return the time [s] since the start of the host's clock."""
         return time.monotonic() - self.steady_s
 
     def seconds_of(self, stamp_ns: int) -> float:
@@ -115,10 +115,10 @@ class Feed(ABC):
 
     @abstractmethod
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the signals in the received messages, by name."""
+        """Return the signals that the received messages `heard` contain, by name."""
 
     def start(self) -> None:
-        """Start the thread that listens to the source."""
+        """Start the thread that listens to the live source."""
         self.last = self.clock.now()
         self._thread.start()
 
@@ -150,7 +150,9 @@ class Feed(ABC):
         self.newest = max(self.newest, placed)
 
     def unreadable(self, reason: str) -> None:
-        """Count an unreadable message. The first message with this reason is logged."""
+        """Count a message of the source that cannot be read. The first message with this reason is
+        logged.
+        """
         self.broken += 1
         self.say(reason)
 

@@ -112,7 +112,7 @@ class LiveRows:
                 feed.close()
 
     def health_problems(self) -> list[str]:
-        """Return one message for each silent source."""
+        """Return one message for each live source that delivers nothing."""
         return [trouble for feed in self.feeds if (trouble := feed.trouble)]
 
     def _may_deliver(self, time: float) -> bool:

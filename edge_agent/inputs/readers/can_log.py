@@ -41,7 +41,7 @@ class Frames:
     shortest: int = LONGEST
 
     def add(self, time: float, data: bytes | bytearray) -> None:
-        """Add one CAN frame."""
+        """Add one received CAN frame: time of arrival [s] and data bytes."""
         self.times.append(time)
         self.shortest = min(self.shortest, len(data))
         self.data += data[:LONGEST].ljust(LONGEST, b"\0")

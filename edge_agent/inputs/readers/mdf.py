@@ -143,7 +143,7 @@ def _read_content(path: Path, identifiers: set[int] | None, names: set[str] | No
 
 
 def has_frames(mdf: Any) -> bool:  # noqa: ANN401
-    """Return True if the file contains the frames of a logged bus."""
+    """Return True if an MDF file contains the frames of a logged bus."""
     return any("CAN_DataFrame" in name for name in mdf.channels_db)
 
 

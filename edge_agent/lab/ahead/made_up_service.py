@@ -95,7 +95,7 @@ class MadeUpService:
         self.session.close()
 
     def put(self, alert: Alert) -> None:
-        """Publish the start or end of an alert."""
+        """Publish an alert as a service does when it begins or ends."""
         tile = int(grid.tile_of(alert.cell))
         self.session.put(
             keys.alert_key(tile), wire.encode_alert(alert), encoding=wire.ALERT_ENCODING

@@ -111,7 +111,7 @@ def _simulate_drive(
 
 
 def join_drives(drives: Sequence[tuple[pa.Table, Vehicle]]) -> DriveSet:
-    """Return drives of equal length as one batch."""
+    """Return simulated drives of equal length joined into one set."""
 
     def stack_column(name: str) -> FloatArray:
         return np.stack(

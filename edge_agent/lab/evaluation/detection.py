@@ -90,7 +90,7 @@ class DetectionTally:
         self.add(name, np.array([holds]))
 
     def merge(self, other: DetectionTally) -> None:
-        """Add the sums and times of another tally to this one."""
+        """Add the sums and detection times of another tally to this one."""
         for name, value in other.total.items():
             self.total[name] = self.total.get(name, 0.0) + value
             self.count[name] = self.count.get(name, 0) + other.count[name]

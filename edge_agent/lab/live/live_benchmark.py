@@ -38,12 +38,12 @@ KILLS: Final = 3  # of each source while an agent drives
 
 @dataclass
 class Peer:
-    """A running test sender in its process."""
+    """Test sender ("peer") that runs in a process of its own."""
 
     process: subprocess.Popen[str]
 
     def wait_for(self, word: str) -> None:
-        """Wait until the sender prints the line `word`."""
+        """Wait until the test sender prints the line `word`."""
         for line in _read_lines(self.process.stdout):
             if line == word:
                 return
@@ -59,7 +59,7 @@ class Peer:
         self.process.stdin.flush()
 
     def kill(self) -> None:
-        """Kill the process immediately, like a device that loses its power."""
+        """Kill the test sender's process immediately, like a device that loses its power."""
         self.process.kill()
         self.process.wait()
 

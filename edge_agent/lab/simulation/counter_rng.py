@@ -49,7 +49,7 @@ def key_of(*seeds: int) -> np.uint64:
 
 @compiled
 def mix_bits(key: np.uint64, counter: np.uint64) -> np.uint64:
-    """Return 64 random bits for `counter` in the stream `key`."""
+    """Return 64 random bits, a hash of `counter` in the random stream `key`."""
     z = key + (counter + ONE) * STEP
     z = (z ^ (z >> SHIFTS[0])) * MULTIPLY_1
     z = (z ^ (z >> SHIFTS[1])) * MULTIPLY_2

@@ -60,7 +60,7 @@ class Patch:
 
 
 class PatchColumn(IntEnum):
-    """Columns of a friction table (one row per patch, float64)."""
+    """Index of a column in the friction table, which has one row per patch of road surface."""
 
     X = 0
     Y = 1

@@ -84,12 +84,12 @@ class WarnedDrivers:
             self.act()
 
     def refresh(self) -> None:
-        """Update the routes of the warned drivers."""
+        """Update the stored routes ahead of the drivers who receive warnings."""
         for k in self.warned.nonzero()[0].tolist():
             self._routes[k] = GivenRoute(*self._fleet.route_ahead(k, ROUTE_M))
 
     def act(self) -> None:
-        """Pass the stored warnings to their drivers."""
+        """Pass the stored warnings to the simulated drivers who receive them."""
         while not self._warnings.empty():
             k, warning = self._warnings.get()
             if warning.state != "ended":  # one that is passed he leaves behind by himself

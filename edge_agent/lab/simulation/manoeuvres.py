@@ -275,7 +275,7 @@ def throttle(_now: Moment) -> tuple[float, float]:
 
 
 def kmh(speed: float) -> float:
-    """Return a speed in m/s, converted from km/h."""
+    """Convert a speed from km/h to m/s."""
     return speed / 3.6
 
 

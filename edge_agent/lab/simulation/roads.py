@@ -32,7 +32,9 @@ HANDLE: Final = 0.39  # of the chord: a cubic Bezier curve of 90 degrees is then
 
 
 class LanePoint(IntEnum):
-    """Index of a column in the table of lane points."""
+    """Index of a column in the table of lane points (points along the lanes of the road
+    network).
+    """
 
     X = 0  # [m]
     Y = 1
@@ -165,7 +167,7 @@ def resample_line(line: FloatArray, spacing: float = SPACING_M) -> FloatArray:
 
 
 def shifted_right(line: FloatArray, offset: float) -> FloatArray:
-    """Return the line shifted to its right by `offset` [m]."""
+    """Return a line (n, 2) [m] shifted to its right by `offset` [m]."""
     direction = np.gradient(line, axis=0)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return line + offset * np.column_stack([direction[:, 1], -direction[:, 0]])
@@ -192,7 +194,9 @@ def _unit_vectors(v: FloatArray) -> FloatArray:
 
 
 def _distance_along(line: FloatArray) -> FloatArray:
-    """Return the distance along a line [m] at each of its points."""
+    """Return, for each point of a line (n, 2) [m], its distance from the line's start along the
+    line [m].
+    """
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
 
 

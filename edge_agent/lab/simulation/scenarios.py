@@ -63,7 +63,7 @@ class Scenario:
 
     @cached_property
     def network(self) -> Network:
-        """Return the network of lanes for the roads."""
+        """Return the road network of the scenario, that is, its lanes and connectors."""
         return build_network(self.junctions, self.roads)
 
     @cached_property

@@ -9,7 +9,7 @@ from edge_agent.dynamics.parameters import Parameter
 
 
 class Motion(IntEnum):
-    """Index of a state variable of one simulated vehicle."""
+    """Index of a variable in the state of one simulated vehicle."""
 
     VX = 0  # [m/s]
     VY = 1

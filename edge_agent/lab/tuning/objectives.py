@@ -55,7 +55,7 @@ WARM_S: Final = 15.0  # of a town before the recording begins: its cars set out 
 
 @dataclass(frozen=True)
 class TuningDrive:
-    """One simulated drive of a tuning set."""
+    """One simulated drive of a set for tuning: manoeuvre, vehicle, friction and seed."""
 
     manoeuvre: str
     vehicle: str

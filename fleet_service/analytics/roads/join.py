@@ -67,7 +67,7 @@ class _Marks(NamedTuple):
 
 
 class _Joined(NamedTuple):
-    """Cells and sectors that are assigned to links, in columns (n,)."""
+    """Cells and sectors that are assigned to road links, in columns (n,)."""
 
     cell: IntArray
     sector: IntArray
@@ -182,7 +182,7 @@ def read_roads(path: Path) -> pa.Table:
 
 
 def _link_marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
-    """Return the lengths [m] of the links, and the marks along them."""
+    """Return the lengths [m] of the road links, and the marks (points every STEP_M) along them."""
     lengths = np.empty(len(links))
     parts = []
     for k, link in enumerate(links):

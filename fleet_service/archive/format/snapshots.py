@@ -39,13 +39,13 @@ def write_snapshot(root: Path, table: pa.Table, now: int) -> Path:
 
 
 def path_of(root: Path, now: int) -> Path:
-    """Return the path of the snapshot for the time `now` [ns]."""
+    """Return the path of the map snapshot for the time `now` [ns]."""
     moment = datetime.fromtimestamp(now // NS, UTC)
     return root / TABLE / f"date={moment:%Y-%m-%d}" / f"{moment:{_NAME}}.parquet"
 
 
 def time_of(path: Path) -> int:
-    """Return the time [ns] of a snapshot from its file name."""
+    """Return the time [ns] of a map snapshot, from its file name."""
     return int(datetime.strptime(path.stem, _NAME).replace(tzinfo=UTC).timestamp()) * NS
 
 

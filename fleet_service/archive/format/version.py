@@ -29,7 +29,7 @@ from schemas.errors import InputError
 
 
 class Version(NamedTuple):
-    """Version of the file format: major and minor number."""
+    """Version of the archive's file format: major and minor number."""
 
     major: int
     minor: int

@@ -70,7 +70,7 @@ class _AmqpEvents(MessagingHandler):
         self._send_queued()
 
     def on_send(self, _: Any) -> None:  # noqa: ANN401
-        """Send to the interchange the messages that another thread queued."""
+        """Send the messages that another thread queued to the interchange."""
         self._link.is_waking = False
         self._send_queued()
 
@@ -166,12 +166,12 @@ class AmqpLink:
         self._thread = threading.Thread(target=self._container.run, name="amqp", daemon=True)
 
     def open(self) -> AmqpLink:
-        """Start the thread that connects, and reconnects after a loss."""
+        """Start the thread that connects to the interchange, and reconnects after a loss."""
         self._thread.start()
         return self
 
     def send(self, parcel: Parcel) -> None:
-        """Queue a message; it is sent until the interchange accepts it."""
+        """Queue a message (DENM); it is sent repeatedly until the interchange accepts it."""
         self.queue.append(parcel)
         if not self.is_waking:
             self.is_waking = True

@@ -75,7 +75,7 @@ class EventBook:
 
     @property
     def open_events(self) -> list[OpenEvent]:
-        """Return the events that have not ended."""
+        """Return the hazard events that have not ended."""
         return [event for event in self._events.values() if not event.ended]
 
     @property

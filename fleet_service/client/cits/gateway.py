@@ -68,11 +68,13 @@ class Witness:
         self.refused = self.silent = 0
 
     def close(self) -> None:
-        """Close the Zenoh session."""
+        """Close the publisher's Zenoh session."""
         self._session.close()
 
     def publish_report(self, body: bytes, _: Mapping[str, Any]) -> None:
-        """Publish the report about friction that a received message contains."""
+        """Publish on Zenoh the report about friction that a received DENM (hazard message)
+        contains.
+        """
         try:
             batches = encode_reports(
                 decode_denm(body), self._name, self._boot, self._seq, self._clock()

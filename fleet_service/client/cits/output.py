@@ -71,11 +71,13 @@ class DenmOutput:
 
     @property
     def open_event_count(self) -> int:
-        """Return the number of events that have not ended."""
+        """Return the number of hazard events that have not ended."""
         return len(self._book.open_events)
 
     def mark_accepted(self, name: str) -> None:
-        """Record that the interchange accepted the message with this name."""
+        """Record that the interchange accepted the DENM with this name, so that it is not sent
+        again.
+        """
         with self._lock:
             self._pending.pop(name, None)
 

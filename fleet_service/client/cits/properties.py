@@ -33,7 +33,7 @@ class Originator:
     publication: str = "gripmap"
 
     def __post_init__(self) -> None:
-        """Check country and publisher; raise InputError if one is not valid."""
+        """Check the fields country and publisher; raise InputError if one is not valid."""
         if not re.fullmatch("[A-Z]{2}", self.country):
             raise InputError(
                 "country",

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 
 class BitWriter:
-    """Growing sequence of bits."""
+    """Sequence of bits that grows by one number after another."""
 
     def __init__(self) -> None:
         self._bits = 0

@@ -85,7 +85,7 @@ class Store:
     def of(
         state: State, peers: RecordArray, names: RecordArray, size: int, vehicles: int, hour: int
     ) -> Store:
-        """Return a store that contains the given arrays and counts."""
+        """Return a store of a fusion that contains the given arrays and counts."""
         store = Store()
         store.state = state
         store.peers = peers

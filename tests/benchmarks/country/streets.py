@@ -47,7 +47,7 @@ class Drive(NamedTuple):
 
 @dataclass(frozen=True)
 class Streets(Scenario):
-    """Scenario of the simulation whose lanes are given."""
+    """Scenario of the vehicle simulation whose lanes are given instead of computed from roads."""
 
     lanes: Network | None = None
 

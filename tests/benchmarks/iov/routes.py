@@ -41,7 +41,9 @@ class StreetTown:
     streets: list[tuple[int, int]]
 
     def line(self, street: tuple[int, int]) -> routing.RoadLine:
-        """Return a street as a road line of the map."""
+        """Return a street of the town as a directed polyline, as the computation of route costs
+        takes it.
+        """
         first, last = self.crossings[list(street)]
         return routing.RoadLine(np.array([first[0], last[0]]), np.array([first[1], last[1]]))
 
@@ -62,7 +64,7 @@ def make_town(draw: np.random.Generator) -> StreetTown:
 
 
 def write_town(town: StreetTown, path: Path) -> None:
-    """Write a town as OpenStreetMap XML."""
+    """Write the street network of a town as OpenStreetMap XML, from which Valhalla is built."""
     nodes = [
         f'<node id="{n + 1}" version="1" lat="{a:.7f}" lon="{b:.7f}"/>'
         for n, (a, b) in enumerate(town.crossings)
@@ -129,7 +131,7 @@ class Valhalla:
         self.config = folder / "valhalla.json"
 
     def build(self, network: Path) -> None:
-        """Build the routing tiles of a street network."""
+        """Build Valhalla's routing tiles from a street network in OpenStreetMap XML."""
         sys.path.insert(0, str(self.folder / "wheel" / "valhalla"))
         try:
             import valhalla_build_config as made  # type: ignore[import-not-found]

@@ -59,7 +59,7 @@ def cells(
 
 
 def make_local_map(parts: list[ReceivedCells]) -> LocalMap:
-    """Return a car's map cache that contains these cells."""
+    """Return a car's local map that contains these cells."""
     cache = LocalMap()
     for part in parts:
         for tile in np.unique(grid.tile_of(part.key // grid.SECTORS)).tolist():

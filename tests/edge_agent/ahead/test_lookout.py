@@ -96,7 +96,7 @@ def driving(router: Router) -> Iterator[Driving]:
 
 @pytest.fixture
 def town(router: Router) -> Iterator[MadeUpService]:
-    """Yield a simulated fleet service, without ice at first."""
+    """Yield a simulated fleet service for a map in which no cell is icy at first."""
     with MadeUpService(router.settings, time.time_ns()) as town:
         yield town
 

@@ -22,7 +22,7 @@ ROAD = 600.0
 
 
 class Car:
-    """Car that drives along the road and collects its warnings."""
+    """Simulated car that drives along the road and collects the warnings that it gets."""
 
     def __init__(self, cache: LocalMap, speed: float = 14.0) -> None:
         self.cache = cache

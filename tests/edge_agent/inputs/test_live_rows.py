@@ -180,7 +180,7 @@ def test_the_receivers_date_holds_where_the_hosts_is_wrong(clock: Steered) -> No
 
 
 class Failing(Scripted):
-    """Source whose driver first raises an error, then ends, and then works."""
+    """Simulated live source whose driver first raises an error, then ends, and then works."""
 
     tries = 0
 
@@ -229,7 +229,7 @@ def test_rows_wait_for_a_slow_source_and_count_late_readings(
 
 
 class Hanging(Scripted):
-    """Source whose driver becomes available when the test decides."""
+    """Simulated live source whose driver hangs until the test lets it continue."""
 
     def __init__(self, name: str, clock: Steered) -> None:
         super().__init__(name, clock)

@@ -100,7 +100,7 @@ class Fleet:
         send(self.session, sent)
 
     def list_unsettled(self, sent: list[Batch]) -> list[Batch]:
-        """Return the batches that are not acknowledged yet."""
+        """Return those of the batches `sent` that the service has not acknowledged yet."""
         return [one for one in sent if one.seq not in self.durable[one.vehicle]]
 
     def settle(self, *sent: Batch) -> None:
@@ -261,7 +261,7 @@ def test_ice_raises_an_alert_after_few_passes_and_grip_clears_it(fleet: Fleet) -
 
 
 def standing(session: zenoh.Session) -> list[wire.Alert]:
-    """Return the active alerts that a late client receives."""
+    """Query the active alerts as a client that starts late does, and return them."""
     replies = [reply.ok for reply in session.get(f"{keys.ROOT}/alert/**") if reply.ok]
     assert all(str(reply.encoding) == wire.STANDING_ENCODING for reply in replies)
     return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]

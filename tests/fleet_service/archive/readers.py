@@ -16,7 +16,9 @@ from pyarrow import dataset
 
 
 class Seen(NamedTuple):
-    """Result of a tool that has read the observations."""
+    """Result of a tool that has read the observations of an archive: counts, mean of mu, and
+    zones.
+    """
 
     rows: int
     mu: float

@@ -50,7 +50,7 @@ def page_of(connection: ZenohSettings, **changed: object) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def bare(router: ZenohSettings) -> Iterator[str]:
-    """Yield the address of a page that has no service."""
+    """Yield the address of a page whose router has no fleet service."""
     with page_of(router) as address:
         yield address
 

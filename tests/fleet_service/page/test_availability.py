@@ -104,11 +104,11 @@ class Transport:
         self.is_aborted = False
 
     def abort(self) -> None:
-        """Close the connection."""
+        """Record that the simulated connection was closed."""
         self.is_aborted = True
 
     def get_extra_info(self, name: str) -> Any:  # noqa: ANN401 as asyncio has it
-        """Return the address of the client."""
+        """Return the network address of the simulated connection's client."""
         return (self._host, 1) if name == "peername" else None
 
 

@@ -29,7 +29,7 @@ AT: Final = (57.7, 11.97)
 
 
 def png(colour: tuple[int, int, int], side: int = 256) -> bytes:
-    """Return a PNG picture of one colour."""
+    """Return the bytes of a square PNG picture of one colour."""
 
     def part(name: bytes, body: bytes) -> bytes:
         return (

@@ -177,7 +177,7 @@ class Machine:
         return self.holding.copy
 
     def freeze(self) -> None:
-        """Stop the service's renewals of its lease."""
+        """Stop the service's renewals of its lease, as if its process were frozen."""
         assert self.holding.lease is not None
         self.holding.lease._stop.set()
 

@@ -27,7 +27,7 @@ OTHERS: Final = [style.colour for style in ESTIMATORS.values() if style.colour !
 
 
 def draw_plot(plot: PaperPlot) -> Figure:
-    """Return the matplotlib figure of a plot."""
+    """Return a plot of a reproduction as a matplotlib figure."""
     from matplotlib.figure import Figure as Canvas
 
     rows = -(-len(plot.panels) // plot.columns)

@@ -83,7 +83,7 @@ class Curve(NamedTuple):
 
 
 class PlotPanel(NamedTuple):
-    """One panel of a plot: a pair of axes with its curves."""
+    """One panel of a reproduction's plot: a pair of axes with its curves."""
 
     title: str
     x: str
@@ -94,7 +94,7 @@ class PlotPanel(NamedTuple):
 
 
 class Heat(NamedTuple):
-    """One panel of a plot: a table of numbers shown as colours."""
+    """One panel of a reproduction's plot: a table of numbers shown as colours."""
 
     title: str
     x: str
@@ -105,7 +105,7 @@ class Heat(NamedTuple):
 
 
 class PaperPlot(NamedTuple):
-    """One plot: panels arranged in a grid."""
+    """One plot of a reproduction: panels arranged in a grid."""
 
     name: str
     title: str
@@ -135,7 +135,7 @@ class Reproduction:
 
     @property
     def rows(self) -> list[PaperRow]:
-        """Return all rows of all tables."""
+        """Return the rows of all tables of the reproduction."""
         return [row for table in self.tables for row in table.rows]
 
     @property
@@ -145,7 +145,9 @@ class Reproduction:
         return [row.name for row in self.rows if not row.holds]
 
     def all_figures(self) -> list[Figure]:
-        """Return all figures: those of the tables first, then the additional ones."""
+        """Return all figures of the reproduction: those of its tables first, then the additional
+        ones.
+        """
         listed = []
         for row in self.rows:
             listed.append(row.figure(f"papers.{self.paper}"))

@@ -314,7 +314,7 @@ def _sensor_errors() -> tuple[PaperRow, ...]:
 
 
 def _add_noise(signals: FloatArray) -> FloatArray:
-    """Return the signals with white noise added to the wheel speeds."""
+    """Return the signals (T, 18) with white noise added to the wheel speeds."""
     changed = signals.copy()
     shape = changed[:, S.OMEGA : S.OMEGA + 4].shape
     changed[:, S.OMEGA : S.OMEGA + 4] += WHEEL_SPEED_NOISE * np.random.default_rng(3).normal(

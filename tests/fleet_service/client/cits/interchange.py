@@ -22,7 +22,7 @@ from schemas.runtime.ports import free_ports
 
 @dataclass
 class Interchange:
-    """Messages that the interchange received, and its address."""
+    """Simulated interchange: its address, and the messages that it has received."""
 
     url: str
     received: list[tuple[bytes, dict[str, Any]]] = field(default_factory=list)
