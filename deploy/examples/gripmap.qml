@@ -9,6 +9,7 @@
    <rule key="r4" symbol="4" label="damp: 0.7 to 0.8" filter="&quot;mu&quot; &gt;= 0.7 AND &quot;mu&quot; &lt; 0.8"/>
    <rule key="r5" symbol="5" label="dry: 0.8 to 2" filter="&quot;mu&quot; &gt;= 0.8 AND &quot;mu&quot; &lt; 2"/>
    <rule key="unknown" symbol="6" label="not measured: only lower bounds" filter="&quot;mu&quot; IS NULL"/>
+   <rule key="known" symbol="1" label="slippery, without a value" filter="&quot;mu&quot; IS NULL AND &quot;p_slippery&quot; &gt; 0.5"/>
   </rules>
   <symbols>
    <symbol type="fill" name="0" alpha="1"><layer class="SimpleFill" enabled="1" locked="0" pass="0"><Option type="Map">

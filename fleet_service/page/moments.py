@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 
 from fleet_service.archive.format import layout, snapshots
 from fleet_service.page import map_mirror, records
+from fleet_service.page.colours import KNOWN_SLIPPERY
 from fleet_service.page.recent import RecentMoments
 from fleet_service.page.records import Records
 from schemas import grid
@@ -95,8 +96,8 @@ class Moments:
             except FileNotFoundError:  # retention was quicker
                 continue
             for row in table.to_pylist()[:1]:
-                measured = row["basis"] == "measured"
-                found.append({"moment": moment, **row, "mu": row["mu"] if measured else None})
+                known = row["basis"] == "measured" or row["p_slippery"] > KNOWN_SLIPPERY
+                found.append({"moment": moment, **row, "mu": row["mu"] if known else None})
         return found
 
     def _recent_history(self, moment: int, cell: int, sector: int) -> list[dict[str, Any]]:

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from fleet_service.page.colours import KNOWN_SLIPPERY
 from schemas import grid
 from schemas.numeric import FloatArray
 from schemas.thresholds import NS
@@ -96,11 +97,13 @@ def of_table(table: pa.Table) -> Records:
     found["upper"] = _to_steps(np.ceil, table["mu_upper"], MU_STEPS)
     found["slippery"] = _to_steps(np.ceil, table["p_slippery"], SHARE_STEPS)
     basis = table["basis"].to_numpy()
-    found["basis"] = np.select(
-        [basis == "measured", basis == "borrowed"], [MEASURED, BORROWED], BOUND
-    )
     # whoever sent it: a bound has no number to colour by
-    found["mu"][found["basis"] == BOUND] = NO_NUMBER
+    found["mu"][basis == "bound"] = NO_NUMBER
+    # snapshots of older versions call known ice a bound
+    known = (basis == "measured") | (
+        (basis == "bound") & (found["slippery"] > KNOWN_SLIPPERY * SHARE_STEPS)
+    )
+    found["basis"] = np.select([known, basis == "borrowed"], [MEASURED, BORROWED], BOUND)
     found["vehicles"] = np.minimum(table["vehicles"].to_numpy(), 255)
     found["unknown"] = np.where(found["basis"] == MEASURED, 0, SHARE_STEPS)
     return found[np.argsort(found["place"], kind="stable")]

@@ -43,6 +43,7 @@ from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import page_of
 from tests.structure import ROOT
 from tests.usability import mistakes, waiting
+from tests.usability.known_ice import KnownIce, find_hidden
 from tests.usability.wrong_logs import WRONG, find_unnoticed
 from tests.waiting import until
 
@@ -175,6 +176,17 @@ def bound_painted(house: House) -> float:
         "error",
     }  # what was not tried is not well
     return float(counts.get("failed", 0)) if whole else float("nan")
+
+
+def known_ice_hidden(house: House) -> float:
+    """Return the number of places known to be slippery that any output draws as unknown."""
+    ice = KnownIce(house.folder)
+    found = find_hidden(ice)
+    hidden = {name: len(places) for name, places in found.items() if places}
+    house.print_measured(
+        "known ice", f"{len(ice.places)} cells in {len(found)} outputs, hidden: {hidden}"
+    )
+    return float(len(set().union(*found.values()))) if len(ice.places) > 100 else float("nan")
 
 
 def colour_distance(house: House) -> float:
@@ -348,6 +360,7 @@ PARTS: Final[dict[str, tuple[Callable[[House], float], str, float, str]]] = {
     "readme_commands_failed": (readme_commands_failed, "", 0, "less"),
     "pages_with_errors": (pages_with_errors, "", 0, "less"),
     "bound_painted": (bound_painted, "outputs", 0, "less"),
+    "known_ice_hidden": (known_ice_hidden, "cells with P(slippery) > 0.5", 0, "less"),
     "colour_distance": (colour_distance, "CIEDE2000", 10, "more"),
     "wrong_logs_unnoticed": (wrong_logs_unnoticed, "of 12", 0, "less"),
     "tracebacks": (count_tracebacks, "", 0, "less"),

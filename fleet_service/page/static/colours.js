@@ -27,10 +27,11 @@ export const alertColour = () => rule[rule.theme].alert;
 export const groundColour = () => rule[rule.theme].ground;
 export const inks = () => rule[rule.theme].inks;
 export const rankOf = kind => RANK[kind];
+export const isKnownSlippery = slippery => slippery > rule.known;
 
 // A place that is more likely slippery than not is never hollow and never grey, whatever its basis says.
 export function kindOf(basis, mu, lower, upper, slippery = 0) {
-  const sure = slippery > rule.known;
+  const sure = isKnownSlippery(slippery);
   if ((basis !== MEASURED && basis !== BORROWED) || mu === NO_NUMBER) return !sure ? HOLLOW : upper < rule.edges[0] ? 0 : upper < rule.slippery ? 1 : 4;
   const width = upper - lower;
   if (upper < rule.slippery || width < rule.narrow) {

@@ -1,12 +1,13 @@
 // Drawing: base map, roads as ribbons, squares where the map is far or cells are asked for; a bound is hollow, nobody is
 // nothing.
-import { BORROWED } from "./blocks.js";
-import { HOLLOW, alertColour, fills, groundColour, inks, themeName } from "./colours.js";
+import { BORROWED, NO_NUMBER } from "./blocks.js";
+import { HOLLOW, alertColour, fills, groundColour, inks, isKnownSlippery, themeName } from "./colours.js";
 import { CELLS, CELL_LEVEL, TILES, metresPerWorld, worldX, worldY } from "./grid.js";
 import { Pixels } from "./pixels.js";
 import { ribbons, ribbonWidth, streets, track } from "./ribbons.js";
 import { write } from "./vector.js";
 
+const CORNER_PX = [60, 140];  // of the buttons at the upper right
 const NEAR_PX = 14, MOST_RECORDS = 9000, LEAST_RIBBON_ZOOM = 14.7, pixels = new Pixels();
 
 const hatches = {};
@@ -50,16 +51,18 @@ export function paint(pen, view, cells, extra) {
     for (const alert of extra.alerts) halo(pen, view, tracesOf(view, alert, null));
   }
   if (extra.truth) truthDots(pen, view, extra.truth);
-  if (extra.base?.label) extra.base.label(pen, view);
-  else if (named) names(pen, view, roads);
-  extra.alerts.forEach((alert, k) => badge(pen, view, tracesOf(view, alert, asRoads ? roads : null), k + 1));
+  const badges = extra.alerts.map(alert => badgeAt(view, tracesOf(view, alert, asRoads ? roads : null)));
+  const placed = [...badges.map(([x, y]) => [x, y + 5, 15, 21]), [view.width, 0, CORNER_PX[0], CORNER_PX[1]]];  // no name lies below them
+  if (extra.base?.label) extra.base.label(pen, view, placed);
+  else if (named) names(pen, view, roads, placed);
+  badges.forEach((at, k) => badge(pen, at, k + 1));
   if (extra.route.length) stops(pen, view, extra.route);
   if (extra.chosen) mark(pen, view, extra.chosen);
   return { drawn, asRoads };
 }
 
 // What a person asked to see, or null: all. What is known to be slippery is no mere bound, whatever its basis.
-const passing = extra => extra.oldest === 0 && extra.bounds ? null : (rows, k) => (extra.oldest === 0 || rows.last[k] >= extra.oldest) && (extra.bounds || rows.mu[k] !== 255);
+export const passing = extra => extra.oldest === 0 && extra.bounds ? null : (rows, k) => (extra.oldest === 0 || rows.last[k] >= extra.oldest) && (extra.bounds || rows.mu[k] !== NO_NUMBER || isKnownSlippery(rows.slippery[k]));
 
 // 0 east, 1 north, 2 west, 3 south: the triangle on that side of the square.
 export const SIDES = [[1, 0, 1, 1], [1, 0, 0, 0], [0, 0, 0, 1], [0, 1, 1, 1]];
@@ -146,23 +149,28 @@ function halo(pen, view, traces) {
 
 const middle = (view, { bbox: [west, south, east, north] }) => [view.left(worldX((west + east) / 2)), view.top((worldY(south) + worldY(north)) / 2)];
 
-function badge(pen, view, [points], number) {
-  const [x, y] = points[points.length >> 1], up = Math.max(18, 2.6 * ribbonWidth(view)) * .5 + 16;
+// The middle of an alert's badge: above the middle of its longest trace.
+function badgeAt(view, [points]) {
+  const [x, y] = points[points.length >> 1];
+  return [x, y - Math.max(18, 2.6 * ribbonWidth(view)) * .5 - 16];
+}
+
+function badge(pen, [x, y], number) {
   pen.beginPath();
-  pen.moveTo(x, y - up + 18);
-  pen.arc(x, y - up, 12, .8, Math.PI - .8, true);
+  pen.moveTo(x, y + 18);
+  pen.arc(x, y, 12, .8, Math.PI - .8, true);
   pen.closePath();
   for (const [paintIt, ink, wide] of [["stroke", groundColour(), 4], ["fill", alertColour(), 0]]) { pen.lineWidth = wide; pen[`${paintIt}Style`] = ink; pen[paintIt](); }
   pen.font = "700 13px system-ui, sans-serif";
   pen.textAlign = "center";
   pen.textBaseline = "middle";
   pen.fillStyle = themeName() === "dark" ? "#000000" : "#ffffff";
-  pen.fillText(String(number), x, y - up + .5);
+  pen.fillText(String(number), x, y + .5);
 }
 
 // Names of roads where no base map has them.
-function names(pen, view, roads) {
-  const placed = [], said = new Set(), ink = inks();
+function names(pen, view, roads, placed) {
+  const said = new Set(), ink = inks();
   if (view.zoom < LEAST_RIBBON_ZOOM) return;
   for (const line of roads.lines) {
     if (!line.name || said.has(line.name)) continue;

@@ -1,0 +1,34 @@
+"""Tests that every output of the map shows each place that is known to be slippery."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.usability.known_ice import KnownIce, find_hidden
+
+pytestmark = pytest.mark.campaign  # two pages in a browser
+
+
+def test_no_output_draws_known_ice_as_unknown(tmp_path: Path) -> None:
+    ice = KnownIce(tmp_path)
+    assert len(ice.places) > 100
+    assert len(ice.unvalued) > 20
+    found = find_hidden(ice)
+    assert len(found) > 30
+    assert {name: len(places) for name, places in found.items() if places} == {}
+
+
+def test_an_older_snapshot_shows_known_ice_on_page_and_in_qgis(tmp_path: Path) -> None:
+    """Snapshots of older versions state known ice as a lower bound without μ. Tables then lack μ,
+    which also proves that the measurement finds hidden ice.
+    """
+    ice = KnownIce(tmp_path, is_older=True)
+    found = find_hidden(ice)
+    tables = [name for name in found if name.startswith(("answer", "export map --snap"))]
+    assert tables
+    assert all(found[name] == ice.unvalued for name in tables)
+    pages = [name for name in found if name.startswith("page") or name == "QGIS style"]
+    assert len(pages) > 20
+    assert not any(found[name] for name in pages)
