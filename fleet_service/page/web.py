@@ -144,6 +144,7 @@ class Routes:
                     "attribution": base.attribution,
                 },
                 "archive": self._of.moments.has_archive,
+                "roads": self._of.roads is not None,
             }
         )
 

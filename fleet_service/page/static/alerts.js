@@ -11,15 +11,23 @@ export function alertsPanel(app) {
   return [...head, alertList(app), sound];
 }
 
-export function alertList(app, most = Infinity) {
-  return make("ol", { class: "alerts" }, ...bySeverity(app.alerts).slice(0, most).map((alert, k) => item(app, alert, k + 1)));
+export const alertList = app => make("ol", { class: "alerts" }, ...bySeverity(app.alerts).map((alert, k) => item(app, alert, k + 1)));
+
+// Two lines each, so that more than alerts fits on a small screen.
+export const shortList = (app, most) => make("ol", { class: "alerts" }, ...bySeverity(app.alerts).slice(0, most).map((alert, k) => make("li", { "data-alert": alert.id, class: surface(alert) }, badge(k + 1),
+  make("a", { href: "#alert", onclick: e => { e.preventDefault(); app.jump(alert); } }, make("strong", {}, wordsOf(app, alert)), make("span", {}, say("alerts.short", valuesOf(app, alert)))))));
+
+const surface = alert => alert.mu < .2 ? "ice" : "snow", badge = number => make("span", { class: "number", "aria-hidden": "true" }, String(number));
+const wordsOf = (app, alert) => alertWords(alert, app.roadAt(alert.longitude, alert.latitude));
+
+function valuesOf(app, alert) {
+  return { length: Math.round(alert.length_m), mu: alert.mu.toFixed(2), lower: alert.mu_lower.toFixed(2), upper: alert.mu_upper.toFixed(2), vehicles: alert.vehicles, percent: certainty(alert.p_slippery), ago: ago(app.live.now() - Date.parse(alert.since) / 1000) };
 }
 
 function item(app, alert, number) {
-  const values = { length: Math.round(alert.length_m), mu: alert.mu.toFixed(2), lower: alert.mu_lower.toFixed(2), upper: alert.mu_upper.toFixed(2), vehicles: alert.vehicles, percent: certainty(alert.p_slippery), ago: ago(app.live.now() - Date.parse(alert.since) / 1000) };
-  return make("li", { "data-alert": alert.id, class: alert.mu < .2 ? "ice" : "snow" },
-    make("span", { class: "number", "aria-hidden": "true" }, String(number)),
-    make("div", {}, make("strong", {}, alertWords(alert, app.roadAt(alert.longitude, alert.latitude))), make("span", {}, say("alerts.line", values)), make("span", { class: "note" }, say("alerts.grip", values)),
+  const values = valuesOf(app, alert);
+  return make("li", { "data-alert": alert.id, class: surface(alert) }, badge(number),
+    make("div", {}, make("strong", {}, wordsOf(app, alert)), make("span", {}, say("alerts.line", values)), make("span", { class: "note" }, say("alerts.grip", values)),
       make("div", { class: "line" }, make("button", { type: "button", onclick: () => app.jump(alert) }, say("alerts.jump")), make("span", { class: "note place" }, coordinates(alert.longitude, alert.latitude)))));
 }
 

@@ -4,6 +4,12 @@ import { byId, make } from "./elements.js";
 import { searchBox } from "./search.js";
 import { say } from "./texts.js";
 
+// Mark the tab that is open.
+export function markTab(tabs, name) {
+  for (const one of tabs) Object.assign(byId(`tab-${one}`), { ariaSelected: String(one === name), tabIndex: one === name ? 0 : -1 });
+  byId("panel").setAttribute("aria-labelledby", `tab-${name}`);
+}
+
 export function addControls(app, tabs) {
   const button = (key, sign, act) => make("button", { type: "button", "aria-label": say(key), title: say(key), onclick: act }, sign);
   byId("controls").append(button("zoom.in", "+", () => app.view.turn(2)), button("zoom.out", "−", () => app.view.turn(.5)), button("zoom.all", say("zoom.all.sign"), () => app.all()));
@@ -16,6 +22,7 @@ export function addControls(app, tabs) {
   addEventListener("beforeprint", () => preparePaper(app.cells.at ?? app.live.now()));
   byId("tabs").append(...tabs.map(name => make("button", { type: "button", role: "tab", id: `tab-${name}`, "aria-controls": "panel", "aria-selected": "false", onclick: () => app.open(name) }, say(`tab.${name}`))));
   byId("panel").setAttribute("role", "tabpanel");
+  markTab(tabs, app.tab);
   byId("tabs").addEventListener("keydown", e => {
     const step = { ArrowRight: 1, ArrowLeft: -1 }[e.key];
     if (!step) return;

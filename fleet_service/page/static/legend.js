@@ -11,7 +11,7 @@ export const ladder = () => make("ul", { class: "ladder" }, ...DANGER.map(kind =
 
 // The short one, on the map itself.
 export function mapKey() {
-  byId("key").replaceChildren(...DANGER.map(kind => make("div", {}, make("span", { class: `swatch ${kind === HOLLOW ? "hollow" : `k${kind}`}` }), say(`legend.short.${kind}`))));
+  byId("key").replaceChildren(...DANGER.map(kind => make("div", {}, make("span", { class: `swatch ${kind === HOLLOW ? "hollow" : `k${kind}`}` }), say(`legend.short.${kind}`))), make("div", {}, make("span", { class: "swatch ground" }), say("legend.short.nobody")));
 }
 
 export function legend(app) {

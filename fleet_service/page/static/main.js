@@ -3,7 +3,7 @@ import { alertsPanel, beep, begun } from "./alerts.js";
 import { dress, moveDivider } from "./appearance.js";
 import { BaseMap } from "./basemap.js";
 import { Cells } from "./cells.js";
-import { addControls } from "./controls.js";
+import { addControls, markTab } from "./controls.js";
 import { kindOf, setColours } from "./colours.js";
 import { byId, make } from "./elements.js";
 import { CELLS, CELL_LEVEL, cellAt, cellOf, latitudeOf, localOfCell, longitudeOf, metresPerWorld, middleOf, tileOfCell, worldX, worldY } from "./grid.js";
@@ -16,7 +16,7 @@ import { placePanel } from "./place.js";
 import { sidewaysOf } from "./ribbons.js";
 import { Roads } from "./roads.js";
 import { ask, open, routePanel } from "./route.js";
-import { fromHash, sharePanel, toHash } from "./share.js";
+import { fromHash, linkTo, sharePanel } from "./share.js";
 import { stateCard } from "./states.js";
 import { ago, clock, loadTexts, say, zone } from "./texts.js";
 import { Timeline } from "./timeline.js";
@@ -64,19 +64,23 @@ class App {
     setInterval(() => this.tick(), CLOCK_MS);
     setInterval(() => ["health", "now"].includes(this.tab) && !document.activeElement?.closest("#panel > *") && this.panel(), HEALTH_MS);
     setInterval(() => { this.now.list().catch(() => {}); this.timeline.load(); this.loadAreas(); this.loadRoads(); this.tab === "alerts" && this.panel(); }, LIST_MS);
-    const state = fromHash(location.hash), beside = Promise.all([this.timeline.load(), this.loadAreas(), this.loadRoads(), this.settings.overlay ? this.loadTruth() : null]);
-    if (state.at !== undefined || state.compare !== undefined) await beside;
+    const state = fromHash(location.hash), ofPast = state.at !== undefined || state.compare !== undefined;
+    this.firstRoads = this.settings.roads ? this.loadRoads() : null;
+    if (ofPast) await this.loadBeside();
     this.started = true;
     await (state.x ? this.restore(state) : this.begin());
     this.open(this.tab);
     this.tick();
     await this.look();
-    await beside;
+    if (!ofPast) await this.loadBeside();
     document.body.dataset.ready = "1";
     this.drawNow();
     if (this.missed) this.reload();
     this.panel();
   }
+
+  // What the first picture does not need: the server computes areas and roads of its own while it could send cells.
+  loadBeside() { return Promise.all([this.timeline.load(), this.loadAreas(), this.firstRoads ?? this.loadRoads(), this.settings.overlay ? this.loadTruth() : null]); }
 
   async restore(state) {
     const number = (name, other) => Number.isFinite(Number(state[name])) && state[name] !== undefined ? Number(state[name]) : other;
@@ -177,6 +181,7 @@ class App {
     if (this.live.look(this.view)) this.draw();
     const level = this.view.level, box = this.view.box, stores = this.comparing ? [this.cells, this.pinned] : [this.cells];
     try { await Promise.all(stores.map(store => store.show(box, level))); } catch { this.note(say("error.asked")); }
+    if (!this.asked && this.view.gone) this.drawNow();  // before any panel is made
     this.asked = true;
     if (this.chosen && this.chosen.level !== level) this.choose(this.chosen.tile, this.chosen.local, this.chosen.sector);
     this.remember();
@@ -233,6 +238,8 @@ class App {
     words.hidden = !state.away.length;
     if (state.away.length) words.textContent = say("away", { count: state.away.length, ago: ago(state.now - since) });
     this.tick();
+    if (this.tab === "now" && this.served !== state.served) this.panel();  // its words say whether a service answers
+    this.served = state.served;
     this.draw();
   }
 
@@ -295,8 +302,7 @@ class App {
 
   open(name) {
     this.tab = name;
-    for (const one of TABS) { byId(`tab-${one}`).setAttribute("aria-selected", String(one === name)); byId(`tab-${one}`).tabIndex = one === name ? 0 : -1; }
-    byId("panel").setAttribute("aria-labelledby", `tab-${name}`);
+    markTab(TABS, name);
     this.remember();
     this.panel();
   }
@@ -380,14 +386,7 @@ class App {
     this.draw();
   }
 
-  remember() {
-    const { view, show, chosen } = this, state = {
-      x: view.x.toFixed(8), y: view.y.toFixed(8), zoom: view.zoom.toFixed(2), at: this.past?.at, compare: this.comparing ? this.pinned.at ?? "now" : null, tab: this.tab,
-      cell: chosen ? cellOf(chosen.tile, chosen.local) : null, passed: show.bounds ? null : "0", cells: show.roads ? null : "1", theme: this.theme, overlay: show.overlay, borrowed: show.borrowed,
-      recent: show.recent || null, sound: show.sound, route: this.route.map(point => point.map(v => v.toFixed(6)).join(",")).join("|"),
-    };
-    if (this.view.gone || this.cells.known.size) history.replaceState(null, "", toHash(state));
-  }
+  remember() { if (this.view.gone || this.cells.known.size) history.replaceState(null, "", linkTo(this)); }
 }
 
 const now = new Cells();

@@ -1,5 +1,5 @@
 // The first panel: what is slippery now, how much is unknown, and where there are data.
-import { alertList } from "./alerts.js";
+import { shortList } from "./alerts.js";
 import { byId, make } from "./elements.js";
 import { areaList } from "./search.js";
 import { sharesOf, slipperyStretches } from "./stretches.js";
@@ -13,7 +13,7 @@ export function overviewPanel(app) {
   const late = byId("live").dataset.state === "late" && app.live.state?.heard, past = app.past || late ? make("p", { class: "note" }, say(app.past ? "alerts.none.past" : "overview.late")) : null;
   return [
     make("h2", {}, say(alerts ? "overview.alerts" : "overview.none", { count: alerts })), past,
-    ...(alerts ? [alertList(app, MOST), more] : [make("p", { class: "quiet" }, say(app.areas.length ? "overview.no_alert" : app.live.state?.served ? "overview.nothing" : "overview.unheard"))]),
+    ...(alerts ? [shortList(app, MOST), more] : [make("p", { class: "quiet" }, say(app.areas.length ? "overview.no_alert" : app.live.state?.served ? "overview.nothing" : "overview.unheard"))]),
     ...(app.asRoads && !app.past && !app.comparing ? inView(app) : []),
     make("h2", {}, say("areas.head")), ...areaList(app),
   ].filter(Boolean);
@@ -21,20 +21,20 @@ export function overviewPanel(app) {
 
 // Of the roads in view: slippery stretches without an alert, and the share that nobody knows.
 function inView(app) {
-  const found = slipperyStretches(app.roads, app.view.box, app.alerts), shares = app.roads.learned ? null : sharesOf(app.roads, app.view.box), more = found.length - MOST_STRETCHES;
+  const found = slipperyStretches(app.roads, app.view.box, app.alerts), shares = sharesOf(app.roads, app.view.box), more = found.length - MOST_STRETCHES;
   const item = one => make("li", {}, make("a", { class: "stretch", href: "#stretch", onclick: e => { e.preventDefault(); app.showPlace(one.x, one.y); } },
     make("span", { class: `swatch k${one.kind}` }), make("span", {}, make("strong", {}, stretchWords(one)), make("small", {}, say("overview.stretch", { what: say(`legend.short.${one.kind}`), length: Math.round(one.length_m), percent: Math.min(99, Math.floor(100 * one.slippery / app.settings.share_steps)), vehicles: one.vehicles })))));
   return [
-    ...(shares ? [make("h2", {}, say("overview.known")), ...knownBar(shares)] : []),
+    ...(shares ? [make("h2", {}, say("overview.known")), ...knownBar(shares, app.roads.learned)] : []),
     ...(found.length ? [make("h2", {}, say("overview.stretches")), make("ul", { class: "stretches" }, ...found.slice(0, MOST_STRETCHES).map(item)), more > 0 ? make("p", { class: "note" }, say("overview.stretches.more", { count: more })) : null] : []),
   ];
 }
 
-function knownBar(shares) {
+function knownBar(shares, learned) {
   const parts = ["slippery", "grip", "unknown", "never"].filter(name => shares[name] > 0), percent = name => Math.round(100 * shares[name] / shares.whole);
   return [
     make("div", { class: "known", "aria-hidden": "true" }, ...parts.map(name => make("span", { class: `part-${name}`, style: { flexGrow: shares[name] } }))),
     make("ul", { class: "plain known-words" }, ...parts.map(name => make("li", {}, make("span", { class: `swatch part-${name}` }), make("span", { "data-share": name }, say(`overview.share.${name}`, { percent: percent(name) }))))),
-    make("p", { class: "note" }, say("overview.known.note", { length: (shares.whole / 1000).toFixed(1) })),
+    make("p", { class: "note" }, say(learned ? "overview.known.driven" : "overview.known.note", { length: (shares.whole / 1000).toFixed(1) })),
   ];
 }

@@ -44,7 +44,7 @@ export function searchBox(app) {
 }
 
 export function areaList(app) {
-  if (!app.areas.length) return [make("p", { class: "quiet" }, say("areas.none"))];
+  if (!app.areas.length) return [make("p", { class: "quiet" }, say(app.cells.known.size ? "card.loading" : "areas.none"))];
   return [make("ul", { class: "areas" }, ...app.areas.map(area => make("li", {}, make("a", { class: "area", href: "#area", onclick: e => { e.preventDefault(); app.showArea(area); } },
     make("strong", {}, areaName(area)), make("span", {}, say("areas.line", { cells: area.cells.toLocaleString(document.documentElement.lang), alerts: area.alerts }))))))];
 }

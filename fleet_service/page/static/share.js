@@ -5,8 +5,13 @@ import { HEADINGS, cellOf, latitudeOf, longitudeOf } from "./grid.js";
 import { SIDES } from "./paint.js";
 import { say } from "./texts.js";
 
-export function toHash(state) {
-  const words = new URLSearchParams();
+// The hash of a link to what the page shows.
+export function linkTo(app) {
+  const { view, show, chosen } = app, words = new URLSearchParams(), state = {
+    x: view.x.toFixed(8), y: view.y.toFixed(8), zoom: view.zoom.toFixed(2), at: app.past?.at, compare: app.comparing ? app.pinned.at ?? "now" : null, tab: app.tab,
+    cell: chosen ? cellOf(chosen.tile, chosen.local) : null, passed: show.bounds ? null : "0", cells: show.roads ? null : "1", theme: app.theme, overlay: show.overlay, borrowed: show.borrowed,
+    recent: show.recent || null, sound: show.sound, route: app.route.map(point => point.map(v => v.toFixed(6)).join(",")).join("|"),
+  };
   for (const [name, value] of Object.entries(state)) if (value !== null && value !== undefined && value !== "" && value !== false) words.set(name, value === true ? "1" : String(value));
   return `#${words}`;
 }
@@ -21,9 +26,9 @@ export function sharePanel(app) {
     e.target.textContent = say("share.copied");
   } }, say("share.copy"));
   const save = (id, name, kind, write) => make("button", { type: "button", id, onclick: () => download(name, kind, write(seen(app))) }, say(`share.${id}`));
-  return [make("h2", {}, say("share.head")), make("label", { class: "line", for: "link" }, say("share.link")), link, copy,
-    make("p", {}, save("geojson", "gripmap.geojson", "application/geo+json", geojson), " ", save("csv", "gripmap.csv", "text/csv", csv), " ",
-      make("button", { type: "button", onclick: () => print() }, say("share.print"))), make("p", { class: "note" }, say("share.zoomed_out"))];
+  return [make("h2", {}, say("share.head")), make("label", { class: "line", for: "link" }, say("share.link")), link,
+    make("div", { class: "buttons" }, copy, save("geojson", "gripmap.geojson", "application/geo+json", geojson), save("csv", "gripmap.csv", "text/csv", csv), make("button", { type: "button", onclick: () => print() }, say("share.print"))),
+    make("p", { class: "note" }, say("share.zoomed_out"))];
 }
 
 // The places in view as rows; what is a mere bound has no mu.

@@ -2,10 +2,11 @@
 import { byId, make } from "./elements.js";
 import { say } from "./texts.js";
 
-const SILENT_MS = 6000;
+const SILENT_MS = 6000, SLOW_MS = 800;  // until a page that is about to be shown says that it loads
 
 export function stateOf({ live, now, asked }) {
-  if (!live.state) return asked ? "loading" : null;
+  if (!asked) return performance.now() > SLOW_MS ? "loading" : null;
+  if (!live.state) return now.known.size ? null : "loading";
   if (performance.now() - live.beaten > SILENT_MS) return "error";
   if (now.known.size) return null;
   if (!live.state.router) return "no_router";

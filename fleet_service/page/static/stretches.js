@@ -41,12 +41,13 @@ function stretchOf(lane, pieces) {
 
 // Shares of the lanes in view: slippery, not slippery, unknown although somebody drove there, and not driven at all; null where no lane is in view.
 export function sharesOf(roads, box) {
-  const metres = { slippery: 0, grip: 0, unknown: 0, never: 0 };
+  const metres = { slippery: 0, grip: 0, unknown: 0, never: 0 };  // lines learned from vehicles tell nothing of roads that nobody drove
   for (const lane of roads.lanes) {
     const piece = lane.length / lane.count * metresPerWorld(lane.y[0]);
     for (let i = 0; i < lane.count; i++) {
       if (!inBox(lane, i, box)) continue;
       const kind = lane.kind[i];
+      if (roads.learned && isNone(kind)) continue;
       metres[isNone(kind) ? "never" : kind >= LITTLE ? "unknown" : SLIPPERY.includes(kind) ? "slippery" : "grip"] += piece;
     }
   }

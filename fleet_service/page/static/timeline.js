@@ -17,6 +17,7 @@ export class Timeline {
     addEventListener("beforeprint", () => this.say(true));  // paper has no clock beside it
     addEventListener("afterprint", () => this.say());
     footer.append(this.play, this.slider, this.shown, this.compare, this.none);
+    this.say();
   }
 
   async load() {

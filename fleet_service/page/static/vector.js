@@ -136,8 +136,8 @@ export class VectorMap {
   }
 
   // Names above all else, none upon another.
-  label(pen, view) {
-    const placed = [], ink = inks(), said = new Map();
+  label(pen, view, placed) {
+    const ink = inks(), said = new Map();
     for (const { tile, left, top, px } of this.seen(view)) for (const label of tile.labels)
       if (label.at) write(pen, ink, label.name, left + label.at[0] * px, top + label.at[1] * px, 0, label.size, placed, view, label.quiet);
       else street(pen, ink, label, left, top, px, placed, view, said);
@@ -162,12 +162,12 @@ function street(pen, ink, { name, along }, left, top, px, placed, view, said) {
   for (let k = 1; k < points.length; k++) run.push(run[k - 1] + Math.hypot(points[k][0] - points[k - 1][0], points[k][1] - points[k - 1][1]));
   const at = far => { let k = 1; while (k < run.length - 1 && run[k] < far) k++; const share = (far - run[k - 1]) / (run[k] - run[k - 1] || 1); return [0, 1].map(j => points[k - 1][j] + share * (points[k][j] - points[k - 1][j])); };
   const inside = ([x, y]) => x > 30 && y > 20 && x < view.width - 30 && y < view.height - 20;
-  for (const share of [.5, .35, .65, .2, .8]) {
+  for (const side of [1, -1]) for (const share of [.5, .35, .65, .2, .8]) {
     const far = run.at(-1) * share;
     if (far < half || run.at(-1) - far < half || (said.get(name) ?? 0) > 0) continue;
     const [a, b, middle] = [at(far - half), at(far + half), at(far)], chord = Math.hypot(b[0] - a[0], b[1] - a[1]);
     if (chord < 1.93 * half || !inside(middle)) continue;
-    const turn = Math.atan2(b[1] - a[1], b[0] - a[0]), flat = Math.abs(turn) > Math.PI / 2 ? turn + Math.PI : turn, off = Math.max(13, 6.5 * view.scale / metresPerWorld(view.y));
+    const turn = Math.atan2(b[1] - a[1], b[0] - a[0]), flat = Math.abs(turn) > Math.PI / 2 ? turn + Math.PI : turn, off = side * Math.max(13, 6.5 * view.scale / metresPerWorld(view.y));
     if (write(pen, ink, name, middle[0] + Math.sin(flat) * off, middle[1] - Math.cos(flat) * off, flat, 12, placed, view)) said.set(name, 1);
   }
 }

@@ -9,15 +9,18 @@ export const coordinates = (longitude, latitude) => `${Math.abs(latitude).toFixe
 // The most dangerous first: ice before snow, then the longer one.
 export const bySeverity = alerts => [...alerts].sort((a, b) => surfaceRank(a.mu) - surfaceRank(b.mu) || b.p_slippery - a.p_slippery || b.length_m - a.length_m);
 
+// "a", "a and b", "a, b and c".
+const listed = words => [words.slice(0, -1).join(", "), words.at(-1)].filter(Boolean).join(` ${say("and")} `);
+
 const surfaceRank = mu => mu < .2 ? 0 : 1;
 
 export function alertWords(alert, road) {
-  const what = say(alert.mu < .2 ? "alert.ice" : "alert.slippery"), ways = alert.headings.length >= 4 ? say("alert.all_ways") : alert.headings.map(one => say(`alert.${BOUNDS[one]}`)).join(` ${say("and")} `);
+  const what = say(alert.mu < .2 ? "alert.ice" : "alert.slippery"), ways = alert.headings.length >= 4 ? say("alert.all_ways") : listed(alert.headings.map(one => say(`alert.${BOUNDS[one]}`)));
   return say(road ? "alert.on_road" : "alert.on_no_road", { what, road, ways, place: coordinates(alert.longitude, alert.latitude) });
 }
 
-export function stretchWords({ name, heading, x, y }) {
-  return say(name ? "alert.on_road" : "alert.on_no_road", { what: say("alert.slippery"), road: name, ways: say(`alert.${BOUNDS[heading]}`), place: coordinates(longitudeOf(x), latitudeOf(y)) });
+export function stretchWords({ name, heading, kind, x, y }) {
+  return say(name ? "alert.on_road" : "alert.on_no_road", { what: say(kind === 0 ? "alert.ice" : "alert.slippery"), road: name, ways: say(`alert.${BOUNDS[heading]}`), place: coordinates(longitudeOf(x), latitudeOf(y)) });
 }
 
 // Percent of certainty, never rounded up to all of it.

@@ -113,8 +113,8 @@ def test_overview_names_slippery_stretches_and_the_unknown_share(
         waits(seen, "document.querySelectorAll('.stretch').length >= 2")
         words = seen.page.locator(".stretch").first.inner_text()
         assert re.search(
-            rf"^Slippery on {STREET} (east|west)bound\n"
-            r"\d+ m; at worst ice, up to \d\d % sure; 6 veh",
+            rf"^Ice on {STREET} (east|west)bound\n"
+            r"\d+ m slippery, at worst ice; up to \d\d % sure; 6 veh",
             words,
         )
         look(seen, "overview")

@@ -1,0 +1,196 @@
+"""Tests of the page's states in a real browser: each state is named in words. A picture of each is
+kept in `.page/states`, so that a person can look at it.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from schemas.config import ZenohSettings
+from tests.browser import Opened, open_page
+from tests.fleet_service.conftest import running
+from tests.fleet_service.page import street
+from tests.fleet_service.page.conftest import Drive, RunningPage, page_of
+from tests.fleet_service.page.test_page import PICTURES, READY, cell_of, near, open_map, waits
+
+pytestmark = pytest.mark.campaign  # a browser takes seconds to start
+
+FOLDER: Final = PICTURES / "states"
+LAPTOP: Final[Any] = {"width": 1366, "height": 768}
+_ICE_DRAWN: Final = f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}"
+
+
+def keep_picture(seen: Opened, name: str) -> Path:
+    """Store a picture of a state, and return its path."""
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    path = FOLDER / f"{name}.png"
+    seen.page.screenshot(path=path)
+    return path
+
+
+def card(seen: Opened, state: str) -> str:
+    """Wait for the card of a state, and return its words."""
+    waits(seen, f"document.getElementById('card').dataset.state === '{state}'")
+    assert seen.page.locator("#card").is_visible()
+    return seen.page.locator("#card").inner_text()
+
+
+def show_ice(seen: Opened, zoom: float = 17.2) -> None:
+    """Show the stretch with ice, and wait until it is drawn."""
+    seen.page.set_viewport_size(LAPTOP)
+    near(seen, cell_of("ice"), zoom)
+    waits(seen, _ICE_DRAWN)
+
+
+def test_empty_map_says_that_no_vehicle_reported_and_what_to_do(page: RunningPage) -> None:
+    with open_map(page) as seen:
+        seen.page.set_viewport_size(LAPTOP)
+        assert "No vehicle has reported yet" in card(seen, "empty")
+        assert "edge-agent fleet" in seen.page.locator("#card code").inner_text()
+        waits(
+            seen, "document.getElementById('panel').innerText.includes('No vehicle has reported')"
+        )
+        keep_picture(seen, "empty")
+
+
+def test_map_without_a_service_says_so_and_is_hatched(bare: str) -> None:
+    with open_page(bare) as seen:
+        seen.page.wait_for_selector(READY, state="attached")
+        assert "No fleet service answers" in card(seen, "no_service")
+        assert seen.page.evaluate("gripmap.away.length") > 0
+        keep_picture(seen, "no-service")
+
+
+def test_slow_map_says_that_it_loads(page: RunningPage, drive: Drive) -> None:
+    drive("ice")
+    with open_page("about:blank") as seen:
+        held = list[Any]()
+        seen.page.set_viewport_size(LAPTOP)
+        seen.page.route("**/blocks*", lambda route: held.append(route))
+        seen.page.goto(page.address)
+        assert "Loading the map" in card(seen, "loading")
+        assert not seen.page.locator("#slider").is_visible()
+        assert "as vehicles report" not in seen.page.locator("#panel").inner_text()
+        keep_picture(seen, "loading")
+        for one in held:
+            one.continue_()
+        seen.page.unroute("**/blocks*")
+        seen.page.wait_for_selector(READY, state="attached")
+        waits(seen, "document.getElementById('card').hidden")
+
+
+def test_map_of_a_silent_server_is_called_stale(page: RunningPage, drive: Drive) -> None:
+    drive("ice")
+    with open_map(page) as seen:
+        show_ice(seen)
+        waits(seen, "gripmap.live.state")
+        seen.page.evaluate("gripmap.live.source.close()")
+        assert "does not answer" in card(seen, "error")
+        assert seen.page.locator("#live").inner_text().startswith("○ last update")
+        assert "not live" in seen.page.locator("#panel").inner_text()
+        keep_picture(seen, "stale")
+
+
+def test_region_without_a_service_is_hatched_and_named(page: RunningPage, drive: Drive) -> None:
+    drive("ice")
+    with open_map(page) as seen:
+        show_ice(seen)
+        waits(seen, "document.getElementById('live').dataset.state === 'live'")
+        assert page.service is not None
+        page.service.end()
+        waits(seen, "!document.getElementById('away').hidden")
+        assert "No service for 1 region" in seen.page.locator("#away").inner_text()
+        keep_picture(seen, "service-away")
+
+
+def test_page_without_a_past_says_so_and_offers_no_slider(
+    router: ZenohSettings, tmp_path: Path
+) -> None:
+    with (
+        running(router, tmp_path / "archive"),
+        page_of(router) as address,
+        open_page(address) as seen,
+    ):
+        seen.page.wait_for_selector(READY, state="attached")
+        seen.page.set_viewport_size(LAPTOP)
+        waits(seen, "gripmap.live.state")
+        assert not seen.page.locator("#slider").is_visible()
+        assert "The past appears" in seen.page.locator("#timeline").inner_text()
+        keep_picture(seen, "no-history")
+
+
+def test_place_without_a_past_says_that_there_is_none(page: RunningPage, drive: Drive) -> None:
+    drive("ice")
+    with open_map(page) as seen:
+        seen.page.route("**/history/**", lambda route: route.fulfill(json=[]))
+        show_ice(seen)
+        seen.page.locator("#map").click()
+        waits(seen, "document.querySelector('.history p')")
+        assert "No history yet" in seen.page.locator(".history").first.inner_text()
+        keep_picture(seen, "place-without-history")
+
+
+def test_dark_page_has_a_dark_ground_and_light_ice(page: RunningPage, drive: Drive) -> None:
+    drive()
+    with open_map(page) as seen:
+        seen.page.emulate_media(color_scheme="dark")
+        show_ice(seen)
+        waits(seen, "document.documentElement.dataset.theme === 'dark'")
+        ground, ice = seen.page.evaluate(
+            "['paper', 'ice'].map(n => getComputedStyle(document.documentElement)"
+            ".getPropertyValue('--' + n).trim())"
+        )
+        assert _lightness(ground) < 60 < 180 < _lightness(ice)
+        keep_picture(seen, "dark")
+
+
+def _lightness(colour: str) -> float:
+    return sum(int(colour[k : k + 2], 16) for k in (1, 3, 5)) / 3
+
+
+def test_phone_shows_map_and_first_alert_at_once(page: RunningPage, drive: Drive) -> None:
+    drive()
+    with open_map(page, phone=True) as seen:
+        near(seen, cell_of("ice"), 17)
+        waits(seen, "document.body.dataset.kinds.split(',')[0] > 0")
+        waits(seen, "document.querySelector('#panel [data-alert]')")
+        first = seen.page.locator("#panel [data-alert]").first
+        box = first.bounding_box()
+        assert box is not None
+        assert box["y"] + box["height"] <= seen.page.evaluate("innerHeight")
+        keep_picture(seen, "phone")
+
+
+def test_print_has_moment_legend_and_map_and_stays_readable_in_grey(
+    page: RunningPage, drive: Drive
+) -> None:
+    drive()
+    with open_map(page) as seen:
+        show_ice(seen)
+        waits(seen, "document.body.dataset.alerts > 0")
+        seen.page.emulate_media(media="print")
+        seen.page.evaluate("dispatchEvent(new Event('beforeprint'))")
+        assert re.search(r"as of \d{4}-", seen.page.locator("#paper h2").inner_text())
+        path = FOLDER / "print.png"
+        FOLDER.mkdir(parents=True, exist_ok=True)
+        seen.page.screenshot(path=path, full_page=True)
+        grey = Image.open(path).convert("L")
+        grey.save(FOLDER / "print-grey.png")
+        steps = seen.page.evaluate(_LADDER)
+        scale = grey.size[0] / seen.page.evaluate("innerWidth")
+        places = [(int(x * scale), int(y * scale)) for x, y in steps]
+        shades = [float(np.asarray(grey)[y, x]) for x, y in places]
+        assert min(np.diff(shades[:6])) >= 8, "the more dangerous, the darker"
+
+
+# The middles of the printed legend's samples, from the most dangerous one.
+_LADDER: Final = """[...document.querySelectorAll("#paper .ladder .ribbon")].map(one => {
+  const box = one.getBoundingClientRect();
+  return [scrollX + box.left + box.width / 2, scrollY + box.top + box.height / 2];
+})"""
