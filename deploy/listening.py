@@ -73,7 +73,9 @@ class Drive:
 
 
 class ListeningTown:
-    """Simulated town with its cars and the fusion, advanced second by second during one drive."""
+    """Simulated town with its cars and the fusion of their reports into a map, advanced second by
+    second during one drive.
+    """
 
     def __init__(
         self, scenario: str, vehicles: int, seed: int, *, listening: bool, rough: float = 0.5

@@ -1,4 +1,4 @@
-"""Measure the language of docstrings, names and pages; lower the ceilings of
+"""Measure the language of docstrings, names and pages; lower the ceilings (upper limits) of
 `tests/test_language.py`.
 
     python -m tests.language          print the figures, and lower the ceilings to them
@@ -189,7 +189,9 @@ def measure_package(package: str) -> dict[str, float]:
 
 
 def round_up(value: float) -> float:
-    """Return a value rounded up to a tenth, so that a ceiling never lies below its measurement."""
+    """Return a value rounded up to a tenth, so that a ceiling (upper limit of a count) never lies
+    below its measurement.
+    """
     return -(-int(value * 1000) // 100) / 10
 
 
@@ -269,7 +271,9 @@ def read_ceilings() -> dict[str, dict[str, dict[str, float]]]:
 
 
 def lower_ceilings() -> None:
-    """Lower each ceiling to the present figure if that is smaller, and add missing ceilings."""
+    """Lower each ceiling (upper limit that a test checks) to the present figure if that is smaller,
+    and add missing ceilings.
+    """
     today = {
         "packages": {package: measure_package(package) for package in PACKAGES},
         "pages": measure_pages(),
@@ -319,7 +323,9 @@ def print_faults(rule: str) -> None:
 
 
 def main() -> None:
-    """Print the figures and lower the ceilings, or print the texts that break the given rule."""
+    """Print the figures and lower the ceilings (upper limits), or print the texts that break the
+    given rule.
+    """
     if len(sys.argv) > 1:
         print_faults(sys.argv[1])
         return

@@ -1,4 +1,4 @@
-"""Tests of SIGTERM and Ctrl-C: agent and service flush, settle as many reports as possible, and
+"""Tests of SIGTERM and Ctrl-C: agent and service flush, deliver as many reports as possible, and
 end, with and without a working router.
 """
 

@@ -1,5 +1,5 @@
 """Tests that docstrings, names and pages keep the rules of language: no count of broken rules may
-exceed the ceiling of its package or page.
+exceed the ceiling (stored upper limit) of its package or page.
 
 `python -m tests.language` lowers the ceilings, `python -m tests.language RULE` prints the texts
 that break a rule.

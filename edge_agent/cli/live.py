@@ -73,7 +73,7 @@ class VssPart:
         self._output.attach(name, session)
 
     def start_part(self) -> None:
-        """Do nothing: the output starts with the first report of friction."""
+        """Do nothing: the output of VSS signals starts with the first report of friction."""
 
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:
         """Report the friction after a block of samples, if the records of the block may be

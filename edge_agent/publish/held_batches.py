@@ -164,7 +164,7 @@ class HeldBatches:
     def is_passed_over(self, batch: HeldBatch) -> bool:
         """Return True if the service seems to ignore this batch: it is the oldest of its stream
         (same vehicle, start, kind, region) in the outbox, and PASSED_OVER later batches of the
-        stream were settled.
+        stream were settled (finally answered).
         """
         sequence = self._streams[batch.stream]
         later = sequence.next - batch.seq - len(sequence.held)

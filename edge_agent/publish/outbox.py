@@ -237,7 +237,7 @@ class Outbox:
         return StoredBatch(key, batch.stream, batch.seq, batch.records, payload)
 
     def close(self) -> None:
-        """Delete the settled batches and release the file.
+        """Delete the settled batches (those that the service has answered) and release the file.
 
         Raises:
             sqlite3.Error: the disk does not accept the last deletions.

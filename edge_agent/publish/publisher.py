@@ -94,7 +94,9 @@ class Publisher:
         )
 
     def count_unsettled(self, kind: Kind | None = None) -> int:
-        """Return the number of records that no service has settled yet; see `PublisherStatus`."""
+        """Return the number of records that no service has settled (finally answered) yet; see
+        `PublisherStatus`.
+        """
         return self.status.count_unsettled(kind)
 
     def offer(self, *blocks: RecordBlock) -> None:

@@ -161,8 +161,8 @@ def _make_chunk(
 def _draw_positions(
     road: IntArray, along: IntArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return latitude and longitude [deg] with the noise of the receiver, and yaw [rad]. Roads are
-    straight, and every second one runs north.
+    """Return positions of vehicles on their roads: latitude and longitude [deg] with the noise of a
+    satellite receiver, and yaw [rad]. Roads are straight, and every second one runs north.
     """
     step = 360.0 / (1 << grid.CELL_ZOOM)
     north = road % 2 == 1

@@ -132,8 +132,8 @@ class Engine:
             return self.state.image(self.settlement.newest_segment, weather_files(self._root))
 
     def mark_survived(self) -> None:
-        """Record that the service has run well for a while after starting from its checkpoint, so
-        that the next start may use it too.
+        """Record that the service has run well for a while after starting from its checkpoint
+        (saved state), so that the next start may use it too.
         """
         checkpoints.mark_survived(self._root)
 

@@ -161,7 +161,7 @@ class Intake:
 
     def update_weather(self, now: int) -> None:
         """Archive the weather reports that arrived since the last call, and apply them to the
-        fusion.
+        fusion (the beliefs about all cells).
         """
         self._apply_weather(self.weather.take(now))
 

@@ -32,7 +32,8 @@ T = TypeVar("T")
 
 
 class Settlement:
-    """Writing of segments, and the acknowledgements that follow; used by the worker thread.
+    """Writing of segments (files of new rows), and the acknowledgements that follow; used by the
+    worker thread.
 
     Args:
         shared: state of the service.
@@ -93,7 +94,9 @@ class Settlement:
         )
 
     def call_when_written(self, wake: Callable[[], None]) -> None:
-        """Call `wake`, in another thread, whenever the writing of a segment has ended."""
+        """Call `wake`, in another thread, whenever the writing of a segment (file of new rows) has
+        ended.
+        """
         self._log.on_written = wake
 
     @property
@@ -102,9 +105,9 @@ class Settlement:
         return self._log.newest
 
     def run_between_segments(self, work: Callable[[], T], stop: threading.Event) -> T | None:
-        """Let the worker run `work` directly after a segment, when all rows that the service
-        accepted are on disk. Return the result of `work`, or None if `stop` is set meanwhile. Other
-        threads call this.
+        """Let the worker run `work` directly after a segment (file of new rows), when all rows that
+        the service accepted are on disk. Return the result of `work`, or None if `stop` is set
+        meanwhile. Other threads call this.
 
         Raises:
             OSError: no segment could be written for too long.
@@ -112,8 +115,8 @@ class Settlement:
         return self._tasks.ask(work, stop)
 
     def flush(self) -> list[tuple[str, bytes]]:
-        """Write the waiting rows as durable segments; return (vehicle, bytes) of each
-        acknowledgement to send.
+        """Write the waiting rows as durable segments (files of new rows); return (vehicle, bytes)
+        of each acknowledgement to send.
 
         If the disk is full, the failure is counted, nothing is acknowledged, and the next call
         tries again.
@@ -157,5 +160,5 @@ class Settlement:
         return self._intake.acks.messages(self._intake.now) if self._holding.may_acknowledge else []
 
     def close(self) -> None:
-        """Stop the thread that writes segments."""
+        """Stop the thread that writes segments (files of new rows)."""
         self._log.close()

@@ -1,5 +1,5 @@
-"""State of a service, loaded from the newest checkpoint and the rows archived after it, or from
-archived rows alone.
+"""State of a service, loaded from the newest checkpoint (saved state) and the rows archived after
+it, or from archived rows alone.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class ServiceState(NamedTuple):
             made from them.
         streams: record of the batches that were admitted.
         weather: all weather reports used.
-        refused: number of checkpoints that could not be loaded.
+        refused: number of checkpoints (saved states) that could not be loaded.
         public: cells that readers may see; None if they may see all cells.
     """
 
@@ -119,8 +119,8 @@ class SharedState:
 
 
 def public_tables(public: PublicCells) -> dict[str, pa.Table]:
-    """Return the public copy of the map (cells that readers may see) as tables for a checkpoint.
-    All columns of a table have the same length.
+    """Return the public copy of the map (cells that readers may see) as tables for a checkpoint
+    (saved state). All columns of a table have the same length.
     """
     columns = public.visitors.columns()
     part = np.full(len(columns["bits"]), columns["part"][0])

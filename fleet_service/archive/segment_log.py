@@ -41,7 +41,7 @@ class _Load(Generic[Batch]):
 
     def take(self, other: _Load[Batch]) -> None:
         """Append the content of another load to this one. A load consists of rows that wait for the
-        disk, their batches (messages), and segments that are already written.
+        disk, their batches (messages), and segments (files of rows) that are already written.
         """
         for kind, waiting in other.waiting.items():
             self.waiting[kind] = self.waiting[kind] + waiting

@@ -1,5 +1,5 @@
-"""Constants of the fusion, each with the reason for its value. `fleet_service/fusion/README.md`
-explains the mathematics.
+"""Constants of the fusion (the map's computation from the reports of all vehicles), each with the
+reason for its value. `fleet_service/fusion/README.md` explains the mathematics.
 """
 
 from __future__ import annotations

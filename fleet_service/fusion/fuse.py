@@ -45,8 +45,9 @@ class Updated(NamedTuple):
     A slot is the storage of one cell and sector.
 
     Attributes:
-        late: True for an observation that is older than the checkpoint, or that was not fused
-            because too many recent visits of its vehicle to the cell were stored.
+        late: True for an observation that is older than the checkpoint (the time before which
+            observations are final), or that was not fused because too many recent visits of its
+            vehicle to the cell were stored.
         late_by: delay between the time of a late observation and the time at which it is fused
             [ns]; 0 if it is in time or not fused.
         weight: weight that was used; 0 if the observation was not fused.
@@ -100,8 +101,8 @@ class Fusion:
         self._shape = UNKNOWN_SHAPE
 
     def resume(self, epoch: int | None, vote_weights: list[VoteWeights], reports: Reports) -> None:
-        """Continue from a checkpoint, with its epoch, vote weights and weather. The caller must
-        have set `store` before.
+        """Continue from a checkpoint (saved state of a service), with its epoch (minute), vote
+        weights (trust in vehicles) and weather. The caller must have set `store` before.
         """
         self._epoch = epoch
         self.vote_weights = vote_weights
@@ -282,8 +283,8 @@ class Fusion:
         return self.store.slots_of(cell * grid.SECTORS + sector)
 
     def trust(self, vehicle: int) -> float:
-        """Return the weight that the next report of a vehicle will have in the fusion; it depends
-        on the vehicle's agreement with others, and 0 means no trust.
+        """Return the weight that the next report of a vehicle will have in the map's beliefs about
+        friction; it depends on the vehicle's agreement with others, and 0 means no trust.
         """
         return float(self.vote_weights[-1].weights(self._index(vehicle))[0])
 
@@ -324,8 +325,9 @@ class Fusion:
         )
 
     def _advance(self, epoch: int) -> None:
-        """Advance the latest time T to `epoch`. While the lateness window is not empty, advance by
-        one epoch (minute) at a time, and commit the observations that the checkpoint passes.
+        """Advance the latest time T to `epoch`. While observations are in the lateness window,
+        whose order can still change, advance by one epoch (minute) at a time. After each, commit
+        (make final) the observations that have become too old for the window.
         """
         if self._epoch is None:
             self._epoch = epoch

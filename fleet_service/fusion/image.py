@@ -1,5 +1,5 @@
-"""Complete state of a fusion as plain arrays, for snapshots. A restored fusion continues exactly
-where the snapshot was taken. Pure.
+"""Complete state of a fusion (the beliefs about all cells and the trust in all vehicles) as plain
+arrays, for snapshots. A restored fusion continues exactly where the snapshot was taken. Pure.
 
 An `Image` maps table names to tables; a table is a set of one-dimensional columns of equal length.
 An array of records is stored as one column of bytes. LAYOUT describes these bytes: name, offset and
@@ -58,8 +58,8 @@ LAYOUT: Final = hashlib.blake2b(
 
 
 def image_of(fusion: Fusion) -> Image:
-    """Return the complete state of a fusion as plain arrays. Rows keep their numbers, because the
-    tables refer to each other by row.
+    """Return the complete state of a fusion (beliefs about all cells) as plain arrays. Rows keep
+    their numbers, because the tables refer to each other by row.
     """
     store = fusion.store
     state = fusion.store.state
@@ -105,8 +105,8 @@ def image_of(fusion: Fusion) -> Image:
 
 
 def fusion_of(image: Image, lateness_s: float) -> Fusion:
-    """Return the fusion that an image describes; `lateness_s` [s] must be the allowed lateness of
-    the original.
+    """Return the fusion (beliefs about all cells) that an image (tables of arrays) describes.
+    `lateness_s` [s] must be the allowed delay of observations in the original.
     """
     fusion = Fusion(lateness_s)
     records = {

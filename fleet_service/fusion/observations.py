@@ -1,4 +1,6 @@
-"""Observations for the fusion, made from the columns of messages or of the archive. Pure."""
+"""Observations of friction for the fusion into a map, made from the columns of messages or of the
+archive. Pure.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +74,7 @@ class Observations:
 
 
 def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> Observations:
-    """Return the columns (n,) of admitted rows as observations for the fusion.
+    """Return the columns (n,) of admitted rows as observations that a `Fusion` accepts.
 
     Args:
         columns: columns of the archive, times in ns; `with_likelihood` (n,) is true for rows with a

@@ -23,7 +23,8 @@ _LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT)
 
 
 class Evidence(NamedTuple):
-    """Likelihoods of visits for the fusion, and the friction values that the vehicles reported.
+    """Likelihoods of friction that visits (passages of cells) contribute to the map, and the
+    friction values that the vehicles reported.
 
     Attributes:
         steps: (n, 32) log-likelihood in steps below its maximum.

@@ -114,8 +114,8 @@ def _clear_padding(scratch: Bins) -> None:
 @refcount_free_inlined
 def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
     """Compute how much of a vote is new information, given the vehicle's earlier reports in this
-    cell. Reports younger than the checkpoint are stored one by one, older ones in one record per
-    vehicle and cell.
+    cell. Reports that are not yet final are stored one by one, older ones in one record per vehicle
+    and cell.
 
     All times are rounded to whole seconds, so that the result is the same for both kinds of
     storage.

@@ -94,8 +94,8 @@ class Marks(NamedTuple):
 def absorb_votes(
     state: State, weather: Weather, arrivals: Arrivals, votes: Votes, most: int
 ) -> BoolArray:
-    """Add the votes of a batch (effects of its observations on cells) to the lateness windows of
-    their cells, and update the beliefs.
+    """Add the votes of a batch (effects of its observations on cells) to the lateness windows
+    (recent observations, sorted by time) of their cells, and update the beliefs.
 
     Every memory pool must have space for k votes. Return a mask of observations (n,) that were left
     out, because `most` observations of their vehicle already wait in the same cell. For an
@@ -120,8 +120,9 @@ def _absorb_votes(
     marks: Marks,
     scratch: Bins,
 ) -> int:
-    """Add the votes (effects of observations on cells) to the lateness windows of their cells and
-    fill the marks. Return the number of windows whose belief must be computed again.
+    """Add the votes (effects of observations on cells) to the lateness windows (recent
+    observations, sorted by time) of their cells, and fill the marks. Return the number of windows
+    whose belief must be computed again.
     """
     cells = state.live.cells
     windows = state.windows
@@ -380,8 +381,9 @@ def _shorten_window(state: State, slot: int, window: int, entry: int) -> None:
 
 @refcount_free_inlined
 def _link_entry(windows: RecordArray, entries: RecordArray, window: int, entry: int) -> None:
-    """Insert an observation (row `entry` of `entries`) into its lateness window in order of time.
-    The search starts at the newest observation, because nearly all arrive in order.
+    """Insert an observation (row `entry` of `entries`) into the lateness window (the recent
+    observations of its cell) in order of time. The search starts at the newest observation, because
+    nearly all arrive in order.
     """
     after = windows[window].tail
     while after != NONE and comes_before(entries, entry, after):

@@ -55,7 +55,7 @@ class WeatherMessage(NamedTuple):
 
 
 class WeatherInbox:
-    """Input of weather reports for one fusion.
+    """Input of weather reports for one fusion (beliefs about all cells).
 
     Args:
         root: folder of the archive.

@@ -33,7 +33,8 @@ CELL: Final = cell_numbers()
 
 
 def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
-    """Return visits as the archive columns that the fusion reads; every row is a separate batch.
+    """Return visits as the archive columns from which a map is computed; every row is a separate
+    batch.
 
     `cells` contains the grid number of each place of the town.
     """
@@ -145,8 +146,8 @@ def split_minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Obser
 def watch_drive(
     rng: Generator, v: Visits, count: int, asked: tuple[int, ...] | None = None
 ) -> AlertWatch:
-    """Deliver the visits to a fusion, and read the map after each of `count` minutes, or only at
-    the minutes in `asked`.
+    """Deliver the visits to a `Fusion` (a map's beliefs), and read the map after each of `count`
+    minutes, or only at the minutes in `asked`.
     """
     rows = rows_of(v)
     at, which = draw_arrivals(rng, v)

@@ -204,8 +204,8 @@ def driven_in(folder: Path) -> DrivenVisits:
 
 
 def observations_in(columns: dict[str, Any]) -> Observations:
-    """Return columns of a drive as observations for the fusion; each row is given as a separate
-    batch.
+    """Return columns of a drive as observations that a `Fusion` accepts; each row is given as a
+    separate batch.
     """
     n = len(columns["cell"])
     with_likelihood = np.full(n, columns["log_likelihood"].shape[1] > 0)

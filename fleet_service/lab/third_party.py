@@ -97,8 +97,8 @@ def make_reports(
 
 
 def make_observations(drive: ForeignDrive) -> Observations:
-    """Return the visits of a drive as observations for the fusion; their optional columns are
-    absent.
+    """Return the visits of a drive as observations that a `Fusion` accepts; their optional columns
+    are absent.
     """
     rows = rows_of(drive.visits, drive.cells)
     rows["used_longitudinal"] = rows["used_lateral"] = np.full(

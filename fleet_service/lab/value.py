@@ -104,7 +104,9 @@ def drive_cars(rng: Generator, place: Town, cars: float, demand: float) -> TownT
 
 
 def make_observations(traffic: TownTraffic) -> Observations:
-    """Return the visits as observations for the fusion, with the flags of the slip controllers."""
+    """Return the visits as observations that a `Fusion` accepts, with the flags of the slip
+    controllers.
+    """
     rows = rows_of(traffic.visits)
     rows["abs_active"] = traffic.limited.astype(np.int8)
     return observations_of(rows, traffic.visits.vehicle)

@@ -1,3 +1,3 @@
 """Reconstruction of a service's state from the archive, for restarts and for maps of past moments;
-checkpoints.
+checkpoints (saved states) for fast restarts.
 """

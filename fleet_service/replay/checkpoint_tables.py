@@ -21,8 +21,8 @@ _KEY: Final = b"gripmap.checkpoint"
 
 
 def tables_of(fusion: Fusion) -> dict[str, pa.Table]:
-    """Return the complete state of a fusion as tables by name. Each column is stored as one list,
-    because columns may differ in length.
+    """Return the complete state of a fusion (beliefs about all cells) as tables by name. Each
+    column is stored as one list, because columns may differ in length.
     """
     out = {}
     for name, columns in image_of(fusion).items():
@@ -52,8 +52,8 @@ def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
 
 
 def fusion_from(tables: dict[str, pa.Table], lateness_s: float) -> Fusion:
-    """Return the fusion that tables describe; it continues exactly like the one passed to
-    `tables_of`.
+    """Return the fusion (beliefs about all cells) that tables describe; it continues exactly like
+    the one passed to `tables_of`.
 
     Raises:
         InputError: the tables are of another version, or incomplete.

@@ -1,5 +1,5 @@
-"""Replay of an archive: it restores the record of accepted batches, and the beliefs of the fusion,
-for now or for a past moment.
+"""Replay of an archive: it restores the record of accepted batches, and the beliefs about the
+friction of all cells, for now or for a past moment.
 """
 
 from __future__ import annotations
@@ -181,8 +181,8 @@ def too_much() -> InputError:
 
 
 def fusion_with_weather(root: Path, lateness_s: float, until: int) -> Fusion:
-    """Return a fusion with the weather received until the time `until` [ns], and without
-    observations.
+    """Return a fusion (beliefs about all cells) with the weather received until the time `until`
+    [ns], and without observations.
 
     Raises:
         OSError: the archive cannot be read.
@@ -200,8 +200,8 @@ def past_fusion(
     most: int | None = None,
     listener: Callable[[Fusion], Heard] | None = None,
 ) -> Fusion:
-    """Return the state of the fusion after everything that was received until the time `until`
-    [ns], near a box (west, south, east, north [deg]).
+    """Return the fusion (beliefs about the cells) after everything that was received until the time
+    `until` [ns], near a box (west, south, east, north [deg]).
 
     `listener` is called with the fusion. It returns a context in which each group of observations
     is fused, so that the listener can follow the fusion.

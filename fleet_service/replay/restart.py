@@ -1,5 +1,5 @@
-"""Start of a service: load the newest readable checkpoint, or an empty state. The caller then
-replays the rows archived later.
+"""Start of a service: load the newest readable checkpoint (saved state), or an empty state. The
+caller then replays the rows archived later.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class Restart(NamedTuple):
 
 
 def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()) -> Restart:
-    """Return the initial state from the newest usable checkpoint of an archive. `extra_tables`
-    names additional tables that the service stored with those of `image_of`.
+    """Return the initial state from the newest usable checkpoint (saved state) of an archive.
+    `extra_tables` names additional tables that the service stored with those of `image_of`.
     """
     refused = 0
     for path in checkpoints.list_checkpoints(root):
@@ -85,7 +85,9 @@ def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()
 def image_of(
     fusion: Fusion, standing: list[Alert], streams: SequenceTrackers
 ) -> dict[str, pa.Table]:
-    """Return the tables of a checkpoint, from which `load_restart` restores the state."""
+    """Return the tables of a checkpoint (saved state), from which `load_restart` restores the
+    state.
+    """
     columns, above = streams.columns()
     return tables_of(fusion) | {
         ALERTS: pa.Table.from_pylist([asdict(alert) for alert in standing]),

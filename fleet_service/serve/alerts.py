@@ -161,7 +161,7 @@ class Alerts:
     def _can_clear(self, slots: IntArray) -> BoolArray:
         """Return a mask of slots (cells and sectors), (k,): True if the alert may be cleared.
         Within the hour, two more vehicles must have reported grip than ice, or as many vehicles
-        grip as the fusion remembers.
+        grip as the map remembers per cell.
         """
         grip = (self._own_sources(slots, GRIP) > 0).sum(axis=1)
         ice = (self._own_sources(slots, ICE) > 0).sum(axis=1)

@@ -17,7 +17,7 @@ PARTS: Final = 32  # of a tile's index before they are joined: each costs as muc
 
 
 class MapState:
-    """Index from the tiles of the map to the cells of a fusion.
+    """Index from the tiles of the map to the cells of a fusion (beliefs about all cells).
 
     Args:
         fusion: owner of the cells.

@@ -45,13 +45,15 @@ PRESENT: Final = "present"
 
 
 class PublicCells:
-    """Public copy of the cells of a fusion; use it only while holding the lock of the map.
+    """Public copy of the cells of a fusion (beliefs about all cells); use it only while holding the
+    lock of the map.
 
     Args:
         fusion: owner of the cells.
         visitors: recent vehicles per cell.
         least: minimum number of vehicles of a public cell, at least 2.
-        tables: result of `columns` from a checkpoint; None for a new start.
+        tables: result of `columns` from a checkpoint (saved state of a service); None for a new
+            start.
 
     Attributes:
         visitors: the argument of that name.
@@ -97,7 +99,9 @@ class PublicCells:
         return self._fusion.beliefs(slots, now, self._rows)
 
     def slots_of(self, cell: IntArray, sector: IntArray) -> IntArray:
-        """Return the slot of each cell and sector; -1 if no vehicle has reported it."""
+        """Return the slot (row number) of each cell and sector; -1 if no vehicle has reported
+        it.
+        """
         return self._fusion.slots_of(cell, sector)
 
     @contextmanager
@@ -171,9 +175,9 @@ class PublicCells:
             self._published.append(slots)
 
     def columns(self) -> dict[str, dict[str, IntArray]]:
-        """Return the state as tables of integer columns for a checkpoint. They contain the cells
-        whose public copy differs from the fusion, and the recent vehicles of each tile. The
-        visitors are not included.
+        """Return the state as tables of integer columns for a checkpoint (saved state). They
+        contain the cells whose public copy differs from the true beliefs, and the recent vehicles
+        of each tile. The visitors are not included.
         """
         self._add_slots()
         used = slice(self._size)

@@ -121,7 +121,7 @@ class TileCache:
     @property
     def source(self) -> Readable:
         """Return the object from which readers' cells are read: the public copy if persons are kept
-        private, otherwise the fusion itself.
+        private, otherwise the fusion (the true beliefs) itself.
         """
         return self.state.fusion if self._public is None else self._public
 

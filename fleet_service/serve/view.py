@@ -52,8 +52,8 @@ class CellView(NamedTuple):
 
 
 class Readable(Protocol):
-    """Interface to the cells of a map and their beliefs: implemented by a fusion and by its public
-    copy.
+    """Interface to the cells of a map and their beliefs: implemented by a `Fusion` and by its
+    public copy.
     """
 
     @property
@@ -66,12 +66,12 @@ class Readable(Protocol):
         """
 
     def slots_of(self, cell: IntArray, sector: IntArray) -> IntArray:
-        """Return the slot of each cell and sector; -1 if there is none."""
+        """Return the slot (row number) of each cell and sector; -1 if there is none."""
 
 
 def view_cells(source: Readable, slots: IntArray, now: int) -> CellView:
     """Return a copy of the state of `slots` (cells and sectors), with beliefs for the time `now`
-    [ns]. The fusion may continue afterwards without changing the copy.
+    [ns]. The map may be updated afterwards without changing the copy.
     """
     live = source.live
     key = live.key[slots]

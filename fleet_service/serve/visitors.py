@@ -27,8 +27,8 @@ _SHIFT: Final = np.uint64(58)
 
 
 class Visitors:
-    """Recent vehicles of each slot (cell and sector) of a fusion. The time window is divided into
-    parts; in each part, a vehicle that visited is one bit of 64.
+    """Recent vehicles of each slot (cell and sector) of a fusion (beliefs about all cells). The
+    time window is divided into parts; in each part, a vehicle that visited is one bit of 64.
 
     Args:
         fusion: owner of the slots; it must process observations before they are passed to `add`.
@@ -75,8 +75,8 @@ class Visitors:
         self._bits = longer[stay]
 
     def columns(self) -> dict[str, IntArray]:
-        """Return the counted visitors as columns for a checkpoint, from which `of` restores this
-        object.
+        """Return the counted visitors as columns for a checkpoint (saved state), from which `of`
+        restores this object.
         """
         self._grow()
         return {
@@ -86,8 +86,8 @@ class Visitors:
 
     @staticmethod
     def of(fusion: Fusion, columns: dict[str, IntArray]) -> Visitors:
-        """Return the visitors that `columns` describe; empty if the columns do not match the
-        fusion.
+        """Return the visitors that `columns` describe; empty if the columns do not match the cells
+        of `fusion`.
         """
         made = Visitors(fusion)
         bits = columns["bits"]

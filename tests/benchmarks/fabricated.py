@@ -1,4 +1,6 @@
-"""Synthetic observations for benchmarks of the wire format, the fusion and the archive."""
+"""Synthetic observations for benchmarks of the wire format, of the fusion into a map, and of the
+archive.
+"""
 
 from __future__ import annotations
 

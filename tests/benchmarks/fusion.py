@@ -76,8 +76,8 @@ def make_visits(
 
 
 def fill_fusion(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.random.Generator]:
-    """Return a fusion that has received `per_cell` visits per cell, and the random generator for
-    further visits.
+    """Return a fusion (a map's beliefs) that has received `per_cell` visits per cell, and the
+    random generator for further visits.
     """
     rng = np.random.default_rng(SEED)
     fusion = Fusion(120.0)

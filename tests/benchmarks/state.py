@@ -39,7 +39,9 @@ SECOND: Final = 10**9
 
 
 def state() -> list[Figure]:
-    """Measure a checkpoint of 10⁶ cells during ingest, and a restart from it."""
+    """Measure the saving of a service's state (a checkpoint) of 10⁶ cells during ingest, and a
+    restart from it.
+    """
     now = START + int(SPAN_S) * SECOND
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -70,7 +72,7 @@ def state() -> list[Figure]:
 
 def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> tuple[float, float]:
     """Return two times [s]: from the request until the checkpoint is on disk, and the longest pass
-    of the worker's loop meanwhile.
+    of the service's main loop (worker) meanwhile.
 
     All messages of `sent` are ingested, half of them after the checkpoint.
     """

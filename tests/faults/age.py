@@ -93,7 +93,7 @@ def run(site: Site) -> list[Figure]:
 
 def _measure_smaller(site: Site, millions: float) -> tuple[dict[str, float], dict[str, float]]:
     """Generate an archive of `millions` million observations, and return the figures of a service's
-    start from a checkpoint and of a query about the past on it.
+    start from a checkpoint (saved state) and of a query about the past on it.
     """
     root = _ensure_archive(site, site.folder / f"age-{millions:g}", round(millions * 1e6))
     ready, past = _measure_archive(root)
@@ -103,8 +103,8 @@ def _measure_smaller(site: Site, millions: float) -> tuple[dict[str, float], dic
 
 
 def _measure_archive(root: Path) -> tuple[dict[str, float], dict[str, float]]:
-    """Measure a service's start from a checkpoint of this archive, and a query about the past;
-    return the figures.
+    """Measure a service's start from a checkpoint (saved state) of this archive, and a query about
+    the past; return the figures.
     """
     _measure_process("checkpoint", root)
     synthetic.write_archive(

@@ -45,7 +45,7 @@ class Census:
 
 class Told(NamedTuple):
     """Content of the load generators' journals: number of records and time [s] of every batch
-    stored in an outbox, and time [s] of every batch that an acknowledgement settled.
+    stored in an outbox, and time [s] of every batch that an acknowledgement settled (made final).
     """
 
     stored: dict[Name, tuple[int, float]]

@@ -363,7 +363,7 @@ class Machines:
 
     def map_difference(self, router: ZenohSettings, parts: list[Part]) -> float:
         """Stop the load and hand the region over. Return the largest difference between the states
-        of the old and the new service, which are read from their checkpoints.
+        of the old and the new service, which are read from their checkpoints (saved states).
         """
         for part in parts:
             part.send_signal(signal.SIGSTOP)

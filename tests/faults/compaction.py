@@ -37,8 +37,8 @@ UNTIL_KILL_S: Final = (0.0, 0.6)  # since it began: a round takes a tenth of a s
 
 
 class Writing:
-    """Thread that writes numbered batches to the segment log until it is closed. Every batch with a
-    number up to `acknowledged` is durable.
+    """Thread that writes numbered batches to the segment log (files of new rows) until it is
+    closed. Every batch with a number up to `acknowledged` is durable.
     """
 
     def __init__(self, root: Path) -> None:

@@ -59,7 +59,9 @@ class Batch(NamedTuple):
 
 
 def rows_of(batches: list[Batch]) -> Rows:
-    """Return the rows of batches of one kind as columns, in the form that the segment log takes."""
+    """Return the rows of batches of one kind as columns, in the form that the segment log (writer
+    of new rows) takes.
+    """
     kind = batches[0].kind
     n = ROWS * len(batches)
     rows: Rows = {

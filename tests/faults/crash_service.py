@@ -299,8 +299,8 @@ class ServiceHistory(Lives[Sent]):
         return found + ["the key of a month came back" for key in keys if key in self.destroyed]
 
     def _find_state_errors(self, root: Path, rows: Counter[int]) -> list[str]:
-        """Compare the map and the known batches restored from a checkpoint with those restored from
-        the log alone, and return the differences.
+        """Compare the map and the known batches restored from a checkpoint (saved state) with those
+        restored from the log alone, and return the differences.
         """
         if not (root / "inbox").is_dir():
             return []

@@ -154,9 +154,9 @@ def _find_finished_jobs(archive: Path) -> frozenset[str]:
 
 
 def map_difference(archive: Path) -> float:
-    """Compare the map that a service restores from its checkpoint with the map from the log alone.
-    Return the largest difference of mu, its bounds and P(slippery), or infinity if a cell or a
-    visit is missing.
+    """Compare the map that a service restores from its checkpoint (saved state) with the map from
+    the log alone. Return the largest difference of mu, its bounds and P(slippery), or infinity if a
+    cell or a visit is missing.
     """
     maps = []
     for _ in range(2):

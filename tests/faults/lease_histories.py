@@ -1,5 +1,5 @@
-"""Simulated histories of services that share an archive, in virtual time, and a checker of these
-histories.
+"""Simulated histories (sequences of events) of services that share an archive, in virtual time, and
+a checker of these histories.
 
 The product's `Lease` runs unchanged on a bucket in memory. Every process has its own clock rate,
 wall clock and lease time. Processes are killed, frozen, cut off from the bucket, and lose their
@@ -39,9 +39,9 @@ _SILENT: Final = logging.Logger("silent", logging.CRITICAL + 1)
 
 
 class Event(NamedTuple):
-    """Event of a history, of one of three kinds. `serves`: a service with a lease number begins to
-    serve and knows some batches. `acknowledges`: it acknowledges batches. `reads`: at the end, a
-    reader finds the batches that count.
+    """Event of the simulated history of several services, of one of three kinds. `serves`: a
+    service with a lease number begins to serve and knows some batches. `acknowledges`: it
+    acknowledges batches. `reads`: at the end, a reader finds the batches that count.
     """
 
     kind: str
@@ -50,16 +50,18 @@ class Event(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """Result of the check of a history: acknowledgements by two holders, and violations."""
+    """Result of the check of a simulated history: acknowledgements by two lease holders for one
+    archive, and violations of the promises to agents.
+    """
 
     acknowledged_by_two: int
     violations: int
 
 
 def judge_history(events: list[Event]) -> Verdict:
-    """Return the number of acknowledgements by a holder after its successor began to serve, and the
-    batches that break a promise: acknowledged but unknown to a later owner or to the reader, or
-    counted twice.
+    """Return the number of acknowledgements by a holder of the lease after its successor began to
+    serve, and the batches that break a promise: acknowledged but unknown to a later owner or to the
+    reader, or counted twice.
     """
     served = 0
     by_two = 0
@@ -79,7 +81,7 @@ def judge_history(events: list[Event]) -> Verdict:
 
 
 class _EndError(BaseException):
-    """Exception that ends a simulated thread when its process was killed or the history has
+    """Exception that ends a simulated thread when its process was killed or the simulation has
     ended.
     """
 
@@ -255,7 +257,7 @@ class VirtualBucket:
 
 
 class ServiceHistory:
-    """History of three services; call `run` once.
+    """Simulation of three services that compete for the lease of one archive; call `run` once.
 
     Attributes:
         events: events in the order of true time.
@@ -273,7 +275,7 @@ class ServiceHistory:
         self.refused = 0
 
     def run(self) -> None:
-        """Simulate the history of the services to its end."""
+        """Simulate the three services to the end of the run."""
         for name in NAMES:
             self._start_process(name, 0.0)
         chaos = _Process("chaos", self._random, 1.0)
@@ -289,8 +291,8 @@ class ServiceHistory:
         self.events.append(Event("reads", max(self._fences, default=0), read))
 
     def _start_process(self, name: str, after: float) -> None:
-        """Start a process. Half of the processes have a lease time that may differ from the common
-        one.
+        """Start a simulated service process. Half of the processes have a lease time that may
+        differ from the common one.
         """
         common = LEASES[0]
         own = self._random.choice(LEASES) if self._random.random() < 0.5 else common
@@ -355,7 +357,7 @@ class ServiceHistory:
 
     def _begin_serving(self, lease: Lease) -> set[int]:
         """List the objects in the bucket, write the fence (the batches of earlier holders that
-        count), and begin to serve. Return the batches that the service knows.
+        count), and begin to serve. Return the batches of observations that the service knows.
         """
         self._world.sleep(self._random.uniform(0.0, 0.3))
         number = lease.term.number

@@ -53,7 +53,7 @@ class Plan:
 
 def print_events(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
     """Print a line for each batch: `sign vehicle boot kind region seq records time`. The sign is
-    `+` for a batch on disk and `-` for a settled batch.
+    `+` for a batch on disk and `-` for a settled (finally answered) batch.
     """
     at = f"{time.time():.3f}"
     for stream, seq, records in events:
@@ -64,7 +64,9 @@ def print_events(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
 
 
 class WatchedOutbox(Outbox):
-    """Outbox of an agent that also prints a line when a batch is stored or settled."""
+    """Outbox of an agent that also prints a line when a batch is stored or settled (finally
+    answered by a service).
+    """
 
     def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
         held = super().store(drafts, now)

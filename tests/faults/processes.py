@@ -168,11 +168,14 @@ class Stage:
 
     @property
     def journals(self) -> list[Path]:
-        """Return the paths of the load generators' journals of stored and settled batches."""
+        """Return the paths of the load generators' journals of stored and settled (finally
+        answered) batches.
+        """
         return [part.log for part in self.loads]
 
     def drain(self, patience_s: float) -> None:
-        """Stop new observations, and wait until every batch of every load generator is settled.
+        """Stop new observations, and wait until every batch of every load generator is settled
+        (finally answered).
 
         The wait ends early if no batch is settled for `patience_s`. Batches left in an outbox are
         then missing in the archive, and the census counts them.

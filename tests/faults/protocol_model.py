@@ -323,8 +323,8 @@ def _advance_clocks(world: World, slow: int, rules: Rules) -> World:
 
 
 def _end_service(one: Service) -> Service:
-    """Return the state of a service after its end; its messages in transit may still
-    take effect.
+    """Return the state of a modelled service after its end; its messages in transit may still take
+    effect.
     """
     return Service("gone", one.number, age=0, sending=one.sending, late=one.late)
 

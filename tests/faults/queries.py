@@ -67,7 +67,7 @@ def run(site: Site) -> list[Figure]:
 
 def _fill_map(session: zenoh.Session, there: Stage, vehicles: int) -> int:
     """Fill the map: each vehicle visits 250 cells, one per second. Return the number of cells after
-    all reports are settled.
+    all reports are settled (acknowledged).
     """
     acked: set[str] = set()
     acks = session.declare_subscriber(

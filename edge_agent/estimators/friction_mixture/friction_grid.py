@@ -22,7 +22,7 @@ SMALLEST = 1e-12  # a probability that mixing by road change will raise again
 
 
 def node_table(count: int) -> tuple[FloatArray, FloatArray]:
-    """Return (mu, prior), shape (K,) each, for K = `count` nodes.
+    """Return (mu, prior), shape (K,) each, for K = `count` nodes (assumed friction values).
 
     The range of sqrt(mu) is divided into K equal cells. `mu` has the friction at the middle of each
     cell, `prior` the probability of each cell under a uniform distribution of mu.
@@ -42,7 +42,8 @@ def change_road(
     drift: float,
     out: FloatArray,
 ) -> None:
-    """Compute the node probabilities `out` after a possible road change.
+    """Compute the probabilities `out` of the nodes (assumed friction values) after a possible road
+    change.
 
     The road changes to any friction with probability `hazard`, and to a neighbouring node with
     probability of about `drift`. Only the first `chain` nodes have neighbours; the other nodes

@@ -70,6 +70,6 @@ def lower_while_sliding(slides: float, used: float, lower: float) -> float:
     Args:
         slides: fuzzy degree to which a wheel slides, 0 to 1.
         used: grip used within the last second, of the axle that uses more [1].
-        lower: lower end according to the node probabilities [1].
+        lower: lower end according to the probabilities of the assumed friction values [1].
     """
     return lower - slides * max(lower - AT_PEAK * used, 0.0)

@@ -186,7 +186,7 @@ def _by_wheel_speeds(
 
     Each wheel's measurement row depends on the speed of this wheel. One evaluation with all four
     radii changed gives all derivatives, because the radii hardly change the rows of the axles.
-    node.force must already be computed at the mean.
+    node.force, the force over load, must already be computed at the mean.
     """
     row = memory.row
     mean = memory.mean[j]

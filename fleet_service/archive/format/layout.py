@@ -158,8 +158,8 @@ def day_folders(
 
 
 def segment_name(prefix: str, number: int) -> str:
-    """Return the file name of a segment; `prefix` has the form SHARD-EPOCH: name of the service,
-    and number of its start.
+    """Return the file name of a segment (file of new rows); `prefix` has the form SHARD-EPOCH: name
+    of the service, and number of its start.
     """
     return f"{prefix}-{number:08d}.parquet"
 
@@ -184,8 +184,8 @@ def term_of(name: str) -> int | None:
     """Return the term (lease epoch) of the service that created an object of an archive's copy;
     None if its name contains none.
 
-    Segments, checkpoints, weather and vehicle identities have the epoch of their service; compacted
-    files and their roll-ups have the epoch of the compacting service.
+    Segments (files of new rows), checkpoints, weather and vehicle identities have the epoch of
+    their service; compacted files and their roll-ups have the epoch of the compacting service.
     """
     folder, _, rest = name.partition("/")
     if folder == CHECKPOINTS:

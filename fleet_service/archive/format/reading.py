@@ -220,8 +220,8 @@ def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Tabl
 
 
 def sources_of(path: Path) -> set[str]:
-    """Return the names of the segments from which a compacted file contains rows; empty if the file
-    is missing or damaged.
+    """Return the names of the segments (files of new rows) from which a compacted file contains
+    rows; empty if the file is missing or damaged.
 
     Raises:
         InputError: the file has a newer major version.

@@ -126,8 +126,8 @@ class Writer:
 
 def round_to_steps(rows: Rows) -> Rows:
     """Return rows with floats rounded to multiples of their column's step (resolution in
-    `schemas/tables.py`) and times rounded down to microseconds. The fusion then uses exactly the
-    values that are stored.
+    `schemas/tables.py`) and times rounded down to microseconds. The fusion of the rows into a map
+    then uses exactly the values that are stored.
     """
     out = {
         name: np.rint(c / _STEPS[name]) * _STEPS[name] if name in _STEPS else c

@@ -35,7 +35,9 @@ ROUND_ROWS: Final = 1_000_000
 
 
 class CompactionResult(NamedTuple):
-    """Result of a compaction: numbers of rows moved, of segments deleted, and of files added."""
+    """Result of a compaction: numbers of rows moved, of segments (files of new rows) deleted, and
+    of files added.
+    """
 
     rows: int
     segments: int

@@ -91,7 +91,8 @@ def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 @refcount_free_inlined
 def _must_stay(pairs: RecordArray, place: int, least: int) -> bool:
     """Return True if the record of a vehicle and cell must stay: the vehicle reported there at
-    `least` [s] or later, or has observations there that are younger than the checkpoint.
+    `least` [s] or later, or has observations there that are younger than the checkpoint (the time
+    before which observations are final).
     """
     pair = pairs[place]
     return bool(pair.last != NONE or pair.time[0] >= least or pair.time[1] >= least)

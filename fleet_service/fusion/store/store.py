@@ -85,7 +85,9 @@ class Store:
     def of(
         state: State, peers: RecordArray, names: RecordArray, size: int, vehicles: int, hour: int
     ) -> Store:
-        """Return a store of a fusion that contains the given arrays and counts."""
+        """Return the store (complete state) of a fusion that contains the given arrays and
+        counts.
+        """
         store = Store()
         store.state = state
         store.peers = peers
@@ -264,7 +266,7 @@ class Store:
 
     def _rebuild_reporters(self, least: int) -> None:
         """Delete lists of recent reporters whose last report was before `least` [s]. Cells with
-        observations younger than the checkpoint keep their lists.
+        observations that are not yet final keep their lists.
         """
         live = self.state.live
         cells = self.state.live.cells[: self.size]

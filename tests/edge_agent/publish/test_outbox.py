@@ -286,8 +286,8 @@ def test_what_was_given_up_does_not_come_back_after_a_restart(path: Path) -> Non
 
 
 def test_a_settled_batch_that_a_crash_brings_back_is_offered_again(path: Path) -> None:
-    """A settled batch whose deletion a crash undid must be sent again. The service knows the batch
-    and acknowledges it again.
+    """A settled (acknowledged) batch whose deletion a crash undid must be sent again. The service
+    knows the batch and acknowledges it again.
     """
     script = f"""
 import os, pathlib, signal
@@ -364,8 +364,8 @@ def test_an_unanswered_batch_is_given_up_before_it_blocks_its_stream(
 
 @pytest.mark.campaign
 def test_waiting_batches_take_little_memory_and_leave_none_behind(path: Path) -> None:
-    """Waiting batches must need little memory, and settled ones none. One vehicle's reports of a
-    day are 170 000 batches.
+    """Waiting batches must need little memory, and settled (acknowledged) ones none. One vehicle's
+    reports of a day are 170 000 batches.
     """
     count = 20_000
     outbox = Outbox(path, boot=BOOT)

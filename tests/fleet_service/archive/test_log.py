@@ -1,5 +1,5 @@
-"""Tests of the segment log: nothing is settled before it is durable, and a failed write loses no
-row.
+"""Tests of the segment log: no batch is acknowledged before it is durable, and a failed write loses
+no row.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def log(tmp_path: Path) -> Iterator[SegmentLog[str]]:
 
 
 def add(log: SegmentLog[str], name: str, seed: int, kind: Kind = Kind.OBSERVATION) -> None:
-    """Add a batch of three rows to the segment log."""
+    """Add a batch of three rows to the segment log (the writer of new rows)."""
     log.add(kind, rows_of(kind, 3, seed), [name])
 
 

@@ -56,8 +56,8 @@ def same(found: dict[str, Any], made: dict[str, Any]) -> None:
     """Assert that a map equals the stored one, except for rounding errors of single precision and
     of another machine's logarithm.
 
-    The stored beliefs were computed by the fusion as it is now. A commit that changes the fusion's
-    results must store them again and give the reason.
+    The stored beliefs were computed with the present rules. A commit that changes the results of
+    these rules must store them again and give the reason.
     """
     assert found["at"] == made["at"]
     np.testing.assert_allclose(found["beliefs"], made["beliefs"], rtol=0.0, atol=1e-6)

@@ -25,7 +25,7 @@ def flags(o: Observations, limited: BoolArray, used: FloatArray) -> Observations
 
 
 def make_acquainted(claims_on_dry: bool) -> Fusion:
-    """Return a fusion after 30 minutes of visits to dry cells.
+    """Return a fusion (beliefs about all cells) after 30 minutes of visits to dry cells.
 
     The vehicle FLAGGED brakes gently every second time, with its flag on if `claims_on_dry`. In its
     other visits it reports values, by which it becomes trusted.

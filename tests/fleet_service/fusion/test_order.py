@@ -1,5 +1,5 @@
-"""Tests of order and replay: within the lateness window the order of arrival has no effect, and a
-replay gives the same map.
+"""Tests of order and replay: within the lateness window (the allowed delay) the order of arrival
+has no effect, and a replay gives the same map.
 """
 
 from __future__ import annotations

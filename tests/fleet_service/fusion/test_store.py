@@ -65,8 +65,8 @@ def test_reporters_and_sources_of_hours_ago_are_dropped_and_reused() -> None:
 
 
 def test_old_cells_back_at_the_prior_are_dropped_without_other_effect() -> None:
-    """A fusion that dropped the memory of unused cells must give the same results for later
-    observations as one that did not drop them.
+    """A fusion (beliefs about all cells) that dropped the memory of unused cells must give the same
+    results for later observations as one that did not drop them.
     """
     fusion = Fusion(LATENESS_S)
     whole = Fusion(LATENESS_S)

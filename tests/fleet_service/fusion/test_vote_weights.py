@@ -23,10 +23,10 @@ VEHICLES = 30
 def make_acquainted(
     slope: float = 0.0, gain_std: float = 0.06, *, gain_in_use: bool = False
 ) -> Fusion:
-    """Return a fusion that has received forty minutes of reports about ten cells, from a fleet
-    whose vehicles have constant relative errors of standard deviation `gain_std`. Each value is too
-    low by `slope` times the unused part of μ. `gain_in_use` is True if the error also affects the
-    used grip.
+    """Return a fusion (beliefs about all cells) that has received forty minutes of reports about
+    ten cells, from a fleet whose vehicles have constant relative errors of standard deviation
+    `gain_std`. Each value is too low by `slope` times the unused part of μ. `gain_in_use` is True
+    if the error also affects the used grip.
     """
     rng = np.random.default_rng(5)
     fusion = Fusion(120.0)

@@ -1,4 +1,6 @@
-"""Tests that a fusion restored from a checkpoint continues exactly like the original."""
+"""Tests that beliefs (a `Fusion`) restored from a checkpoint, the saved state of a service,
+continue exactly like the original.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ from tests.fleet_service.fusion.test_weather import RAIN, reports
 
 
 def store_tables(tables: dict[str, pa.Table]) -> dict[str, pa.Table]:
-    """Write the tables of a fusion as Parquet, read them back, and return them."""
+    """Write the tables of a fusion (beliefs about all cells) as Parquet, read them back, and return
+    them.
+    """
     out = {}
     for name, table in tables.items():
         buffer = io.BytesIO()

@@ -123,7 +123,7 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(
 
 def read_state(engine: Engine) -> dict[str, NDArray[Any]]:
     """Return the beliefs and columns from which a map is made, sorted by cell and sector, with the
-    fusion's epoch and the time of the newest row.
+    latest minute (epoch) and the time of the newest row.
     """
     fusion = engine.state.fusion
     rows = engine.state.fusion.store.state.live
@@ -165,8 +165,8 @@ def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
 
 
 def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) -> None:
-    """The state restored from a checkpoint, or from the log alone, must equal that of the running
-    service. Reports before the checkpoint are late and unordered.
+    """The state restored from a checkpoint (saved state), or from the log alone, must equal that of
+    the running service. Reports before the checkpoint are late and unordered.
     """
     rng = np.random.default_rng(3)
     now = time.time_ns()
@@ -266,8 +266,8 @@ def _set() -> threading.Event:
 
 
 def test_rows_after_the_checkpoint_are_replayed_whatever_the_clock(tmp_path: Path) -> None:
-    """A restart must replay all rows written after the checkpoint, although the clock was an hour
-    ahead when the checkpoint was written and was corrected then.
+    """A restart must replay all rows written after the checkpoint (the service's saved state),
+    although the clock was an hour ahead when the checkpoint was written and was corrected then.
     """
     ahead = time.time_ns() + 3600 * SECOND
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:

@@ -1,5 +1,5 @@
-"""Tests of the bucket replica: it contains settled rows, follows deletions, and restores an empty
-disk.
+"""Tests of the bucket replica: it contains acknowledged rows, follows deletions, and restores an
+empty disk.
 """
 
 from __future__ import annotations

@@ -26,8 +26,9 @@ COLUMN, ROW = (int(part[0]) for part in grid.deinterleave(np.array([CELL])))
 
 
 def icy(vehicles: list[int]) -> tuple[Fusion, Alerts, list[bool]]:
-    """Let `vehicles` vehicles report ice in a cell one after the other. Return the fusion, its
-    alerts, and a list with one item per vehicle: True if its report raised an alert.
+    """Let `vehicles` vehicles report ice in a cell one after the other. Return the fusion (beliefs
+    about all cells), its alerts, and a list with one item per vehicle: True if its report raised an
+    alert.
     """
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)
@@ -116,8 +117,8 @@ def report_in_turn(
     mu: float, vehicles: range, then: float, others: range, wait: float = 400.0
 ) -> tuple[Fusion, list[bool]]:
     """Let `vehicles` report the friction `mu` in a cell, and `wait` seconds later each of `others`
-    the friction `then`. Return the fusion, and a list with one item for each of `others`: True if
-    the cell had an alert after its report.
+    the friction `then`. Return the fusion (beliefs about all cells), and a list with one item for
+    each of `others`: True if the cell had an alert after its report.
     """
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)

@@ -234,8 +234,8 @@ def test_a_restart_does_not_show_a_lone_vehicle(start: Start, tmp_path: Path, ba
 
 
 def taken_from(engine: Engine) -> checkpoints.Taken:
-    """Return a checkpoint of the engine; this thread plays the worker, which writes segments (files
-    of new rows) meanwhile.
+    """Return a checkpoint (saved state) of the engine, the service without its network. This thread
+    plays the worker, which writes segments (files of new rows) meanwhile.
     """
     found: list[checkpoints.Taken | None] = []
     thread = threading.Thread(target=lambda: found.append(engine.checkpoint(threading.Event())))

@@ -227,7 +227,7 @@ def stretch(
 
 
 class Run:
-    """Gateway output with a simulated clock. `sent` are its messages; `settles` is True if the
+    """Gateway output with a simulated clock. `sent` are its messages; `settles` is True if
     interchange accepts them.
     """
 
