@@ -58,7 +58,9 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def two_cells() -> pa.Table:
-    """Return a map table with one measured cell and one cell with only a lower bound."""
+    """Return a map table with one measured cell and one cell with only a lower bound of
+    friction.
+    """
     fusion = Fusion(120.0)
     likelihoods = np.concatenate([value([0.3]), at_least([0.15])])
     fusion.update(observations(np.array([0, 1]), np.array([0, 1]), likelihoods, [CELL, CELL + 1]))

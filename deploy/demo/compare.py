@@ -122,7 +122,9 @@ def write_truth(visits: pa.Table, changed_ns: int, path: Path) -> None:
 
 
 def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison:
-    """Join the map's cells with the true friction by (cell, sector); return one row per pair."""
+    """Join the map's cells with the true friction by (cell, sector); return one row per cell and
+    sector.
+    """
     truth = final_truth(visits, changed_ns)
     found = np.array([truth.get(key, np.nan) for key in _cell_keys(cells)])
     known = np.isfinite(found)
@@ -355,7 +357,7 @@ def archive_counts(archive: Path) -> tuple[int, int, int]:
 
 
 def start_time(visits: pa.Table) -> int:
-    """Return the time [ns] of the first visit of any vehicle."""
+    """Return the time [ns] at which any vehicle first visited a cell."""
     return int(visits["enter_time"].cast(pa.int64()).to_numpy().min())
 
 

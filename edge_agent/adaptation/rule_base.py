@@ -89,10 +89,11 @@ def is_high(value: float, ramp: FloatArray) -> float:
 
 @compiled
 def forgetting_rate(rules: RuleBase, wheels: float) -> float:
-    """Return the rate [1/s] at which offsets, slope and bank return to their prior, in addition to
-    the usual rate.
+    """Return the rate [1/s] at which sensor offsets and the road's slope and bank (lateral slope)
+    return to their prior, in addition to the usual rate.
 
-    `wheels` is the mismatch of the wheel speeds' innovation variance, actual/theoretical - 1 [1].
+    `wheels` is the mismatch of the wheel speeds' innovations (measurement minus prediction):
+    actual/theoretical variance - 1 [1].
     """
     return rules.pace * is_high(wheels, rules.far)
 

@@ -108,8 +108,9 @@ class EstimatesFile:
         self._opened.__exit__(kind, error, trace)
 
     def write(self, t: FloatArray, estimates: Estimates) -> None:
-        """Add a block of T samples to the file: times t (T, 1) and the estimates of a bank with one
-        vehicle."""
+        """Add a block of T samples to the file: times t (T, 1) and the estimates of an estimator
+        for one vehicle.
+        """
         self._writer.write_table(estimates_table(t, estimates))
 
 

@@ -1,5 +1,6 @@
-"""Creation of estimator banks by name. Their memberships (fuzzy sets) are those in this package, or
-those that the caller gives. Estimators of other installed packages are included.
+"""Creation of estimator banks (estimators of N vehicles, advanced together) by name. Their
+memberships (fuzzy sets) are those in this package, or those that the caller gives. Estimators of
+other installed packages are included.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ def known_estimators() -> dict[str, str]:
 def bank_of(
     estimator: str, vehicles: Sequence[Vehicle], memberships: Memberships | None = None
 ) -> EstimatorBank:
-    """Return a bank of estimators, one per vehicle.
+    """Return a bank of estimators (advanced together), one per vehicle.
 
     Args:
         estimator: a key of `known_estimators()`; NAME@CURVE is the estimator NAME with the tyre

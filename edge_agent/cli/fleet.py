@@ -1,5 +1,5 @@
-"""`edge-agent fleet`: run simulated vehicles in real time with one estimator bank; each vehicle has
-its own name and Zenoh session.
+"""`edge-agent fleet`: run simulated vehicles in real time with one estimator bank (filters advanced
+together); each vehicle has its own name and Zenoh session.
 """
 
 from __future__ import annotations

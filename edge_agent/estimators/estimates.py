@@ -63,8 +63,8 @@ def _view_column(place: Column) -> Any:  # noqa: ANN401 the annotation beside it
 
 
 class Estimates:
-    """Output of a bank for T samples of N vehicles. Each column is an array of shape (T, N),
-    documented in `Column`.
+    """Output of an estimator bank for T samples of N vehicles. Each column is an array of shape (T,
+    N), documented in `Column`.
     """
 
     __slots__ = ("evidence", "jumps", "values")

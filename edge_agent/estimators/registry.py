@@ -73,7 +73,8 @@ def create(
     memberships: Memberships | None = None,
     curve: Curve | None = None,
 ) -> EstimatorBank:
-    """Return a bank of estimators called `name`, one per vehicle.
+    """Return a bank (estimators that are advanced together) of the estimator `name`, with one per
+    vehicle.
 
     Args:
         name: a key of ESTIMATORS.

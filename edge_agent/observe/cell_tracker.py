@@ -70,10 +70,10 @@ class ReceiverSample:
 class Located(NamedTuple):
     """Cells visited by N vehicles at T samples, shape (T, N).
 
-    closes: True at the first sample of a new visit, or of being in no cell. inside, outside: True
-    where a fix of this sample lies inside or outside the visited cell. cell, sector: quadint z21
-    and heading sector, -1 when in no cell. latitude, longitude [deg], yaw [rad]: as last received,
-    NaN when too old.
+    closes: True at the first sample of a new visit (passage of a cell), or of being in no cell.
+    inside, outside: True where a position fix of this sample lies inside or outside the visited
+    cell. cell, sector: quadint z21 and heading sector, -1 when in no cell. latitude, longitude
+    [deg], yaw [rad]: as last received, NaN when too old.
     """
 
     closes: BoolArray

@@ -437,10 +437,10 @@ def _context_columns(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
 
 def _likelihood_bytes(ended: RecordArray, evidence: FloatArray | None) -> NDArray[np.uint8]:
     """Return the likelihoods of n visits (passages of a map cell) in the encoding of the message,
-    (n, 32); (n, 0) for a bank without evidence.
+    (n, 32); (n, 0) for an estimator without evidence (likelihood of friction).
 
-    The likelihood is flat for a visit that the bank did not process from its start. If friction
-    changed within the cell, either value may be right, so the larger likelihood counts.
+    The likelihood is flat for a visit that the estimator did not process from its start. If
+    friction changed within the cell, either value may be right, so the larger likelihood counts.
     """
     if evidence is None:
         return np.zeros((len(ended), 0), dtype=np.uint8)

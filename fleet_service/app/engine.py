@@ -34,7 +34,7 @@ T = TypeVar("T")
 
 
 class Engine:
-    """Parts of one service, with a state that is restored from its archive.
+    """Parts of one service (without its network), with a state that is restored from its archive.
 
     Args:
         config: settings.
@@ -120,10 +120,11 @@ class Engine:
 
     def checkpoint(self, stop: threading.Event) -> Taken | None:
         """Return the content of a checkpoint (for a fast restart): a copy of the state, and the
-        name of the last segment that it includes. Return None if `stop` is set meanwhile.
+        name of the last segment (file of new rows) that it includes. Return None if `stop` is set
+        meanwhile.
 
-        Another thread calls this. The worker thread makes the copy directly after a segment (a file
-        of new rows) was written, when all rows in the state are on disk.
+        Another thread calls this. The worker (the thread that processes messages) makes the copy
+        directly after a segment was written, when all rows in the state are on disk.
         """
         return self.settlement.run_between_segments(self._image, stop)
 

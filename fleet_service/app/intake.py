@@ -35,7 +35,7 @@ from schemas.wire import Alert, Kind
 
 
 class Intake:
-    """Admission and fusion of messages; used by the worker thread.
+    """Admission and fusion of messages; used by the worker (the thread that processes messages).
 
     Args:
         config: settings.

@@ -1,5 +1,5 @@
-"""Background jobs that maintain the archive of a running service, at lower priority than the
-worker.
+"""Background jobs that maintain the archive of a running service, at lower priority than its worker
+(the thread that processes messages).
 """
 
 from __future__ import annotations

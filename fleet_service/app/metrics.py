@@ -48,7 +48,8 @@ class Pulse(NamedTuple):
     """Values for metrics and health checks that only the running service knows.
 
     Attributes:
-        turn_age_s: time since the worker thread last began a pass of its loop [s].
+        turn_age_s: time since the worker (the thread that processes messages) last began a pass of
+            its loop [s].
         queued: number of messages that wait.
         routers: number of connected routers.
         clock_lag_s: how far the wall clock is behind the service's time [s].

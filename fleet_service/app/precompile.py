@@ -49,8 +49,8 @@ def warm_up() -> None:
 
 
 def exercise_map() -> None:
-    """Call every compiled function once, with a small temporary map: update, grow, advance in time,
-    update with late visits, commit, and read beliefs.
+    """Call every compiled function once, with a small temporary map: update it with reports, let it
+    grow, advance in time, update it with late reports, make them final, and read beliefs.
     """
     fusion = Fusion(2 * EPOCH_NS * 1e-9)
     for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2)):
@@ -73,7 +73,9 @@ def exercise_map() -> None:
 
 
 def _make_visits(time: int, cells: int) -> Observations:
-    """Return one visit to each of `cells` cells, each by a vehicle of its own."""
+    """Return one visit (a vehicle's passage) to each of `cells` cells, each by a vehicle of its
+    own.
+    """
     one = np.ones(cells, np.int64)
     number = np.arange(cells)
     sector = np.zeros(cells, np.int8)

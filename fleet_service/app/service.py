@@ -173,8 +173,9 @@ class Service:
         return holding.is_lost
 
     def _hanging(self) -> str | None:
-        """Return a description of a part of the service outside the worker that has died or hangs,
-        so that only a restart helps; None if there is none.
+        """Return a description of a part of the service outside the worker (the thread that
+        processes messages) that has died or hangs, so that only a restart helps; None if there is
+        none.
         """
         if self.engine.settlement.hangs_s >= HANGS_S:
             return (
@@ -186,7 +187,7 @@ class Service:
 
     def _works(self) -> bool:
         """Return True if this service can serve its regions: a router is connected, and the worker
-        makes progress.
+        (the thread that processes messages) makes progress.
         """
         session = self._session
         turn_age_s = time.monotonic() - self._stepped_at
@@ -280,8 +281,8 @@ class Service:
 
 
 def ingest_messages(engine: Engine, clock: SteadyClock, messages: list[Message]) -> list[Alert]:
-    """Let the engine process messages now, and pass their times to the clock; return the alerts
-    that are raised or cleared.
+    """Let the engine (service without network) process messages now, and pass their times to the
+    clock; return the alerts that are raised or cleared.
     """
     alerts = engine.intake.ingest(messages, clock.moment())
     clock.record_reports(engine.intake.times)

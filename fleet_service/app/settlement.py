@@ -33,7 +33,7 @@ T = TypeVar("T")
 
 class Settlement:
     """Writing of segments (files of new rows), and the acknowledgements that follow; used by the
-    worker thread.
+    worker (the thread that processes messages).
 
     Args:
         shared: state of the service.
@@ -105,9 +105,9 @@ class Settlement:
         return self._log.newest
 
     def run_between_segments(self, work: Callable[[], T], stop: threading.Event) -> T | None:
-        """Let the worker run `work` directly after a segment (file of new rows), when all rows that
-        the service accepted are on disk. Return the result of `work`, or None if `stop` is set
-        meanwhile. Other threads call this.
+        """Let the worker (the thread that processes messages) run `work` directly after a segment
+        (file of new rows), when all rows that the service accepted are on disk. Return the result
+        of `work`, or None if `stop` is set meanwhile. Other threads call this.
 
         Raises:
             OSError: no segment could be written for too long.

@@ -95,7 +95,8 @@ class ServiceState(NamedTuple):
 
 
 class SharedState:
-    """State of a running service that several threads use: the worker changes it, queries read it.
+    """State of a running service that several threads use: the worker (the thread that processes
+    messages) changes it, queries read it.
 
     Args:
         state: state loaded from the archive.

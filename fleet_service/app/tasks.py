@@ -17,8 +17,8 @@ T = TypeVar("T")
 
 
 class Tasks:
-    """Queue of functions that other threads ask the worker thread to run; `bool()` of it is True if
-    it is not empty.
+    """Queue of functions that other threads ask the worker (the thread that processes messages) to
+    run; `bool()` of it is True if it is not empty.
     """
 
     def __init__(self) -> None:
@@ -30,8 +30,8 @@ class Tasks:
         return not self._queue.empty()
 
     def ask(self, work: Callable[[], T], stop: threading.Event) -> T | None:
-        """Queue the function `work`, wait until the worker thread has run it, and return its
-        result; None if `stop` is set meanwhile.
+        """Queue the function `work`, wait until the worker (the thread that processes messages) has
+        run it, and return its result; None if `stop` is set meanwhile.
 
         Raises:
             OSError: no segment (file of new rows) could be written for too long.
@@ -49,7 +49,7 @@ class Tasks:
                 raise OSError("no segment could be written within the time limit")
 
     def do(self) -> None:
-        """Run all queued functions; the worker thread calls this."""
+        """Run all queued functions; the worker (the thread that processes messages) calls this."""
         while self:
             done, work = self._queue.get()
             if done.set_running_or_notify_cancel():

@@ -60,7 +60,8 @@ def write_atomically(path: Path, data: bytes, mode: int) -> None:
 
 
 def read_pair(stem: Path) -> KeyPair | None:
-    """Return the pair at STEM.pem and STEM.key; None if a file is missing or the two do not match.
+    """Return the certificate STEM.pem and the private key STEM.key; None if a file is missing or
+    the two do not match.
 
     Raises:
         InputError: a file exists and is not valid.

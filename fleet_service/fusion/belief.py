@@ -241,8 +241,9 @@ def kind_of(evidence: ByteArray) -> int:
 
 @refcount_free_inlined
 def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
-    """Fill `out` (32) with the likelihood L̃ of a visit, scaled to mean 1, after averaging over the
-    vehicle's unknown bias. `evidence` (32) is the reported log-likelihood in steps.
+    """Fill `out` (32) with the likelihood L̃ of a visit (passage of a cell), scaled to mean 1,
+    after averaging over the vehicle's unknown bias. `evidence` (32) is the reported log-likelihood
+    in steps.
 
     The average is taken only for the kind VALUE (a measurement of μ). A BOUND (only a lower bound
     of μ) is made flat above its maximum, because a fall there is noise. It is not smoothed:

@@ -1,10 +1,12 @@
-"""The fusion of one service: observations in, beliefs out. The module is pure: it reads no clock,
-because time comes with the observations.
+"""The fusion of one service: it takes the vehicles' observations and computes the beliefs about the
+friction of all cells. The module is pure: it reads no clock, because time comes with the
+observations.
 
 T is the latest observation time, in whole epochs (minutes). The checkpoint is at T - L, where L is
 the allowed lateness (delay of an observation); older observations are final. Trust in vehicles is
 updated when the checkpoint advances, and applies to observations of the epoch that begins at T.
-Therefore the weight of a vote depends on the time of the visit and not on its time of arrival.
+Therefore the weight of an observation depends on the time at which the vehicle was in the cell, and
+not on the time of its arrival.
 """
 
 from __future__ import annotations
@@ -213,8 +215,9 @@ class Fusion:
         return Updated(late, late_by, used, distinct_values(np.concatenate(touched)))
 
     def untouched(self, before: int) -> BoolArray:
-        """Return a mask of slots (cells and sectors), (size,): True if the last visit was before
-        `before` [ns] and no other record refers to the slot. Such slots may be deleted with `drop`.
+        """Return a mask of slots (cells and sectors), (size,): True if the last visit of a vehicle
+        was before `before` [ns] and no other record refers to the slot. Such slots may be deleted
+        with `drop`.
         """
         return self.store.untouched(before)
 

@@ -68,8 +68,8 @@ def bound_by_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     bin the smaller of the reported likelihood and the likelihood of this bound.
 
     An estimator reports a flat likelihood when no friction explains its measurements. The grip that
-    its accelerometers measured is still a lower bound. Likelihood and bound come from one visit, so
-    they are not multiplied.
+    its accelerometers measured is still a lower bound. Likelihood and bound come from one passage
+    of a cell, so they are not multiplied.
     """
     out = steps.copy()
     _bound_rows(out, np.asarray(used, np.float64), _levelled_bounds())

@@ -75,7 +75,7 @@ def manoeuvre_of(longitudinal: FloatArray, lateral: FloatArray) -> NDArray[np.in
 def shared_parts(reported: Float32Array) -> ByteArray:
     """Return the relative error σ_s that the vehicles in a cell have in common, for each reported
     value (n, 3: mean, standard deviation, P(slippery)). The result (n,) is in units of 1/SHARED; 0
-    for lower bounds.
+    for a report that is only a lower bound of friction.
     """
     mean = np.nan_to_num(reported[:, 0], nan=1.0)
     std = np.nan_to_num(reported[:, 1])
@@ -104,9 +104,9 @@ class Shape(NamedTuple):
         """Slope (error of a friction value per unit of unused grip) that an alarm assumes: the
         upper end of its one-sided 95 % interval.
 
-        A new service assumes .5, and a service that has compared many visits little more than
-        `reader`. Missed ice on tuning seeds: with .5 for all services, .044 of the icy cell-minutes
-        of a clean fleet had no alert; with this rule .010.
+        A new service assumes .5, and a service that has compared many passages of vehicles little
+        more than `reader`. Missed ice on tuning seeds: with .5 for all services, .044 of the icy
+        cell-minutes of a clean fleet had no alert; with this rule .010.
         """
         return self.reader + Z_95 * self.std
 

@@ -57,9 +57,9 @@ def other_cells(
 
 
 def cell_shares(std: FloatArray, length: FloatArray) -> FloatArray:
-    """Return the probabilities π that a visit was in a cell behind or ahead of the reported one,
-    (n, 2·SPREAD_CELLS). `std` is the position's standard deviation and `length` the cell length
-    along the heading, both (n,) [m].
+    """Return the probabilities π that a visit (passage of a cell) was in a cell behind or ahead of
+    the reported one, (n, 2·SPREAD_CELLS). `std` is the position's standard deviation and `length`
+    the cell length along the heading, both (n,) [m].
     """
     ratio = (length / np.maximum(std, 1e-6 * length))[:, None]
     return np.asarray(

@@ -355,8 +355,8 @@ def needs_reporters(entries: RecordArray, entry: int) -> bool:
 
 @refcount_free_inlined
 def _count_visit(cells: RecordArray, row: int, entries: RecordArray, entry: int) -> None:
-    """Count the visit and, if new, its vehicle. A visit that was probably in another cell is not
-    counted.
+    """Count one visit of a vehicle to a cell, and the vehicle if it is new there. A visit that was
+    probably in another cell is not counted.
     """
     if entries[entry].share < c.HERE_SHARE:
         return

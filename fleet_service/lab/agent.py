@@ -84,8 +84,8 @@ CLEAN: Final = ErrorModel()
 
 @dataclass(frozen=True)
 class Errors:
-    """Own errors of V vehicles: relative error, additive error, and slope of the likelihood above a
-    lower bound [nat]; each (V,).
+    """Own errors of V vehicles: relative error, additive error, and slope of the reported
+    likelihood above a lower bound of friction [nat]; each (V,).
     """
 
     relative: FloatArray

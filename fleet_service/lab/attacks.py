@@ -96,8 +96,8 @@ def _attacking_rows(v: Visits, count: int) -> BoolArray:
 
 
 def claim_random(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return the visits of the drive with the attackers' reports replaced: at every visit they
-    claim a random friction, with high confidence.
+    """Return the visits (passages of cells) of a drive with the attackers' reports replaced: at
+    every visit they claim a random friction, with high confidence.
     """
     v = drive.visits
     claim = rng.uniform(0.05, 1.2, len(v))
@@ -116,8 +116,8 @@ def _with_claims(v: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
 
 
 def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return the visits of the drive with the attackers' places replaced: they report correct
-    measurements from a wrong place in the town.
+    """Return the visits (passages of cells) of a drive with the attackers' places replaced: they
+    report correct measurements from a wrong place in the town.
     """
     v = drive.visits
     moved = (v.place + int(rng.integers(CELLS // 4, 3 * CELLS // 4))) % CELLS
@@ -140,9 +140,9 @@ def victim_cells(drive: AttackedDrive) -> IntArray:
 
 
 def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return the visits of the drive and of the attackers. The attackers send hundreds of false
-    reports per minute, of ice in the driest cell and of a dry road in the iciest. The values vary,
-    because equal values would count as repetitions.
+    """Return the visits (passages of cells) of a drive and of the attackers. The attackers send
+    hundreds of false reports per minute, of ice in the driest cell and of a dry road in the iciest.
+    The values vary, because equal values would count as repetitions.
     """
     count = FLOODERS * FLOOD
     seconds = rng.uniform(60.0 * BEGIN, 60.0 * MINUTES, count)

@@ -33,8 +33,8 @@ CELL: Final = cell_numbers()
 
 
 def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
-    """Return visits as the archive columns from which a map is computed; every row is a separate
-    batch.
+    """Return simulated visits (passages of cells) as the archive columns from which a map is
+    computed; every row is a separate batch.
 
     `cells` contains the grid number of each place of the town.
     """
@@ -88,8 +88,8 @@ def draw_arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
 
 
 def novel_deliveries(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
-    """Return the indices of the deliveries that the service accepts: the first delivery of each
-    visit.
+    """Return the indices of those deliveries of messages that the service accepts: the first
+    delivery of each visit (passage of a cell).
     """
     streams = SequenceTrackers()
     kept = []
@@ -146,8 +146,8 @@ def split_minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Obser
 def watch_drive(
     rng: Generator, v: Visits, count: int, asked: tuple[int, ...] | None = None
 ) -> AlertWatch:
-    """Deliver the visits to a `Fusion` (a map's beliefs), and read the map after each of `count`
-    minutes, or only at the minutes in `asked`.
+    """Deliver simulated visits (passages of cells) to a `Fusion` (a map's beliefs), and read the
+    map after each of `count` minutes, or only at the minutes in `asked`.
     """
     rows = rows_of(v)
     at, which = draw_arrivals(rng, v)

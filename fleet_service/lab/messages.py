@@ -1,4 +1,6 @@
-"""Simulated visits encoded as messages, so that they pass through the service's real admission."""
+"""Simulated visits (passages of cells) encoded as messages, so that they pass through the service's
+real admission.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ BATCH_ROWS = 12  # the cells of one road
 
 
 class SentMessage(NamedTuple):
-    """Message of a simulated vehicle, and the index of the last visit in it."""
+    """Message of a simulated vehicle, and the index of the last visit (passage of a cell) that it
+    reports.
+    """
 
     message: Message
     last: int
@@ -36,8 +40,8 @@ def clock_of(seconds: float) -> int:
 
 
 def make_messages(v: Visits) -> list[SentMessage]:
-    """Return each vehicle's visits as messages with batches, in order of time per vehicle and
-    region.
+    """Return each vehicle's visits (passages of cells) as messages with batches, in order of time
+    per vehicle and region.
     """
     rows = rows_of(v)
     out = []
@@ -90,7 +94,7 @@ def _make_message(
 
 def forge_messages(message: Message, thief: int) -> tuple[Message, Message]:
     """Return two forged messages: another vehicle's message under the attacker's own key, and the
-    same visits in a batch with the attacker's own name.
+    same observations in a batch with the attacker's own name.
     """
     batch = decode(message.payload, message.encoding, message.kind)
     name = name_of(thief)

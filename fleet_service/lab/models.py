@@ -85,8 +85,8 @@ def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
 
 def measure_real(ways: DrivenVisits, seeds: range) -> dict[str, float]:
     """Return the figures of a fleet whose errors are those of the real estimator; `ways` are its
-    simulated drives. Return an empty dictionary if no visit of the drives, or every visit, used
-    enough grip to measure the friction.
+    simulated drives. Return an empty dictionary if no visit (passage of a cell) of the drives, or
+    every visit, used enough grip to measure the friction.
     """
     if not ways.excited.any() or ways.excited.all():
         return {}

@@ -65,7 +65,7 @@ class DrivenVisits(NamedTuple):
 
 def attach_truth(observations: dict[str, Any], truth: TrueVisits) -> DrivenVisits:
     """Return the observations of a drive (columns of `end_to_end.read_observations`) with the true
-    values at the middle of each visit.
+    values at the middle of each visit (passage of a cell).
     """
     vehicle = observations["vehicle"].astype(np.int64)
     middle = (observations["enter_time"] + observations["leave_time"]) // 2
@@ -90,8 +90,8 @@ def attach_truth(observations: dict[str, Any], truth: TrueVisits) -> DrivenVisit
 
 
 def join_ways(ways: Sequence[DrivenVisits]) -> DrivenVisits:
-    """Return the visits of several drives as one. Vehicles of different drives remain different
-    vehicles.
+    """Return the visits (passages of cells) of several drives as one. Vehicles of different drives
+    remain different vehicles.
     """
     begins = np.cumsum([0, *(int(way.vehicle.max()) + 1 for way in ways)])
     columns = zip(*(vars(way.reports).values() for way in ways), strict=True)
@@ -104,9 +104,9 @@ def join_ways(ways: Sequence[DrivenVisits]) -> DrivenVisits:
 
 
 def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles: int) -> Visits:
-    """Return the town's visits with reports drawn from the drives `ways`. Each of the `vehicles` of
-    the town takes the reports of one vehicle of the drives; no two take those of the same vehicle
-    if there are enough.
+    """Return the visits (passages of cells) in a town with reports drawn from the simulated drives
+    `ways`. Each of the `vehicles` of the town takes the reports of one vehicle of the drives; no
+    two take those of the same vehicle if there are enough.
     """
     there = np.unique(ways.vehicle)
     who = rng.choice(there, vehicles, replace=vehicles > len(there))

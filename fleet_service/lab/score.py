@@ -76,8 +76,8 @@ def excited_vehicles(v: Visits, town: Town, minute: int, vehicles: int) -> IntAr
 
 
 def earlier_visits(v: Visits, until_s: float, vehicles: int) -> IntArray:
-    """Return the number of visits that each vehicle made before the time `until_s` [s],
-    (vehicles,).
+    """Return the number of visits (passages of cells) that each vehicle made before the time
+    `until_s` [s], (vehicles,).
     """
     return np.bincount(v.vehicle[v.seconds < until_s], minlength=vehicles)
 

@@ -131,7 +131,7 @@ def drive_honest(rng: Generator, gain_std: float) -> tuple[ForeignDrive, FloatAr
 
 
 def select_visits(v: Visits, rows: IntArray) -> Visits:
-    """Return those of the simulated visits that have the given indices."""
+    """Return those of the simulated visits (passages of cells) that have the given indices."""
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
     return Visits(
         v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports
@@ -139,8 +139,9 @@ def select_visits(v: Visits, rows: IntArray) -> Visits:
 
 
 def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, IntArray]:
-    """Return three items at the end of an honest drive: the scores of the map, a mask of cells with
-    an alert, and the number of visits of each cell that used enough grip to measure the friction.
+    """Return three items at the end of a drive without attackers: the scores of the map, a mask of
+    cells with an alert, and the number of visits of vehicles to each cell that used enough grip to
+    measure the friction.
     """
     drive, mu = drive_honest(rng, gain_std)
     fusion = Fusion(LATENESS_S)
@@ -157,8 +158,8 @@ def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, In
 
 
 def split_by(seconds: FloatArray, step: float) -> list[IntArray]:
-    """Return the row numbers of visits, divided into portions of `step` seconds each; the visits
-    must be sorted by time.
+    """Return the row numbers of visits (passages of cells), divided into portions of `step` seconds
+    each; the visits must be sorted by time.
     """
     borders = np.flatnonzero(np.diff(seconds // step)) + 1
     return np.split(np.arange(len(seconds)), borders)

@@ -178,7 +178,7 @@ def drive_fleet(
 
 
 def select_visits(v: Visits, rows: IntArray | BoolArray) -> Visits:
-    """Return those of the simulated visits that have the given indices."""
+    """Return those of the simulated visits (passages of cells) that have the given indices."""
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
     return Visits(
         v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports

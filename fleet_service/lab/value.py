@@ -136,8 +136,8 @@ def slippery_median(traffic: TownTraffic, seconds: float) -> BoolArray:
 
 
 def read_map(place: Town, traffic: TownTraffic) -> Readings:
-    """Fuse the visits minute by minute, and read the map every STEP minutes from minute BEGIN
-    on.
+    """Compute the map from the visits (passages of cells) minute by minute, and read the map every
+    STEP minutes from minute BEGIN on.
     """
     o = make_observations(traffic)
     fusion = Fusion(LATENESS_S, enrolled=True)

@@ -65,7 +65,7 @@ class FileTransfer:
 
     def download_missing(self, there: Mapping[str, int]) -> int:
         """Download the files that only the bucket has; return their number. Also remove from the
-        journal the entries of files that the bucket lacks.
+        journal (list of uploaded files) the entries of files that the bucket lacks.
 
         `there` are the names and sizes of the valid objects.
         """

@@ -138,7 +138,7 @@ class BucketReplica:
 
     def _remove_unlisted(self, there: Mapping[str, int]) -> None:
         """Remove the files that differ from the valid objects `there` (names and sizes), and the
-        journal's entries of files that do not exist.
+        entries in the journal (list of uploaded files) of files that do not exist.
         """
         for name, stamp in self._files.list_files().items():
             if there.get(name) != stamp.size:

@@ -1,5 +1,5 @@
 """Publication of changed tiles in rounds. Only a few tiles are published in each pass of the
-worker's loop, so that acknowledgements never wait.
+service's main loop, so that acknowledgements never wait.
 
 A round takes all tiles that changed since the last round. Rounds begin at fixed times, `every_s`
 apart. If the last round is not complete at such a time, the time is skipped and counted, and the

@@ -167,7 +167,7 @@ def write_small_archive(root: Path) -> dict[int, pa.Table]:
 
 def measure_agreement(root: Path, readings: Path) -> list[Figure]:
     """Count files that a validator refuses, programs that cannot read the archive, and questions to
-    which the two query engines give different answers. Return the counts.
+    which the two query engines (DuckDB and Spark) give different answers. Return the counts.
     """
     invalid = sum(bool(_find_refusals(path)) for path in _geo_files(root))
     expected = sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["seq"]))

@@ -94,7 +94,7 @@ def fill_fusion(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.r
 
 def split_batches(o: Observations) -> Iterator[Observations]:
     """Yield observations in batches, each with as many observations as the service processes in one
-    pass of its worker's loop.
+    pass of its main loop.
     """
     for rows in np.array_split(np.arange(len(o.time)), max(len(o.time) // BATCH, 1)):
         yield o.take(rows)

@@ -106,7 +106,7 @@ def pointer_to(array: FloatArray) -> ctypes.c_void_p:
 
 
 class Limit:
-    """Bank of N filters in C, one structure each, on all OpenMP threads."""
+    """Set of N filters in C, one structure each, on all OpenMP threads."""
 
     def __init__(
         self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
@@ -145,7 +145,7 @@ class Limit:
 
 
 class VectorLimit:
-    """Bank of N filters in C, interleaved in SIMD vectors, on one thread. N must be a multiple of
+    """Set of N filters in C, interleaved in SIMD vectors, on one thread. N must be a multiple of
     the vector length.
     """
 

@@ -38,8 +38,8 @@ class Problem(NamedTuple):
 
 
 class Peer(NamedTuple):
-    """Filter made with another library, and the smallest accepted ratio of our bank's speed to its
-    speed.
+    """Filter made with another library, and the smallest accepted ratio of our filters' speed to
+    its speed.
     """
 
     drive: Callable[[Problem], object]

@@ -88,7 +88,7 @@ def make_batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice:
 
 
 def put_batch(session: zenoh.Session, one: Batch) -> None:
-    """Publish a batch of visits on the Zenoh key of its vehicle."""
+    """Publish a batch of observations on the Zenoh key of its vehicle."""
     session.put(
         keys.observation_key(one.region, one.vehicle),
         wire.encode(one),

@@ -44,7 +44,7 @@ PATIENCE_S: Final = 120.0
 
 def shards() -> list[Figure]:
     """Measure the time to ingest a burst of messages in one service, and in two services that share
-    its regions, with engines alone and over Zenoh.
+    its regions, with engines (services without network) and over Zenoh.
     """
     sent = [_make_burst(k) for k in range(ROUNDS + 1)]
     alone = [statistics.median(engines_s(sent, split)) for split in (1, 2)]
@@ -66,8 +66,9 @@ def shards() -> list[Figure]:
 
 
 def engines_s(bursts: Sequence[Sequence[Message]], processes: int) -> list[float]:
-    """Let engines in `processes` processes ingest bursts of messages. Return, for every burst
-    except the first, the time [s] from the start signal to its last acknowledgement.
+    """Let engines (services without network) in `processes` processes ingest bursts of messages.
+    Return, for every burst except the first, the time [s] from the start signal to its last
+    acknowledgement.
     """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -107,7 +108,9 @@ def _time_round(running: Sequence[subprocess.Popen[str]]) -> float:
 
 
 def engine(root: str) -> None:
-    """Run an engine that ingests one burst of messages for each line of standard input."""
+    """Run an engine (service without network) that ingests one burst of messages for each line of
+    standard input.
+    """
     bursts = [
         [Message(*fields) for fields in burst]
         for burst in pickle.loads((Path(root) / "sent").read_bytes())

@@ -1,9 +1,9 @@
 """Benchmark of a million cells: a checkpoint during ingest, and a restart from this checkpoint and
 the later rows.
 
-The checkpoint is requested by a background thread, as in the service, while a worker ingests
-messages. The restart runs in a separate process; its time covers imports, the checkpoint, the later
-rows, loading of compiled code, and the Zenoh session, until the service is ready.
+The checkpoint is requested by a background thread, as in the service, while another thread
+processes messages. The restart runs in a separate process; its time covers imports, the checkpoint,
+the later rows, loading of compiled code, and the Zenoh session, until the service is ready.
 """
 
 from __future__ import annotations

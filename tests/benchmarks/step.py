@@ -195,8 +195,8 @@ def bank() -> list[Figure]:
 
 
 def vs_simd(drive: Drive, speed: float, vehicles: int = 1000, samples: int = 200) -> float:
-    """Return the duration of the bank divided by that of C with vehicles side by side in SIMD
-    vectors. Both use one thread.
+    """Return the duration of a filter step for many vehicles divided by that of C code with
+    vehicles side by side in SIMD vectors. Both use one thread.
 
     Every vehicle has its own noise, so that an error that mixes up vector lanes is found.
 

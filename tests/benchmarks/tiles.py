@@ -116,8 +116,8 @@ class Acks:
 
 
 def drive(endpoint: str) -> None:
-    """Send visits for the given time, wait for the remaining acknowledgements, and print how long
-    each batch waited.
+    """Send observations for the given time, wait for the remaining acknowledgements, and print how
+    long each batch waited.
     """
     session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None
@@ -211,7 +211,7 @@ def _collect_counts(reader: subprocess.Popen[str], got: list[int]) -> None:
 
 def tiles() -> list[Figure]:
     """Measure acknowledgements, published tiles, and a small query behind large ones, at 1 500
-    visits/s over 8 000 tiles.
+    observations/s over 8 000 tiles.
     """
     puts: dict[str, int] = {}
 

@@ -40,8 +40,8 @@ QUEUED: Final = 20.0  # messages of its queue for each
 
 @dataclass
 class Made:
-    """Simulated service: a real engine, and a queue of batches that wait for it. It also counts the
-    bytes that reached the routers.
+    """Simulated service: a real engine (service without network), and a queue of batches that wait
+    for it. It also counts the bytes that reached the routers.
     """
 
     cars: int
@@ -178,6 +178,6 @@ def _run_outage(site: Site, engine: Engine) -> list[Figure]:
 
 
 def _list_shown_cells(engine: Engine) -> set[int]:
-    """Return the cells on the map with at least one counted visit."""
+    """Return the cells on the map with at least one counted visit of a vehicle."""
     fusion = engine.state.fusion
     return set(fusion.cell[fusion.live.visits[: fusion.size] > 0].tolist())

@@ -140,8 +140,8 @@ def _make_honest(seq: int, now: int) -> Iterator[Message]:
 
 
 def _run_turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
-    """Process messages in one pass of the worker's loop of a service. Return 1 if a message caused
-    any failure except a refusal, otherwise 0.
+    """Process messages in one pass of the main loop of a service. Return 1 if a message caused any
+    failure except a refusal, otherwise 0.
     """
     try:
         engine.intake.ingest(messages, now)

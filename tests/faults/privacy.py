@@ -55,8 +55,8 @@ ICE: Final = 0.12
 
 
 class Trip(NamedTuple):
-    """Cells and heading sectors of a trip in the order in which the agent publishes them, one visit
-    a second.
+    """Cells and heading sectors of a trip in the order in which the agent publishes them, one cell
+    per second.
     """
 
     cell: IntArray
@@ -86,7 +86,9 @@ def _trip(street: int, house: int) -> Trip:
 
 
 def _visit(name: str, seq: int, when: int, trip: Trip, at: slice, mu: float) -> list[Message]:
-    """Return the messages for the visits `at` of a trip; the last visit ends at `when` [ns]."""
+    """Return the messages that report the cells numbered `at` of a trip; the last of these cells is
+    left at the time `when` [ns].
+    """
     cell = trip.cell[at]
     latitude, longitude = grid.centre(cell)
     regions = grid.region_of(cell)
@@ -139,7 +141,9 @@ class Town:
     def drive(
         self, name: str, when: int, trip: Trip, at: slice, mu: float = MU
     ) -> list[wire.Alert]:
-        """Process the visits `at` of a trip, and return the alerts that they raise."""
+        """Let the service process a car's reports from the cells numbered `at` of a trip, and
+        return the alerts that they raise.
+        """
         self._sent += 1
         seen = float(np.clip(mu + self._random.normal(0.0, 0.02), 0.05, 1.0))
         alerts = self.engine.intake.ingest(
@@ -248,8 +252,8 @@ def _slippery_delay(folder: Path, public: int) -> float:
 
 
 def run(site: Site) -> list[Figure]:
-    """Pursue a car of each street, and as a control a car on a map that shows every visit; return
-    the figures.
+    """Pursue a car of each street, and as a control a car on a map that shows every report at once;
+    return the figures.
     """
     over: list[float] = []
     puts = 0
@@ -280,7 +284,7 @@ def run(site: Site) -> list[Figure]:
 
 def _control(folder: Path) -> float:
     """Return how much more often than by chance the reader finds the car's place if the map shows
-    every visit at once, as a control of the method.
+    every report at once, as a control of the method.
     """
     with patch.object(TileCache, "source", property(lambda tiles: tiles.state.fusion)):
         town = Town(folder, 0)

@@ -35,8 +35,8 @@ def value(mu: Numbers, std: float = STD) -> FloatArray:
 
 
 def at_least(used: Numbers) -> FloatArray:
-    """Return log-likelihoods (n, 32) of visits that used the grip `used` and measured no upper
-    limit.
+    """Return log-likelihoods (n, 32) of visits (passages of a cell) that used the grip `used` and
+    measured no upper limit of friction.
     """
     return np.where(np.asarray(used, float)[:, None] > mugrid.CENTRES, -8.0, 0.0)
 
@@ -118,10 +118,10 @@ def batch(
     used: float | None = None,
     **changed: object,
 ) -> Batch:
-    """Return a batch of visits in one cell, one second apart and ending at `now` [ns]. `changed`
-    replaces columns.
+    """Return a batch of observations of one cell, one second apart and ending at `now` [ns].
+    `changed` replaces columns.
 
-    Without `used` the visits used all of the grip, so that they are measurements.
+    Without `used` the vehicle used all of the grip, so that the observations are measurements.
     """
     n = len(mu)
     leave = now - np.arange(n)[::-1] * SECOND

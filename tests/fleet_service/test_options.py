@@ -414,8 +414,8 @@ FAR: Final = (LATITUDE, LONGITUDE + 0.05)
 
 
 def there(name: str, mu: float) -> wire.Batch:
-    """Return a batch of the vehicle `name` with friction `mu` whose visits lie in another tile of
-    the same region.
+    """Return a batch of the vehicle `name` with friction `mu` whose observations lie in another
+    tile of the same region.
     """
     cell = int(grid.cell_of(*FAR))
     return batch(

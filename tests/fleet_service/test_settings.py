@@ -36,8 +36,9 @@ Show = Callable[[ServiceConfig, Path], object]
 
 
 def open_engine(config: ServiceConfig, root: Path) -> Iterator[Engine]:
-    """Yield an engine with the setting under test that has ingested reports of three cars: with the
-    present time and minutes old, ten minutes old, and dated a minute ahead.
+    """Yield an engine (service without network) with the setting under test that has ingested
+    reports of three cars: with the present time and minutes old, ten minutes old, and dated a
+    minute ahead.
     """
     with closing(Engine(config, root)) as engine:
         now = time.time_ns()
@@ -101,8 +102,8 @@ def count_queued(made: Service) -> int:
 
 
 def turns(made: Service) -> tuple[int, int]:
-    """Return two numbers from ten simulated passes of the service's worker loop, .3 s each:
-    segments (files of new rows) written, and rounds in which tiles are published.
+    """Return two numbers from ten simulated passes of the service's main loop, .3 s each: segments
+    (files of new rows) written, and rounds in which tiles are published.
     """
     clock = [time.monotonic()]
     calls = {"begin_flush": 0, "take_dirty": 0}

@@ -58,8 +58,8 @@ PROTOBUF_SENDER = "anna"
 
 
 def protobuf_batch(now: int) -> bytes:
-    """Return a batch with visits to one cell and their likelihoods, as protobuf bytes encoded by
-    `schemas.wire`.
+    """Return a batch with observations of one cell and their likelihoods, as protobuf bytes encoded
+    by `schemas.wire`.
     """
     leave = now - SECOND * np.arange(VISITS)[::-1]
     log_likelihood = -0.5 * np.square((mugrid.CENTRES - ICE) / STD)
@@ -83,7 +83,7 @@ def protobuf_batch(now: int) -> bytes:
 
 
 def json_batch(now: int) -> bytes:
-    """Return the same visits as `protobuf_batch` in handwritten JSON without cell, sector and
+    """Return the same observations as `protobuf_batch` in handwritten JSON without cell, sector and
     region.
     """
     times = [str(now - SECOND * k) for k in reversed(range(VISITS))]

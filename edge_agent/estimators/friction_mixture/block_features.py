@@ -3,10 +3,10 @@ block (the samples within 0.05 s).
 
 Longitudinal force comes from torque, F_x = (T - J*omega')/R. Where torque or speed is missing, the
 force m*a_x is divided among the axles, with a larger standard deviation, because this division is
-uncertain (`drive_split.py`). On a slope or bank an accelerometer also measures gravity, and the
-tyres must carry exactly this force. Therefore the forces here include slope and bank; offsets of
-the sensor are subtracted. Lateral axle forces come from m*a_y and Iz*r' (paper 004, equation 2;
-errata 000 on signs and arms).
+uncertain (`drive_split.py`). On a slope or bank (lateral slope) an accelerometer also measures
+gravity, and the tyres must carry exactly this force. Therefore the forces here include slope and
+bank; offsets of the sensor are subtracted. Lateral axle forces come from m*a_y and Iz*r' (paper
+004, equation 2; errata 000 on signs and arms).
 """
 
 from __future__ import annotations

@@ -57,8 +57,8 @@ def curve_distance(along: float, across: float) -> float:
 @compiled
 def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
     """Return the velocity (forward, left) [m/s] gained in the block (0.05 s), corrected by the
-    states in x (n,): leak (gravity that tilted accelerometers measure), sensor offsets, slope and
-    bank.
+    states in x (n,): leak (gravity that tilted accelerometers measure), sensor offsets, and the
+    road's slope and bank (lateral slope).
 
     An offset of a_y has the same effect as an offset of a_x, rotated by 90 degrees.
     """

@@ -1,5 +1,5 @@
-"""Benefit and risk of the map as a prior: error at the entry of a cell, delay caused by a wrong
-map, and effect on published records.
+"""Benefit and risk of the map as a prior: error when a vehicle enters a cell, delay caused by a
+wrong map, and effect on published records.
 
 The default estimator drives through random towns, and its beliefs and likelihoods are recorded ten
 times a second. The maps are applied afterwards, because the filter itself never uses a map. The
@@ -56,9 +56,9 @@ class FilterTrace:
 
 
 def entry_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
-    """Return the figures over all towns: the error at the entry of a cell and the delay caused by a
-    wrong map, each as the value with the map divided by the value without it; and the largest
-    change of a published value.
+    """Return the figures over all towns: the error when a vehicle enters a cell and the delay
+    caused by a wrong map, each as the value with the map divided by the value without it; and the
+    largest change of a published value.
     """
     errors: list[FloatArray] = []
     delays: dict[str, list[tuple[float, float]]] = {"dry": [], "ice": []}

@@ -1,5 +1,5 @@
 """Simulation of several drives of one scenario as a batch, and estimation of their motion and
-friction by an estimator bank.
+friction by an estimator bank (one filter per drive).
 """
 
 from __future__ import annotations

@@ -120,8 +120,8 @@ def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str],
 
 
 def _as_in_paper(estimator: str, batch: DriveSet) -> EstimatorBank:
-    """Return an estimator bank for drives under a paper's own conditions. An estimator that does
-    not estimate friction gets the true friction at the start of the drives.
+    """Return an estimator bank (one filter per drive) for drives under a paper's own conditions. An
+    estimator that does not estimate friction gets the true friction at the start of the drives.
     """
     friction = float(batch.mu[0, 0])
     if estimator == "adaptive-federated-ckf":

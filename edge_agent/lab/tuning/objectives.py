@@ -102,7 +102,9 @@ FELT_SHARE: Final = 0.9  # of the friction in use, from which a slippery road is
 
 @dataclass(frozen=True)
 class TuningSet:
-    """Drives of equal length, as arrays in the form that an estimator bank requires."""
+    """Drives of equal length, as arrays in the form that an estimator bank (filters advanced
+    together) requires.
+    """
 
     vehicles: tuple[Vehicle, ...]
     t: FloatArray  # (T, N) [s]

@@ -20,9 +20,10 @@ _HOUR_S: Final = 3600
 
 
 def expression(t: Table, maps: Table) -> Table:
-    """Return a table of the shares `held` and `compatible`. It has one row for each basis
-    (measured, estimated from neighbouring cells, or only a lower bound) and each number of hours
-    between snapshot and value.
+    """Return a table of two shares: `held` of the values that lie inside the map's interval, and
+    `compatible` of those whose own interval overlaps it. It has one row for each basis (measured,
+    estimated from neighbouring cells, or only a lower bound) and each number of hours between
+    snapshot and value.
     """
     t = t.filter(has_value(t)).select(
         "cell",
@@ -55,7 +56,7 @@ def expression(t: Table, maps: Table) -> Table:
 
 
 def ask(engine: QueryEngine, _: Options) -> pa.Table:
-    """Return the shares `held` and `compatible` for the selected part of the archive; `expression`
-    describes the rows.
+    """Return how often later values lay within the map's intervals, for the selected part of the
+    archive; `expression` describes the rows.
     """
     return engine.answer(expression(engine.observations(), engine.maps()))

@@ -54,7 +54,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 def coverage_lines(found: pa.Table) -> list[str]:
     """Return one line of text per day: the shares of the network with a value, with only a lower
-    bound, and without a visit.
+    bound of friction, and without a visit of a vehicle.
     """
     key = found["cell"].to_numpy() * 4 + found["sector"].to_numpy()
     network = len(np.unique(key))

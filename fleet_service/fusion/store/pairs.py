@@ -146,8 +146,8 @@ def returning_bit(number: int) -> np.uint64:
 @compiled
 def mark_returned(state: State, slots: IntArray, numbers: IntArray) -> None:
     """Record in each cell (slots (k,)) that a vehicle (numbers (k,)) has visited it. This is done
-    before the vehicle's reports there are deleted, so that a later visit does not count it as a new
-    vehicle.
+    before the vehicle's reports there are deleted, so that a later report does not count it as a
+    new vehicle.
     """
     for k in range(len(slots)):
         slot = slots[k]

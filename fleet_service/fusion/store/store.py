@@ -222,8 +222,8 @@ class Store:
             self._rebuild_reporters(hour - _HOUR - _AHEAD)
 
     def untouched(self, before: int) -> BoolArray:
-        """Return a mask of slots (cells and sectors), (size,): True if the last visit was before
-        `before` [ns] and no other record refers to the slot.
+        """Return a mask of slots (cells and sectors), (size,): True if the last visit of a vehicle
+        was before `before` [ns] and no other record refers to the slot.
         """
         cells = self.state.live.cells[: self.size]
         pairs = self.state.pairs

@@ -41,8 +41,8 @@ class Coefficients(NamedTuple):
 
 
 def measure_coefficients() -> Coefficients:
-    """Measure the memory cost of a service per vehicle, cell and pair, and return these
-    coefficients.
+    """Measure the memory cost of a service per vehicle, per cell, and per combination of both;
+    return these coefficients.
     """
     few, vehicles, cells = (_measure_growth(kind) for kind in ("few", "vehicles", "cells"))
     return Coefficients(

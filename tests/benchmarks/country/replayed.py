@@ -145,8 +145,8 @@ def _compute_shares(count: int) -> FloatArray:
 
 
 def _cut_chunks(columns: dict[str, Any], who: int, corner: IntArray) -> list[Chunk]:
-    """Divide the visits of one vehicle, in order of time, into chunks of ROWS visits; return the
-    chunks. If fewer than ROWS visits remain at the end, they are left out.
+    """Divide the visits (passages of cells) of one vehicle, in order of time, into chunks of ROWS
+    visits; return the chunks. If fewer than ROWS visits remain at the end, they are left out.
     """
     mine = np.flatnonzero(columns["vehicle"] == who)
     mine = mine[np.argsort(columns["leave_time"][mine], kind="stable")]

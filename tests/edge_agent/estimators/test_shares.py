@@ -1,5 +1,5 @@
-"""Test that the results of a bank do not change by one bit if several threads share its
-vehicles.
+"""Test that the results of an estimator bank (filters of N vehicles) do not change by one bit if
+several threads share its vehicles.
 """
 
 from __future__ import annotations

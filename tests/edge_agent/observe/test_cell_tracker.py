@@ -45,7 +45,7 @@ def test_the_visited_cell_is_that_of_the_position_but_for_the_margin() -> None:
 
 def test_jitter_at_a_border_does_not_start_a_visit_with_every_fix() -> None:
     """A standing car on the border of two cells, whose receiver scatters by 0.3 m, must begin
-    hardly any visits.
+    hardly any visits (passages of a cell).
     """
     rng = np.random.default_rng(3)
     west, south, _, north = (float(v) for v in grid.bounds(grid.cell_of(57.70, 11.97)))

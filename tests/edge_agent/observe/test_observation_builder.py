@@ -237,9 +237,9 @@ def test_the_noise_of_accelerometers_is_no_grip() -> None:
 def test_visit_with_a_friction_jump_reports_both_and_grip_of_the_lesser(
     cut: int | None,
 ) -> None:
-    """The road changes from ice to dry within the second visit. The observation must allow both
-    frictions. Its used grip must be that of the ice, although the brakes used .7 before the change
-    was detected.
+    """The road changes from ice to dry within the vehicle's passage through the second cell. The
+    observation must allow both frictions. Its used grip must be that of the ice, although the
+    brakes used .7 before the change was detected.
     """
     samples = 40
     east = np.arange(samples)[:, None] * 0.5

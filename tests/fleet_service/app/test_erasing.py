@@ -148,7 +148,7 @@ def fill_engine(root: Path, *names: str) -> Engine:
 
 def answer_requests(engine: Engine, root: Path) -> None:
     """Carry out the waiting requests to erase a vehicle in a background thread, while this thread
-    plays the service's worker.
+    plays the service's worker (the thread that processes messages).
     """
     thread = threading.Thread(
         target=erasing.handle_requests, args=(engine, ServiceConfig(), root, threading.Event())

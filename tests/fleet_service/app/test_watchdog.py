@@ -1,5 +1,5 @@
 """Tests of the watchdog signals of a service: the signals stop when a thread other than the worker
-hangs.
+(which processes messages) hangs.
 """
 
 from __future__ import annotations

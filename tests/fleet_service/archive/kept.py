@@ -121,7 +121,9 @@ def messages(turn: int) -> Iterator[Message]:
 
 
 def take_checkpoint(engine: Engine) -> Any:  # noqa: ANN401 tables and a time
-    """Write a checkpoint as the service does: one thread requests it, and the worker writes it."""
+    """Write a checkpoint as the service does: one thread requests it, and the worker (which
+    processes messages) writes it.
+    """
     found: list[object] = []
     stop = threading.Event()
     thread = threading.Thread(target=lambda: found.append(engine.checkpoint(stop)))

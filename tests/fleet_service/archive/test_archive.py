@@ -46,7 +46,7 @@ def read_settled(acks: list[tuple[str, bytes]]) -> dict[str, list[tuple[int, int
 
 @pytest.fixture
 def engine(tmp_path: Path) -> Iterator[Engine]:
-    """Yield an engine on an empty archive."""
+    """Yield an engine (service without network) on an empty archive."""
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         yield engine
 

@@ -19,8 +19,8 @@ LATENESS_S = 120.0
 
 
 def drive(seed: int, n: int, duration_s: float) -> Observations:
-    """Return visits of 12 vehicles, one of which reports wrong values, to 6 cells, in order of
-    time.
+    """Return observations of 12 vehicles, one of which reports wrong values, in 6 cells, in order
+    of time.
     """
     rng = np.random.default_rng(seed)
     vehicle = rng.integers(0, 12, n)
@@ -40,7 +40,7 @@ def drive(seed: int, n: int, duration_s: float) -> Observations:
 
 
 def delay_arrivals(o: Observations, most_s: float, seed: int) -> IntArray:
-    """Return an order of arrival in which each visit is at most `most_s` late."""
+    """Return an order of arrival of observations in which each is at most `most_s` [s] late."""
     return np.argsort(
         o.time + (np.random.default_rng(seed).random(len(o.time)) * most_s * 1e9).astype(np.int64)
     )

@@ -108,7 +108,9 @@ def test_a_wrong_weather_file_is_refused_with_row_and_column(
 
 
 def drive(engine: Engine, begin: int, seq: int) -> None:
-    """Let the engine ingest one visit of each of three vehicles at the time `begin` [ns]."""
+    """Let the engine (service without network) process one observation of each of three vehicles at
+    the time `begin` [ns].
+    """
     for k in range(3):
         sent = batch(f"sim-00{k}", seq, begin + k * SECOND, [0.8])
         engine.intake.ingest(

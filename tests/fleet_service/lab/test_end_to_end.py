@@ -53,7 +53,7 @@ def test_a_figure_of_nothing_is_not_a_number_and_holds_no_bar() -> None:
 
 
 def visits(*rows: tuple[int, float, float]) -> pa.Table:
-    """Return a table of visits.
+    """Return a table of visits (passages of cells).
 
     Args:
         rows: (steps east of CELL, time [s], friction) of each visit.

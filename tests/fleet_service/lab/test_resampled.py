@@ -21,8 +21,8 @@ MINUTES = 6
 
 
 def visits_on(mu: FloatArray, vehicle: IntArray, low: FloatArray) -> DrivenVisits:
-    """Return made-up visits of drives on roads with friction `mu`. They alternately use little
-    grip, and enough to measure μ; vehicle k then reports `low[k]` times the true friction.
+    """Return made-up visits (passages of cells) on roads with friction `mu`. They alternately use
+    little grip, and enough to measure μ; vehicle k then reports `low[k]` times the true friction.
     """
     excited = np.arange(len(mu)) % 2 == 1
     reading = mu * low[vehicle]

@@ -61,8 +61,8 @@ def put(
     first_seq: int = 1,
     cars: Sequence[str] = CARS,
 ) -> int:
-    """Publish the visits of cars that drive over parts of the street, there and back, with the last
-    visit at `now` [ns]. Return the next free sequence number.
+    """Publish the observations of cars that drive over parts of the street, there and back, with
+    the last observation at `now` [ns]. Return the next free sequence number.
     """
     place, heading, mu = _drive([PARTS[name] for name in parts])
     time = now - (len(place) - 1 - np.arange(len(place))) * VISIT_NS

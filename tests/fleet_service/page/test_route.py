@@ -22,8 +22,8 @@ from tests.fleet_service.page import street
 
 
 def make_ice_table() -> pa.Table:
-    """Return a map table with five cells of ice eastward, followed by cells with only a lower
-    bound.
+    """Return a map table with five cells of ice eastward, followed by cells for which only a lower
+    bound of friction is known.
     """
     ice = street.cells(street.PARTS["ice"])
     passed = street.cells(street.PARTS["passed"])

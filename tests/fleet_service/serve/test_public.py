@@ -48,8 +48,8 @@ MORE = tuple(
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """Yield a function that opens an engine which shows only cells with at least
-    `public` vehicles.
+    """Yield a function that opens an engine (service without network) which shows only cells with
+    at least `public` vehicles.
     """
     opened: list[Engine] = []
 
@@ -63,7 +63,9 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 
 def hear(engine: Engine, *names: str, now: int | None = None) -> None:
-    """Let the engine ingest one visit of each named vehicle, at the time `now` [ns]."""
+    """Let the engine (service without network) process one observation of each named vehicle, at
+    the time `now` [ns].
+    """
     now = time.time_ns() if now is None else now
     sent = [
         Message(Kind.OBSERVATION, key(n), wire.encode(batch(n, 1, now - SECOND, [0.8])), "")
@@ -74,12 +76,14 @@ def hear(engine: Engine, *names: str, now: int | None = None) -> None:
 
 
 def later() -> int:
-    """Return a time [ns] in the near future by which visits made now are visible to readers."""
+    """Return a time [ns] in the near future by which observations made now are visible to
+    readers.
+    """
     return time.time_ns() + PERIOD_NS
 
 
 def rows(engine: Engine, now: int | None = None, **parameters: str) -> list[dict[str, object]]:
-    """Return the cells in the engine's answer to a map query."""
+    """Return the cells in the answer of the engine (service without network) to a map query."""
     tiles = engine.queries.answer(
         query.parse(parameters), lambda _: True, time.time_ns() if now is None else now
     )

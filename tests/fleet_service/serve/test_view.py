@@ -1,4 +1,6 @@
-"""Test of a cell's basis: a cell that is probably slippery is never shown as a lower bound."""
+"""Test of a cell's basis: a cell that is probably slippery is never shown as one with only a lower
+bound of friction.
+"""
 
 from __future__ import annotations
 
