@@ -162,14 +162,15 @@ class ServiceToken(NamedTuple):
         return self.key_under(SERVES)
 
     def key_under(self, root: str) -> str:
-        """Return the key of the token with the first part `root` instead of `gripmap/v1/serves`:
-        CLAIMS for a service that serves or will soon serve the region, WAITS for a standby service.
+        """Return the key of the token (sign that a service is alive) with the first part `root`
+        instead of `gripmap/v1/serves`: CLAIMS for a service that serves or will soon serve the
+        region, WAITS for a standby service.
         """
         return f"{root}/{self.region.replace('*', _ALL)}/{self.service}/{self.start}"
 
 
 def parse_served(key: str, root: str = SERVES) -> ServiceToken:
-    """Parse the key of a service's token.
+    """Parse the key of a service's token (sign that it is alive).
 
     Raises:
         InputError: the key does not belong to a service's token.

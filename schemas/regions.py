@@ -81,13 +81,15 @@ class Rank:
         self._place = {key: place for place, key in enumerate(keys_along(route).tolist())}
 
     def of(self, cell: int, sector: int) -> int:
-        """Return a number that grows along the route, for a cell and sector. It only serves to
-        compare positions; it is not a distance.
+        """Return a number that grows along the route, for a cell and heading sector. It only serves
+        to compare positions; it is not a distance.
         """
         return self._place.get(cell * grid.SECTORS + sector, len(self._place))
 
     def order(self, cells: IntArray, sectors: IntArray) -> IntArray:
-        """Return the indices (n,) that sort the given cells and sectors (n,) along the route."""
+        """Return the indices (n,) that sort the given cells and sectors (n,) in their order along
+        the route.
+        """
         ranks = [
             self.of(cell, sector)
             for cell, sector in zip(cells.tolist(), sectors.tolist(), strict=True)

@@ -107,7 +107,7 @@ def _load_manifest(data: bytes) -> object:
 
 
 class _OneFence:
-    """Simulated bucket that contains one fence object."""
+    """Simulated bucket that contains one fence object (list of a former owner's valid files)."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content

@@ -1,4 +1,4 @@
-"""Helper of tests that look into the outbox of an agent."""
+"""Helper of tests that look into the outbox of an agent (file of unsettled batches)."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ from edge_agent.publish.outbox import Outbox, StoredBatch
 
 
 def read_batches(outbox: Outbox) -> list[StoredBatch]:
-    """Return all batches in the outbox, oldest first."""
+    """Return all batches (messages with records) in the outbox file, oldest first."""
     return [batch for key in list(outbox.held) if (batch := outbox.read_batch(key)) is not None]

@@ -1,5 +1,5 @@
-"""Tests that simulated histories of the lease in virtual time keep every promise, and that
-deliberately broken protocols are detected.
+"""Tests that simulated histories of the lease (ownership of an archive) in virtual time keep every
+promise, and that deliberately broken protocols are detected.
 """
 
 from __future__ import annotations

@@ -158,8 +158,8 @@ def delay_passes(
 def known_patches(
     visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
 ) -> list[tuple[IntArray, int]]:
-    """Return, for each patch of ice, its cells and the time of its first alert [ns]; the time is
-    NEVER if there was no alert.
+    """Return, for each patch of ice, its cells and the time of the first alert on the map [ns]; the
+    time is NEVER if there was no alert.
     """
     cells = np.unique(visits["cell"].to_numpy()[patch])
     label = link_cells(cells)
@@ -271,8 +271,8 @@ class LostGrip:
 def lost_grip(
     visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int, share: float
 ) -> LostGrip:
-    """Return the passes over new ice after the first alert of its patch. `share` is the share of
-    drivers that are warned.
+    """Return the passes of cars over new ice after the first alert of its patch. `share` is the
+    share of drivers that are warned.
     """
     on = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
     since = np.full(visits.num_rows, NEVER)

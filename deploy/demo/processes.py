@@ -156,8 +156,8 @@ def run_page(folder: Path, endpoint: str, service: ManagedProcess, port: int) ->
 def start_fleet(
     folder: Path, vehicles: int, duration_s: float, seed: int, warned: float
 ) -> ManagedProcess:
-    """Start the process of the simulated vehicles and return it. Each vehicle has its own session
-    and identity. A share `warned` of the drivers is warned of ice.
+    """Start the process of the simulated vehicles and return it. Each vehicle has its own network
+    session and name. A share `warned` of the drivers is warned of ice.
     """
     scripts = Path(sys.executable).parent
     options = {

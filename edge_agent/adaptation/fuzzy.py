@@ -25,7 +25,7 @@ LARGEST_FACTOR = 10.0
 @compiled
 def infer_step(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> float:
     """Return the logarithm of the factor on the measurement noise R [nat] for a mismatch of the
-    innovation variance [1].
+    variance of the innovations (measurement minus prediction) [1].
 
     It is the mean of `outputs` (5,), weighted by the memberships (degrees, 0 to 1) of the mismatch
     in triangular fuzzy sets with peaks `inputs` (5,). Each triangle ends at its neighbours' peaks,
@@ -47,7 +47,7 @@ def adapted_factor(
 ) -> float:
     """Return the next factor on the measurement noise R: factor*exp(infer_step(actual/theoretical -
     1)), limited to [LEAST_FACTOR, LARGEST_FACTOR]. `actual` and `theoretical` are variances of the
-    innovations; `inputs` and `outputs` are those of `infer_step`.
+    innovations (measurement minus prediction); `inputs` and `outputs` are those of `infer_step`.
     """
     return adapted_within(
         factor, actual, theoretical, inputs, outputs, 1.0, (LEAST_FACTOR, LARGEST_FACTOR)

@@ -84,8 +84,8 @@ class LowerVertices:
         return _triangle_sets(self.peaks, self.feet), _triangle_sets(self.out_peaks, self.out_feet)
 
     def step(self, mismatch: float) -> float:
-        """Return ln of the factor on R [nat] for a mismatch of the innovation variance,
-        actual/theoretical - 1 [1].
+        """Return ln of the factor on R [nat] for a mismatch of the innovations (measurement minus
+        prediction): actual/theoretical variance - 1 [1].
         """
         inputs, outputs = self.triangle_sets()
         weight = _membership_weights(inputs, mismatch)

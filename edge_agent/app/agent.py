@@ -211,8 +211,8 @@ class Agent:
         ]
 
     def _warm_up(self) -> None:
-        """Run one step with a temporary vehicle, so that the kernels are loaded or compiled before
-        the loop starts.
+        """Run one step with a temporary vehicle, so that the compiled functions are loaded or
+        compiled before the loop starts.
         """
         t = np.zeros((1, 1))
         time = np.zeros((1, 1), dtype=np.int64)

@@ -186,7 +186,9 @@ class Trip:
 
 
 def state_path_for(spool: Path, name: str) -> Path:
-    """Return the path of the file with a car's stored knowledge, next to its outbox."""
+    """Return the path of the file with a car's stored knowledge, next to its outbox (file of unsent
+    batches).
+    """
     return spool.with_name(f"{spool.stem}.{name}.json")
 
 

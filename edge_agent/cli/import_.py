@@ -1,5 +1,5 @@
-"""`edge-agent import`: convert a car's recording to a signal log by a profile; without a profile,
-write a draft of one.
+"""`edge-agent import`: convert a car's recording to a signal log by a profile (assignment of
+signals to channels); without a profile, write a draft of one.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from schemas.wire.ahead import GripWarning
 
 
 def warm_up_simulation(scenario: str, rate_hz: float, rough: float = 0.0) -> None:
-    """Load or compile the kernels of the simulation, by one step before the run."""
+    """Compile the functions of the simulation, or load them, by one step before the run."""
     from edge_agent.lab.simulation import SimulatedFleet
 
     with progress_messages.show_status("starting the simulation"):

@@ -1,4 +1,4 @@
-"""Parameters of a vehicle as an array of numbers for the compiled kernels."""
+"""Parameters of a vehicle as an array of numbers for the compiled functions."""
 
 from __future__ import annotations
 

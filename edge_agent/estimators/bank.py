@@ -1,4 +1,4 @@
-"""The estimator bank: a compiled kernel steps the filters of N vehicles in one call.
+"""The estimator bank: a compiled function steps the filters of N vehicles in one call.
 
 The filter state of each vehicle is stored in a record of its own. Therefore results are bit-equal
 whatever N is and however the samples are split into calls.

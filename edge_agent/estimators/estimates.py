@@ -1,4 +1,4 @@
-"""Output of an estimator bank: the array that compiled kernels write, with a named column per
+"""Output of an estimator bank: the array that compiled functions write, with a named column per
 estimated quantity.
 """
 

@@ -1,5 +1,5 @@
-"""The cubature filter with its points in adjacent columns, for kernels that run millions of steps
-per second.
+"""The cubature filter with its points in adjacent columns, for compiled functions that run millions
+of steps per second.
 
 Legend
     m, L     state's mean (n,), and lower-triangular square root of its covariance, P = L*L' (n, n)

@@ -30,9 +30,11 @@ def fuse_estimates(
     other_root: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Fuse the independent estimate (other, other_root) with (mean, sqrt_cov), in place.
+    """Fuse an independent estimate into another, in place. Each estimate is a mean (n,) and a
+    square root of its covariance (n, n): `other` and `other_root` are fused into `mean` and
+    `sqrt_cov`.
 
-    `work` is scratch, (2n, 2n) or larger.
+    `work` is scratch memory, (2n, 2n) or larger.
     """
     n = mean.shape[0]
     for i in range(n):

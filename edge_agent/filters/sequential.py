@@ -23,8 +23,9 @@ from schemas.runtime.jit import inlined
 @inlined
 def potter_factors(f: FloatArray, noise: float) -> tuple[float, float]:
     """Return (a, g) for a scalar measurement with row f (k,) (see module) and noise variance
-    `noise` > 0: a is the variance of the innovation, g the factor of the covariance update. The
-    update is then m <- m + L*f*nu/a and L <- L*(I - g*f*f') (Potter 1963).
+    `noise` > 0: a is the variance of the innovation (measurement minus prediction), g the factor of
+    the covariance update. The update is then m <- m + L*f*nu/a and L <- L*(I - g*f*f') (Potter
+    1963).
     """
     a = noise
     for c in range(f.shape[0]):

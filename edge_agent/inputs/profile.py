@@ -150,11 +150,11 @@ class Profile(Part):
         return self
 
     def needed_signals(self) -> set[str]:
-        """Return the names of all recorded signals that the profile's channels need."""
+        """Return the names of all recorded signals from which the profile computes its channels."""
         return {name for channel in self.channels.values() for name in channel.needed_signals()}
 
     def to_json(self) -> str:
-        """Return the profile as JSON, without unset fields."""
+        """Return the profile (assignment of signals to channels) as JSON, without unset fields."""
         return (
             json.dumps(self.model_dump(exclude_defaults=True) | {"version": self.version}, indent=1)
             + "\n"
@@ -162,13 +162,15 @@ class Profile(Part):
 
 
 def shipped_profiles() -> list[str]:
-    """Return the names of the profiles that are part of the package."""
+    """Return the names of the profiles (assignments of signals to channels) that are part of the
+    package.
+    """
     return sorted(path.stem for path in FOLDER.glob("*.json"))
 
 
 def load_profile(name: str) -> tuple[Profile, Path]:
-    """Load a profile by path or by the name of a shipped profile; return it with the folder of its
-    CAN database.
+    """Load a profile (assignment of signals to channels) by path or by the name of a shipped
+    profile; return it with the folder of its CAN database.
 
     Raises:
         InputError: it cannot be read, or a field is missing, unknown or out of range.

@@ -277,8 +277,8 @@ def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
     """Begin a new part of a visit (passage of a map cell) after a change of friction within the
     cell.
 
-    The recorded grip used in the visit is limited to the largest friction that `told`, the evidence
-    of the ended part, does not exclude.
+    The recorded grip used in the visit is limited to the largest friction that `told`, the
+    likelihood of the ended part, does not exclude.
     """
     most = mugrid.UPPER
     for i in range(mugrid.BINS - 1, -1, -1):

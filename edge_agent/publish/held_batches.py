@@ -118,7 +118,9 @@ class HeldBatches:
         return batch
 
     def remove_all(self) -> None:
-        """Remove all held batches. The sequence numbers of this start's streams continue."""
+        """Remove all held batches (messages not yet answered). The sequence numbers of the streams
+        (vehicle, kind, region) continue.
+        """
         own = {
             stream: sequence
             for stream, sequence in self._streams.items()
@@ -132,17 +134,21 @@ class HeldBatches:
         self.bytes = 0
 
     def has_stream(self, stream: Stream) -> bool:
-        """Return True if the stream belongs to this start, or has batches in the outbox."""
+        """Return True if the stream (vehicle, start, kind, region) belongs to this start, or has
+        batches in the outbox.
+        """
         return stream in self._streams
 
     def next_numbers(self, stream: Stream) -> tuple[int, int]:
-        """Return the next free sequence number of a stream, and the lowest one that is held."""
+        """Return the next free sequence number of a stream (vehicle, start, kind, region), and the
+        lowest one that is held.
+        """
         known = self._streams.get(stream) or _Sequence(stream)
         return known.next, known.first_held()
 
     def keys_within(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> set[int]:
-        """Return the keys of the held batches of a stream in inclusive ranges of sequence
-        numbers.
+        """Return the keys of the held batches of a stream (vehicle, start, kind, region) in
+        inclusive ranges of sequence numbers.
         """
         sequence = self._streams.get(stream)
         if sequence is None:

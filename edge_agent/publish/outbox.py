@@ -92,8 +92,8 @@ class Outbox:
         self._load_batches()
 
     def _load_batches(self) -> None:
-        """Load the batches that the outbox's file contains from an earlier start; all are due at
-        once.
+        """Load the batches (messages with records) that the outbox's file contains from an earlier
+        start; all are due at once.
         """
         for key, (vehicle, boot, kind, region, seq, records), size in self._file.list_batches():
             stream = Stream(vehicle, boot, Kind(kind), region)
@@ -118,7 +118,9 @@ class Outbox:
         self.counts.damaged += max(before - self.held.count_records(), 0)
 
     def _drop_batch(self, key: int) -> int:
-        """Remove a batch from the outbox, and return the number of its records."""
+        """Remove a batch (message with records) from the outbox, and return the number of its
+        records.
+        """
         batch = self.held.remove_batch(key)
         self.schedule.record_removal(batch)
         self._deletable.append(key)
@@ -150,8 +152,9 @@ class Outbox:
     def _insert_draft(
         self, draft: Draft, ahead: dict[Stream, int]
     ) -> tuple[int, Stream, int, Draft, bytes]:
-        """Insert a batch into the file; return its key, stream, sequence number, draft and payload.
-        `ahead` holds the next numbers of the streams within the transaction.
+        """Insert a batch into the file; return its key, stream (vehicle, start, kind, region),
+        sequence number, draft and payload. `ahead` holds the next numbers of the streams within the
+        transaction.
         """
         stream = Stream(draft.vehicle, self.boot, draft.kind, draft.region)
         following, first_held = self.held.next_numbers(stream)

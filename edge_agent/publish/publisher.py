@@ -162,8 +162,8 @@ class Publisher:
         self._resend_due()
 
     def _recover_outbox(self) -> None:
-        """Recover the readable content of an outbox that was damaged during use, and continue with
-        it.
+        """Recover the readable content of an outbox (file of unsettled batches) that was damaged
+        during use, and continue with it.
         """
         try:
             self._outbox.recover_file()
@@ -192,8 +192,8 @@ class Publisher:
             log.exception("%d records that cannot be sent are dropped", len(records.vehicle))
 
     def _store_and_send(self) -> None:
-        """Commit the waiting records to the outbox, then send them. If the disk does not accept the
-        write, the next round tries again.
+        """Commit the waiting records to the outbox (file on disk), then send them. If the disk does
+        not accept the write, the next round tries again.
         """
         if not self._waiting:
             return

@@ -59,14 +59,17 @@ class PublisherStatus:
 
     @property
     def stranded_records(self) -> int:
-        """Return the number of records in the outbox that are not sent, because they belong to
-        other vehicle names than those of this agent, for example after a change of name.
+        """Return the number of records in the outbox (file of unsettled batches) that are not sent,
+        because they belong to other vehicle names than those of this agent, for example after a
+        change of name.
         """
         return self._outbox.held.count_stranded(self._names)
 
     @property
     def fill_share(self) -> float:
-        """Return the used share of the outbox capacity [1]."""
+        """Return the used share of the capacity of the outbox, the file of unsettled batches
+        [1].
+        """
         return self._outbox.held.bytes / self._outbox.capacity_bytes
 
     @property
@@ -85,7 +88,9 @@ class PublisherStatus:
 
     @property
     def dropped_records(self) -> int:
-        """Return the number of records dropped for lack of space, in the queue or in the outbox."""
+        """Return the number of records dropped for lack of space, in the queue or in the outbox
+        (file of unsettled batches).
+        """
         return sum(self.counts.dropped.values()) + sum(self._outbox.counts.evicted.values())
 
     def count_unsettled(self, kind: Kind | None = None) -> int:

@@ -72,15 +72,15 @@ class ResendSchedule:
         return True
 
     def record_answer(self, stream: Stream) -> None:
-        """Record that an acknowledgement arrived for any batch of the stream's vehicle and
-        region.
+        """Record that an acknowledgement arrived for any batch of the vehicle and region of
+        `stream`.
         """
         pacer = self._pacers.get((stream.vehicle, stream.region))
         if pacer is not None:
             pacer.record_answer()
 
     def record_removal(self, batch: HeldBatch) -> None:
-        """Record that a batch was removed from the outbox."""
+        """Record that a batch (message with records) was removed from the outbox file."""
         if batch.due is not None:
             self._pacer_of(batch).record_settled()
 

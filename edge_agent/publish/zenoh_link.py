@@ -1,5 +1,5 @@
 """Zenoh session of one vehicle: it sends batches, receives acknowledgements, and declares the
-vehicle's liveliness token.
+vehicle's liveliness token (sign that it is connected).
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ class Endpoints:
     @contextmanager
     def declare_all(self, session: zenoh.Session) -> Iterator[None]:
         """Provide a context in which the service subscribes to reports, answers queries, and has a
-        liveliness token in Zenoh.
+        liveliness token in Zenoh (sign that it is connected).
         """
         regions = self._config.regions
         own = keys.shard_key(self._config.name)
@@ -73,8 +73,8 @@ class Endpoints:
                 queryable.undeclare()
 
     def _hand_over(self, query: zenoh.Query, session: zenoh.Session) -> None:
-        """Answer a hand-over request: shut the service down regularly, so that the named standby
-        takes over.
+        """Answer a hand-over request: shut the service down regularly, so that the named standby (a
+        waiting service) takes over.
         """
         self._engine.holding.to = (
             handover.answer_request(query, session, self._config.regions) or self._engine.holding.to

@@ -40,7 +40,7 @@ class Engine:
         config: settings.
         root: folder of the archive; it is locked while the engine is open.
         holding: ownership of the archive, which is closed with the engine; None to open the archive
-            now, without a lease.
+            now, without a lease (ownership limited in time).
 
     Raises:
         InputError: another service has the archive.

@@ -56,7 +56,8 @@ class Service:
         config: settings.
         root: folder of the archive.
         log_line: called with lines for the operator.
-        holding: ownership of the archive; None to open it without a lease.
+        holding: ownership of the archive; None to open it without a lease (ownership limited in
+            time).
 
     Raises:
         InputError: the archive belongs to another service.
@@ -163,9 +164,9 @@ class Service:
                 raise
 
     def _has_lost_archive(self, came: Callable[[], bool]) -> bool:
-        """Return True if another service has taken over the archive. The lease in the bucket shows
-        this. While the bucket does not answer, the Zenoh liveliness tokens of another service for
-        the same regions show it.
+        """Return True if another service has taken over the archive. The lease in the bucket, which
+        names the owner, shows this. While the bucket does not answer, the Zenoh liveliness tokens
+        of another service for the same regions show it.
         """
         holding = self.engine.holding
         if not holding.may_acknowledge and came():

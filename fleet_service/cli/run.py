@@ -108,7 +108,7 @@ def _open_archive(
     config: ServiceConfig, root: Path, stop: threading.Event, log_line: Callable[[str], None]
 ) -> Ownership | None:
     """Wait until the archive is available, and open it; return None if `stop` is set first. A
-    standby serves its metrics while it waits.
+    standby (waiting service) serves its metrics while it waits.
     """
     from fleet_service.app.metrics import standby_metrics
     from fleet_service.replication.ownership import acquire_archive

@@ -89,8 +89,9 @@ def road_beliefs(
     now: IntArray,
 ) -> FloatArray:
     """Return the belief about the road for each slot (cell and sector), (k, 32), at the times `now`
-    (k,) [ns]. `kernels` are distributions of the error that all reports share (see `shared`);
-    `table` is the hash table that finds slots by key.
+    (k,) [ns]. `kernels` (32, 32 each) map a belief about measured friction to one about the road,
+    because all reports share an error (see `shared`); `table` is the hash table that finds slots by
+    key.
     """
     out = np.empty((len(slots), _BINS))
     scratch = np.empty((3, SCRATCH))

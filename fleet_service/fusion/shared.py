@@ -183,8 +183,8 @@ def shape_class(slope: float) -> int:
 
 @refcount_free_inlined
 def kernel_of(cells: RecordArray, row: int) -> int:
-    """Return the index, in the table of kernels, of the kernel for the cell in row `row` of
-    `cells`.
+    """Return the index of the kernel for the cell in row `row` of `cells`, in the table of kernels.
+    A kernel (32, 32) maps a belief about measured friction to one about the road.
     """
     whole = 0.0
     squares = 0.0
@@ -267,7 +267,7 @@ def _moving_mean(before: int, new: float, part: float) -> np.uint8:
 @refcount_free
 def fade_weights(cells: RecordArray, row: int, begin: int, end: int) -> None:
     """Reduce two weights of a cell for the time from `begin` to `end` [ns]: the weights of the
-    manoeuvres, and the number of votes by untrusted vehicles.
+    manoeuvres, and the number of reports by untrusted vehicles.
     """
     borders = min(end // TENTH_NS - begin // TENTH_NS, len(_FADES) - 1)
     if borders > 0:

@@ -113,9 +113,9 @@ def _clear_padding(scratch: Bins) -> None:
 
 @refcount_free_inlined
 def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
-    """Compute how much of a vote is new information, given the vehicle's earlier reports in this
-    cell. Reports that are not yet final are stored one by one, older ones in one record per vehicle
-    and cell.
+    """Compute how much of a vote (effect of an observation on a cell) is new information, given the
+    vehicle's earlier reports in this cell. Reports that are not yet final are stored one by one,
+    older ones in one record per vehicle and cell.
 
     All times are rounded to whole seconds, so that the result is the same for both kinds of
     storage.
@@ -369,8 +369,9 @@ def _count_visit(cells: RecordArray, row: int, entries: RecordArray, entry: int)
 def _untrusted_weight(
     cells: RecordArray, row: int, kind: int, power: float, weight: float
 ) -> float:
-    """Return the weight of an untrusted vehicle's vote, reduced by earlier votes of other untrusted
-    vehicles in the cell. The k-th new vehicle counts 1/k², so all together count at most 1.6 votes.
+    """Return the weight of an untrusted vehicle's vote (effect of its observation on a cell),
+    reduced by earlier votes of other untrusted vehicles in the cell. The k-th new vehicle counts
+    1/k², so all together count at most 1.6 votes.
 
     Therefore an attacker gains nothing from many new names. Repeated votes of one vehicle are
     already discounted by `power` (share of new information). The weight of a trusted vehicle is

@@ -97,7 +97,9 @@ def _split_stream(
     rejected: tuple[tuple[int, int, str], ...],
     late: tuple[tuple[int, int], ...],
 ) -> Iterator[StreamAck]:
-    """Yield the acknowledgements of a stream in pieces of at most ITEMS_PER_STREAM items."""
+    """Yield the acknowledgements of a stream (batches of one vehicle, kind and region) in pieces of
+    at most ITEMS_PER_STREAM items.
+    """
     for at in range(0, max(len(durable), len(rejected), len(late)), ITEMS_PER_STREAM):
         some = slice(at, at + ITEMS_PER_STREAM)
         yield StreamAck(*stream, durable[some], rejected[some], late[some])

@@ -40,8 +40,8 @@ class Bucket:
         self._left: dict[int, tuple[float, float]] = {}
 
     def take(self, vehicle: int, wanted: int, now: float) -> int:
-        """Take up to `wanted` tokens from a vehicle's bucket at time `now` [s]; return the number
-        of tokens taken.
+        """Take up to `wanted` units of a vehicle's remaining allowance at time `now` [s]; return
+        the number of units taken.
         """
         left, since = self._left.get(vehicle, (self._at_once, now))
         left = min(self._at_once, left + max(now - since, 0.0) * self._rate)

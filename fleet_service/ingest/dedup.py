@@ -55,7 +55,9 @@ class SequenceTracker:
         self.seen: set[int] | frozenset[int] = _NONE
 
     def accepted(self, seq: int) -> bool:
-        """Return True if the stream's batch with this sequence number was accepted before."""
+        """Return True if the batch of this stream (vehicle, start, kind, region) with this sequence
+        number was accepted before.
+        """
         return seq <= self.low or seq in self.seen
 
     def accept(self, seq: int, time: int = 0) -> bool:
@@ -76,7 +78,9 @@ class SequenceTracker:
         return True
 
     def add(self, seqs: list[int]) -> None:
-        """Record sequence numbers of accepted batches of the stream, given in ascending order."""
+        """Record sequence numbers of accepted batches of this stream (vehicle, start, kind,
+        region), given in ascending order.
+        """
         if (
             seqs[0] == self.low + 1 and seqs[-1] - seqs[0] == len(seqs) - 1
         ):  # as most often: a run that goes on
@@ -192,8 +196,9 @@ class SequenceTrackers:
         return out
 
     def forget(self, before: int) -> None:
-        """Drop streams whose newest record is older than `before` [ns]. Duplicates of their batches
-        are still not accepted, because they are refused as too old.
+        """Drop streams (vehicle, start, kind, region) whose newest record is older than `before`
+        [ns]. Duplicates of their batches are still not accepted, because they are refused as too
+        old.
         """
         for key in [key for key, stream in self._streams.items() if stream.newest < before]:
             del self._streams[key]

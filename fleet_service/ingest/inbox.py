@@ -207,7 +207,7 @@ class BatchIntake:
         return self._witnesses.number_of(name)
 
     def sync(self) -> None:
-        """Make the identities of the vehicles of accepted batches durable.
+        """Write the numbers and pseudonyms of the vehicles of accepted batches durably to disk.
 
         Raises:
             OSError: the disk is full or broken.
@@ -457,8 +457,8 @@ def _select_batches(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, In
 def _with_identity(
     kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: IntArray, clock: Clock
 ) -> Rows:
-    """Return the rows with columns for the identity of their batches, as the archive stores
-    them.
+    """Return the rows with columns that identify their batches (vehicle, start, region, sequence
+    number), as the archive stores them.
     """
     numbers = np.array([stream.key[0] for stream, _ in batches], np.int64)
     identity = {

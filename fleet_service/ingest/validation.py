@@ -73,8 +73,8 @@ class Clock(NamedTuple):
 
     @property
     def horizon(self) -> int:
-        """Oldest time [ns] that a record may have to be accepted; streams without newer records are
-        dropped.
+        """Oldest time [ns] that a record may have to be accepted; streams (vehicle, start, kind,
+        region) without newer records are dropped.
         """
         return (self.now if self.least is None else min(self.least, self.now)) - self.oldest
 

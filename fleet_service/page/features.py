@@ -127,8 +127,8 @@ def collection_document(base: str, extent: Box | None) -> dict[str, Any]:
 
 
 def feature_schema(base: str) -> dict[str, Any]:
-    """Return the JSON Schema of a feature. GDAL needs it to know that `mu` is a number, even if the
-    first features have no `mu`.
+    """Return the JSON Schema of a feature (map cell with its properties). GDAL needs it to know
+    that `mu` is a number, even if the first features have no `mu`.
     """
     columns = {
         f.name: {**_TYPES[f.type], "description": f"{f.meaning} [{f.unit}]"} for f in COLUMNS
@@ -214,7 +214,7 @@ def api_definition(base: str) -> dict[str, Any]:
 def page_of(
     features: Iterable[dict[str, Any]], more: bool, address: str, following: str, stamp: str
 ) -> dict[str, Any]:
-    """Return features as one page of an answer (GeoJSON).
+    """Return features (map cells) as one page of an answer (GeoJSON).
 
     Args:
         features: features with their ids.
@@ -237,7 +237,9 @@ def page_of(
 
 
 def with_identity(features: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]]:
-    """Yield features with their id. Properties that repeat the geometry are left out."""
+    """Yield the features (GeoJSON objects, one per cell and heading) with an id added. Properties
+    that repeat the geometry are left out.
+    """
     names = {field.name for field in COLUMNS}
     for feature in features:
         properties = {name: value for name, value in feature["properties"].items() if name in names}

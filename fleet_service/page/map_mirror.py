@@ -46,7 +46,7 @@ class _Before(NamedTuple):
 
 
 class MapMirror:
-    """All received tiles and alerts; thread-safe."""
+    """Local copy of the live map: all received tiles and alerts; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

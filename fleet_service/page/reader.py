@@ -136,8 +136,8 @@ class Reader:
         self._fallen = {region: self._fallen.get(region, time.time()) for region in fallen}
 
     def names(self, kind: str) -> list[str]:
-        """Return the names that have a liveliness token of the given kind; empty if the access list
-        hides the tokens.
+        """Return the names that have a Zenoh liveliness token (sign of a connected process) of the
+        given kind; empty if the access list hides the tokens.
         """
         return sorted(self._names[kind])
 

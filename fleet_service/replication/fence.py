@@ -45,7 +45,9 @@ class Fence(NamedTuple):
     names: frozenset[str]
 
     def counts_object(self, name: str) -> bool:
-        """Return True if the object with this name is valid according to the fence."""
+        """Return True if the object with this name is valid according to the fence (list of the
+        former owners' objects that count).
+        """
         epoch = layout.term_of(name)
         return epoch is None or epoch >= self.epoch or name in self.names
 

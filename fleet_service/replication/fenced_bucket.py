@@ -29,14 +29,14 @@ class FencedBucket:
         self._turn = 0
 
     def attach_lease(self, may_write: Callable[[], bool], assert_alone: Callable[[], None]) -> None:
-        """From now on, write to the bucket only while this service has the lease; see the
-        attributes.
+        """From now on, write to the bucket only while this service has the lease (ownership of the
+        archive); see the attributes.
         """
         self.may_write = may_write
         self.assert_alone = assert_alone
 
     def require_lease(self) -> None:
-        """Check in the bucket that no later lease exists.
+        """Check in the bucket that no later lease (ownership of the archive) exists.
 
         Raises:
             CopyError: a later lease exists, or the check fails.

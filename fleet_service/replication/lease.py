@@ -109,12 +109,16 @@ class LeaseRecord(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return the name of the lease object in the bucket."""
+        """Return the name of the lease object (it states the owner of the archive) in the
+        bucket.
+        """
         return f"{FOLDER}/{self.number:010d}.json"
 
     @property
     def content(self) -> bytes:
-        """Return the JSON content that the lease object in the bucket gets."""
+        """Return the JSON content of the lease object (it states the owner of the archive) in the
+        bucket.
+        """
         return json.dumps(
             {name: value for name, value in self._asdict().items() if name != "number"}
         ).encode()
@@ -172,7 +176,9 @@ class Lease:
 
     @property
     def former_holders(self) -> tuple[str, ...]:
-        """Return the names of the services that had the lease earlier."""
+        """Return the names of the services that had the lease (ownership of the archive)
+        earlier.
+        """
         return () if self._mine is None else self._mine.before
 
     @property
@@ -210,7 +216,8 @@ class Lease:
         epoch: Callable[[], int],
         standby: Standby | None,
     ) -> bool:
-        """Wait until this service has the lease; return False if `stop` is set first.
+        """Wait until this service has the lease (ownership of the archive); return False if `stop`
+        is set first.
 
         Args:
             stop: event that ends the wait.
@@ -274,16 +281,16 @@ class Lease:
         return False
 
     def start_renewal(self) -> None:
-        """Start a thread that renews the lease while `serves` returns True. Otherwise the lease
-        expires, and another service takes over.
+        """Start a thread that renews the lease (ownership of the archive) while `serves` returns
+        True. Otherwise the lease expires, and another service takes over.
         """
         self._thread = threading.Thread(target=self._renew_until_stopped, name="lease", daemon=True)
         self._thread.start()
 
     def release(self, to: str = "") -> None:
-        """Release the lease if this service still has it. Then the service named `to` may take over
-        at once, or any service if `to` is empty. This service must not acknowledge anything
-        afterwards.
+        """Release the lease (ownership of the archive) if this service still has it. Then the
+        service named `to` may take over at once, or any service if `to` is empty. This service must
+        not acknowledge anything afterwards.
         """
         self._stop.set()
         if self._thread is not None:
@@ -299,9 +306,7 @@ class Lease:
                 log.warning("the lease was not released and expires by itself: %s", error)
 
     def make_new_lease(self) -> Lease:
-        """Return a new lease object with which the service can wait again after this lease was
-        lost.
-        """
+        """Return a new `Lease` with which the service can wait again after this lease was lost."""
         return Lease(self._holder, self._bucket, self.service, self._lease_s)
 
     def renew(self) -> None:
@@ -351,8 +356,8 @@ class Lease:
     def _create_next(
         self, found: LeaseRecord | None, known: Callable[[], int], stop: threading.Event
     ) -> bool:
-        """Create the lease object with the next number; return False if another service was
-        faster.
+        """Create the lease object with the next number in the bucket, by which this service takes
+        over; return False if another service was faster.
         """
         number = 1 if found is None else found.number + 1
         epoch = max(int(time.time()), known() + 1, 0 if found is None else found.epoch + 1)

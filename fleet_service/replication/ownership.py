@@ -61,8 +61,8 @@ class Ownership:
 
     @property
     def left_s(self) -> float:
-        """Return the time [s] for which the service may acknowledge without renewing the lease;
-        infinite without a lease.
+        """Return the time [s] for which the service may acknowledge without renewing its lease
+        (ownership of the archive's copy); infinite without a lease.
         """
         return math.inf if self.lease is None else self.lease.left_s
 
@@ -73,25 +73,27 @@ class Ownership:
 
     @property
     def all_holders(self) -> tuple[str, ...]:
-        """Return the names of this and all earlier holders of the lease; empty without a lease."""
+        """Return the names of this and all earlier holders of the lease (ownership of the archive);
+        empty without a lease.
+        """
         return () if self.lease is None else (*self.lease.former_holders, self.lease.service)
 
     def mark_lost(self) -> None:
         """Record that another service has taken over; the caller knows this from the other
-        service's liveliness tokens.
+        service's liveliness tokens (signs in Zenoh that it is alive).
         """
         if self.lease is not None:
             self.lease.lost = True
 
     def release(self) -> None:
-        """Release the lease of the archive's copy, if any; the service may acknowledge nothing
-        afterwards.
+        """Release the lease (ownership) of the archive's copy, if any; the service may acknowledge
+        nothing afterwards.
         """
         if self.lease is not None:
             self.lease.release(self.to if self.leaves else "")
 
     def close(self) -> None:
-        """Release the lease, and the file lock of the folder."""
+        """Release the lease (ownership of the bucket copy), and the file lock of the folder."""
         self.release()
         if self.copy is not None:
             self.copy.close()
@@ -99,7 +101,8 @@ class Ownership:
 
 
 def open_exclusive(config: ServiceConfig, root: Path) -> Ownership:
-    """Lock an archive that is used without a lease, and synchronise it with its copy, if any.
+    """Lock an archive that is used without a lease (ownership in a bucket), and synchronise it with
+    its copy, if any.
 
     Raises:
         InputError: another service has the archive, or its copy cannot be used.
@@ -126,8 +129,8 @@ def acquire_archive(
     say: Callable[[str], None],
     signs: Signs | None = None,
 ) -> Ownership | None:
-    """Lock an archive and wait for the lease of its copy, if it has a copy. Return None if `stop`
-    is set.
+    """Lock an archive and wait for the lease (ownership) of its copy, if it has a copy. Return None
+    if `stop` is set.
 
     Args:
         config: settings.
@@ -228,8 +231,9 @@ def _sync_folder(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> bool:
-    """Synchronise the folder with the copy. Return False if `stop` is set, or if another service
-    has the lease. A standby retries while the bucket cannot be reached.
+    """Synchronise the archive's folder with its copy in the bucket. Return False if `stop` is set,
+    or if another service has the lease (ownership). A standby service retries while the bucket
+    cannot be reached.
     """
     logged = ""
     while not stop.is_set():

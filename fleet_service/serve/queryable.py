@@ -98,8 +98,8 @@ class _Answered:
 
 
 class _TokenBucket:
-    """Token bucket that limits the total estimated cost of the queries that are answered at once,
-    per second.
+    """Token bucket (allowance that refills at a constant rate) that limits the total estimated cost
+    of the queries that are answered at once, per second.
     """
 
     def __init__(self) -> None:

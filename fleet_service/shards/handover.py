@@ -39,8 +39,8 @@ class HandoverResult(NamedTuple):
 
 
 def answer_request(query: zenoh.Query, session: zenoh.Session, served: Sequence[str]) -> str | None:
-    """Answer a hand-over request; return the name of the standby, or None if the hand-over is
-    impossible.
+    """Answer a hand-over request; return the name of the standby (the waiting service that takes
+    over), or None if the hand-over is impossible.
 
     Args:
         query: request as sent by `hand_over`.
@@ -69,8 +69,8 @@ def answer_request(query: zenoh.Query, session: zenoh.Session, served: Sequence[
 def hand_over(
     session: zenoh.Session, region: str, to: str, say: Callable[[str], None]
 ) -> HandoverResult | None:
-    """Ask the service of a region to hand over to a standby, and wait. Return the result, or None
-    if the standby already serves the region.
+    """Ask the service of a region to hand over to a standby (a waiting service), and wait. Return
+    the result, or None if the standby already serves the region.
 
     Args:
         session: Zenoh session of a client with a service certificate.

@@ -86,8 +86,8 @@ def watch_successors(
 def rival_tokens(
     mine: frozenset[ServiceToken], there: set[ServiceToken], former: Collection[str] = ()
 ) -> list[ServiceToken]:
-    """Return, sorted, the tokens by which other services announce regions that overlap the regions
-    of `mine`. Tokens of the `former` services are excluded.
+    """Return, sorted, the liveliness tokens by which other services announce regions that overlap
+    the regions of `mine`. Tokens of the `former` services are excluded.
     """
     others = (one for one in there - mine if one.service not in former)
     return sorted(one for one in others if any(overlap(one.region, own.region) for own in mine))
@@ -136,10 +136,10 @@ def _declare_tokens(
 def standby_signs(
     config: ServiceConfig, stop: threading.Event, alive: Callable[[], None] = lambda: None
 ) -> Iterator[tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]] | None]:
-    """Yield three functions that a standby needs while it waits for the lease. The first returns
-    True if a router is reachable, the second if the service of a given name is present. The third
-    is `alive`, which the standby calls at each check. Yield None if the service is no standby, or
-    was stopped before it reached a router.
+    """Yield three functions that a standby (waiting service) needs while it waits for the lease
+    (ownership of the archive). The first returns True if a router is reachable, the second if the
+    service of a given name is present. The third is `alive`, which the standby calls at each check.
+    Yield None if the service is no standby, or was stopped before it reached a router.
     """
     session = (
         zenoh_session.open_session(config.zenoh, stop, config.name) if config.standby else None

@@ -19,8 +19,8 @@ _ALL: Final = f"{SERVES}/**"
 
 
 def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToken]:
-    """Return the liveliness tokens of services that are active now and visible to this session.
-    Another `root` selects other kinds of tokens.
+    """Return the Zenoh liveliness tokens (signs that a process is alive) of services that are
+    active now and visible to this session. Another `root` selects other kinds of tokens.
     """
     found = set[ServiceToken]()
     for reply in session.liveliness().get(f"{root}/**", timeout=ANSWER_S):
@@ -31,8 +31,8 @@ def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToke
 
 
 class PresenceTracker:
-    """Set of the liveliness tokens of services that are active now, updated as tokens come and
-    go.
+    """Set of the Zenoh liveliness tokens (signs that a process is alive) of services that are
+    active now, updated as tokens come and go.
     """
 
     def __init__(self) -> None:
@@ -43,24 +43,31 @@ class PresenceTracker:
 
     @property
     def active(self) -> set[ServiceToken]:
-        """Return the liveliness tokens of services that are active now."""
+        """Return the liveliness tokens (signs that a process is alive) of services that are active
+        now.
+        """
         with self._guard:
             return set(self._here)
 
     @property
     def lost_tokens(self) -> set[ServiceToken]:
-        """Return the services' tokens that were active earlier and are no longer active."""
+        """Return the services' liveliness tokens (signs that a process is alive) that were active
+        earlier and are no longer active.
+        """
         with self._guard:
             return set(self._withdrawn)
 
     @property
     def ever_lost(self) -> set[ServiceToken]:
-        """Return all services' tokens that were ever lost; some may be active again."""
+        """Return all services' liveliness tokens (signs that a process is alive) that were ever
+        lost; some may be active again.
+        """
         with self._guard:
             return set(self._fell)
 
     def refresh(self, session: zenoh.Session) -> set[ServiceToken]:
-        """Query the active tokens, and return them together with the tracked ones.
+        """Query the active liveliness tokens (signs that a service is alive), and return them
+        together with the tracked ones.
 
         A router's answer may lack a token that the router is just sending to the same session's
         subscription (1 of 60 answers). The subscription then delivers the token before the answer
@@ -79,8 +86,8 @@ class PresenceTracker:
 
 @contextmanager
 def track_tokens(session: zenoh.Session) -> Iterator[PresenceTracker]:
-    """Yield a tracker of the service tokens. It contains the tokens that are active now, and
-    follows changes until the block ends.
+    """Yield a tracker of the services' liveliness tokens (signs that a service is alive). It
+    contains the tokens that are active now, and follows changes until the block ends.
     """
     tokens = PresenceTracker()
 

@@ -33,7 +33,7 @@ R_co = TypeVar("R_co", covariant=True)
 
 
 class EmptyRecord:
-    """Record for kernels that need no data of this kind; its only field is not used."""
+    """Record for compiled functions that need no data of this kind; its only field is not used."""
 
     unused: bool
 

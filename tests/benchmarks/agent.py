@@ -183,7 +183,7 @@ def measure_fleet(folder: Path, endpoint: str) -> list[Figure]:
 
 def measure_replay(folder: Path) -> list[Figure]:
     """Measure the throughput of a replay of many logs with two jobs, Parquet included, divided by
-    twice the throughput of the kernel on one core.
+    twice the throughput of the compiled estimator on one core.
     """
     logs = [simulate_drive(folder, f"log-{seed:02d}", seed, LOG_S) for seed in range(LOGS)]
     log = read_log(logs[0][0])

@@ -36,7 +36,7 @@ VECTORS = ("-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd", "-lmvec")
 
 @cache
 def compile_library(source: str, *options: str) -> ctypes.CDLL:
-    """Compile a kernel with gcc -O3 -march=native and `options`, and load it.
+    """Compile a C file with gcc -O3 -march=native and `options`, and load it.
 
     Raises:
         OSError, subprocess.CalledProcessError: gcc is missing or fails.

@@ -320,8 +320,8 @@ class Cluster:
                 return
 
     def fetch_page(self, pod: Pod, path: str) -> str:
-        """Return a page of a pod's metrics server. The text is empty while a standby takes over,
-        because it then replaces its own server by that of the service.
+        """Return a page of a pod's metrics server. The text is empty while a standby (waiting
+        service) takes over, because it then replaces its own server by that of the service.
         """
         (container,) = pod.containers
         address = f"http://127.0.0.1:{pod.port_of(container, 'metrics')}{path}"

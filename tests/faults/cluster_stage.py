@@ -302,8 +302,8 @@ class Machines:
         )
 
     def fail_over(self, name: str) -> Failover | None:
-        """Let the active service fail, and return the result. Return None if no standby had to take
-        over.
+        """Let the active service fail, and return the result. Return None if no standby (waiting
+        service) had to take over.
         """
         gone = self.serving
         way = WAYS[name]
@@ -340,8 +340,8 @@ class Machines:
         )
 
     def hand_over(self, router: ZenohSettings) -> Host:
-        """Hand the region over to the standby, wait until the old service has ended, and return the
-        standby.
+        """Hand the region over to the standby (a waiting service), wait until the old service has
+        ended, and return the standby.
         """
         former = self.serving
         to = self.waiting[0].root.parent.name
@@ -353,8 +353,8 @@ class Machines:
         return former
 
     def pause_s(self, router: ZenohSettings) -> float:
-        """Hand the region over to the standby under load, and return the longest time [s] without
-        any acknowledgement.
+        """Hand the region over to the standby (a waiting service) under load, and return the
+        longest time [s] without any acknowledgement.
         """
         began = self._journals.first_after(time.time())
         self.hand_over(router)

@@ -40,8 +40,8 @@ class Lives(ABC, Generic[BatchType]):
         self.at_stake = 0
 
     def find_violations(self) -> list[str]:
-        """Run the history, and return a message for each broken promise, such as a lost
-        acknowledged row.
+        """Run the simulated sequence of lives of an archive, and return a message for each broken
+        promise, such as a lost acknowledged row.
         """
         live = self.folder / "life-0"
         live.mkdir()

@@ -86,7 +86,7 @@ def rows_of(batches: list[Batch]) -> Rows:
 
 
 class History(Lives[Batch]):
-    """History of an archive's log on a disk with power loss."""
+    """Simulated history (sequence of operations and power losses) of an archive's log."""
 
     lives = 3
     operations = 80
@@ -171,13 +171,15 @@ class History(Lives[Batch]):
 
 
 def run_log_history(number: int) -> list[str]:
-    """Return the violations (broken promises) found in one history of the log."""
+    """Return the violations (broken promises) found in one simulated history of the log (sequence
+    of operations and power losses).
+    """
     return _run_log(number)[0]
 
 
 def _run_log(number: int) -> tuple[list[str], int]:
-    """Return the violations of one history of the log, and the number of batches acknowledged
-    before a power loss.
+    """Return the violations (broken promises) in one simulated history of the log, and the number
+    of batches acknowledged before a power loss.
     """
     folder = Path(tempfile.mkdtemp(prefix="crash-", dir=_find_memory_folder()))
     one = History(number, folder)
@@ -188,15 +190,15 @@ def _run_log(number: int) -> tuple[list[str], int]:
 
 
 def _run_outbox(number: int) -> tuple[list[str], int]:
-    """Return the violations found in one history of the outbox, and 0 for the number of
-    acknowledged batches, which an outbox does not have.
+    """Return the violations (broken promises) found in one simulated history of the outbox, and 0
+    for the number of acknowledged batches, which an outbox does not have.
     """
     return spool_history(number), 0
 
 
 def _run_service(number: int) -> tuple[list[str], int]:
-    """Return the violations found in one history of a whole service, and the number of batches
-    acknowledged before a power loss.
+    """Return the violations (broken promises) found in one simulated history of a whole service,
+    and the number of batches acknowledged before a power loss.
     """
     with tempfile.TemporaryDirectory(prefix="crash-", dir=_find_memory_folder()) as folder:
         one = ServiceHistory(number, Path(folder))
@@ -211,8 +213,8 @@ def _find_memory_folder() -> str | None:
 
 
 def run(site: Site) -> list[Figure]:
-    """Run 5 000 histories of the log, 500 of the outbox and 600 of a service (in a quick run, 120
-    in total), and return the figures.
+    """Run 5 000 simulated histories of the log, 500 of the outbox and 600 of a service (in a quick
+    run, 120 in total), and return the figures.
     """
     logs = site.choose_amount(5000, 100)
     outboxes = site.choose_amount(500, 10)

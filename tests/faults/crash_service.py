@@ -77,7 +77,7 @@ class Sent(NamedTuple):
 
 
 class ServiceHistory(Lives[Sent]):
-    """History of a service on a disk with power loss.
+    """Simulated history of a service (operations and power losses) on one disk.
 
     Attributes:
         done: operations that were completed before a power loss.

@@ -43,7 +43,9 @@ def _return_payload(payload: bytes, sequence: int, first: int) -> bytes:
 
 
 def spool_history(number: int) -> list[str]:
-    """Return the violations (broken promises) found in one history of the outbox."""
+    """Return the violations (broken promises) found in one simulated history of an agent's outbox
+    (batches stored on disk).
+    """
     random_ = random.Random(number)
     folder = Path(tempfile.mkdtemp(prefix="spool-"))
     try:

@@ -1,5 +1,5 @@
-"""Campaign of simulated lease histories with different lease times, skewed clocks, pauses,
-partitions and kills; see `lease_histories`.
+"""Campaign of simulated histories of the lease (a service's exclusive ownership of an archive) with
+different lease times, skewed clocks, pauses, partitions and kills; see `lease_histories`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ class Judged(NamedTuple):
 
 
 def judge_seeds(seeds: Iterable[int]) -> Judged:
-    """Simulate and judge one history per seed, and return the sums."""
+    """Simulate services that compete for a lease, once per seed; check each run, and return the
+    sums of the results.
+    """
     counts = [0] * len(Judged._fields)
     for seed in seeds:
         history = ServiceHistory(seed)
@@ -48,7 +50,9 @@ def judge_seeds(seeds: Iterable[int]) -> Judged:
 
 
 def judge_without_comparison(seeds: Iterable[int]) -> Judged:
-    """Judge histories of a broken protocol: services do not compare their lease times."""
+    """Check simulated histories of a broken lease protocol: services do not compare their lease
+    times.
+    """
     with patch.object(lease_module, "_check_settings", lambda *_: None):
         return judge_seeds(seeds)
 
@@ -63,8 +67,8 @@ def judge_without_expiry(seeds: Iterable[int]) -> Judged:
 
 
 def run(site: Site) -> list[Figure]:
-    """Judge histories of the real lease protocol, and of two broken protocols in which violations
-    must be found; return the figures.
+    """Check simulated histories of the real lease protocol, and of two broken protocols in which
+    violations must be found; return the figures.
     """
     first = 1000 * site.seed
     judged = judge_seeds(range(first, first + site.choose_amount(200, 12)))

@@ -329,7 +329,7 @@ class ServiceHistory:
         return process is not None and self._world.now >= process.token_until
 
     def _serve_once(self, process: _Process) -> None:
-        """Wait for the lease, and serve until it is lost or released."""
+        """Wait for the lease (ownership of the archive), and serve until it is lost or released."""
         name = process.name
         lease = Lease(name, cast(ObjectBucket, self._bucket), name, process.lease_s)
         stop = VirtualStop(self._world)
@@ -394,7 +394,7 @@ class ServiceHistory:
 
     def _find_counted(self, names: Iterable[str]) -> list[str]:
         """Return the names of the objects that count: those of the newest owner or of a later one,
-        and those in the newest owner's fence.
+        and those in the newest owner's fence (list of valid older objects).
         """
         newest = max(self._fences, default=0)
         before = self._fences.get(newest, frozenset())

@@ -11,8 +11,8 @@ from tests.faults.protocol_model import BROKEN, Rules, explore_states
 
 
 def run(site: Site) -> list[Figure]:
-    """Check all states of the model with equal and different lease times, and that the model finds
-    each broken protocol; return the figures.
+    """Check all states of the model of acknowledgement and takeover with equal and different lease
+    times, and that the model finds each broken protocol; return the figures.
     """
     checked = [
         explore_states(Rules(), most_turn=site.choose_amount(2, 1)),

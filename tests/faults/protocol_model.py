@@ -36,8 +36,8 @@ NOT_YET: Final = -1
 
 
 class Rules(NamedTuple):
-    """Rules of the modelled protocol that are switched on, and the lease times [ticks] of both
-    services.
+    """Rules of the modelled takeover protocol that are switched on, and the lease times [ticks] of
+    both services.
     """
 
     lease: tuple[int, int] = (4, 4)

@@ -87,8 +87,8 @@ def longest_silence(command: list[str], cache: Path, ready: bytes | None = None)
 
 
 def silent_seconds(folder: Path, archive: Path) -> dict[str, float]:
-    """Return for each command the longest time [s] without output, with an empty cache
-    of kernels.
+    """Return for each command the longest time [s] without output, with an empty cache of compiled
+    functions.
     """
     found = {}
     for command in COMMANDS:

@@ -68,7 +68,8 @@ def write_quality(
     output: FloatArray, utilised: float, nis: float, adaptation: float, log_likelihood: float
 ) -> None:
     """Write four quality figures to `output`: grip in use `utilised`, normalised squared innovation
-    `nis`, largest factor on the measurement noise R, and log-likelihood.
+    (measurement minus prediction) `nis`, largest factor on the measurement noise R, and
+    log-likelihood.
     """
     output[Column.MU_UTILISED], output[Column.INNOVATION_NIS] = utilised, nis
     output[Column.ADAPTATION], output[Column.INNOVATION_LOG_LIKELIHOOD] = adaptation, log_likelihood

@@ -103,7 +103,7 @@ def new_filters(
     """Return an array of records of type `kind`, one per vehicle, with the vehicle's parameters in
     `row`.
 
-    All other fields are zero, by which the compiled kernel recognises that no sample has been
+    All other fields are zero, by which the compiled function recognises that no sample has been
     processed.
     """
     filters = records(kind, len(vehicles))

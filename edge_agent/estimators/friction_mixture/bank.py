@@ -1,5 +1,5 @@
-"""Friction mixture (grid of friction hypotheses): compiled kernel for many vehicles, and output of
-the estimates.
+"""Friction mixture (grid of friction hypotheses): compiled function for many vehicles, and output
+of the estimates.
 """
 
 from __future__ import annotations

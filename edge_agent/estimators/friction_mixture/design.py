@@ -1,5 +1,5 @@
-"""Tables of the default estimator, computed once from its constants for the compiled kernels; they
-do not change while driving.
+"""Tables of the default estimator, computed once from its constants for the compiled functions;
+they do not change while driving.
 """
 
 from __future__ import annotations

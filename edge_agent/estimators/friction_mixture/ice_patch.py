@@ -24,7 +24,7 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def grow_patches(memory: MixtureMemory, design: MixtureDesign, metres: float) -> None:
-    """Increase the probabilities that the car is on an ice patch, for `metres` driven."""
+    """Increase the probabilities that the car is on a short ice patch, for `metres` driven."""
     share = 1.0 - math.exp(-metres / design.constants.patch_length)
     for j in range(PATCH_NODES):
         memory.patch[j] += share * (max(design.prior[j] - memory.weight[j], 0.0) - memory.patch[j])

@@ -70,8 +70,8 @@ class MotionSetting(NamedTuple):
 
 
 class FederatedMotion:
-    """Setting, master state, information shares and latest innovations of the motion filter of one
-    vehicle.
+    """Setting, master state, information shares and latest innovations (measurement minus
+    prediction) of the motion filter of one vehicle.
     """
 
     process: Annotated[FloatArray, STATES]  # standard deviations per STEP_S
@@ -245,7 +245,7 @@ def mean_wheel_velocity(row: FloatArray, track: InputTrack, x: FloatArray, yaw_r
 @compiled
 def widened_speed_std(std: float, innovation: float) -> float:
     """Return the standard deviation [m/s] of the measured wheel speed, increased for a large
-    innovation.
+    innovation (measurement minus prediction).
 
     The innovation is then at most FARTHEST standard deviations, so spinning or locked wheels have
     little effect.

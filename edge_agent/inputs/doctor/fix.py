@@ -1,4 +1,6 @@
-"""Conversion of findings to corrections of the profile and of the vehicle file."""
+"""Corrections of the signal doctor's findings (faults) in the profile (signal names and units) and
+in the vehicle file.
+"""
 
 from __future__ import annotations
 
@@ -54,8 +56,8 @@ def list_corrections(diagnosis: Diagnosis) -> list[Finding]:
 def apply_findings(
     findings: Sequence[Finding], profile: Profile, vehicle: Vehicle
 ) -> tuple[Profile, Vehicle, list[Finding]]:
-    """Return profile and vehicle file corrected by the findings, and those findings that cannot be
-    corrected in a profile or vehicle file.
+    """Return the profile (signal names and units) and the vehicle file, corrected by the findings
+    (faults), and those findings that cannot be corrected in a profile or vehicle file.
     """
     channels = dict(profile.channels)
     left = list[Finding]()

@@ -1,5 +1,5 @@
-"""Tests that distinguish a sliding wheel from a faulty sensor: evidence of slip, and evidence of
-constant errors.
+"""Tests that distinguish a sliding wheel from a faulty sensor: signs of slip, and signs of constant
+errors.
 """
 
 from __future__ import annotations

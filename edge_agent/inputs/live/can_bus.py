@@ -1,5 +1,5 @@
-"""Live source for a CAN bus, by python-can; the interface filters for the identifiers that the
-profile needs.
+"""Live source for a CAN bus, by python-can; the interface filters for the identifiers of the needed
+messages.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ OWN: Final = "gripmap"
 class Decoder:
     """Decoder of CAN frames to signals, by a CAN database.
 
-    Messages that the profile assigns to another bus are left out.
+    Messages that the profile (assignment of signals to channels) assigns to another bus are left
+    out.
     """
 
     def __init__(self, profile: Profile, database: Database, bus: int | None = None) -> None:
@@ -58,7 +59,7 @@ class CanFeed(Feed):
     Args:
         name: name of the source.
         clock: clock of the host.
-        decoder: decodes the frames that the profile needs.
+        decoder: decodes the frames with the needed signals.
         options: options of `can.Bus`: interface, channel and further options of the interface.
 
     Raises:
@@ -93,5 +94,5 @@ class CanFeed(Feed):
                 self.hear(round(message.timestamp * NS), frame)
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the signals that the profile needs, by name, from the received frames."""
+        """Return the needed signals by name, decoded from the received CAN frames."""
         return self._decoder.series(heard)

@@ -58,7 +58,7 @@ class Ros2Feed(Feed):
         clock: clock of the host.
         settings: Zenoh settings to reach the router.
         domain: ROS_DOMAIN_ID.
-        signals: signals that the profile needs; each name begins with its topic.
+        signals: needed signals; each name begins with its topic.
         decoder: decoder for topics of CAN frames, if there is a CAN database.
         buses: topics of CAN frames.
         types: folder of PACKAGE/NAME.msg files, for message types that no ROS distribution has.

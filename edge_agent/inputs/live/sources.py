@@ -46,7 +46,8 @@ def is_live(source: str) -> bool:
 def open_sources(
     sources: Sequence[str], profile_name: str | None, dbc: Path | None = None
 ) -> tuple[list[Feed], Profile, HostClock]:
-    """Create the live sources; return them with their profile and their common clock.
+    """Create the live sources; return them with their profile (assignment of signals to channels)
+    and their common clock.
 
     Args:
         sources: sources in the notation of the command line.

@@ -90,7 +90,7 @@ class DetectionTally:
         self.add(name, np.array([holds]))
 
     def merge(self, other: DetectionTally) -> None:
-        """Add the sums and detection times of another tally to this one."""
+        """Add the sums and detection times of another tally (sums over towns) to this one."""
         for name, value in other.total.items():
             self.total[name] = self.total.get(name, 0.0) + value
             self.count[name] = self.count.get(name, 0) + other.count[name]
@@ -98,8 +98,8 @@ class DetectionTally:
             self.seconds.setdefault(name, []).extend(times)
 
     def mean(self, name: str) -> float:
-        """Return the mean of those values of the tally that have the name `name`; NaN without
-        values.
+        """Return the mean of those values of the detection evaluation that have the name `name`;
+        NaN without values.
         """
         return self.total[name] / self.count[name] if self.count.get(name) else float("nan")
 
@@ -112,8 +112,9 @@ class DetectionTally:
         )
 
     def quantile(self, name: str, share: float) -> float:
-        """Return the quantile `share` of the times [s] with the name `name`; NaN if there are no
-        times."""
+        """Return the quantile `share` of the detection times [s] with the name `name`; NaN if there
+        are no times.
+        """
         return (
             float(np.quantile(self.seconds[name], share))
             if self.seconds.get(name)
@@ -255,8 +256,8 @@ def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
 
 
 def _add_seconds(tally: DetectionTally, key: str, activity: str, wait: float) -> None:
-    """Add a time until detection [s] to the tally's list for all slides, and to its list for slides
-    with this cause (`activity`).
+    """Add a time until detection [s] to the evaluation's list for all slides, and to its list for
+    slides with this cause (`activity`).
     """
     tally.seconds.setdefault(key, []).append(wait)
     tally.seconds.setdefault(f"{key}.{activity}", []).append(wait)
@@ -392,8 +393,8 @@ class DetectionResults:
     def pool_towns(
         self, lengths: Sequence[str], kind: str, *, winter: bool | None = None
     ) -> DetectionTally:
-        """Return the pooled tally of all towns of one kind. If `winter` is True or False, only
-        winter towns or only other towns are included.
+        """Return the pooled tally (sums and counts) of all towns of one kind. If `winter` is True
+        or False, only winter towns or only other towns are included.
         """
         found = DetectionTally()
         for length in lengths:

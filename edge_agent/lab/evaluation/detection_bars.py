@@ -46,8 +46,8 @@ def mean_of(name: str) -> Callable[[DetectionTally], float]:
 
 
 def seconds_of(name: str, share: float) -> Callable[[DetectionTally], float]:
-    """Return a function that reads from a tally the quantile `share` of the detection times [s]
-    with the name `name`.
+    """Return a function that reads from a tally (values of the evaluation) the quantile `share` of
+    the detection times [s] that are stored under `name`.
     """
     return lambda tally: tally.quantile(name, share)
 

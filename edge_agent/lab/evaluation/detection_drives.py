@@ -214,7 +214,7 @@ def _samples_of(
 
 def _bytes_of(column: NDArray[np.generic]) -> NDArray[np.uint8]:
     """Return the encoded likelihoods of V visits (passages of a map cell), (V, 32) bytes; flat
-    likelihoods if the estimator has no evidence.
+    likelihoods if the estimator computes no likelihood of friction.
     """
     found = np.asarray(column, dtype=np.uint8)
     return found if found.shape[1] else np.zeros((len(found), mugrid.BINS), np.uint8)

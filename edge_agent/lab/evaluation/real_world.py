@@ -163,7 +163,7 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
 
 
 def tally_town(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) -> None:
-    """Add an estimator's results in one town to its tally."""
+    """Add an estimator's results in one town to its tally (sums and counts)."""
     mu = batch.mu
     inside = is_covered(batch, reported)
     width = reported.mu_upper - reported.mu_lower

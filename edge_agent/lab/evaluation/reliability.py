@@ -43,7 +43,7 @@ def estimate_with_ranks(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates
 
 def join_estimates(parts: list[Estimates]) -> Estimates:
     """Return the estimates of successive parts of one drive, joined into one object, without the
-    evidence on friction.
+    evidence (likelihoods of friction).
     """
     return Estimates(np.concatenate([part.values for part in parts]))
 

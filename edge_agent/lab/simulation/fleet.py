@@ -1,5 +1,5 @@
-"""Simulation of a fleet of vehicles that drive endlessly on a road network, in one
-compiled kernel.
+"""Simulation of a fleet of vehicles that drive endlessly on a road network, in one compiled
+function.
 """
 
 from __future__ import annotations

@@ -144,12 +144,14 @@ LEVEL: Final = Relief()
 
 
 def level_relief(_seed: int) -> Relief:
-    """Return a relief without slope or crossfall."""
+    """Return a relief (slopes of the road surface) without slope or crossfall."""
     return LEVEL
 
 
 def rolling_relief(seed: int) -> Relief:
-    """Return a relief of waves along the road, 300 and 120 m long, with slopes of 3 %."""
+    """Return a relief (slopes of the road surface) of waves along the road, 300 and 120 m long,
+    with slopes of 3 %.
+    """
     key = key_of(seed, RELIEF_STREAM)
     return Relief(
         tuple(
@@ -159,8 +161,8 @@ def rolling_relief(seed: int) -> Relief:
 
 
 def stepped_relief(seed: int) -> Relief:
-    """Return a relief of slopes of alternately +4 % and -4 %, 60 m long each, with kinks between
-    them.
+    """Return a relief (slopes of the road surface) of slopes of alternately +4 % and -4 %, 60 m
+    long each, with kinks between them.
     """
     return Relief(
         (Wave(0.04, 120.0, 0.0, _random_turn(key_of(seed, RELIEF_STREAM), 0), stepped=True),)
@@ -168,7 +170,9 @@ def stepped_relief(seed: int) -> Relief:
 
 
 def banked_relief(_seed: int) -> Relief:
-    """Return a relief with a crossfall of 4 % and no longitudinal slope."""
+    """Return a relief (slopes of the road surface) with a crossfall of 4 % and no longitudinal
+    slope.
+    """
     return Relief(crossfall=0.04)
 
 
@@ -197,7 +201,8 @@ ROADS: Final[dict[str, Callable[[int], Relief]]] = {
 
 
 def road_named(name: str | Relief, seed: int, slope: float = 0.0) -> Relief:
-    """Return the relief with that name, with a constant `slope` [1] along the track added.
+    """Return the relief (slopes of the road surface) with that name, with a constant `slope` [1]
+    along the track added.
 
     Raises:
         InputError: there is no relief with that name, or the slope is too steep.

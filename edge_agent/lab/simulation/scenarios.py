@@ -73,7 +73,9 @@ class Scenario:
 
     @property
     def events(self) -> tuple[Patch, ...]:
-        """Return the patches that appear during the drive, sorted by start time."""
+        """Return the patches of road surface (ice, snow) that appear during the drive, sorted by
+        start time.
+        """
         return tuple(
             sorted((p for p in self.patches if math.isfinite(p.start)), key=lambda p: p.start)
         )
@@ -272,8 +274,8 @@ def winter(seed: int) -> Scenario:
 
 
 def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[float]) -> list[Patch]:
-    """Return the patches of one kind on the points of a lane. `numbers` are three random numbers in
-    [0, 1) that determine position, length and friction.
+    """Return the patches of other road surface (ice, snow) of one kind on the points of a lane.
+    `numbers` are three random numbers in [0, 1) that determine position, length and friction.
     """
     place, size, grip = numbers
     ice = 0.10 + 0.095 * grip
@@ -325,7 +327,9 @@ def _lay_patch(
 
 
 def tiny() -> Scenario:
-    """Return a triangle of three streets for tests: half of it snow, an ice patch at 5 s."""
+    """Return a triangle of three streets for tests: half of its road is snow, and an ice patch
+    appears after 5 s.
+    """
     return Scenario(
         name="test",
         about="a triangle of 300 m, half of it snow; ice appears at 5 s",

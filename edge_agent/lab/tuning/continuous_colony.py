@@ -54,8 +54,9 @@ class ArchiveHabits:
 
 
 class SearchTally:
-    """Record of a search over continuous variables: number of evaluations, best vector, and history
-    of the objective."""
+    """Record of a search over continuous variables: number of evaluations, best vector, and the
+    objective's values over the iterations.
+    """
 
     def __init__(self, problem: Problem) -> None:
         """Create the record of a search before the first evaluation.
@@ -107,7 +108,7 @@ class SearchTally:
         )
 
     def record(self, values: list[float], progress: Progress | None) -> None:
-        """Append the objective `values` of an iteration to the history, and report the iteration to
+        """Append the objective `values` of an iteration to the record, and report the iteration to
         `progress`.
         """
         finite = [value for value in values if np.isfinite(value)]
@@ -117,7 +118,7 @@ class SearchTally:
             progress(self.history[-1])
 
     def result(self) -> Result:
-        """Return the best vector, its value and the history.
+        """Return the best vector, its value, and the objective's values over the iterations.
 
         Raises:
             InputError: nothing was evaluated.

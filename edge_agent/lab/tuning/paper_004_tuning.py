@@ -71,7 +71,7 @@ def record_levels(
 
 def likelihood(sets: Sets, drive: LevelDrive) -> float:
     """Run paper 004's filter with the given fuzzy sets on a drive; return the mean log-likelihood
-    of its innovations [nat per sample].
+    of its innovations (measurement minus prediction) [nat per sample].
     """
     reported = _run_filter(sets, drive)
     value = np.nan_to_num(
@@ -82,7 +82,8 @@ def likelihood(sets: Sets, drive: LevelDrive) -> float:
 
 def mismatch(sets: Sets, drive: LevelDrive) -> float:
     """Run paper 004's filter with the given fuzzy sets on a drive; return the tuning objective of
-    the paper's equation (33), with the absolute mismatch |e| of the innovation variance.
+    the paper's equation (33), with the absolute mismatch |e| of the variance of the innovations
+    (measurement minus prediction).
     """
     batch = drive.batch
     filters = make_bank(batch.vehicles, sets, drive.setting)

@@ -61,7 +61,9 @@ class Problem:
 
 @dataclass(frozen=True)
 class Result:
-    """The best vector (V,) of a search, its value, and the history of the search."""
+    """The best vector (V,) of a search, its value, and the objective's values over the
+    iterations.
+    """
 
     best: FloatArray
     value: float
@@ -153,7 +155,7 @@ class Ledger:
         return self.values[key]
 
     def record(self, values: Sequence[float], progress: Progress | None) -> None:
-        """Append the objective `values` of an iteration to the history, and report the iteration to
+        """Append the objective `values` of an iteration to the record, and report the iteration to
         `progress`.
         """
         finite = [value for value in values if np.isfinite(value)]

@@ -188,8 +188,8 @@ def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[flo
 
 
 def overall(memberships: Memberships, drives: StudySet) -> float:
-    """Return the objective of the search: the mean log-likelihood of the innovations over all
-    conditions of R [nat/s].
+    """Return the objective of the search: the mean log-likelihood of the innovations (measurement
+    minus prediction) over all conditions of R [nat/s].
     """
     return float(
         np.mean([scores_of(memberships, drives, name).log_likelihood for name in CONDITIONS])

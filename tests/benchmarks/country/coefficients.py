@@ -78,7 +78,7 @@ def _make_stream(kind: str) -> list[Message]:
 
 
 def main(kind: str) -> None:
-    """Ingest a stream of the given kind, and print the memory that it added [bytes]."""
+    """Ingest simulated messages of the given kind, and print the memory that it added [bytes]."""
     sent = _make_stream(kind)
     with (
         tempfile.TemporaryDirectory() as folder,

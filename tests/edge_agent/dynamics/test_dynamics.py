@@ -1,4 +1,4 @@
-"""Tests of identities that the vehicle equations must satisfy."""
+"""Tests that the vehicle equations satisfy laws of physics and mathematical identities."""
 
 from __future__ import annotations
 

@@ -269,7 +269,7 @@ def figures(place: str, name: str | None, times: float) -> dict[str, float]:
 
 def summarize_reports(estimates: Estimates) -> dict[str, float]:
     """Return the means of the estimator's outputs over one drive, by name: interval of friction,
-    standard deviations, innovation statistics.
+    standard deviations, statistics of measurement minus prediction.
     """
     mean = {
         "width": estimates.mu_upper - estimates.mu_lower,

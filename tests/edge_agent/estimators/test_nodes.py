@@ -1,5 +1,5 @@
 """Tests of mathematical identities of the friction mixture (grid of friction hypotheses): prior,
-road change, quantiles, evidence.
+road change, quantiles, likelihoods.
 """
 
 from __future__ import annotations

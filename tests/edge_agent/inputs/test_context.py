@@ -155,8 +155,8 @@ def test_a_bus_fills_the_context_that_its_profile_reads(
 
 
 def plain_profile(names: dict[str, str]) -> Profile:
-    """Return a profile that reads context channels, and one wheel, from signals with
-    these names.
+    """Return a profile (assignment of signals to channels) that reads context channels, and one
+    wheel, from signals with these names.
     """
     return Profile(
         name="p", channels={channel: Channel(signal=signal) for channel, signal in names.items()}

@@ -148,8 +148,8 @@ def test_unsettled_batches_are_resent_oldest_first_at_growing_intervals(path: Pa
 
 
 def silence_route(outbox: Outbox, now: float = 0.0) -> float:
-    """Store batches that no service answers, until the outbox regards the route as silent; return
-    the simulated time [s] at that moment.
+    """Store batches (messages) that no service answers, until the outbox regards the route as
+    silent; return the simulated time [s] at that moment.
     """
     outbox.store([draft()], now)
     while outbox.store([draft()], now)[0].fresh:

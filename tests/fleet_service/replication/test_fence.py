@@ -1,5 +1,5 @@
-"""Tests of fencing: late uploads of a service that lost its lease replace no object of its
-successor.
+"""Tests of fencing: late uploads of a service that lost its lease (ownership of the archive)
+replace no object of its successor.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ def test_a_standby_goes_on_with_all_that_was_acknowledged(
 
 
 def make_driver(fleet: Fleet, sent: list[Batch]) -> Callable[[], bool]:
-    """Return a function that sends unacknowledged batches again each second, as outboxes do, and
+    """Return a function that sends unacknowledged batches again each second, as agents do, and
     returns True when all batches are acknowledged.
     """
     last = [0.0]
@@ -145,7 +145,9 @@ def test_of_two_standbys_one_takes_over_and_the_other_waits_for_it(
 
 
 class Machine:
-    """Folder with a service in threads, which a test can stop between any two steps."""
+    """Folder of an archive with a service that runs in threads; a test can stop the service between
+    any two steps.
+    """
 
     def __init__(
         self,
@@ -177,7 +179,9 @@ class Machine:
         return self.holding.copy
 
     def freeze(self) -> None:
-        """Stop the service's renewals of its lease, as if its process were frozen."""
+        """Stop the service's renewals of its lease (ownership of the archive), as if its process
+        were frozen.
+        """
         assert self.holding.lease is not None
         self.holding.lease._stop.set()
 

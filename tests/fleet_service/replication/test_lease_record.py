@@ -42,7 +42,9 @@ def lease_on(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
 
 
 def standby_of(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
-    """Let a standby service take over the lease, and return the lease of the standby."""
+    """Let a standby service take over the lease (ownership of an archive), and return its
+    `Lease`.
+    """
     standby = Standby(
         may=lambda: True, stands=lambda _: False, alive=lambda: None, get_ahead=lambda: None
     )

@@ -1,5 +1,5 @@
-"""Tests of the presence of regions: every client learns from liveliness tokens which regions are
-served. Three services run, and one of them stops.
+"""Tests of the presence of regions: every client learns from liveliness tokens (signs of connected
+services) which regions are served. Three services run, and one of them stops.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ CARS = 3
 
 @pytest.fixture(autouse=True)
 def nobody(session: zenoh.Session) -> None:
-    """Wait until no service has a presence token, because the router may learn late that the
-    services of the previous test have ended.
+    """Wait until no service has a liveliness token (sign of a connected service), because the
+    router may learn late that the services of the previous test have ended.
     """
     until(lambda: not presence.active_tokens(session))
 
@@ -253,8 +253,8 @@ def test_who_comes_while_it_is_asked_may_not_have_been_asked(
 def test_who_is_found_after_it_was_asked_is_asked_again(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A client must ask a service again if its queryables exist but its presence token has not
-    arrived yet.
+    """A client must ask a service again if its queryables exist but its liveliness token (sign of a
+    connected service) has not arrived yet.
     """
     monkeypatch.setattr("fleet_service.app.service.serving_regions", lambda *_: nullcontext())
     with running(router, tmp_path / "one", name="first", regions=NAMES[1:2]) as service:

@@ -1,4 +1,4 @@
-"""Tests that compiled kernels are rebuilt when their sources change."""
+"""Tests that compiled functions are compiled again when their sources change."""
 
 from __future__ import annotations
 

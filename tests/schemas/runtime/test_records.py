@@ -1,5 +1,5 @@
-"""Tests of records: the annotations of a class become the fields of an array, for Python and for a
-kernel.
+"""Tests of records: the annotations of a class become the fields of an array, for Python and for
+compiled functions.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Outer(NamedTuple):
 
 
 class Row:
-    """Record type whose fields the test changes in a compiled kernel."""
+    """Record type whose fields the test changes in a compiled function."""
 
     begun: bool
     seen: int

@@ -60,8 +60,9 @@ class NoisyRun:
     reported: dict[str, Estimates]
 
     def values(self, name: str) -> Values:
-        """Return MAE and RMSE of each state, averaged over the seeds, and the relative errors of
-        the peaks.
+        """Return the errors of the states (v_x, v_y, yaw rate, friction) of one filter by name: MAE
+        and RMSE averaged over the noise seeds, and the relative errors of the largest absolute
+        values.
         """
         found: Values = {}
         truth = {key: self.batch.truth[f"true_{key}"] for key in ("vx", "vy", "yaw_rate")} | {
