@@ -84,8 +84,8 @@ class LowerVertices:
         return _triangle_sets(self.peaks, self.feet), _triangle_sets(self.out_peaks, self.out_feet)
 
     def step(self, mismatch: float) -> float:
-        """Return ln of the factor on R [nat] for a mismatch of the innovations (measurement minus
-        prediction): actual/theoretical variance - 1 [1].
+        """Return ln of the factor [nat] on the measurement noise R for a mismatch of the
+        innovations (measurement minus prediction): actual/theoretical variance - 1 [1].
         """
         inputs, outputs = self.triangle_sets()
         weight = _membership_weights(inputs, mismatch)
@@ -93,8 +93,9 @@ class LowerVertices:
         return float(weight @ outputs.mean(axis=1)) / total if total > 0.0 else 0.0
 
     def knot_table(self, knots: int) -> tuple[FloatArray, FloatArray]:
-        """Return a table for linear interpolation of `step`: mismatches of the innovation variance
-        [1] and steps of ln R [nat], (knots,) each.
+        """Return a table for linear interpolation of `step`, two arrays (knots,): mismatches
+        (actual over theoretical variance of the innovations, minus 1) [1] and the steps of ln R
+        [nat] for them. R is the measurement noise.
         """
         inputs, _ = self.triangle_sets()
         corners = np.unique(np.clip(inputs.ravel(), self.peaks[0], self.peaks[-1]))

@@ -65,9 +65,10 @@ def rule_table(printed: tuple[str, ...] = PRINTED) -> FloatArray:
 def infer_two(
     alpha: float, rate: float, at: FloatArray, of: FloatArray, levels: FloatArray
 ) -> float:
-    """Return ln of the factor on R [nat] by bilinear interpolation in the table `levels` (5, 7).
-    The arguments are alpha (mismatch; peaks `at` (7,)) and rate (of alpha; peaks `of` (5,)). Beyond
-    the outer peaks the result is constant.
+    """Return ln of the factor on the measurement noise R [nat] by bilinear interpolation in the
+    table `levels` (5, 7). The arguments are `alpha`, the mismatch of the innovations' variance,
+    with set peaks `at` (7,), and its rate, with set peaks `of` (5,). Beyond the outer peaks the
+    result is constant.
     """
     i, u = bracket_peaks(alpha, at)
     j, v = bracket_peaks(rate, of)

@@ -30,7 +30,7 @@ def weighted_noise(
     """Return the noise variance R of one measurement row from its window of innovations (N,),
     limited to [least, largest]*nominal. While the window is not full, return `nominal`.
 
-    `predicted` is P, the variance of the predicted measurement.
+    `predicted` is the variance of the predicted measurement, without noise.
     """
     weight = total = 0.0
     for error in window:

@@ -49,7 +49,8 @@ def axle_lateral_forces(
     """Return (front, rear) lateral force [N] of the axles in body axes, computed from accelerometer
     and gyroscope readings.
 
-    moment_x [N m] is the yaw moment of the forces along the body, sum of -y*F_ahead.
+    moment_x [N m] is the yaw moment of the wheels' forward forces: the sum of -y*F, with lateral
+    position y.
     """
     base = row[Parameter.TO_FRONT] + row[Parameter.TO_REAR]
     total = row[Parameter.MASS] * ay
@@ -62,8 +63,8 @@ def axle_lateral_forces(
 def advance_velocity(
     vx: float, vy: float, ax: float, ay: float, yaw_rate: float, step: float
 ) -> tuple[float, float]:
-    """Return (v_x, v_y) [m/s] after `step` [s] with constant a_x, a_y and r. The solution is exact:
-    a rotation by -r*step.
+    """Return (v_x, v_y) [m/s] after `step` [s] with constant accelerations a_x, a_y and yaw rate r.
+    The solution is exact: a rotation by -r*step.
 
     The solution replaces Euler's rule, with which the error of v_y is four times larger (errata).
     """

@@ -77,11 +77,12 @@ def tyre_forces(
     force_x: FloatArray,
     force_y: FloatArray,
 ) -> None:
-    """Fill force_x and force_y (4,) [N], the tyre forces in the wheels' axes, at motion (5,) = v_x,
-    v_y, r, a_x, a_y. The accelerations determine the loads.
+    """Fill force_x and force_y (4,) [N], the tyre forces in the wheels' axes, at motion (5,):
+    velocities v_x, v_y, yaw rate, and accelerations a_x, a_y. The accelerations determine the
+    loads.
 
-    wheels: result (4, 3) of `wheel_inputs`; a wheel with speed NaN rolls freely; mu (4,); shape: c
-    of the Magic Formula (e = 0), or DUGOFF.
+    wheels: result (4, 3) of `wheel_inputs`; a wheel with speed NaN rolls freely; mu (4,); shape:
+    shape factor c of the Magic Formula (with curvature 0), or DUGOFF.
     """
     parameters = body_of(row)
     loads = wheel_loads(parameters, motion[3], motion[4])

@@ -25,14 +25,16 @@ EFFICIENCY: Final = 0.95  # eta_t
 
 @inlined
 def midpoint_speed(left: float, right: float) -> float:
-    """Return the midpoint speed omega_c [rad/s] of an axle from the speeds of its wheels."""
+    """Return the rotational speed [rad/s] at the midpoint of an axle from the speeds of its
+    wheels.
+    """
     return 0.5 * (left + right)
 
 
 @inlined
 def axle_force(torque: float, turning: float, inertia: float, radius: float) -> float:
     """Return the longitudinal force F_x [N] of an axle from the sum of its wheel torques [N m] and
-    omega_c' [rad/s^2].
+    `turning`, the acceleration of the speed at its midpoint [rad/s^2].
     """
     return (torque - 2.0 * inertia * turning) / radius
 

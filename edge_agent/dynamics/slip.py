@@ -55,8 +55,9 @@ def along_wheel(
 
 @inlined
 def wheel_slips(radius: float, omega: float, along: float, across: float) -> tuple[float, float]:
-    """Return the slips (slip_x, slip_y) [1]: (R*omega - v_wx)/|v_wx| and -v_wy/|v_wx|, the tangent
-    of the slip angle.
+    """Return the slips (slip_x, slip_y) [1] of a wheel: (R*omega - v_wx)/|v_wx| and -v_wy/|v_wx|,
+    the tangent of the slip angle. R is the radius, omega the wheel speed; v_wx and v_wy are the
+    velocity of the wheel's centre `along` and `across` its plane [m/s].
 
     Positive slip_x gives a forward force, positive slip_y a force to the left.
     """

@@ -24,9 +24,11 @@ TINY = 1e-12  # below it a slip has no direction and no force
 
 @compiled
 def magic_formula(theta: float, c: float, e: float) -> float:
-    """Return the Magic Formula f(theta) = sin(c*atan(b - e*(b - atan(b)))) with b = theta/c.
+    """Return the tyre force over its largest value by the Magic Formula, f(theta) = sin(c*atan(b -
+    e*(b - atan(b)))) with b = theta/c.
 
-    It is odd in theta; 1 < c <= 2, e < 1.
+    `theta` is the normalised slip; f is odd in it. c and e are shape and curvature, 1 < c <= 2, e <
+    1.
     """
     b = theta / c
     return math.sin(c * math.atan(b - e * (b - math.atan(b))))
@@ -34,8 +36,9 @@ def magic_formula(theta: float, c: float, e: float) -> float:
 
 @compiled
 def magic_formula_inverse(rho: float, c: float) -> float:
-    """Return theta on the rising branch such that magic_formula(theta, c, 0) = rho; infinite at and
-    beyond the peak, |rho| >= 1.
+    """Return the normalised slip `theta` on the rising branch of the Magic Formula with shape `c`
+    where the force over its largest value is `rho`: magic_formula(theta, c, 0) = rho. The result is
+    infinite at and beyond the peak, |rho| >= 1.
     """
     if rho >= 1.0:
         return math.inf
@@ -46,8 +49,9 @@ def magic_formula_inverse(rho: float, c: float) -> float:
 
 @compiled
 def brush(theta: float) -> float:
-    """Return the brush curve with parabolic pressure, odd in theta: theta - theta|theta|/3 +
-    theta^3/27 up to theta = 3, then 1.
+    """Return the tyre force over its largest value by the brush model with parabolic pressure, at
+    the normalised slip theta: theta - theta|theta|/3 + theta^3/27 up to theta = 3, then 1. The
+    curve is odd in theta.
     """
     size = min(abs(theta), 3.0)
     return math.copysign(size - size * size / 3.0 + size**3 / 27.0, theta)
@@ -55,7 +59,9 @@ def brush(theta: float) -> float:
 
 @compiled
 def dugoff(theta: float) -> float:
-    """Return the Dugoff curve of theta >= 0: theta up to one half, then 1 - 1/(4*theta)."""
+    """Return the tyre force over its largest value by the Dugoff model, at the normalised slip
+    theta >= 0: theta up to one half, then 1 - 1/(4*theta).
+    """
     return theta if theta <= 0.5 else 1.0 - 0.25 / theta
 
 
@@ -68,8 +74,8 @@ def combined_magic(
     c: float,
     e: float,
 ) -> tuple[float, float]:
-    """Return the forces (Fx, Fy) [N] of one wheel in its own frame, by similarity with the Magic
-    Formula.
+    """Return the forces (Fx, Fy) [N] of one wheel in its own frame, from its slip in both
+    directions, by similarity with the Magic Formula.
 
     slip (longitudinal, tangent of the slip angle) [1], stiffness (longitudinal [N], lateral
     [N/rad]), mu [1], load [N].
@@ -90,11 +96,11 @@ def combined_magic(
 def combined_dugoff(
     slip: tuple[float, float], stiffness: tuple[float, float], mu: float, load: float
 ) -> tuple[float, float]:
-    """Return the forces (Fx, Fy) [N] of one wheel in its own frame, by similarity with the Dugoff
-    curve. The arguments are as in `combined_magic`.
+    """Return the forces (Fx, Fy) [N] of one wheel in its own frame, from its slip in both
+    directions, by similarity with the Dugoff curve. The arguments are as in `combined_magic`.
 
-    The curve is theta up to one half, where the force is K*slip itself, then 1 - 1/(4*theta). It
-    has no falling branch.
+    The curve of the normalised slip theta is theta up to one half, where the force is stiffness
+    times slip, then 1 - 1/(4*theta). It has no falling branch.
     """
     grip = max(mu * load, 0.0)
     free_x = stiffness[0] * slip[0]

@@ -14,13 +14,15 @@ from schemas.runtime.jit import compiled
 def force_from_torque(
     torque: float, wheel_acceleration: float, inertia: float, radius: float
 ) -> float:
-    """Return the longitudinal tyre force F_x = (T - J*omega')/R [N] that follows from the wheel
-    torque T.
+    """Return the longitudinal tyre force (T - J*omega')/R [N] that follows from the wheel torque T,
+    the wheel acceleration omega', inertia J and radius R.
     """
     return (torque - inertia * wheel_acceleration) / radius
 
 
 @compiled
 def wheel_acceleration(torque: float, force_x: float, inertia: float, radius: float) -> float:
-    """Return the wheel acceleration omega' = (T - R*F_x)/J [rad/s^2]."""
+    """Return the wheel acceleration (T - R*F_x)/J [rad/s^2] from the wheel torque T, the
+    longitudinal tyre force F_x, radius R and inertia J.
+    """
     return (torque - radius * force_x) / inertia

@@ -116,7 +116,7 @@ def make_bank(
 ) -> EstimatorBank:
     """Return a bank of filters, one per vehicle, on a road with the given friction [1].
 
-    The tyre option corresponds to C_f and C_r of the paper's table 1.
+    The tyre option corresponds to the cornering stiffnesses in the paper's table 1.
     """
     context = records(FrictionSet, 1)
     context["friction"] = friction

@@ -53,8 +53,8 @@ def factorize(covariance: FloatArray, sqrt_cov: FloatArray, least: float) -> Non
 def covariance_of_factor(
     sqrt_cov: FloatArray, variances: FloatArray, covariance: FloatArray
 ) -> None:
-    """Compute covariance (n, n) = L*L' + diag(q), for any square root L (n, n) and variances q (n,)
-    of independent noise.
+    """Compute the covariance (n, n) from any square root `sqrt_cov` (n, n) of a covariance, and add
+    the `variances` (n,) of independent noise to its diagonal.
     """
     n = sqrt_cov.shape[0]
     for i in range(n):

@@ -22,8 +22,8 @@ from schemas.runtime.jit import inlined
 
 @inlined
 def spread_points(mean: FloatArray, sqrt_cov: FloatArray, points: FloatArray) -> None:
-    """Compute the cubature points (n, 2n) of mean m and covariance root L: column j is m +
-    sqrt(n)*L[:, j], and column n + j is m - sqrt(n)*L[:, j].
+    """Compute the cubature points (n, 2n) of a mean m (n,) and a square root L (n, n) of the
+    covariance. Column j is m + sqrt(n)*L[:, j], and column n + j is m - sqrt(n)*L[:, j].
     """
     n = mean.shape[0]
     size = math.sqrt(n)

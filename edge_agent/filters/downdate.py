@@ -17,10 +17,11 @@ LEAST_LEFT = 1e-12  # of the variance in the direction of v; below it rounding d
 
 @compiled
 def downdate(sqrt_cov: FloatArray, column: FloatArray, white: FloatArray) -> bool:
-    """Change the factor L (`sqrt_cov`, (n, n)) to that of L*L' - column*column', with column (n,).
-    Return True.
+    """Change a lower-triangular factor L (`sqrt_cov`, (n, n)) of a covariance to that of the
+    smaller covariance L*L' - column*column', with column (n,). Return True.
 
-    If the result is not a covariance, return False and change nothing. `white` (n,) is scratch.
+    If the result is not a covariance, return False and change nothing. `white` (n,) is scratch
+    memory.
     """
     n = column.shape[0]
     square = 0.0
@@ -59,8 +60,8 @@ def update_by_downdate(
     noise_std: FloatArray,
     work: FloatArray,
 ) -> tuple[int, float, float, bool]:
-    """Run the measurement update in place as in paper 003: the factor L is downdated with the
-    columns of U = P_xz*S^-T/2, one after the other.
+    """Run the measurement update in place as in paper 003: the covariance factor is reduced by the
+    columns of the gain times the root of the innovation covariance, one after the other.
 
     Arguments as in `householder.update`. Return the same values, and True if a downdate was refused
     because the result would not be a covariance. In that case `householder.update`, which cannot

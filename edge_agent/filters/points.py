@@ -37,8 +37,9 @@ def sigma_points(
 
 @compiled
 def axis_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray) -> None:
-    """Compute points[p] = mean + A·S·xi[p] with the singular value decomposition A·S·Vᵀ of
-    `sqrt_cov`.
+    """Compute the points of a rule with offsets `xi`: points[p] = mean + A·S·xi[p]. A (singular
+    vectors) and S (singular values) come from the decomposition A·S·Vᵀ of `sqrt_cov`, a square root
+    of the covariance.
 
     Shapes: mean (n,), sqrt_cov (n, n), finite; xi and points (points, n).
     """

@@ -22,10 +22,10 @@ from schemas.runtime.jit import inlined
 
 @inlined
 def potter_factors(f: FloatArray, noise: float) -> tuple[float, float]:
-    """Return (a, g) for a scalar measurement with row f (k,) (see module) and noise variance
-    `noise` > 0: a is the variance of the innovation (measurement minus prediction), g the factor of
-    the covariance update. The update is then m <- m + L*f*nu/a and L <- L*(I - g*f*f') (Potter
-    1963).
+    """Return (a, g) for a scalar measurement with noise variance `noise` > 0, of which f (k,) is
+    the measurement row times the covariance root L. a is the variance of the innovation nu
+    (measurement minus prediction), g the factor of the covariance update. The update is then m <- m
+    + L*f*nu/a and L <- L*(I - g*f*f') (Potter 1963).
     """
     a = noise
     for c in range(f.shape[0]):
@@ -38,8 +38,9 @@ def potter_factors(f: FloatArray, noise: float) -> tuple[float, float]:
 def apply_projection(
     mean: FloatArray, root: FloatArray, f: FloatArray, step: float, gain: float
 ) -> None:
-    """Apply the update of one row to the mean and to the covariance root L (n, k or more): mean
-    (n,) += L*f*step and L <- L*(I - gain*f*f'), with f (k,). Columns of L beyond k are unchanged.
+    """Apply the update of one scalar measurement to the mean and to the covariance root L (n, k or
+    more): mean (n,) += L*f*step and L <- L*(I - gain*f*f'), with f (k,), the measurement row times
+    L. Columns of L beyond k are unchanged.
     """
     for i in range(mean.shape[0]):
         along = 0.0

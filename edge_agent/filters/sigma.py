@@ -71,11 +71,11 @@ class SigmaRule:
 
 
 def unscented_rule(n: int, alpha: float, beta: float, kappa: float) -> SigmaRule:
-    """Return the scaled unscented rule (Julier 2002). A central point with zero weights is left
-    out.
-
-    lambda = alpha^2*(n + kappa) - n; points 0 and +-sqrt(n + lambda)*e_i; w_mean_0 = lambda/(n +
-    lambda), w_cov_0 = w_mean_0 + 1 - alpha^2 + beta, others 1/(2*(n + lambda)).
+    """Return points and weights of the scaled unscented rule for n dimensions (Julier 2002). With
+    lambda = alpha^2*(n + kappa) - n, the points are 0 and +-sqrt(n + lambda)*e_i (unit vectors).
+    The central point has the weight w = lambda/(n + lambda) for the mean and w + 1 - alpha^2 + beta
+    for the covariance; the others have 1/(2*(n + lambda)). A central point with zero weights is
+    left out.
     """
     scale = alpha**2 * (n + kappa)
     if n < 1 or scale <= 0.0:
@@ -98,8 +98,8 @@ def unscented_rule(n: int, alpha: float, beta: float, kappa: float) -> SigmaRule
 
 
 def cubature_rule(n: int) -> SigmaRule:
-    """Return the third-degree spherical-radial rule (Arasaratnam and Haykin 2009): +-sqrt(n)*e_i
-    with weights 1/(2n).
+    """Return points and weights of the third-degree spherical-radial rule for n dimensions
+    (Arasaratnam and Haykin 2009): +-sqrt(n)*e_i (unit vectors) with weights 1/(2n).
     """
     if n < 1:
         raise InputError("cubature", "n must be at least 1", "give the dimension of the state")

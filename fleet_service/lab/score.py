@@ -54,7 +54,7 @@ class Scores:
 
 
 def join_scores(scores: list[Scores]) -> Scores:
-    """Return the scores of several runs as one."""
+    """Return the scores of the map in several runs as one object."""
     return Scores(
         *(
             np.concatenate(columns)
@@ -113,8 +113,9 @@ def of_intervals(
 
 
 def of_beliefs(belief: FloatArray, truth: FloatArray, vehicles: IntArray) -> Scores:
-    """Return the scores of beliefs (k, 32). `rank` is P(μ ≤ true value), which is uniformly
-    distributed for calibrated beliefs.
+    """Return the scores of beliefs (k, 32) against the true friction (k,), such as errors and
+    widths of their intervals. `rank` is P(μ ≤ true value), which is uniformly distributed for
+    calibrated beliefs.
     """
     lower, mid, upper = (mugrid.quantiles(belief, q) for q in (0.05, 0.5, 0.95))
     place = np.clip(

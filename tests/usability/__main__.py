@@ -389,7 +389,9 @@ PARTS: Final[dict[str, tuple[Callable[[House], float], str, float, str]]] = {
 
 
 def main() -> int:
-    """Measure the figures. Return 1 if a figure misses its target or is missing, otherwise 0."""
+    """Measure how easily a new user can use GripMap. Return 1 if a figure misses its target or is
+    missing, otherwise 0.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m tests.usability", description=(__doc__ or "").splitlines()[0]
     )

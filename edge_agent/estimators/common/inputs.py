@@ -144,7 +144,8 @@ def _grip_used(track: InputTrack, row: FloatArray) -> float:
 
 @compiled
 def wheel_force(row: FloatArray, track: InputTrack, wheel: int, step: float) -> float:
-    """Return the longitudinal force F_x = (T - J*omega')/R [N] of a wheel (paper 000, equation 10).
+    """Return the longitudinal force F_x = (T - J*omega')/R [N] of a wheel (paper 000, equation 10),
+    from torque T, inertia J and radius R.
 
     omega' is the difference of the wheel speeds of two samples, which are `step` [s] apart, over
     that time.

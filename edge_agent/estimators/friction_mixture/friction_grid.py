@@ -129,7 +129,8 @@ def probability_below(mu: FloatArray, prior: FloatArray, w: FloatArray, limit: f
 @compiled
 def _segment_mass(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
     """Return the unnormalised probability mass between the grid values (nodes) of friction j - 1
-    and j. For j = 0 and j = K, one end is the end of the friction range.
+    and j. For j = 0 and for j equal to the number of nodes, one end is the end of the friction
+    range.
     """
     count = mu.shape[0]
     if j == 0:

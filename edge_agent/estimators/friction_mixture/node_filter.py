@@ -70,9 +70,10 @@ def update_node(
     """Run the cubature update of node j (friction hypothesis) with the measurement noise R times
     `inflation`. The update changes the node's mean and scratch.root[j].
 
-    R of the axles' rows is increased further if these rows contradict the model, and while the
-    inputs are steady. With steady inputs, errors of the tyre curve and of offsets repeat from block
-    to block; if they were treated as noise, the filter would average them into stiffness and shape.
+    The noise of the axles' rows is increased further if these rows contradict the model, and while
+    the inputs are steady. With steady inputs, errors of the tyre curve and of offsets repeat from
+    block to block; if they were treated as noise, the filter would average them into stiffness and
+    shape.
 
     The function also stores each innovation (measurement minus prediction), and its expected
     variance without `inflation`.
@@ -392,9 +393,9 @@ def predict_node(
     the velocity by the yaw angle (given by its cosine and sine), add the velocity gained by
     acceleration, and add the process variances scratch.process.
 
-    The prediction is affine, so cubature is exact: covariance <- F*L*(F*L)' + diag(noise). Vehicle
-    and sensor states return to their prior by the factors scratch.keep. The function changes
-    scratch.root[j] to F*L.
+    The prediction is affine, so cubature is exact: the covariance P becomes F*P*F' + diag(noise),
+    where F is the matrix of the prediction. Vehicle and sensor states return to their prior by the
+    factors scratch.keep. The function multiplies the covariance root scratch.root[j] by F.
     """
     nominal = memory.nominal
     keep = scratch.keep

@@ -43,10 +43,10 @@ FLATTEST = 0.03  # a sliding wheel's slip is not quite arbitrary: its inertia ho
 
 @compiled
 def curve_distance(along: float, across: float) -> float:
-    """Return the signed distance e [1] of a measured point (slip, force) from the tyre curve:
-    `along` is its distance e_a along the slip axis, `across` its distance e_b along the force axis.
+    """Return the signed distance [1] of a measured point (slip, force) from the tyre curve: `along`
+    is its distance along the slip axis, `across` its distance along the force axis.
 
-    If e_a is infinite (the force exceeds the peak), return e_b.
+    If `along` is infinite (the force exceeds the peak), return `across`.
     """
     if math.isinf(along):
         return across

@@ -98,8 +98,8 @@ def interpolate_table(table: FloatArray, place: float) -> float:
 
 @compiled
 def ratio_at(curve: TyreCurve, theta: float) -> float:
-    """Return f/theta (tyre force over mu*F_z, divided by normalised slip) at theta >= 0; beyond the
-    table the force is constant.
+    """Return the tyre force over mu*F_z (friction times load), divided by the normalised slip
+    `theta` >= 0; beyond the table the force is constant.
     """
     last = curve.ratio.shape[0] - 2
     if theta >= last:
@@ -109,7 +109,7 @@ def ratio_at(curve: TyreCurve, theta: float) -> float:
 
 @compiled
 def theta_at(curve: TyreCurve, force: float) -> float:
-    """Return theta on the rising branch at a given force over mu*F_z (0 or more); infinite at and
-    beyond the peak.
+    """Return the normalised slip on the rising branch of the tyre curve at a given force over
+    mu*F_z (friction times load; 0 or more); infinite at and beyond the peak.
     """
     return math.inf if force >= 1.0 else interpolate_table(curve.inverse, math.sqrt(1.0 - force))

@@ -255,11 +255,11 @@ def widened_speed_std(std: float, innovation: float) -> float:
 
 @compiled
 def slip_free_speed(row: FloatArray, track: InputTrack, dt: float) -> tuple[float, float]:
-    """Return the mean over the wheels of R*omega/(1 + slip) and its standard deviation, both in
-    [m/s].
+    """Return the vehicle speed according to the wheels, and its standard deviation, both in [m/s]:
+    the mean of R*omega/(1 + slip) with radius R and wheel speed omega.
 
-    The slip of a wheel is F_x/K (force over slip stiffness). The result is NaN if no wheel speed is
-    measured.
+    The slip of a wheel is its longitudinal force over its slip stiffness. The result is NaN if no
+    wheel speed is measured.
     """
     use = track.inputs
     loads = wheel_loads(body_of(row), use[S.AX], use[S.AY])

@@ -27,7 +27,7 @@ SIDE_CORRELATION = 0.9
 
 
 def prior_root() -> FloatArray:
-    """Return the Cholesky factor (4, 4) of the prior covariance P_0 of the wheels' friction.
+    """Return the Cholesky factor (4, 4) of the prior covariance of the wheels' friction.
 
     The wheels of one side are almost equal, and the two sides are correlated. Wheel order fl, fr,
     rl, rr.

@@ -59,8 +59,8 @@ def visit_evidence(
     grid, with maximum 0.
 
     Args:
-        force: true f (T, 4) [1].
-        slip: true q (T, 4) [1].
+        force: true force over load (T, 4) [1].
+        slip: true slip (T, 4) [1].
         speed: (T,) [m/s].
         rng: random generator of the noise.
     """
@@ -83,8 +83,8 @@ def _evidence(
     """Return the log-likelihood ln L on the friction grid for each of the random tyres, (TYRES,
     BINS).
 
-    force and slip are f and q with noise, (T, 4); noise (T,) is the standard deviation of q; tyres
-    (TYRES, 3) is the result of `tyres_drawn`.
+    force and slip are force over load and slip with noise, (T, 4); noise (T,) is the standard
+    deviation of the slip noise; tyres (TYRES, 3) is the result of `tyres_drawn`.
     """
     out = np.zeros((tyres.shape[0], BINS))
     for j in range(tyres.shape[0]):

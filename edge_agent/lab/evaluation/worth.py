@@ -112,8 +112,8 @@ def ways() -> dict[str, list[MixtureDesign]]:
 
 def without_sets() -> MixtureDesign:
     """Return the tables (`design`) of the default filter for the variant without fuzzy sets. Like
-    the default, this variant still adapts R to strain (deviation of states from their prior) and
-    runs the consistency test.
+    the default, this variant still adapts the measurement noise R to strain (deviation of states
+    from their prior) and runs the consistency test.
     """
     design = design_of(Memberships(), adaptive=True)
     c = design.constants

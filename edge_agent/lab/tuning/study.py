@@ -43,8 +43,8 @@ WAYS: Final[dict[str, Callable[..., Result]]] = {
 
 
 class Condition(NamedTuple):
-    """Condition of a study: the filter's measurement noise R divided by VARIANCE, and True if the
-    simulated noise varies over time by the paper's schedule.
+    """Condition of a study: the filter's measurement noise R divided by the true constant variance
+    (VARIANCE), and True if the simulated noise varies over time by the paper's schedule.
     """
 
     scale: float
@@ -99,7 +99,9 @@ class StudySet:
 
 
 class StudyScores(NamedTuple):
-    """Scores of memberships (fuzzy sets) under one condition of R, averaged over the drives."""
+    """Scores of memberships (fuzzy sets) under one condition of the measurement noise R, averaged
+    over the drives.
+    """
 
     log_likelihood: float  # of the innovations, more is better [nat/s]
     nis: float  # per row; near 1 where the stated covariance is right [1]
@@ -157,8 +159,9 @@ def setting(condition: Condition) -> Setting:
 
 
 def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudyScores:
-    """Return the scores of memberships (fuzzy sets) on the drives under the condition of R called
-    `name`."""
+    """Return the scores of memberships (fuzzy sets) on the drives under the condition of the
+    measurement noise R called `name`.
+    """
     filters = make_bank(drives.vehicles, memberships, setting(CONDITIONS[name]))
     reported = filters.advance(drives.t, drives.signals[name])
     log_likelihoods = np.nan_to_num(
@@ -189,7 +192,7 @@ def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[flo
 
 def overall(memberships: Memberships, drives: StudySet) -> float:
     """Return the objective of the search: the mean log-likelihood of the innovations (measurement
-    minus prediction) over all conditions of R [nat/s].
+    minus prediction) over all conditions of the measurement noise R [nat/s].
     """
     return float(
         np.mean([scores_of(memberships, drives, name).log_likelihood for name in CONDITIONS])

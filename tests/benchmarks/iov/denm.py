@@ -59,7 +59,9 @@ def _count_and_send(parcels: list[Parcel], link: AmqpLink, parcel: Parcel) -> No
 
 
 def measure_denm(folder: Path, quick: bool) -> list[Figure]:
-    """Raise, change and end events, restart the gateway after each step, and return the figures."""
+    """Raise, change and end hazard events (DENM), restart the gateway after each step, and return
+    the figures.
+    """
     from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
 
     draw = np.random.default_rng(4202)

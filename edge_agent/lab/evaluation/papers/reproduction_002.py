@@ -91,8 +91,8 @@ class ForceRun:
     second: dict[str, FloatArray]  # forces compensated (TFC), motion of WCKF-B
 
     def erms(self, stage: str) -> Values:
-        """Return the root mean square error of each quantity (equation 38), for stage "A"
-        or "B".
+        """Return the root mean square error of each quantity (equation 38), for stage "A" (wheel
+        filter) or "B" (vehicle filter).
         """
         found = self.first if stage == "A" else self.second
         return {
@@ -102,7 +102,7 @@ class ForceRun:
 
     def pre(self, stage: str) -> Values:
         """Return the relative error of the peak of each quantity (equation 37) [1], for stage "A"
-        or "B". The peak is the value of largest magnitude.
+        (wheel filter) or "B" (vehicle filter). The peak is the value of largest magnitude.
         """
         found = self.first if stage == "A" else self.second
         values = {}

@@ -34,8 +34,8 @@ LONGEST_S: Final = 90.0  # of one paper on two cores
 def write_paper(
     paper: str, seeds: Sequence[int], folder: Path, *, plots: bool = True
 ) -> Reproduction:
-    """Reproduce a paper; write figures.json, report.md, and index.html with its plots, and return
-    the reproduction.
+    """Reproduce the results of a paper; write figures.json, report.md, and index.html with its
+    plots, and return the reproduction.
     """
     began = time.monotonic()
     done = REPRODUCTIONS[paper](seeds)
