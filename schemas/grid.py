@@ -67,13 +67,15 @@ def _gather_bits(v: IntArray) -> IntArray:
 
 def interleave(x: IntArray, y: IntArray) -> IntArray:
     """Return the quadint (number of a grid square) from the square's column x and row y at its
-    zoom.
+    zoom; arrays of any equal shape.
     """
     return _spread_bits(x) | (_spread_bits(y) << 1)
 
 
 def deinterleave(cell: ArrayLike) -> tuple[IntArray, IntArray]:
-    """Return column x and row y of a grid square, given by its quadint (number of the square)."""
+    """Return column x and row y of a grid square, given by its quadint (number of the square);
+    arrays of the same shape.
+    """
     c = np.asarray(cell, dtype=np.int64)
     return _gather_bits(c), _gather_bits(c >> 1)
 
@@ -90,22 +92,24 @@ def cell_of(latitude: ArrayLike, longitude: ArrayLike, zoom: int = CELL_ZOOM) ->
 
 
 def parent(cell: ArrayLike, zoom: int, of: int = CELL_ZOOM) -> IntArray:
-    """Return the grid square at `zoom` that contains a cell whose own zoom is `of`."""
+    """Return the quadint (number) of the grid square at `zoom` that contains a cell whose own zoom
+    is `of`; arrays of any shape.
+    """
     return np.asarray(cell, dtype=np.int64) >> (2 * (of - zoom))
 
 
 def tile_of(cell: ArrayLike) -> IntArray:
-    """Return the tile (zoom 14) that contains a cell."""
+    """Return the quadint of the tile (zoom 14) that contains a cell; arrays of any shape."""
     return parent(cell, TILE_ZOOM)
 
 
 def region_of(cell: ArrayLike) -> IntArray:
-    """Return the region (zoom 10) that contains a cell."""
+    """Return the quadint of the region (zoom 10) that contains a cell; arrays of any shape."""
     return parent(cell, REGION_ZOOM)
 
 
 def zone_of(cell: ArrayLike) -> IntArray:
-    """Return the zone (zoom 7) that contains a cell."""
+    """Return the quadint of the zone (zoom 7) that contains a cell; arrays of any shape."""
     return parent(cell, ZONE_ZOOM)
 
 
@@ -118,7 +122,9 @@ def _longitude(column: NDArray[Any], zoom: int) -> FloatArray:
 
 
 def centre(cell: ArrayLike, zoom: int = CELL_ZOOM) -> tuple[FloatArray, FloatArray]:
-    """Return latitude and longitude [deg] of the centre of a cell."""
+    """Return latitude and longitude [deg] of the centre of a cell at `zoom`, in the shape of
+    `cell`.
+    """
     x, y = deinterleave(cell)
     return _latitude(y + 0.5, zoom), _longitude(x + 0.5, zoom)
 
@@ -126,7 +132,9 @@ def centre(cell: ArrayLike, zoom: int = CELL_ZOOM) -> tuple[FloatArray, FloatArr
 def bounds(
     cell: ArrayLike, zoom: int = CELL_ZOOM
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the west, south, east and north edges [deg] of a cell."""
+    """Return the west, south, east and north edges [deg] of a cell at `zoom`, each in the shape of
+    `cell`.
+    """
     x, y = deinterleave(cell)
     return _longitude(x, zoom), _latitude(y + 1, zoom), _longitude(x + 1, zoom), _latitude(y, zoom)
 
@@ -187,14 +195,14 @@ def from_quadkey(digits: str) -> int:
 
 
 def sector_of(yaw: ArrayLike) -> NDArray[np.int8]:
-    """Return the heading sector of a yaw [rad, counter-clockwise from east]."""
+    """Return the heading sector of a yaw [rad, counter-clockwise from east], in the same shape."""
     quarter = np.floor((np.asarray(yaw, dtype=np.float64) + np.pi / 4) / (np.pi / 2))
     return np.mod(quarter, SECTORS).astype(np.int8)
 
 
 def sectors_touched(yaw: ArrayLike) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-    """Return two arrays: the heading sector of each yaw [rad], and a second sector if the yaw lies
-    within 15° of the edge to that sector, else -1.
+    """Return two arrays in the shape of `yaw`: the heading sector of each yaw [rad], and a second
+    sector if the yaw lies within 15° of the edge to that sector, else -1.
     """
     angle = np.asarray(yaw, dtype=np.float64)
     first = sector_of(angle)

@@ -158,8 +158,8 @@ def delay_passes(
 def known_patches(
     visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
 ) -> list[tuple[IntArray, int]]:
-    """Return, for each patch of ice, its cells and the time of the first alert on the map [ns]; the
-    time is NEVER if there was no alert.
+    """Return, for each patch of ice, its cells (numbers) and the time of the first alert on the map
+    [ns]; the time is NEVER if there was no alert.
     """
     cells = np.unique(visits["cell"].to_numpy()[patch])
     label = link_cells(cells)

@@ -80,7 +80,9 @@ def _centre_line(scenario: Scenario, road: Road) -> FloatArray:
 
 
 def _blob_outline(shape: tuple[float, float, float, float], seed: int) -> FloatArray:
-    """Return a smooth closed outline around a point; `shape` is x, y and the two radii [m]."""
+    """Return a smooth closed outline, points (48, 2) [m], around a point; `shape` is x, y and the
+    two radii [m].
+    """
     x, y, a, b = shape
     rng = np.random.default_rng(seed)
     angle = np.linspace(0.0, 2.0 * math.pi, 48, endpoint=False)
@@ -90,8 +92,8 @@ def _blob_outline(shape: tuple[float, float, float, float], seed: int) -> FloatA
 
 
 def _place_houses(centres: FloatArray) -> Iterable[FloatArray]:
-    """Yield the outlines of houses along the streets, parallel to them. Houses do not touch
-    streets, parks or each other.
+    """Yield the outlines of houses, points (n, 2) [m], along the streets, parallel to them. Houses
+    do not touch streets, parks or each other.
     """
     rng = np.random.default_rng(5)
     placed: list[tuple[float, float, float]] = []
@@ -125,8 +127,8 @@ def _place_houses(centres: FloatArray) -> Iterable[FloatArray]:
 
 
 def _lanes_around(centres: FloatArray) -> list[tuple[str, FloatArray, str]]:
-    """Return roads that lead from the simulated streets out of the town. They are only drawn; no
-    simulated car uses them.
+    """Return roads, with points (n, 2) [m], that lead from the simulated streets out of the town.
+    They are only drawn; no simulated car uses them.
     """
     out = []
     for name, angle in (("E20", 0.55), ("E20", math.pi + 0.35), ("Skogsvägen", 2.2)):
@@ -256,8 +258,8 @@ def _clip_line(points: list[tuple[int, int]]) -> Iterable[list[tuple[int, int]]]
 
 
 def _to_mercator(scenario: Scenario, line: FloatArray) -> FloatArray:
-    """Return points [m] as fractions of the Web Mercator square, x to the east and y to the
-    south.
+    """Return points (n, 2) [m] as fractions (n, 2) of the Web Mercator square, x to the east and y
+    to the south.
     """
     latitude, longitude = (np.asarray(one) for one in scenario.to_latlon(line[:, 0], line[:, 1]))
     y = (1.0 - np.arcsinh(np.tan(np.radians(latitude))) / math.pi) / 2.0

@@ -241,7 +241,7 @@ class LocalMap:
         return np.asarray((1.0 - share) * belief[0] + share * mugrid.PRIOR)
 
     def keys(self) -> IntArray:
-        """Return the keys (cell·4 + sector) of all places in the local map, sorted."""
+        """Return the keys (cell·4 + sector) of all places in the local map, (n,), sorted."""
         return self._all_cells().key
 
     def _all_cells(self) -> ReceivedCells:
@@ -252,8 +252,9 @@ class LocalMap:
         return self._all
 
     def _look_up(self, key: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]:
-        """Return, for n places (map cells with heading sector): belief, basis (origin of the
-        values), time of the last observation, time of receipt and number of observing vehicles.
+        """Return, for n places (map cells with heading sector): belief (n, 32) and, each (n,),
+        basis (origin of the values), time of the last observation, time of receipt and number of
+        observing vehicles.
         """
         whole = self._all_cells()
         if not len(whole.key):

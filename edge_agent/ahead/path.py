@@ -86,8 +86,8 @@ class Path(NamedTuple):
 def to_plane(
     latitude: FloatArray, longitude: FloatArray, pose: Pose
 ) -> tuple[FloatArray, FloatArray]:
-    """Return east and north coordinates [m] of a point relative to the car; the error is below a
-    centimetre within a kilometre.
+    """Return east and north coordinates [m] of points relative to the car, in the shape of
+    `latitude`; the error is below a centimetre within a kilometre.
     """
     east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
     return (np.asarray(longitude) - pose.longitude) * east, (
@@ -97,7 +97,7 @@ def to_plane(
 
 def to_degrees(x: FloatArray, y: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
     """Return latitude and longitude [deg] of points given by east and north coordinates [m]
-    relative to the car.
+    relative to the car; all arrays have the same shape.
     """
     east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
     return pose.latitude + y / METRES_PER_DEGREE, pose.longitude + x / east

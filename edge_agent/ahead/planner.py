@@ -63,8 +63,9 @@ def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
 
 
 def cautious_bound(mu: FloatArray, mu_lower: FloatArray) -> FloatArray:
-    """Return the friction that the road exceeds with a probability of 99.5 %; NaN if unknown. It is
-    extrapolated from the median `mu` and the 5 % quantile `mu_lower` of its friction.
+    """Return the friction that the road exceeds with a probability of 99.5 %; NaN if unknown;
+    arrays of any shape. It is extrapolated from the median `mu` and the 5 % quantile `mu_lower` of
+    its friction.
     """
     below = np.nan_to_num(mu - mu_lower)
     return np.asarray(np.maximum(mu_lower - CAUTION * below, LEAST_GRIP))

@@ -283,8 +283,8 @@ def make_channel(
 
 
 def _hold_last(series: Series, t: FloatArray) -> FloatArray:
-    """Return, for each time in `t`, the last reading of a series at or before it; for times before
-    the first reading, the first reading.
+    """Return, for each time in `t` (n,), the last reading of a series at or before it; for times
+    before the first reading, the first reading.
     """
     return series.values[
         np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, len(series.t) - 1)
@@ -299,8 +299,8 @@ def _describe_rates(series: Series) -> dict[str, object]:
 
 
 def straighten_times(t: FloatArray) -> tuple[FloatArray, float]:
-    """Return smoothed times of a periodic signal whose time stamps come in bursts, and the standard
-    deviation of the stamps' error [s].
+    """Return smoothed times (n,) [s] of a periodic signal whose time stamps come in bursts, and the
+    standard deviation of the stamps' error [s].
 
     The time stamps vary around a straight line over the number of readings. A running mean over
     SMOOTH readings to either side follows slow variations. Times that are not periodic (off by more
@@ -372,8 +372,9 @@ def _row_rate(dense: Mapping[str, Series]) -> float:
 
 
 def sample_at_rows(series: Series, t: FloatArray, *, sparse: bool) -> FloatArray:
-    """Return a series sampled at the times of the log's rows; NaN in rows that have no reading near
-    enough in time."""
+    """Return a series sampled at the times `t` (n,) of the log's rows; NaN in rows that have no
+    reading near enough in time.
+    """
     good = np.isfinite(series.values)
     known = series.t[good]
     values = series.values[good]

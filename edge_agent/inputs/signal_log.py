@@ -120,7 +120,7 @@ def _read_context(table: pa.Table) -> FloatArray | None:
 
 
 def _float_column(table: pa.Table, name: str) -> FloatArray:
-    """Return a column as float64, with NaN for null.
+    """Return a column as float64 (n,), with NaN for null.
 
     The result is a writable copy. Arrow's own array is read-only, and numba would compile a second
     version of each function for it.
@@ -135,8 +135,8 @@ def _float_column(table: pa.Table, name: str) -> FloatArray:
 
 
 def _read_time(table: pa.Table) -> tuple[FloatArray, int | None]:
-    """Return the times t [s] of a signal log, and the time of t = 0 [ns UTC]; the latter is None
-    for a log that has only the column `t`.
+    """Return the times t (n,) [s] of a signal log, and the time of t = 0 [ns UTC]; the latter is
+    None for a log that has only the column `t`.
     """
     name = next((name for name in ("t", "timestamp") if name in table.column_names), None)
     if name is None:
@@ -159,8 +159,8 @@ def _read_time(table: pa.Table) -> tuple[FloatArray, int | None]:
 
 # pyarrow's column types are not generic
 def _seconds_from_first(column: Any) -> tuple[FloatArray, int | None]:  # noqa: ANN401
-    """Convert the column `timestamp` of a signal log. Return the seconds since the first sample,
-    and the time of that sample [ns UTC], or None if it is not finite.
+    """Convert the column `timestamp` of a signal log. Return the seconds (n,) since the first
+    sample, and the time of that sample [ns UTC], or None if it is not finite.
     """
     if column.null_count:
         row = int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])

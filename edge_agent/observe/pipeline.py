@@ -106,8 +106,9 @@ class Pipeline:
         )
 
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return the current friction beliefs of the estimators, and the evidence of the current
-        visits (passages of a map cell) so far; see `EstimatorBank.beliefs`.
+        """Return two arrays (N, 32): the current friction beliefs of the estimators, and the
+        likelihoods of the current visits (passages of a map cell) so far. `EstimatorBank.beliefs`
+        describes both.
         """
         return self._bank.beliefs()
 

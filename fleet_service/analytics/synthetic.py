@@ -161,8 +161,9 @@ def _make_chunk(
 def _draw_positions(
     road: IntArray, along: IntArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return positions of vehicles on their roads: latitude and longitude [deg] with the noise of a
-    satellite receiver, and yaw [rad]. Roads are straight, and every second one runs north.
+    """Return positions of n vehicles on their roads, arrays (n,): latitude and longitude [deg] with
+    the noise of a satellite receiver, and yaw [rad]. Roads are straight, and every second one runs
+    north.
     """
     step = 360.0 / (1 << grid.CELL_ZOOM)
     north = road % 2 == 1
@@ -179,8 +180,8 @@ def _draw_positions(
 
 
 def night_factor(seconds: FloatArray) -> FloatArray:
-    """Return how much a time of day [s] belongs to the night: a factor from 0 by day to 1 at four
-    in the morning.
+    """Return how much each time of day `seconds` (n,) belongs to the night: a factor from 0 by day
+    to 1 at four in the morning.
     """
     return np.clip(np.cos(2 * np.pi * (seconds / DAY_S - 4 / 24)), 0.0, 1.0)
 
@@ -188,8 +189,8 @@ def night_factor(seconds: FloatArray) -> FloatArray:
 def truth_of(
     world: SyntheticFleet, road: IntArray, along: IntArray, seconds: FloatArray
 ) -> FloatArray:
-    """Return the true friction: dry, except ice on the middle fifth of icy roads during the
-    night.
+    """Return the true friction (n,) at n places and times: dry, except ice on the middle fifth of
+    icy roads during the night.
     """
     middle = np.abs(along - world.length // 2) < world.length // 10
     return np.where((road % world.icy == 0) & middle & (night_factor(seconds) > 0.5), ICE, DRY)

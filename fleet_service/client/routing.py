@@ -149,8 +149,8 @@ def _has_evidence(table: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
 
 
 def _sorted_factors(table: pa.Table) -> tuple[IntArray, FloatArray]:
-    """Return two arrays: the keys (cell · 4 + sector) of the map's cells in ascending order, and
-    the cost factor of each.
+    """Return two arrays (n,): the keys (cell · 4 + sector) of the map's cells in ascending order,
+    and the cost factor of each.
     """
     counts = _has_evidence(table)
     cell, sector = (
@@ -163,8 +163,8 @@ def _sorted_factors(table: pa.Table) -> tuple[IntArray, FloatArray]:
 
 
 def _sample_road(road: RoadLine) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return latitude, longitude and yaw of points every STEP_M along a road; empty arrays for a
-    road without length.
+    """Return latitude, longitude [deg] and yaw [rad] (n,) of points every STEP_M along a road;
+    empty arrays for a road without length.
     """
     east = METRES_PER_DEGREE * np.cos(np.radians(float(np.mean(road.latitude))))
     dx = np.diff(road.longitude) * east

@@ -227,7 +227,9 @@ def link_cells(cell: IntArray) -> IntArray:
 
 
 def _find_neighbours(cell: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the positions of each pair of distinct cells at most LINK_CELLS apart."""
+    """Return the positions in `cell` of each pair of distinct cells at most LINK_CELLS apart, as
+    two arrays with one item per pair.
+    """
     column, row = (part.astype(np.int64) for part in grid.deinterleave(cell))
     key = column << 32 | row
     order = np.argsort(key)

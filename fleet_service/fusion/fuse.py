@@ -265,8 +265,8 @@ class Fusion:
         )
 
     def beliefs_for_alerts(self, slots: IntArray) -> FloatArray:
-        """Return the same as `beliefs_at_last_report`, but with a more cautious tyre-shape slope,
-        as alerts require.
+        """Return the same array (k, 32) as `beliefs_at_last_report`, but with a more cautious
+        tyre-shape slope, as alerts require.
 
         The slope says how far a report may be too low if the vehicle used little grip. Alerts use
         the upper end of the slope's range; see `shared`.
@@ -280,8 +280,8 @@ class Fusion:
         return road_beliefs(rows, self.store.table, self._weather, kernels, slots, now)
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
-        """Return the slot number of each pair of cell and sector; -1 if no vehicle has reported the
-        pair.
+        """Return the slot (row number) (n,) of each pair of cell and sector; -1 if no vehicle has
+        reported the pair.
         """
         return self.store.slots_of(cell * grid.SECTORS + sector)
 
@@ -396,8 +396,8 @@ def _make_arrivals(
 
 
 def voted_keys(o: Observations) -> IntArray:
-    """Return the keys (cell · 4 + sector) of all cells and sectors that the observations affect. A
-    key occurs once for each observation that affects it.
+    """Return the keys (cell · 4 + sector) of all cells and sectors that the observations affect, as
+    one array. A key occurs once for each observation that affects it.
     """
     return _spread_votes(o, np.arange(len(o.time)))[1]
 

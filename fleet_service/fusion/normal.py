@@ -19,7 +19,9 @@ _FAR: Final = (
 
 
 def normal_cdf(x: FloatArray) -> FloatArray:
-    """Return the distribution function Φ(x) of the standard normal distribution."""
+    """Return the distribution function Φ(x) of the standard normal distribution, in the shape of
+    `x`.
+    """
     return _normal_cdf(np.ravel(x)).reshape(x.shape)
 
 

@@ -132,8 +132,8 @@ def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
 
 
 def victim_cells(drive: AttackedDrive) -> IntArray:
-    """Return the two cells that are attacked: among the cells in which enough honest vehicles
-    measured the friction, the one with the most and the one with the least friction.
+    """Return the numbers of the two cells that are attacked: among the cells in which enough honest
+    vehicles measured the friction, the one with the most and the one with the least friction.
     """
     mu = np.where(drive.counted, drive.town.mu[BEGIN], np.nan)
     return np.array([np.nanargmax(mu), np.nanargmin(mu)])

@@ -68,9 +68,9 @@ def measure(seeds: range) -> dict[str, float]:
 
 
 def lower_ends(rng: Generator, known: WeatherSince | None) -> FloatArray:
-    """Return the lower end of the interval at each time in AFTER_MIN after the last pass. Before
-    that, vehicles drove over the dry road for an hour with enough grip used to measure the
-    friction.
+    """Return the lower end of the interval of friction at each time in AFTER_MIN after the last
+    pass. Before that, vehicles drove over the dry road for an hour with enough grip used to measure
+    the friction.
     """
     seconds = np.sort(rng.random(PASSES)) * HOUR_S
     who = rng.integers(0, CARS, PASSES)

@@ -126,9 +126,9 @@ def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles
 
 
 def _nearest_friction(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntArray) -> IntArray:
-    """Return one element of `rows` for each friction in `mu`, drawn at random from the NEAREST rows
-    with the most similar friction. `rows` must be sorted by friction; the result is -1 if there are
-    no rows.
+    """Return one element of `rows` (m,) for each friction in `mu` (n,), drawn at random from the
+    NEAREST rows with the most similar friction. `rows` must be sorted by friction; the result is -1
+    if there are no rows.
     """
     if not len(rows):
         return np.full(len(mu), -1)

@@ -93,8 +93,8 @@ def of_intervals(
 ) -> Scores:
     """Return the scores of 90 % intervals of friction; each column has k values.
 
-    The interval score is the width plus 2/α times the distance by which the interval misses the
-    true value.
+    The interval score is the width plus 20 times the distance by which the interval misses the true
+    value.
     """
     missed = np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0)
     interval = upper - lower + 2.0 / ALPHA * missed
@@ -167,8 +167,8 @@ def score_snapshots(
 
 
 def rmse(s: Scores) -> float:
-    """Return the root mean square error of the map's friction over the cells in which at least
-    ENOUGH vehicles used enough grip to measure the friction.
+    """Return the root mean square error of the map's friction values over the cells in which at
+    least ENOUGH vehicles used enough grip to measure the friction.
     """
     error = s.error[s.vehicles >= ENOUGH]
     return float(np.sqrt(np.mean(error**2))) if len(error) else float("nan")
@@ -261,7 +261,7 @@ def _mean_or_nan(values: FloatArray | BoolArray) -> float:
 
 
 def reliability(s: Scores) -> FloatArray:
-    """Return, for each quantile level in LEVELS, the share of answers in which the true friction is
-    below this quantile of the belief. For calibrated beliefs the result equals LEVELS.
+    """Return, as an array, for each quantile level in LEVELS the share of answers in which the true
+    friction is below this quantile of the belief. For calibrated beliefs the result equals LEVELS.
     """
     return np.asarray((s.rank[:, None] <= LEVELS).mean(axis=0))

@@ -158,8 +158,8 @@ def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, In
 
 
 def split_by(seconds: FloatArray, step: float) -> list[IntArray]:
-    """Return the row numbers of visits (passages of cells), divided into portions of `step` seconds
-    each; the visits must be sorted by time.
+    """Return the row numbers of visits (passages of cells) at the times `seconds` (n,), divided
+    into one array for each period of `step` seconds. The times must be in ascending order.
     """
     borders = np.flatnonzero(np.diff(seconds // step)) + 1
     return np.split(np.arange(len(seconds)), borders)

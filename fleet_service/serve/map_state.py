@@ -60,7 +60,9 @@ class MapState:
         return sorted(self._slots)
 
     def slots(self, tile: int) -> IntArray:
-        """Return the slots (cells and sectors) of a tile, in the order of their first visit."""
+        """Return the slots (row numbers of cells and sectors), (n,), of a tile, in the order of
+        their first visit.
+        """
         self._index()
         if tile not in self._slots:
             return np.zeros(0, np.int64)
@@ -97,5 +99,5 @@ class MapState:
 
 
 def tile_of(fusion: Fusion, slots: IntArray) -> IntArray:
-    """Return the tile of each slot (cell and sector)."""
+    """Return the tile number (n,) of each slot (cell and sector), given by row numbers (n,)."""
     return grid.tile_of(fusion.live.key[slots] // grid.SECTORS)

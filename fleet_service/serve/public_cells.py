@@ -99,7 +99,7 @@ class PublicCells:
         return self._fusion.beliefs(slots, now, self._rows)
 
     def slots_of(self, cell: IntArray, sector: IntArray) -> IntArray:
-        """Return the slot (row number) of each cell and sector; -1 if no vehicle has reported
+        """Return the slot (row number) (n,) of each cell and sector; -1 if no vehicle has reported
         it.
         """
         return self._fusion.slots_of(cell, sector)
@@ -128,12 +128,16 @@ class PublicCells:
         self._copy_more_slippery(voted[voted >= 0], now)
 
     def select(self, slots: IntArray, now: int) -> IntArray:
-        """Return those of the slots (cells and sectors) that are public at `now` [ns]."""
+        """Return those of the slots (row numbers of cells and sectors) that are public at `now`
+        [ns].
+        """
         self.publish(now)
         return slots[self._shown[slots]]
 
     def take_published(self) -> IntArray:
-        """Return the slots (cells and sectors) that were published since the last call."""
+        """Return the slots (row numbers of cells and sectors) that were published since the last
+        call.
+        """
         found = np.concatenate([np.zeros(0, np.int64), *self._published])
         self._published.clear()
         return found

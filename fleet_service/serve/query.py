@@ -117,8 +117,8 @@ def _view_tile(
 
 
 def _select_rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
-    """Return the rows of the tile's cells that enough vehicles have visited and that touch the
-    query's box.
+    """Return the rows of the tile's cells, as a slice or a mask, that enough vehicles have visited
+    and that touch the query's box.
 
     Usually this is a complete tile, or a contiguous part of it. Each step that releases the
     interpreter lock may wait ten times as long as the step takes, so cells are compared one by one

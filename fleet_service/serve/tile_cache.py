@@ -132,7 +132,9 @@ class TileCache:
         return cells if self._public is None else coarsen_cells(cells)
 
     def public(self, slots: IntArray, now: int) -> IntArray:
-        """Return those of the slots (cells and sectors) that are public at `now` [ns]."""
+        """Return those of the slots (row numbers of cells and sectors) that are public at `now`
+        [ns].
+        """
         slots = slots[self.state.fusion.live.vehicles[slots] >= self._least]
         return slots if self._public is None else self._public.select(slots, now)
 

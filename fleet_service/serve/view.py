@@ -66,7 +66,7 @@ class Readable(Protocol):
         """
 
     def slots_of(self, cell: IntArray, sector: IntArray) -> IntArray:
-        """Return the slot (row number) of each cell and sector; -1 if there is none."""
+        """Return the slot (row number) (n,) of each cell and sector; -1 if there is none."""
 
 
 def view_cells(source: Readable, slots: IntArray, now: int) -> CellView:

@@ -98,7 +98,7 @@ def turn_of(sent: list[Message]) -> int:
 
 
 def _decode_messages(sent: list[Message]) -> list[NDArray[Any]]:
-    """Return the columns of the observations in messages, decoded by protobuf's generated
+    """Return the columns (n,) of the n observations in messages, decoded by protobuf's generated
     module.
     """
     read = [MESSAGE.FromString(message.payload) for message in sent]

@@ -57,7 +57,9 @@ def compile_library(source: str, *options: str) -> ctypes.CDLL:
 
 
 def setting_row(memberships: Memberships) -> FloatArray:
-    """Return an array with the fields of the structure Setting of the C kernels."""
+    """Return the settings of the C filters as an array: the fields of the structure Setting in
+    order.
+    """
     setting = Setting()
     return np.array(
         [

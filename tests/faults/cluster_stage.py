@@ -96,7 +96,7 @@ class Journals:
         return float(np.diff(sorted(at for at in self._times if at >= since)).max())
 
     def first_after(self, moment: float) -> float:
-        """Wait for the first acknowledgement after a moment, and return its time."""
+        """Wait for the first acknowledgement after a moment, and return its time [s]."""
         later: list[float] = []
 
         def has_arrived() -> bool:

@@ -182,7 +182,7 @@ def _suspects(before: pa.Table | None, after: pa.Table) -> Iterator[tuple[float,
 
 
 def _places(cells: IntArray) -> FloatArray:
-    """Return the positions of map cells as complex numbers, east + i·north [m]."""
+    """Return the positions of map cells as an array of complex numbers (n,), east + i·north [m]."""
     latitude, longitude = grid.centre(cells)
     north = (latitude - LATITUDE) * 111_195.0
     east = (longitude - LONGITUDE) * 111_195.0 * np.cos(np.radians(LATITUDE))

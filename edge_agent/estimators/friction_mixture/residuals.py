@@ -75,8 +75,8 @@ def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
 
 @compiled
 def slope_along(curve: TyreCurve, g_x: float, g_y: float, mu: float) -> float:
-    """Return the derivative of the tyre's longitudinal force by the longitudinal force of a linear
-    tyre.
+    """Return the derivative [1] of the tyre's longitudinal force by that of a linear tyre with the
+    same slip.
 
     It is 1 at small slip, 0 on the flat part of the curve, and limited to at least FLATTEST.
     """

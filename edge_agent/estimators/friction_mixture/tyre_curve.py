@@ -38,8 +38,8 @@ class TyreCurve(NamedTuple):
 
 
 def magic_formulas(theta: FloatArray, c: float, e: float) -> FloatArray:
-    """Return the Magic Formula force (peak 1) at an array of normalised slips, with slope 1 at zero
-    slip.
+    """Return the Magic Formula force (peak 1) at an array of normalised slips `theta` of any shape,
+    with slope 1 at zero slip.
     """
     b = theta / c
     return np.asarray(np.sin(c * np.arctan(b - e * (b - np.arctan(b)))))

@@ -44,7 +44,7 @@ class GivenMotion:
 
     @property
     def row(self) -> FloatArray:
-        """Return the parameters of the vehicle as an array indexed by `Parameter`."""
+        """Return the parameters of the vehicle as an array (15,) indexed by `Parameter`."""
         return parameter_row(self.vehicle)
 
     def wheel_forces(self) -> FloatArray:

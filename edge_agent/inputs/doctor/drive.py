@@ -84,7 +84,7 @@ def smooth_twice(x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
 
 
 def interpolate_near(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray:
-    """Return the readings x of a signal interpolated linearly at the times `at`; NaN between
+    """Return the readings x of a signal interpolated linearly at the times `at` (n,); NaN between
     readings that are more than JOINED_S apart.
     """
     good = np.isfinite(x)
@@ -100,8 +100,8 @@ def interpolate_near(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray
 def over_ground(
     t: FloatArray, latitude: FloatArray, longitude: FloatArray, at: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return speed [m/s] and course [rad] at the times `at`, computed from the positions FIX_S / 2
-    before and FIX_S / 2 after each time.
+    """Return speed [m/s] and course [rad] at the times `at` (n,), computed from the positions FIX_S
+    / 2 before and FIX_S / 2 after each time.
     """
     north = interpolate_near(t, np.radians(latitude) * EARTH_RADIUS_M, at)
     east = interpolate_near(t, np.radians(longitude) * EARTH_RADIUS_M, at) * np.cos(
@@ -236,9 +236,9 @@ def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
 
 
 def _nearest_yaw(t: FloatArray, yaw: FloatArray, at: FloatArray) -> FloatArray:
-    """Return, for each time in `at`, the nearest reading of the yaw angle, which is recorded less
-    often than other signals. Readings are not averaged, because averages of angles near ±π would be
-    wrong.
+    """Return, for each time in `at` (n,), the nearest reading of the yaw angle, which is recorded
+    less often than other signals. Readings are not averaged, because averages of angles near ±π
+    would be wrong.
     """
     good = np.flatnonzero(np.isfinite(yaw))
     if len(good) < 2:

@@ -159,7 +159,7 @@ def diagnose(
 
 
 def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
-    """Return the times in seconds, and True if the sampling rate is unusable.
+    """Return the times (n,) in seconds, and True if the sampling rate is unusable.
 
     Times in another unit are converted. A wrong unit and an unusable rate are added to the
     diagnosis as faults.

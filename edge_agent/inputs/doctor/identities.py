@@ -275,8 +275,9 @@ def _bend_of(
 def _fit_with_priors(
     table: FloatArray, y: FloatArray, loose: tuple[float, ...], count: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the gains of the terms of an identity (left = Σ gain · term), fitted by robust least
-    squares, and their standard deviations.
+    """Return the gains (k,) of the terms of an identity `y` = Σ gain · term, with the terms as
+    columns of `table` (n, k), and the gains' standard deviations (k,). They are fitted by robust
+    least squares.
 
     The gains of the last columns have a prior with mean 0 and the standard deviations `loose`.
     """
@@ -317,8 +318,9 @@ def _median_ratio(x: FloatArray, y: FloatArray) -> float:
 
 
 def fit_robustly(table: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the least-squares solution of table · x = y, fitted twice. The second fit leaves out
-    points whose residual in the first fit exceeds three robust standard deviations.
+    """Return the least-squares solution x (k,) of table · x = y for a table (n, k), fitted twice.
+    The second fit leaves out points whose residual in the first fit exceeds three robust standard
+    deviations.
     """
     solution = np.linalg.lstsq(table, y, rcond=None)[0]
     off = np.abs(y - table @ solution)

@@ -63,8 +63,8 @@ class Stamps:
 
     @property
     def lead(self) -> float:
-        """Return the seconds to add to the source's time stamps; 0 where the stamps are used
-        unchanged.
+        """Return the time [s] that is added to the source's time stamps; 0 where the stamps are
+        used unchanged.
         """
         least = min(self._before, self._lately)
         return 0.0 if -EARLY_S <= least < BELIEVED_S or least == float("inf") else least

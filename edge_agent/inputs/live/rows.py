@@ -257,8 +257,8 @@ class LiveRows:
 
 
 def _readings_at(series: Series | None, times: FloatArray) -> FloatArray:
-    """Return the readings of a signal at exactly the given times, without interpolation; NaN at
-    times without a reading.
+    """Return the readings of a signal at exactly the given times (n,), without interpolation; NaN
+    at times without a reading.
     """
     found = np.full(len(times), np.nan)
     if series is not None and len(series.t):

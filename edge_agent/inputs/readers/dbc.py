@@ -108,8 +108,9 @@ class CanMessage:
     multiplexer: str | None = None
 
     def decode(self, data: Bytes, names: list[str]) -> dict[str, FloatArray]:
-        """Decode the frames of this message: return the physical values by signal; NaN where a
-        frame does not contain a multiplexed signal."""
+        """Decode the frames of this message: return the physical values (n,) by signal; NaN where a
+        frame does not contain a multiplexed signal.
+        """
         found = {name: self.signals[name].decode(data) for name in names}
         switched = [name for name in names if self.signals[name].switch is not None]
         if switched and self.multiplexer is not None:

@@ -191,8 +191,8 @@ def _parse_seconds(
     name: str,
     unit: str | None,
 ) -> tuple[FloatArray, int | None]:
-    """Convert the time column of a table. Return the seconds since the first row, and the time of
-    that row [ns UTC], or None if the column has no dates.
+    """Convert the time column of a table. Return the seconds (n,) since the first row, and the time
+    of that row [ns UTC], or None if the column has no dates.
     """
     if pa.types.is_timestamp(column.type):
         ns = pc.cast(pc.cast(column, pa.timestamp("ns", tz=column.type.tz)), pa.int64())

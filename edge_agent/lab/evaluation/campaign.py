@@ -145,7 +145,8 @@ def _all_measures(name: str, batch: DriveSet, reported: Estimates) -> dict[str, 
 
 def _foreign_tyres(seeds: Sequence[int], log_line: Callable[[str], None]) -> dict[str, FloatArray]:
     """Return, by kind of tyre, how often the default estimator's friction interval contains the
-    true value, over all scenarios. The tyres differ from the filter's tyre model.
+    true value: one share per simulated drive of all scenarios. The tyres differ from the filter's
+    tyre model.
     """
     found: dict[str, list[float]] = {kind: [] for kind in FOREIGN}
     kinds = list(FOREIGN)

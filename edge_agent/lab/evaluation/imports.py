@@ -150,7 +150,9 @@ def import_s(folder: Path) -> float:
 
 
 def estimates_of(log: Path, drive: Recorded) -> FloatArray:
-    """Return all outputs of the default estimator for a signal log that was imported."""
+    """Return all outputs of the default estimator, (T, 1, columns), for the T samples of an
+    imported signal log.
+    """
     read = read_log(log)
     return np.asarray(
         bank_of("aco-fckf", [drive.vehicle]).advance(read.t[:, None], read.signals[:, None]).values

@@ -98,9 +98,9 @@ def consistency(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Return two measures over the last LAST_S of drives on a road with different friction left and
-    right: the friction error on the side with less friction, and the coverage of the interval on
-    the other side.
+    """Return two measures by name, one value per drive, over the last LAST_S of drives on a road
+    with different friction left and right: the friction error on the side with less friction, and
+    the coverage of the interval on the other side.
     """
     end = batch.last(LAST_S)
     truth = batch.mu_wheel
@@ -118,8 +118,9 @@ def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def arrival(batch: DriveSet, reported: Estimates) -> FloatArray:
-    """Return the time [s] from the change of friction until the friction estimate is within NEAR of
-    the new value; if this never happens, the time from the change to the end of the drive.
+    """Return, per drive, the time [s] from the change of friction until the friction estimate is
+    within NEAR of the new value; if this never happens, the time from the change to the end of the
+    drive.
     """
     changed = batch.mu == batch.mu[-1]
     seconds = np.empty(batch.t.shape[1])
@@ -132,8 +133,8 @@ def arrival(batch: DriveSet, reported: Estimates) -> FloatArray:
 
 
 def false_changes(batch: DriveSet, reported: Estimates) -> FloatArray:
-    """Return, per drive, how often the friction interval lies more than NEAR away from the constant
-    true friction for at least HOLD_S.
+    """Return, for each of N drives, how often the friction interval lies more than NEAR away from
+    the constant true friction for at least HOLD_S.
     """
     wrong = (reported.mu_upper < batch.mu - NEAR) | (reported.mu_lower > batch.mu + NEAR)
     hold = max(1, round(HOLD_S / float(batch.t[1, 0] - batch.t[0, 0])))

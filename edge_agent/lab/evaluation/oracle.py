@@ -166,8 +166,8 @@ def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
 
 
 def _theta(force: FloatArray, shape: float, curvature: float) -> FloatArray:
-    """Return the normalised slip on the rising branch at which the tyre uses the share `force` of
-    its grip.
+    """Return the normalised slips (n,) on the rising branch at which the tyre uses the shares
+    `force` (n,) of its grip.
     """
     curve = _curve(shape, curvature)
     return np.interp(force, curve, THETA[: len(curve)])
@@ -175,8 +175,8 @@ def _theta(force: FloatArray, shape: float, curvature: float) -> FloatArray:
 
 @cache
 def _curve(shape: float, curvature: float) -> FloatArray:
-    """Return the tyre's force curve: force over peak force at the normalised slips THETA, up to the
-    peak.
+    """Return the tyre's force curve: an array of force over peak force at the normalised slips
+    THETA, up to the peak.
     """
     curve = np.array([magic_formula(x, shape, curvature) for x in THETA])
     return curve[: int(np.argmax(curve)) + 1]

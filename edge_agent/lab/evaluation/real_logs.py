@@ -141,8 +141,8 @@ def replay_log(log: SignalLog, vehicle: Vehicle) -> tuple[FloatArray, int | None
 
 
 def read_truth(path: Path, t: FloatArray) -> dict[str, FloatArray]:
-    """Return the measured true values by column at the times of the log; NaN where they were not
-    measured.
+    """Return the measured true values by name, at the times `t` (T,) of the log; NaN where they
+    were not measured.
     """
     file = path.with_suffix(".truth.parquet")
     if not file.exists():

@@ -153,9 +153,9 @@ def recent_maximum(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDO
 
 
 def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
-    """Return the interval score: width of the interval plus, if the true value lies outside, MISS
-    times its distance from the interval. The score rewards narrow intervals that contain the true
-    value.
+    """Return the interval score of each sample, in the arrays' common shape: width of the interval
+    plus, if the true value lies outside, MISS times its distance from the interval. The score
+    rewards narrow intervals that contain the true value.
     """
     return np.asarray(
         upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0))

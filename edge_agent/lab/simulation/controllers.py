@@ -59,7 +59,7 @@ HELD_RATE: Final = 2.0  # of these, per second
 
 @compiled
 def slip_limit(p: FloatArray, i: int) -> float:
-    """Return the slip limit of wheel `i` at which ABS begins to release the brake."""
+    """Return the slip limit [1] of wheel `i` at which ABS begins to release the brake."""
     return float(p[TrueParameter.SLIP_LIMIT] if i < 2 else REAR_LIMIT * p[TrueParameter.SLIP_LIMIT])
 
 
@@ -115,7 +115,7 @@ def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int,
 
 @compiled
 def spin_excess(x: FloatArray, p: FloatArray, w: FloatArray, i: int) -> float:
-    """Return the drive slip of wheel `i` divided by the slip limit of traction control."""
+    """Return the drive slip of wheel `i` divided by the slip at which traction control acts [1]."""
     along = w[Wheel.SPEED, i]
     faster = p[Parameter.RADIUS] * x[Motion.OMEGA + i] - along
     return float(faster / (p[TrueParameter.SLIP_LIMIT] * max(abs(along), TCS_SLOWEST)))

@@ -340,8 +340,9 @@ def _truth(records: FloatArray, air_temperature: float) -> Truth:
 def _start(
     network: Network, parameters: FloatArray, rngs: list[np.random.Generator]
 ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
-    """Return the initial states of the vehicles. Each starts at a start point of the road network
-    at walking pace, with a driver of its own drawn at random.
+    """Return the initial states of N vehicles as arrays with N rows: motion, drivers, routes and
+    wheels. Each starts at a start point of the road network at walking pace, with a driver of its
+    own drawn at random.
     """
     count = len(rngs)
     vehicles = np.zeros((count, STATES))

@@ -275,7 +275,7 @@ def throttle(_now: Moment) -> tuple[float, float]:
 
 
 def kmh(speed: float) -> float:
-    """Convert a speed from km/h to m/s."""
+    """Return a speed given in km/h in m/s."""
     return speed / 3.6
 
 

@@ -79,7 +79,7 @@ class Network:
     starts: IntArray | None = None
 
     def lane(self, k: int) -> FloatArray:
-        """Return the points of lane k, one row of the table each."""
+        """Return the points of lane k as rows of a table (n, columns)."""
         return self.points[self.first[k] : self.first[k] + self.size[k]]
 
 
@@ -158,8 +158,8 @@ def round_corners(corners: list[tuple[float, float]], radius: float) -> FloatArr
 
 
 def resample_line(line: FloatArray, spacing: float = SPACING_M) -> FloatArray:
-    """Return the same line with equally spaced points, about `spacing` [m] apart, and the same
-    ends.
+    """Return the same line of points (x, y), shape (n, 2) [m], with equally spaced points, about
+    `spacing` [m] apart, and the same ends.
     """
     run = _distance_along(line)
     even = np.linspace(0.0, run[-1], max(2, round(run[-1] / spacing) + 1))
@@ -174,8 +174,8 @@ def shifted_right(line: FloatArray, offset: float) -> FloatArray:
 
 
 def connect_lanes(arriving: FloatArray, leaving: FloatArray) -> FloatArray:
-    """Return the line through a junction: a cubic Bezier curve from the end of one lane to the
-    start of the other, without a kink.
+    """Return the line through a junction: points (n, 2) [m] of a cubic Bezier curve from the end of
+    one lane to the start of the other, without a kink.
     """
     p0 = arriving[-1]
     p3 = leaving[0]
@@ -242,8 +242,8 @@ def network_of(
 
 
 def _lane_table(lane: FloatArray) -> FloatArray:
-    """Return the table of the points of one lane, with heading and smoothed curvature. Its speed
-    profile is not yet computed.
+    """Return the table of the points of one lane, one row each, with position, heading and smoothed
+    curvature. Its speed profile is not yet computed.
     """
     step = np.gradient(lane, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))

@@ -68,7 +68,9 @@ class Scenario:
 
     @cached_property
     def table(self) -> FloatArray:
-        """Return the friction table of background and patches, for `friction.look_up`."""
+        """Return the friction table (one row per patch of road surface, the first is the
+        background), for `friction.look_up`.
+        """
         return friction_table(self.background, self.patches)
 
     @property

@@ -93,8 +93,8 @@ class SearchTally:
         return np.asarray(np.clip(vector, self.lower, self.upper))
 
     def uniform(self, rng: np.random.Generator) -> FloatArray:
-        """Return a random vector, uniform over the whole range of the variables, that the problem
-        admits.
+        """Return a random vector (V,), uniform over the whole range of the variables, that the
+        problem admits.
 
         Raises:
             InputError: no vector out of REDRAWS draws is admissible.
@@ -171,8 +171,8 @@ def _next_vector(
     rng: np.random.Generator,
     habits: ArchiveHabits,
 ) -> FloatArray:
-    """Return the next vector to evaluate: first the start vector, then random vectors until the
-    archive is full, then vectors drawn near a vector of the archive (the best vectors so far).
+    """Return the next vector (V,) to evaluate: first the start vector, then random vectors until
+    the archive is full, then vectors drawn near a vector of the archive (the best vectors so far).
     """
     if tally.count == 0 and tally.problem.start is not None:
         return tally.fit(np.asarray(tally.problem.start, float))

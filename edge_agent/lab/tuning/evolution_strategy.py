@@ -51,8 +51,8 @@ def optimise(
 def _mutate_vector(
     tally: SearchTally, parent: FloatArray, step: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Return a random variation of the vector `parent` that the problem admits; return `parent` if
-    none is found.
+    """Return a random variation of the vector `parent` (V,) that the problem admits; return
+    `parent` if none is found.
     """
     for _ in range(REDRAWS):
         child = tally.fit(rng.normal(parent, step * (tally.upper - tally.lower)))

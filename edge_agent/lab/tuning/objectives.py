@@ -222,7 +222,7 @@ def record_town(seed: int, cars: int, duration_s: float) -> TuningSet:
 
 
 def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
-    """Return the interval score of each 90 % interval, in the unit of `truth`."""
+    """Return the interval score of each 90 % interval, in the shape and unit of `truth`."""
     score: FloatArray = (
         upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0))
     )
@@ -302,9 +302,9 @@ def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
 
 
 def choices(positions: int) -> tuple[FloatArray, ...]:
-    """Return, for every vertex (corner of a fuzzy set) and every noise scale, `positions` candidate
-    values. They are evenly spaced within the bounds; the one nearest to the default value is
-    replaced with the default.
+    """Return an array of `positions` candidate values for every vertex (corner of a fuzzy set) and
+    every noise scale. They are evenly spaced within the bounds; the one nearest to the default
+    value is replaced with the default.
     """
     default = Memberships().to_vector()
     found = []

@@ -122,8 +122,8 @@ class Ledger:
     history: list[Iteration] = field(default_factory=list)
 
     def draw(self, sample: Callable[[], IntArray]) -> IntArray:
-        """Return a path (one index of a value per variable) that `sample` draws and the problem
-        admits, if possible one that was not evaluated before.
+        """Return a path (V,), one index of a value per variable, that `sample` draws and the
+        problem admits, if possible one that was not evaluated before.
 
         Raises:
             InputError: no drawn path is admissible.

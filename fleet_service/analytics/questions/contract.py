@@ -105,8 +105,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def slot_intervals(found: pa.Table) -> dict[str, FloatArray]:
-    """Return mean and 90 % interval of mu for each piece of a link and each time slot, computed
-    from the values of its vehicles.
+    """Return arrays by name with mean and 90 % interval of mu for each piece of a link and each
+    time slot, computed from the values of its vehicles.
 
     The error of a mean is the larger of two estimates: from the spread between vehicles, and from
     the intervals that they reported.

@@ -182,7 +182,9 @@ def read_roads(path: Path) -> pa.Table:
 
 
 def _link_marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
-    """Return the lengths [m] of the road links, and the marks (points every STEP_M) along them."""
+    """Return the lengths (n,) [m] of the road links, and the marks (points every STEP_M) along
+    them.
+    """
     lengths = np.empty(len(links))
     parts = []
     for k, link in enumerate(links):
@@ -210,8 +212,8 @@ def _link_marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
 
 
 def _nearby_cells(marks: _Marks, side: float) -> IntArray:
-    """Return the cells that may lie on a road link: all cells within REACH_M metres of a mark, and
-    some further ones.
+    """Return the numbers (n,) of the cells that may lie on a road link: all cells within REACH_M
+    metres of a mark, and some further ones.
     """
     x, y = grid.deinterleave(np.unique(grid.cell_of(marks.latitude, marks.longitude)))
     wide = int(np.ceil(REACH_M / side))
@@ -221,8 +223,9 @@ def _nearby_cells(marks: _Marks, side: float) -> IntArray:
 
 
 def _first_of(order: IntArray, *groups: IntArray) -> IntArray:
-    """Return the first index of each group in `order`. Elements with equal numbers in all arrays
-    `groups` form a group; `order` contains the indices of the elements, sorted by group.
+    """Return the first index of each group in `order`, one item per group. Elements with equal
+    numbers in all arrays `groups` form a group; `order` contains the indices of the elements,
+    sorted by group.
     """
     new = np.zeros(len(order), np.bool_)
     new[:1] = True

@@ -110,7 +110,7 @@ def count_staying(pairs: RecordArray, least: int) -> int:
 @compiled
 def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: int) -> IntArray:
     """Move the pairs (vehicle and cell) that must stay to another table, see `_must_stay`. Return
-    the rows of the other pairs in the old table.
+    the row numbers of the other pairs in the old table, one array.
     """
     dropped = np.empty(len(old), np.int64)
     count = 0

@@ -124,7 +124,9 @@ class Store:
         ]
 
     def slots_of(self, keys: IntArray) -> IntArray:
-        """Return the slot of each key (cell and sector); NONE if the key has no slot."""
+        """Return the slot (row number) (n,) of each key (cell and sector); NONE if the key has no
+        slot.
+        """
         return rows_of(self._slots, self.state.live.cells, np.asarray(keys, np.int64))
 
     @property
@@ -133,8 +135,8 @@ class Store:
         return self._slots
 
     def slots_for(self, keys: IntArray) -> IntArray:
-        """Return the slot of each key (cell and sector). An unknown key gets a new slot, which
-        begins with the prior.
+        """Return the slot (row number) (n,) of each key (cell and sector). An unknown key gets a
+        new slot, which begins with the prior.
         """
         slots = self.slots_of(keys)
         new = np.flatnonzero(slots == NONE)
@@ -154,11 +156,15 @@ class Store:
         return slots
 
     def known(self, vehicle: IntArray) -> IntArray:
-        """Return the index of each vehicle; NONE for an unknown vehicle."""
+        """Return the row number (n,) of each of the given vehicle numbers (n,); NONE for an unknown
+        vehicle.
+        """
         return rows_of(self._known, self.names, vehicle)
 
     def vehicles_of(self, vehicle: IntArray) -> IntArray:
-        """Return the index of each vehicle; an unknown vehicle gets the next free index."""
+        """Return the row number (n,) of each of the given vehicle numbers (n,); an unknown vehicle
+        gets the next free index.
+        """
         index = self.known(vehicle)
         if not len(index) or index.min() != NONE:
             return index
@@ -285,9 +291,9 @@ class Store:
 
 @compiled
 def find_due_windows(windows: RecordArray, before: int) -> tuple[IntArray, IntArray]:
-    """Return the lateness windows that contain observations older than `before` [ns], as two
-    arrays: windows in which all observations are lower bounds, and windows with at least one value
-    of friction.
+    """Return the lateness windows that contain observations older than `before` [ns], as two arrays
+    of row numbers: windows in which all observations are lower bounds, and windows with at least
+    one value of friction.
     """
     plain = np.empty(len(windows), np.int64)
     valued = np.empty(len(windows), np.int64)
@@ -305,15 +311,17 @@ def find_due_windows(windows: RecordArray, before: int) -> tuple[IntArray, IntAr
 
 
 def no_peers(vehicles: int) -> RecordArray:
-    """Return empty comparison records for vehicles that have not been compared with others yet."""
+    """Return empty comparison records, one row for each of the `vehicles` vehicles that have not
+    been compared with others yet.
+    """
     peers = np.zeros(vehicles, PEER)
     peers["other"] = NOBODY
     return peers
 
 
 def distinct_values(values: IntArray) -> IntArray:
-    """Return the distinct values of an array in ascending order. Sorting is several times faster
-    than a set here.
+    """Return the distinct values of an array (n,) in ascending order. Sorting is several times
+    faster than a set here.
     """
     ordered = np.sort(values)
     return np.asarray(

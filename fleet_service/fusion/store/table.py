@@ -172,8 +172,8 @@ def pair_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
 
 
 def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
-    """Return a hash table that has room for `entries` row numbers and contains the first `used`
-    rows.
+    """Return a hash table (one array of row numbers) that has room for `entries` row numbers and
+    contains the first `used` rows.
     """
     table = np.full(places_for(entries, ROWS_MOST), NONE, np.int64)
     fill_table(table, rows, used)

@@ -21,8 +21,8 @@ HOME = Pose(57.7, 11.97, 0.3, 14.0, NOW)
 def line(
     length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Return latitude and longitude [deg] of points of a straight road through the car's position,
-    one point per metre.
+    """Return latitude and longitude [deg] of the points (n,) of a straight road through the car's
+    position, one point per metre.
 
     Args:
         length: distance of the last point from the car [m].
@@ -34,7 +34,9 @@ def line(
 
 
 def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) -> IntArray:
-    """Return the keys (cell · 4 + sector) along the road of `line`, in order, each once."""
+    """Return the keys (cell · 4 + sector) along the road that `line` returns, (n,), in order, each
+    once.
+    """
     key = grid.cell_of(*line(length, yaw, start)) * grid.SECTORS + int(grid.sector_of(yaw))
     return key[np.sort(np.unique(key, return_index=True)[1])]
 

@@ -43,8 +43,9 @@ def join_drives(*parts: tuple[FloatArray, FloatArray, Vehicle]) -> tuple[FloatAr
 
 
 def drive_over_joints() -> tuple[FloatArray, FloatArray, Vehicle]:
-    """Return a drive of gentle acceleration over joints in a dry motorway, without torque signals.
-    At each joint the wheel speeds of an axle jump by 3 to 4 % for 50 ms.
+    """Return times, signals and vehicle of a drive of gentle acceleration over joints in a dry
+    motorway, without torque signals. At each joint the wheel speeds of an axle jump by 3 to 4 % for
+    50 ms.
 
     The recorded minute tests/data/rav4.blf has such jumps at 1.7 and 38.4 s.
     """

@@ -228,8 +228,8 @@ def make_drive(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
 
 
 def made_up(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
-    """Return a drive with signals that the simulator cannot produce: a stop with slipping wheels, a
-    standing car, or side force without yaw.
+    """Return times, signals and vehicle of a drive with signals that the simulator cannot produce:
+    a stop with slipping wheels, a standing car, or side force without yaw.
     """
     t = np.arange(0.0, 4.0 if name == "stopping" else 20.0, 0.01)
     signals = np.zeros((len(t), len(CHANNELS)))

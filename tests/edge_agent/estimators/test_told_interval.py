@@ -65,7 +65,7 @@ def find_told_interval(
 
 
 def about(mu: float, width: float) -> FloatArray:
-    """Return probabilities of the nodes (friction hypotheses) as a bell curve of width `width`
+    """Return the probabilities (nodes,) of the friction hypotheses as a bell curve of width `width`
     around the friction `mu`.
     """
     weight = DESIGN.prior * np.exp(-0.5 * ((DESIGN.mu - mu) / width) ** 2)

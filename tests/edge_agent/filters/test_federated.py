@@ -21,7 +21,7 @@ def covariance(n: int, seed: int) -> FloatArray:
 
 
 def root_of(cov: FloatArray) -> FloatArray:
-    """Return the lower triangular factor of a covariance."""
+    """Return the lower triangular Cholesky factor (n, n) of a covariance (n, n)."""
     return np.asarray(np.linalg.cholesky(cov), np.float64)
 
 
@@ -32,8 +32,8 @@ System = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 def textbook(
     mean: FloatArray, cov: FloatArray, system: System, z: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean and covariance after one step of the textbook Kalman filter, which computes with
-    full covariances.
+    """Return mean (n,) and covariance (n, n) after one step of the textbook Kalman filter with the
+    measurement `z`, which computes with full covariances.
     """
     f, q, h, noise = system
     mean = f @ mean

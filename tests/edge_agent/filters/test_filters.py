@@ -82,7 +82,7 @@ def test_a_covariance_keeps_a_centimetre_at_an_offset_of_5400_kilometres(rule: S
 
 
 def factor_of(cov: FloatArray) -> FloatArray:
-    """Return the lower-triangular factor of a covariance."""
+    """Return the lower triangular Cholesky factor (n, n) of a covariance (n, n)."""
     return np.asarray(np.linalg.cholesky(cov), np.float64)
 
 
@@ -189,8 +189,8 @@ def test_square_root_filter_is_textbook_for_a_nonlinear_measurement() -> None:
 def _textbook(
     rule: SigmaRule, mean: FloatArray, cov: FloatArray, q: FloatArray, r: FloatArray, z: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean and covariance after one step of the cubature filter with full covariances, for
-    the pendulum below.
+    """Return mean (2,) and covariance (2, 2) after one step of the cubature filter with full
+    covariances, for the pendulum below.
     """
     points = swing(mean + rule.xi @ np.linalg.cholesky(cov).T)
     mean = points.mean(axis=0)

@@ -37,7 +37,7 @@ HOUR_NS = 3600 * 10**9
 
 
 def find_visited(fusion: Fusion) -> IntArray:
-    """Return the row numbers (slots) of those cells and sectors in a `Fusion` (beliefs about all
+    """Return the row numbers (n,) of those cells and sectors in a `Fusion` (beliefs about all
     cells) that a vehicle visited.
     """
     return np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)

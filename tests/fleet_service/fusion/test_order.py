@@ -40,7 +40,9 @@ def drive(seed: int, n: int, duration_s: float) -> Observations:
 
 
 def delay_arrivals(o: Observations, most_s: float, seed: int) -> IntArray:
-    """Return an order of arrival of observations in which each is at most `most_s` [s] late."""
+    """Return an order of arrival (indices of the observations) in which each is at most `most_s`
+    [s] late.
+    """
     return np.argsort(
         o.time + (np.random.default_rng(seed).random(len(o.time)) * most_s * 1e9).astype(np.int64)
     )

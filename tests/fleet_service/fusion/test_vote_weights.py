@@ -71,8 +71,9 @@ def test_gain_error_common_to_value_and_use_is_no_shape(gain_std: float) -> None
 
 
 def road_after(slope: float, used: float) -> FloatArray:
-    """Return the belief about a new cell after three reported values of .5 from vehicles that used
-    a grip of `used`, in a fleet whose values are too low by `slope` per unit of unused μ.
+    """Return the belief (32 probabilities of μ) about a new cell after three reported values of .5
+    from vehicles that used a grip of `used`, in a fleet whose values are too low by `slope` per
+    unit of unused μ.
     """
     fusion = make_acquainted(slope)
     o = observations(2500.0 + np.arange(3.0), np.arange(3), value(np.full(3, 0.5)), cell=70)

@@ -107,8 +107,8 @@ def _report(
 
 
 def _drive(parts: Sequence[Part]) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return cell, heading and mu of each visit, in the order of a drive: east, west,
-    north, south.
+    """Return cell, heading sector and mu of each visit as arrays (n,), in the order of a drive:
+    east, west, north, south.
     """
     found = []
     for heading in (EAST, WEST, NORTH, SOUTH):

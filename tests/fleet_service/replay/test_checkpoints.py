@@ -122,8 +122,8 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(
 
 
 def read_state(engine: Engine) -> dict[str, NDArray[Any]]:
-    """Return the beliefs and columns from which a map is made, sorted by cell and sector, with the
-    latest minute (epoch) and the time of the newest row.
+    """Return the beliefs and columns from which a map is made as arrays by name, sorted by cell and
+    sector, with the latest minute (epoch) and the time of the newest row.
     """
     fusion = engine.state.fusion
     rows = engine.state.fusion.store.state.live

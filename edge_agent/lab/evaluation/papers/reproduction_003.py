@@ -324,8 +324,8 @@ def _add_noise(signals: FloatArray) -> FloatArray:
 
 
 def _scale_radius(signals: FloatArray) -> FloatArray:
-    """Return the signals of a car whose wheel radius is larger than the filter assumes, by the
-    share WHEEL_RADIUS_ERROR.
+    """Return the signals (T, 18) of a car whose wheel radius is larger than the filter assumes, by
+    the share WHEEL_RADIUS_ERROR.
     """
     changed = signals.copy()
     changed[:, S.OMEGA : S.OMEGA + 4] /= 1.0 + WHEEL_RADIUS_ERROR

@@ -19,8 +19,8 @@ from schemas.signals import CHANNELS, S
 
 @pytest.fixture(scope="module")
 def drive() -> tuple[SimulatedFleet, FloatArray, FloatArray, Truth]:
-    """Return two minutes of thirty vehicles in the demonstration with ideal sensors: fleet, times,
-    signals, and true states.
+    """Return two minutes of thirty vehicles in the demonstration with ideal sensors: fleet, times
+    (T, N), signals (T, N, 18), and true states.
     """
     fleet = SimulatedFleet("demo", 30, seed=11, rate_hz=50.0, sensors="ideal")
     t, signals = fleet.step(120 * 50)

@@ -48,7 +48,7 @@ def column(log: pa.Table, name: str) -> FloatArray:
 
 
 def sine(slope: float) -> float:
-    """Return the sine of the slope angle, for a slope given as its tangent."""
+    """Return the sine of the slope angle, for a slope given as rise per metre."""
     return slope / float(np.hypot(1.0, slope))
 
 
