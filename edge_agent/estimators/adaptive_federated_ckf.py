@@ -133,7 +133,7 @@ def _step_filter(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> b
 @compiled
 def _adapt_noise_and_shares(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> None:
     """Compute the factors on the measurement noise R of both sub-filters, and the shares of the
-    master's information that they get, for the next sample.
+    master's information that they get, for the next sample, `dt` [s] after the last one.
     """
     motion = memory.motion
     keep = 0.5 ** (dt / WINDOW_S)

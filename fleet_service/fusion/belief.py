@@ -111,8 +111,8 @@ def quantiles(belief: FloatArray, levels: tuple[float, ...]) -> FloatArray:
 
 @refcount_free_inlined
 def sum_bins(p: Bins) -> float:
-    """Return the sum of an array with one number per friction bin (32). Eight partial sums do not
-    depend on each other, so the processor computes them in parallel.
+    """Return the sum of an array `p` (32,) with one number per friction bin. Eight partial sums do
+    not depend on each other, so the processor computes them in parallel.
     """
     a = p[0]
     b = p[1]
@@ -136,8 +136,8 @@ def sum_bins(p: Bins) -> float:
 
 @refcount_free_inlined
 def largest_bin(p: Bins) -> float:
-    """Return the largest number of an array with one number per friction bin (32). Eight partial
-    results do not depend on each other, so the processor computes them in parallel (SIMD).
+    """Return the largest number of an array `p` (32,) with one number per friction bin. Eight
+    partial results do not depend on each other, so the processor computes them in parallel (SIMD).
     """
     a = p[0]
     b = p[1]

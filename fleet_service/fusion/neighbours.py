@@ -190,8 +190,8 @@ def _slippery_probability(road: Bins) -> float:
 
 @refcount_free_inlined
 def _stored_slippery(live: Rows, row: int) -> float:
-    """Return P(slippery) of a stored belief without unpacking it, which takes a tenth of the
-    time.
+    """Return P(slippery) of the belief stored in `row` of the cells without unpacking it, which
+    takes a tenth of the time.
     """
     whole = 0.0
     slippery = 0.0

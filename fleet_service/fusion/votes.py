@@ -265,8 +265,9 @@ def update(
 
 @refcount_free_inlined
 def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
-    """Lower P(slippery) of a belief after a visit without a value and without an intervention of a
-    slip controller. `noticed` is the probability that a visitor of a slippery road gives a value.
+    """Lower P(slippery) of a belief `p` (32,) in place after a visit without a value and without an
+    intervention of a slip controller. `noticed` is the probability that a visitor of a slippery
+    road gives a value.
 
     P(slippery) does not fall below the larger of UNSURE and the prior's P(slippery), because such a
     visit can end the certainty of ice but does not show grip.

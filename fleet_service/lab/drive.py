@@ -73,8 +73,9 @@ def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
 
 
 def draw_arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
-    """Draw deliveries of the visits: some come late, some twice. Return two arrays with one item
-    per delivery: the arrival time [s], in ascending order, and the index of the visit.
+    """Draw at random how the reports of the visits are delivered: some come late, some twice.
+    Return two arrays with one item per delivery: the arrival time [s], in ascending order, and the
+    index of the visit.
     """
     n = len(v)
     delay = rng.exponential(DELAY_S, n) + np.where(

@@ -121,8 +121,8 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
 
 
 def raised_alerts(fusion: Fusion, o: Observations) -> list[Alert]:
-    """Fuse the observations of a drive second by second, as a service does; return the alerts that
-    were raised.
+    """Compute a map from the observations of a drive second by second, as a service does; return
+    the alerts that were raised.
     """
     alerts = Alerts(fusion)
     raised = []

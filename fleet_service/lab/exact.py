@@ -30,8 +30,8 @@ PARTS: Final = 60  # portions in which a shuffled drive comes
 
 
 def largest_difference(a: Fusion, b: Fusion) -> float:
-    """Return the largest difference between two fusions in any probability of any cell's belief; 1
-    if a cell exists in only one of them.
+    """Return the largest difference between two `Fusion` objects in any of the 32 probabilities of
+    any cell's belief; 1 if a cell exists in only one of them.
     """
     there = b.slots_of(a.cell[: a.size], a.sector[: a.size])
     if a.size != b.size or (there < 0).any():
@@ -51,8 +51,9 @@ def drive_town(rng: Generator) -> Visits:
 
 
 def order_difference(rng: Generator) -> float:
-    """Return the largest difference of a probability between fusing in order of time and fusing in
-    random order within the allowed lateness.
+    """Return the largest difference of a probability of a belief between two maps: one from
+    observations in order of time, the other from observations in random order within the allowed
+    delay.
     """
     visits = drive_town(rng)
     o = observations_of(rows_of(visits), visits.vehicle)

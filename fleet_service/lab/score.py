@@ -91,7 +91,7 @@ def of_intervals(
     rank: FloatArray,
     slippery: FloatArray,
 ) -> Scores:
-    """Return the scores of 90 % intervals of friction; each column has k values.
+    """Return the scores of 90 % intervals of friction; each argument is an array (k,).
 
     The interval score is the width plus 20 times the distance by which the interval misses the true
     value.
@@ -167,7 +167,7 @@ def score_snapshots(
 
 
 def rmse(s: Scores) -> float:
-    """Return the root mean square error of the map's friction values over the cells in which at
+    """Return the root mean square error of the map's friction values [1] over the cells in which at
     least ENOUGH vehicles used enough grip to measure the friction.
     """
     error = s.error[s.vehicles >= ENOUGH]

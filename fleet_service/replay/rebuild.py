@@ -321,8 +321,8 @@ def _select_rows(
 def _fuse_epochs(
     fusion: Fusion, o: Observations, before: RecordedResult, heard: Heard
 ) -> Iterator[Updated]:
-    """Fuse rows epoch by epoch (minutes of the fusion), in order of the time at which they were
-    first fused.
+    """Add archived observations to the beliefs epoch by epoch (minute by minute), in order of the
+    time at which they were first fused.
     """
     time = o.time + before.late_by
     order = np.argsort(time, kind="stable")

@@ -103,7 +103,7 @@ def first_memory(first: FloatArray, speed: float) -> FloatArray:
 
 
 def pointer_to(array: FloatArray) -> ctypes.c_void_p:
-    """Return the memory address of an array's data as a C pointer."""
+    """Return the memory address of an array's data as a C pointer (void *)."""
     return ctypes.c_void_p(array.ctypes.data)
 
 
@@ -154,7 +154,7 @@ class VectorLimit:
     def __init__(
         self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
     ) -> None:
-        """Create the N filters in C. The arguments are those of `Limit`."""
+        """Create N filters in C, one per vehicle. The arguments are those of `Limit`."""
         self._library = compile_library("kernel_simd.c", *VECTORS)
         self._lanes = int(self._library.lanes())
         self._setting = setting_row(memberships)

@@ -134,8 +134,9 @@ def open_window(address: str) -> Iterator[Opened]:
 
 
 def measure_drawing(on: Stage) -> dict[str, float]:
-    """Measure time of the first picture and frame rate, of our page and of MapLibre in turn. Also
-    count the page's errors and its requests to other hosts. Return the figures by name.
+    """Measure in a browser the time of the first picture and the frame rate, of our page and of
+    MapLibre in turn. Also count the page's errors and its requests to other hosts. Return the
+    figures by name.
     """
     ours: list[tuple[float, float]] = []
     theirs: list[tuple[float, float]] = []
@@ -253,8 +254,8 @@ def pushed_ms(on: Stage) -> float:
 
 
 def bytes_per_cell(on: Stage) -> float:
-    """Return the mean number of uncompressed bytes per cell in the page's data blocks (encoded
-    cells).
+    """Return the mean number of bytes, before compression, per cell in the page's data blocks
+    (encoded cells).
     """
     tiles = ",".join(map(str, on.town.tiles))
     with urllib.request.urlopen(f"{on.address}blocks?tiles={tiles}", timeout=30) as answer:

@@ -136,8 +136,8 @@ def step() -> list[Figure]:
 
 
 def call_s(bank: EstimatorBank, t: FloatArray, signals: FloatArray) -> float:
-    """Return the time [s] of one call of the bank with one sample: the median over rounds of CALLS
-    calls, after a warm-up.
+    """Return the time [s] of one call of an estimator bank with one sample of each vehicle: the
+    median over rounds of CALLS calls, after a warm-up.
     """
     spent = []
     for begin in range(0, SAMPLES, CALLS):

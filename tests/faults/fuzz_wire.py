@@ -93,7 +93,9 @@ def run(site: Site) -> list[Figure]:
 
 
 def _make_message(r: random.Random, mutants: Mutants) -> tuple[str, bytes, str]:
-    """Return Zenoh key, payload and encoding of the next malformed message."""
+    """Return Zenoh key, payload and encoding of a malformed message, drawn with the random
+    generator `r`.
+    """
     message = mutants.make_message()
     what = r.random()
     if what < 0.02:
@@ -138,8 +140,8 @@ def _put_message(session: zenoh.Session, key: str, payload: bytes, encoding: str
 
 
 def _ask_query(session: zenoh.Session, r: random.Random, mutants: Mutants) -> int:
-    """Send a malformed query with a malformed payload. Return the number of answers, errors not
-    counted.
+    """Send a malformed query, drawn with the random generator `r`, with a malformed payload. Return
+    the number of answers, errors not counted.
     """
     parameters = ";".join(f"{name}={value}" for name, value in mutants.make_query().items())
     payload = r.choice((None, b"", r.randbytes(300), mutants.make_message().payload))

@@ -98,12 +98,12 @@ def belief(fusion: Fusion, cell: int = CELL, sector: int = 0, now: int | None = 
 
 
 def interval(p: FloatArray) -> tuple[float, float]:
-    """Return the 5 % and 95 % quantiles of a belief."""
+    """Return the 5 % and 95 % quantiles of a belief `p` (32,)."""
     return float(mugrid.quantiles(p, 0.05)), float(mugrid.quantiles(p, 0.95))
 
 
 def slippery(p: FloatArray) -> float:
-    """Return P(μ < 0.4) of a belief."""
+    """Return P(μ < 0.4) of a belief `p` (32,) about friction."""
     return float(p @ SLIPPERY_SHARE)
 
 

@@ -42,8 +42,8 @@ def change_road(
     drift: float,
     out: FloatArray,
 ) -> None:
-    """Compute the probabilities `out` of the nodes (assumed friction values) after a possible road
-    change.
+    """Compute the probabilities `out` (K,) of K nodes (assumed friction values), which were `w`,
+    after a possible road change.
 
     The road changes to any friction with probability `hazard`, and to a neighbouring node with
     probability of about `drift`. Only the first `chain` nodes have neighbours; the other nodes
@@ -128,9 +128,9 @@ def probability_below(mu: FloatArray, prior: FloatArray, w: FloatArray, limit: f
 
 @compiled
 def _segment_mass(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
-    """Return the unnormalised probability mass between the grid values (nodes) of friction j - 1
-    and j. For j = 0 and for j equal to the number of nodes, one end is the end of the friction
-    range.
+    """Return the unnormalised probability mass between the friction values `mu` of the nodes j - 1
+    and j, for their prior and weights `w`. For j = 0 and for j equal to the number of nodes, one
+    end is the end of the friction range.
     """
     count = mu.shape[0]
     if j == 0:

@@ -201,8 +201,8 @@ def _interpolate_inputs(track: InputTrack, share: float, force_x: Four, mu: Four
 
 @inlined
 def _motor_forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
-    """Return the longitudinal forces [N] of the four wheels for one motor per axle, (4) to (6) of
-    paper 004.
+    """Return the longitudinal forces [N] of the four wheels for one motor per axle, by equations
+    (4) to (6) of paper 004; `dt` [s] is the time since the last sample.
     """
     front = _half_axle_force(row, track, 0, dt)
     rear = _half_axle_force(row, track, 2, dt)
@@ -212,7 +212,7 @@ def _motor_forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
 @inlined
 def _half_axle_force(row: FloatArray, track: InputTrack, first: int, dt: float) -> float:
     """Return half of the longitudinal tyre force [N] of an axle with one motor; its left wheel has
-    index `first`.
+    index `first`. `dt` [s] is the time since the last sample.
     """
     use = track.inputs
     before = track.inputs_before
@@ -227,7 +227,9 @@ def _half_axle_force(row: FloatArray, track: InputTrack, first: int, dt: float) 
 
 @inlined
 def _torque_forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
-    """Return the longitudinal forces [N] of the four wheels, computed from their torques."""
+    """Return the longitudinal forces [N] of the four wheels, computed from their torques and the
+    change of their speeds over `dt` [s].
+    """
     return (
         wheel_force(row, track, 0, dt),
         wheel_force(row, track, 1, dt),

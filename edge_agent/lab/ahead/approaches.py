@@ -232,8 +232,8 @@ def _count_outcome(track: _Track, counts: Approaches) -> None:
 def _stopping_shortfall(
     metre: FloatArray, speed: FloatArray, mu: FloatArray, at: int, start: float
 ) -> float:
-    """Return the stopping distance of the car at second `at` minus its distance to the slippery
-    stretch [m]. The result is 0 or less if the car can stop in time.
+    """Return the stopping distance of the car at the time `at` [s] minus its distance to the
+    slippery stretch [m]. The result is 0 or less if the car can stop in time.
     """
     v = float(speed[at])
     on_the_way = (metre >= metre[at]) & (metre <= start)

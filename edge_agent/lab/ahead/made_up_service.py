@@ -102,8 +102,9 @@ class MadeUpService:
         )
 
     def tile_answer(self, key: IntArray, mu: FloatArray) -> bytes:
-        """Return the answer to a query for map places (cell·4 + sector) of a tile, with friction
-        `mu`."""
+        """Return the answer to a query for map places (cell·4 + sector) of a tile, with the
+        friction values `mu`.
+        """
         age = 1.0 if self.kept else 1.0 + (time.time_ns() - self.now) / NS
         return tile_payload(key, mu, self.now, age_s=np.full(len(key), age))
 

@@ -61,8 +61,9 @@ def true_errors(seed: int, car: int) -> dict[str, float]:
 
 
 def _mass_radius_ratio(seed: int, car: int) -> float:
-    """Return the true mass times the true wheel radius, divided by the same product of the vehicle
-    file."""
+    """Return the true mass times the true wheel radius of an inaccurate car, divided by the same
+    product according to its vehicle file.
+    """
     rng = np.random.default_rng([seed, car, VEHICLE_STREAM])
     true = one_of_a_fleet(car, "car", rng)
     file = nominal(true, rng)

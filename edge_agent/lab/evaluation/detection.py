@@ -81,7 +81,9 @@ class DetectionTally:
     seconds: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, name: str, values: NDArray[np.generic]) -> None:
-        """Add values to the sum and the count from which the mean called `name` is computed."""
+        """Add an array of values to the sum and the count from which the mean called `name` is
+        computed.
+        """
         self.total[name] = self.total.get(name, 0.0) + float(np.sum(values, dtype=np.float64))
         self.count[name] = self.count.get(name, 0) + int(np.size(values))
 

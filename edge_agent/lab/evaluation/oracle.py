@@ -185,8 +185,9 @@ def _curve(shape: float, curvature: float) -> FloatArray:
 def _cost(
     measured: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stiff: float
 ) -> float:
-    """Return −ln of the likelihood of one friction and one shape of the tyre curve, given the
-    measurements. The other unknowns are integrated out by Laplace's method.
+    """Return −ln of the likelihood of one friction and one shape of the tyre curve, given the wheel
+    speeds and accelerations measured in a drive. The other unknowns (such as stiffness and wheel
+    radius) are integrated out by Laplace's method.
     """
     t = np.arange(len(v)) / 100.0
     std = np.array(

@@ -59,14 +59,16 @@ HELD_RATE: Final = 2.0  # of these, per second
 
 @compiled
 def slip_limit(p: FloatArray, i: int) -> float:
-    """Return the slip limit [1] of wheel `i` at which ABS begins to release the brake."""
+    """Return, from the vehicle's parameters `p`, the slip limit [1] of wheel `i` at which ABS
+    begins to release the brake.
+    """
     return float(p[TrueParameter.SLIP_LIMIT] if i < 2 else REAR_LIMIT * p[TrueParameter.SLIP_LIMIT])
 
 
 @compiled
 def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float) -> None:
-    """Advance the state of all controllers in `x` by `dt` [s], from the wheel slips in `w` and the
-    inputs `u`.
+    """Advance the state of all slip controllers in the vehicle's state `x` by `dt` [s], from the
+    wheel slips in `w` (8, 4), the parameters `p` and the inputs `u` (5, 4).
     """
     x[Motion.ABS_LEFT] = max(x[Motion.ABS_LEFT] - dt, 0.0)
     x[Motion.TCS_LEFT] = max(x[Motion.TCS_LEFT] - dt, 0.0)
@@ -91,7 +93,8 @@ def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt:
 @compiled
 def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int, dt: float) -> None:
     """Advance by `dt` [s] the limit that ABS sets to the brake torque of wheel `i`: reduce, hold or
-    increase it, as the module describes.
+    increase it, as the module describes. `x` is the vehicle's state, which is changed, `p` its
+    parameters, `u` the inputs and `w` the forces and slips of the wheels.
     """
     asked = u[Control.BRAKE, i] + x[Motion.HELD + i]
     limit = slip_limit(p, i)
@@ -115,7 +118,9 @@ def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int,
 
 @compiled
 def spin_excess(x: FloatArray, p: FloatArray, w: FloatArray, i: int) -> float:
-    """Return the drive slip of wheel `i` divided by the slip at which traction control acts [1]."""
+    """Return the drive slip of wheel `i` divided by the slip at which traction control acts [1].
+    `x` is the vehicle's state, `p` its parameters, and `w` contains the wheels' speeds over ground.
+    """
     along = w[Wheel.SPEED, i]
     faster = p[Parameter.RADIUS] * x[Motion.OMEGA + i] - along
     return float(faster / (p[TrueParameter.SLIP_LIMIT] * max(abs(along), TCS_SLOWEST)))
@@ -123,7 +128,8 @@ def spin_excess(x: FloatArray, p: FloatArray, w: FloatArray, i: int) -> float:
 
 @compiled
 def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float) -> bool:
-    """Cut or restore the engine torque over `dt` [s].
+    """Cut or restore the engine torque in the vehicle's state `x` over `dt` [s], as traction
+    control does.
 
     Return True if the slip of a wheel now exceeds the limit, because it spins or because drag
     torque slows it.
@@ -147,7 +153,8 @@ def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: fl
 
 @compiled
 def stabilise(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> tuple[int, float]:
-    """Update ESC by `dt` [s]. Return (index of the wheel that ESC brakes, or -1; its brake torque
+    """Update the stability control (ESC) in the vehicle's state `x` by `dt` [s], from the inputs
+    `u` and the parameters `p`. Return (index of the wheel that ESC brakes, or -1; its brake torque
     divided by weight times radius).
     """
     vx = x[Motion.VX]

@@ -138,7 +138,8 @@ def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
 @compiled
 def place_ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[int, float]:
     """Return the position `distance` [m] ahead of the vehicle on its route, as (row of a lane
-    point, metres beyond that point).
+    point, metres beyond that point). `d` is the driver's state, `g` the vehicle's place on the
+    route.
 
     The route is decided only to the end of the next lane; beyond that, the function assumes the
     first continuation of each lane.
@@ -159,8 +160,8 @@ def place_ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tu
 
 @compiled
 def budget(d: FloatArray) -> float:
-    """Return the budget q: the acceleration [m/s^2] that the driver is ready to demand from the
-    tyres.
+    """Return the budget q: the acceleration [m/s^2] that the driver with the state `d` is ready to
+    demand from the tyres.
     """
     style = d[Driver.STYLE] * (
         CAREFUL if heeds_warning(d) and d[Driver.WARNED_START] <= 0.0 else 1.0
@@ -170,16 +171,16 @@ def budget(d: FloatArray) -> float:
 
 @compiled
 def cruise(d: FloatArray) -> float:
-    """Return the speed that the driver chooses on an open road [m/s]; it is lower where the driver
-    believes that the road is slippery.
+    """Return the speed that the driver with the state `d` chooses on an open road [m/s]; it is
+    lower where the driver believes that the road is slippery.
     """
     return float(d[Driver.CRUISE] * math.sqrt(min(1.0, 0.25 + 1.1 * d[Driver.BELIEF])))
 
 
 @compiled
 def update_belief(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None:
-    """Update the grip that the driver believes in, from the appearance of the road ahead and from
-    sliding wheels.
+    """Update the grip that the driver believes in (part of the state `d`) after `dt` [s], from the
+    friction `looks` that the road ahead seems to have, and from sliding wheels in `w`.
     """
     lag = WORSE_S if looks < d[Driver.BELIEF] else BETTER_S
     d[Driver.BELIEF] += (looks - d[Driver.BELIEF]) * -math.expm1(-dt / lag)
@@ -192,8 +193,9 @@ def update_belief(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None
 
 @compiled
 def advance_warning(d: FloatArray, vx: float, dt: float) -> None:
-    """Update the stored distance to the stretch of which the driver was warned: it decreases by
-    `vx` * `dt`."""
+    """Update, in the driver's state `d`, the stored distance to the stretch of which the driver was
+    warned: it decreases by `vx` * `dt`.
+    """
     if d[Driver.WARNED_END] > 0.0:
         d[Driver.WARNED_IN] -= dt
         d[Driver.WARNED_START] -= vx * dt
@@ -202,7 +204,9 @@ def advance_warning(d: FloatArray, vx: float, dt: float) -> None:
 
 @compiled
 def heeds_warning(d: FloatArray) -> bool:
-    """Return True if the driver takes a warning into account now, after the reaction time."""
+    """Return True if the driver with the state `d` takes a warning into account now, after the
+    reaction time.
+    """
     return bool(d[Driver.WARNED_END] > 0.0 and d[Driver.WARNED_IN] <= 0.0)
 
 
@@ -254,7 +258,10 @@ def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
 def wished_acceleration(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float, key: Key
 ) -> float:
-    """Return the longitudinal acceleration [m/s^2] that the driver demands now."""
+    """Return the longitudinal acceleration [m/s^2] that the driver demands at time `t` [s]. `x` is
+    the vehicle's state, `d` the driver's, `g` the place on the route, `p` the vehicle's parameters,
+    and `key` the random key of the traffic.
+    """
     vx = x[Motion.VX]
     q = budget(d)
     reach = max(2.0, 0.5 * vx)
@@ -303,8 +310,9 @@ def wished_acceleration(
 def wished_force(
     p: FloatArray, d: FloatArray, vx: float, acceleration: float, along: float
 ) -> float:
-    """Return the longitudinal force [N] that the driver demands for an acceleration [m/s^2] while
-    gravity acts with `along` [m/s^2] along the road. It is limited by tyres and engine.
+    """Return the longitudinal force [N] that a driver demands from a vehicle with the parameters
+    `p` for an acceleration [m/s^2] while gravity acts with `along` [m/s^2] along the road. It is
+    limited by tyres and engine.
     """
     driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
     most = min(
@@ -319,7 +327,8 @@ def wished_steer(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float
 ) -> float:
     """Return the mean road-wheel angle [rad] with which the driver steers on a circle to a point
-    ahead. It is limited to the angles that the front tyres can follow.
+    ahead. `x` is the vehicle's state, `d` the driver's, `g` the place on the route. The angle is
+    limited to the angles that the front tyres can follow.
     """
     vx = max(x[Motion.VX], SLOWEST)
     base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
@@ -350,8 +359,8 @@ def drive(
     now: tuple[float, float, float],
     keys: tuple[Key, Key],
 ) -> None:
-    """Advance a driver's state d and route state g by one sample. Afterwards d[STEER] and d[FORCE]
-    are the actual controls.
+    """Advance a driver's state and place on the route, `driver` = (d, g), by one sample. Afterwards
+    d[STEER] and d[FORCE] are the actual controls.
 
     `world` contains lanes and friction table; `w` the wheels at the last sample; `now` time [s],
     length of the sample [s] and acceleration by gravity along the road [m/s^2]; `keys` the random

@@ -22,7 +22,9 @@ class Origin:
 
     @property
     def per_metre(self) -> tuple[float, float]:
-        """Return degrees of latitude per metre north and of longitude per metre east."""
+        """Return the degrees of latitude per metre north, and the degrees of longitude per metre
+        east, at this origin.
+        """
         north = float(np.degrees(1.0 / EARTH_RADIUS_M))
         return north, north / float(np.cos(np.radians(self.latitude)))
 

@@ -100,8 +100,8 @@ def allowed_share(slip: float, limit: float) -> float:
 def wheel_torques(
     x: FloatArray, p: FloatArray, u: FloatArray, i: int, slip: float
 ) -> tuple[float, float]:
-    """Return the driving and the braking torque [N·m] at wheel `i` after the controllers have
-    responded to its slip.
+    """Return the driving and the braking torque [N·m] at wheel `i` of a vehicle with state `x`,
+    parameters `p` and inputs `u`, after the controllers have responded to its slip.
     """
     drive = u[Control.DRIVE, i]
     brake = u[Control.BRAKE, i]
@@ -124,8 +124,8 @@ def wheel_torques(
 
 @compiled
 def relax_slip(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
-    """Advance the slip of the tyres by `dt` [s] over their relaxation length, after the wheel
-    speeds have been updated.
+    """Advance the slip of the tyres in the vehicle's state `x` by `dt` [s] over their relaxation
+    length, after the wheel speeds have been updated.
     """
     for i in range(4):
         along, across = wheel_velocity(
@@ -198,7 +198,8 @@ def body_accelerations(
     """Return (a_x, a_y) that an accelerometer at the centre of gravity measures [m/s^2], and the
     yaw acceleration [rad/s^2].
 
-    `w` must contain the wheel forces.
+    `x`, `p` and `u` are state, parameters and inputs of the vehicle; `w` must contain the wheel
+    forces.
     """
     ax, ay, yaw_acceleration = planar_accelerations(p, w[Wheel.FX], w[Wheel.FY], u[Control.STEER])
     return (
@@ -218,8 +219,8 @@ def turn_wheels(
     gain: float,
     yaw_acceleration: float,
 ) -> None:
-    """Apply one linearly implicit Euler step of `dt` [s] to the wheel speeds in `x`: every torque
-    that decreases with ω acts as damping.
+    """Apply one linearly implicit Euler step of `dt` [s] to the wheel speeds in the vehicle's state
+    `x`: every torque that decreases with ω acts as damping.
 
     `gain` is dv_x/dt [m/s^2], and `yaw_acceleration` is in rad/s^2. They give the change of the
     ground's speed under the wheels.
@@ -251,8 +252,8 @@ def turn_wheels(
 
 @compiled
 def is_held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
-    """Return True if the brakes hold a standing vehicle: brakes and tyres are stronger than engine
-    and slope.
+    """Return True if the brakes hold a standing vehicle with state `x`, parameters `p` and inputs
+    `u`: brakes and tyres are stronger than engine and slope.
     """
     if abs(x[Motion.VX]) > STILL or abs(x[Motion.VY]) > STILL or abs(x[Motion.YAW_RATE]) > STILL:
         return False
@@ -270,8 +271,8 @@ def is_held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
 
 @compiled
 def settle_standing(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
-    """Apply one step to a vehicle that is held by its brakes: only the suspension moves, towards
-    its equilibrium on the slope.
+    """Apply one step of `dt` [s] to the state `x` of a vehicle that is held by its brakes: only the
+    suspension moves, towards its equilibrium on the slope.
     """
     along, across, _ = gravity(u)
     x[Motion.VX] = x[Motion.VY] = x[Motion.YAW_RATE] = 0.0
@@ -319,8 +320,8 @@ def advance(
 
 @compiled
 def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
-    """Fill the rows STEER, DRIVE and BRAKE of the inputs `u` from a mean road-wheel angle [rad] and
-    a demanded longitudinal force [N].
+    """Fill the rows STEER, DRIVE and BRAKE of the inputs `u` of a vehicle with parameters `p`, from
+    a mean road-wheel angle [rad] and a demanded longitudinal force [N].
 
     The steered wheels follow Ackermann geometry: their axes meet at one point on the line of the
     rear axle. If the rear wheels steer too, `steer` is the angle of a car without rear steering on
@@ -345,8 +346,8 @@ def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
 
 @compiled
 def regenerate(x: FloatArray, p: FloatArray, u: FloatArray) -> None:
-    """Replace a part of the brake torque in the inputs `u` by drag torque of engine or generator,
-    which acts at the driven wheels only.
+    """Replace a part of the brake torque in the inputs `u` of a vehicle (state `x`, parameters `p`)
+    by drag torque of engine or generator, which acts at the driven wheels only.
     """
     total = 0.0
     for i in range(4):
@@ -381,7 +382,9 @@ def substeps_of(rate_hz: float) -> int:
 
 @compiled
 def wheel_place(x: FloatArray, p: FloatArray, i: int) -> tuple[float, float]:
-    """Return the position of wheel `i` on the ground, (x, y) [m]."""
+    """Return the position of wheel `i` on the ground, (x, y) [m], of a vehicle with state `x` and
+    parameters `p`.
+    """
     ahead, left = wheel_position(p, i)
     c = math.cos(x[Motion.YAW])
     s = math.sin(x[Motion.YAW])
@@ -390,7 +393,7 @@ def wheel_place(x: FloatArray, p: FloatArray, i: int) -> tuple[float, float]:
 
 @compiled
 def strongest_pull(p: FloatArray, vx: float) -> float:
-    """Return the largest driving force of the engine [N]: limited by its power, and below 5 m/s by
-    the gearbox.
+    """Return the largest driving force of the engine [N] at the speed `vx` [m/s]: limited by its
+    power, and below 5 m/s by the gearbox.
     """
     return float(p[TrueParameter.POWER] / max(vx, 5.0))

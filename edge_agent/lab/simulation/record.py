@@ -47,8 +47,8 @@ RECORD: Final = 39
 
 @compiled
 def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: FloatArray) -> None:
-    """Fill `record` (RECORD,) with the true values of the vehicle at this instant, under the inputs
-    `u`. The function also fills `w`, the forces of the wheels.
+    """Fill `record` (RECORD,) with the true values of the vehicle at this instant, from its state
+    `x`, parameters `p` and inputs `u`. The function also fills `w`, the forces of the wheels.
     """
     wheel_forces(x, p, u, w)
     ax, ay, _ = body_accelerations(x, p, u, w)
@@ -90,7 +90,9 @@ def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: 
 
 @compiled
 def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArray) -> None:
-    """Fill the record of a standing vehicle that is held: brakes and tyres balance the slope."""
+    """Fill `record` with the true values of a standing vehicle that is held: brakes and tyres
+    balance the slope.
+    """
     along, across, share = gravity(u)
     record[RecordColumn.AX], record[RecordColumn.AY] = -along, -across
     record[RecordColumn.AX_FELT] = -along + p[TrueParameter.PITCH_LEAK] * x[Motion.AX_LAGGED]

@@ -33,8 +33,8 @@ def comes_before(entries: RecordArray, a: int, b: int) -> bool:
 
 @refcount_free_inlined
 def pair_of(pairs: RecordArray, used: IntArray, slot: int, vehicle: int) -> int:
-    """Return the row of the pair of `slot` (cell and sector) and `vehicle`; create the pair if it
-    does not exist.
+    """Return the row of the pair of `slot` (cell and sector) and `vehicle`; create the pair (record
+    of a vehicle in a cell) if it does not exist.
     """
     pair = pair_place(pairs, slot, vehicle)
     if pairs[pair].slot == NONE:

@@ -57,7 +57,9 @@ def fold_in(
 
 
 def difference(a: Fusion, b: Fusion) -> float:
-    """Return the largest difference of a probability in two fusions, over all cells."""
+    """Return the largest difference between two `Fusion` objects in any probability of any cell's
+    belief.
+    """
     assert a.size == b.size
     there = b.slots_of(a.cell[: a.size], a.sector[: a.size])
     now = int(max(a.live.time.max(), b.live.time.max()))

@@ -39,8 +39,8 @@ def test_what_bounds_share_never_lowers_the_upper_end_of_a_rising_belief(p: np.n
 
 
 def width(used: float, manoeuvres: np.ndarray, mu: float = 0.6) -> float:
-    """Return the width of a cell's friction interval after thirty vehicles have reported the
-    friction `mu`, using the grip `used` in the given manoeuvres.
+    """Return the width [1] of a cell's 90 % interval of friction after thirty vehicles have
+    reported the friction `mu`, using the grip `used` in the given manoeuvres.
     """
     fusion = Fusion(120.0)
     n = len(manoeuvres)

@@ -25,7 +25,7 @@ def spread(std: float, yaw: float = 0.0, cell: int = CELL) -> tuple[IntArray, Fl
 
 
 def information(p: FloatArray) -> float:
-    """Return the information that a belief has gained over the prior [nat]."""
+    """Return the information that a belief `p` (32,) has gained over the prior [nat]."""
     return float(np.sum(p * np.log(np.maximum(p, 1e-300) * mugrid.BINS)))
 
 

@@ -90,8 +90,8 @@ class CaseRuns:
     runs: dict[str, FrictionRun]
 
     def error(self, name: str) -> float:
-        """Return the mean absolute error of friction over all wheels and samples, including the
-        time before convergence.
+        """Return the mean absolute error of the estimated friction over all wheels and samples,
+        including the time before convergence.
         """
         return float(np.abs(self.runs[name].mu - self.batch.mu_wheel[:, 0]).mean())
 

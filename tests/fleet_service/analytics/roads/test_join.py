@@ -27,7 +27,9 @@ EAST = METRES_PER_DEGREE * np.cos(np.radians(LATITUDE))
 
 
 def place(x: float, y: float) -> tuple[float, float]:
-    """Return latitude and longitude of a point given in metres east and north."""
+    """Return latitude and longitude [deg] of a point given in metres east and north of a fixed
+    place.
+    """
     return LATITUDE + y / METRES_PER_DEGREE, LONGITUDE + x / EAST
 
 
