@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -184,16 +184,22 @@ def count_passes(rows: pa.Table) -> int:
     return 1 + int(np.sum((vehicle[1:] != vehicle[:-1]) | (enter[1:] - left[:-1] > PASS_GAP_NS)))
 
 
+class DemoRun(NamedTuple):
+    """Results of one run of the demo: the true visits, the alerts with their times [ns], the time
+    [ns] at which ice appears, and the counts of the agents.
+    """
+
+    visits: pa.Table
+    alerts: list[tuple[int, Alert]]
+    changed_ns: int
+    counts: dict[str, float]
+
+
 def demo_figures(
-    comparison: MapComparison,
-    visits: pa.Table,
-    alerts: list[tuple[int, Alert]],
-    changed_ns: int,
-    counts: dict[str, float],
-    archive: Path,
-    wall_s: float,
+    comparison: MapComparison, run: DemoRun, archive: Path, wall_s: float
 ) -> list[Figure]:
-    """Return all figures of the demo, each with its target."""
+    """Return all figures of the demo, each with its target. `wall_s` [s] is its duration."""
+    visits, alerts, changed_ns, counts = run
     several = comparison.has_several_vehicles
     value = comparison.has_several_vehicles & comparison.is_measured
     error = comparison.cells["mu"].to_numpy() - comparison.truth

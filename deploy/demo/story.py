@@ -121,9 +121,8 @@ def run(args: argparse.Namespace) -> int:
         show_clients(FOLDER, endpoint, comparison)
         listener.close()
         wall_s = time.monotonic() - began
-        measured = compare.demo_figures(
-            comparison, visits, listener.alerts, changed_ns, counts, FOLDER / "archive", wall_s
-        )
+        demo = compare.DemoRun(visits, listener.alerts, changed_ns, counts)
+        measured = compare.demo_figures(comparison, demo, FOLDER / "archive", wall_s)
         grip = compare.lost_grip(visits, listener.alerts, changed_ns, args.warned)
         found = report_figures(FOLDER, comparison, measured, grip, args.seed)
         if args.screenshot is not None:

@@ -14,6 +14,7 @@ the direction corrected (errata), and with bounds that the paper does not have.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -41,6 +42,16 @@ def infer_step(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> floa
     return float(outputs[last])
 
 
+class FactorLimits(NamedTuple):
+    """Limits of a factor on the measurement noise R: `pace` multiplies each change of ln R; `least`
+    and `largest` bound the factor.
+    """
+
+    pace: float
+    least: float
+    largest: float
+
+
 @compiled
 def adapted_factor(
     factor: float, actual: float, theoretical: float, inputs: FloatArray, outputs: FloatArray
@@ -49,9 +60,8 @@ def adapted_factor(
     1)), limited to [LEAST_FACTOR, LARGEST_FACTOR]. `actual` and `theoretical` are variances of the
     innovations (measurement minus prediction); `inputs` and `outputs` are those of `infer_step`.
     """
-    return adapted_within(
-        factor, actual, theoretical, inputs, outputs, 1.0, (LEAST_FACTOR, LARGEST_FACTOR)
-    )
+    limits = FactorLimits(1.0, LEAST_FACTOR, LARGEST_FACTOR)
+    return adapted_within(factor, actual, theoretical, inputs, outputs, limits)
 
 
 @compiled
@@ -61,13 +71,12 @@ def adapted_within(
     theoretical: float,
     inputs: FloatArray,
     outputs: FloatArray,
-    pace: float,
-    bounds: tuple[float, float],
+    limits: FactorLimits,
 ) -> float:
-    """Return the next factor on the measurement noise R like `adapted_factor`, but limited to
-    `bounds` (least, largest), and with each change of ln R multiplied by `pace`.
+    """Return the next factor on the measurement noise R like `adapted_factor`, but with the given
+    limits.
     """
     if not theoretical > 0.0:
         return factor
-    step = pace * infer_step(actual / theoretical - 1.0, inputs, outputs)
-    return min(max(factor * math.exp(step), bounds[0]), bounds[1])
+    step = limits.pace * infer_step(actual / theoretical - 1.0, inputs, outputs)
+    return min(max(factor * math.exp(step), limits.least), limits.largest)

@@ -18,10 +18,11 @@ from schemas.thresholds import NS
 
 if TYPE_CHECKING:
     from edge_agent.app.backfill import Outcome
-    from edge_agent.estimators import Estimates, EstimatorBank
+    from edge_agent.estimators import Estimates
     from edge_agent.inputs.block import Block
     from edge_agent.inputs.signal_log import SignalLog
-    from schemas.config import AgentConfig
+    from edge_agent.observe.pipeline import Pipeline
+    from edge_agent.publish.publisher import Publisher
     from schemas.vehicle import Vehicle
 
 NOW = "now"
@@ -155,9 +156,14 @@ def run(args: argparse.Namespace) -> int:
             file.write(block.t, estimates)
 
         if args.publish:
-            code = _publish_log(
-                args.name or vehicle.name, log, start_ns, bank, estimator, config, keep_estimates
-            )
+            from edge_agent.app.publishing import open_publisher
+            from edge_agent.cli.common import checked_name
+            from edge_agent.observe.pipeline import Pipeline
+
+            name = checked_name(args.name or vehicle.name)
+            pipeline = Pipeline(bank, 1, config)
+            publisher = open_publisher([name], config, estimator)
+            code = _publish_log(log, start_ns, pipeline, publisher, keep_estimates)
         else:
             for block in log.blocks(start_ns):
                 keep_estimates(block, bank.advance(block.t, block.signals))
@@ -237,21 +243,18 @@ def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
 
 
 def _publish_log(
-    name: str,
     log: SignalLog,
     start_ns: int,
-    bank: EstimatorBank,
-    estimator: str,
-    config: AgentConfig,
+    pipeline: Pipeline,
+    publisher: Publisher,
     keep: Callable[[Block, Estimates], None],
 ) -> int:
+    """Estimate a log that begins at `start_ns` [ns UTC], and publish its records; `keep` is called
+    with each block and its estimates. Return 1 if a record was refused or not acknowledged.
+    """
     from edge_agent.app.live_loop import Progress
-    from edge_agent.app.publishing import close_publisher, open_publisher
-    from edge_agent.cli.common import checked_name
-    from edge_agent.observe.pipeline import Pipeline
+    from edge_agent.app.publishing import close_publisher
 
-    pipeline = Pipeline(bank, 1, config)
-    publisher = open_publisher([checked_name(name)], config, estimator)
     progress = Progress(signals_s=float(log.t[-1] - log.t[0]))
     try:
         for block in log.blocks(start_ns):

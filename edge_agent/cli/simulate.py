@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Simulate a manoeuvre and write its log, or list the manoeuvres; return 0."""
     from edge_agent.app.estimates_file import prepare_path, write_table
-    from edge_agent.lab.simulation import MANOEUVRES, Fault, simulate_manoeuvre
+    from edge_agent.lab.simulation import MANOEUVRES, DriveSetup, Fault, simulate_manoeuvre
     from schemas.errors import InputError
 
     if args.list:
@@ -72,12 +72,14 @@ def run(args: argparse.Namespace) -> int:
         mu=args.mu,
         speed=args.speed,
         seed=args.seed,
-        rate_hz=args.rate,
         duration_s=args.duration,
-        sensors=args.sensors,
-        faults=(Fault("missing", "torque"),) if args.no_torque else (),
-        road=args.road,
-        slope=args.slope,
+        setup=DriveSetup(
+            rate_hz=args.rate,
+            sensors=args.sensors,
+            faults=(Fault("missing", "torque"),) if args.no_torque else (),
+            road=args.road,
+            slope=args.slope,
+        ),
     )
     write_table("out", args.out, log)
     if args.vehicle_out is not None:

@@ -176,9 +176,11 @@ def run(args: argparse.Namespace) -> int:
         found[winner],
         chosen,
         scores,
-        Budget(ants=ants, iterations=iterations, evaluations=evaluations),
-        command,
-        args.seed,
+        _make_provenance(
+            command,
+            args.seed,
+            Budget(ants=ants, iterations=iterations, evaluations=evaluations),
+        ),
     )
     candidates = {way: [one.to_json() for one in found] for way, found in sets.items()}
     save_tuned(args.out, document.model_copy(update={"winner": winner, "candidates": candidates}))
@@ -265,9 +267,11 @@ def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
         done.best("colony"),
         "innovation",
         scores,
-        Budget(ants=ants, iterations=iterations, evaluations=evaluations),
-        command + " --quick" * args.quick,
-        args.seed,
+        _make_provenance(
+            command + " --quick" * args.quick,
+            args.seed,
+            Budget(ants=ants, iterations=iterations, evaluations=evaluations),
+        ),
         "paper-aco-fckf",
     )
     save_tuned(args.study / "paper-aco-fckf.json", document)
@@ -328,20 +332,21 @@ def _score_memberships(memberships: Memberships, drives: TuningSet) -> Score:
     )
 
 
+def _make_provenance(command: str, seed: int, budget: Budget) -> Provenance:
+    header = figures.header("tune", [seed])
+    return Provenance.model_validate(
+        {name: header[name] for name in ("date", "commit", "machine", "versions")}
+        | {"command": command, "seed": seed, "budget": budget}
+    )
+
+
 def _make_document(
     memberships: Memberships,
     objective: str,
     scores: dict[str, SplitScores],
-    budget: Budget,
-    command: str,
-    seed: int,
+    provenance: Provenance,
     estimator: str = ESTIMATOR,
 ) -> Document:
-    header = figures.header("tune", [seed])
-    provenance = Provenance.model_validate(
-        {name: header[name] for name in ("date", "commit", "machine", "versions")}
-        | {"command": command, "seed": seed, "budget": budget}
-    )
     return Document(
         estimator=estimator,
         memberships=memberships.to_json(),

@@ -74,12 +74,11 @@ def tyre_forces(
     wheels: FloatArray,
     mu: FloatArray,
     shape: float,
-    force_x: FloatArray,
-    force_y: FloatArray,
+    forces: tuple[FloatArray, FloatArray],
 ) -> None:
-    """Fill force_x and force_y (4,) [N], the tyre forces in the wheels' axes, at motion (5,):
-    velocities v_x, v_y, yaw rate, and accelerations a_x, a_y. The accelerations determine the
-    loads.
+    """Fill the two arrays (4,) of `forces` [N], the longitudinal and lateral tyre forces in the
+    wheels' axes, at motion (5,): velocities v_x, v_y, yaw rate, and accelerations a_x, a_y. The
+    accelerations determine the loads.
 
     wheels: result (4, 3) of `wheel_inputs`; a wheel with speed NaN rolls freely; mu (4,); shape:
     shape factor c of the Magic Formula (with curvature 0), or DUGOFF.
@@ -103,7 +102,7 @@ def tyre_forces(
             force = combined_dugoff(slip, slopes, mu[wheel], loads[wheel])
         else:
             force = combined_magic(slip, slopes, mu[wheel], loads[wheel], shape, 0.0)
-        force_x[wheel], force_y[wheel] = force
+        forces[0][wheel], forces[1][wheel] = force
 
 
 class PlanarMotion(NamedTuple):

@@ -44,12 +44,18 @@ def wheel_velocity(
 
 @inlined
 def along_wheel(
-    row: FloatArray, wheel: int, vx: float, vy: float, yaw_rate: float, cos: float, sin: float
+    row: FloatArray,
+    wheel: int,
+    vx: float,
+    vy: float,
+    yaw_rate: float,
+    direction: tuple[float, float],
 ) -> float:
-    """Return v_wx [m/s]: the velocity of the wheel's centre along the wheel, for given cosine and
-    sine of its steering angle.
+    """Return v_wx [m/s]: the velocity of the wheel's centre along the wheel, for a given
+    `direction`, the cosine and sine of its steering angle.
     """
     x, y = wheel_position(row, wheel)
+    cos, sin = direction
     return cos * (vx - y * yaw_rate) + sin * (vy + x * yaw_rate)
 
 

@@ -24,8 +24,8 @@ vehicles [first, last).
 """
 
 Kernel: TypeAlias = Callable[..., None]
-"""Compiled function that advances filters: kernel(filters, contexts, t, signals, outputs, part), or
-with visits = (closes, evidence) before `part`.
+"""Compiled function that advances filters: kernel(filters, contexts, t, signals, outputs, part). A
+bank with evidence passes (outputs, closes, evidence) in place of `outputs`.
 
 It reads t (T, N) and signals (T, N, 18) of the vehicles of `part`, changes their filters (N,), and
 writes outputs (T, N, …), indexed by Column. It writes evidence (T, N, 32) where closes (T, N) is
@@ -58,7 +58,7 @@ class EstimatorBank:
         self._entered = kernel
         count = len(filters)
         self._nowhere = (
-            ((np.zeros((0, count), np.bool_), np.zeros((0, count, BINS))),) if evidence else ()
+            (np.zeros((0, count), np.bool_), np.zeros((0, count, BINS))) if evidence else ()
         )
 
     def advance(
@@ -94,9 +94,10 @@ class EstimatorBank:
         values = np.empty((samples, count, self._columns))
         if visits and closes is not None:
             evidence = np.full((samples, count, BINS), np.nan)
-            visits = ((np.ascontiguousarray(closes, np.bool_), evidence),)
+            visits = (np.ascontiguousarray(closes, np.bool_), evidence)
+        results = (values, *visits) if visits else values
         if threads == 1:
-            self._entered(self._filters, self._contexts, t, signals, values, *visits, (0, 0, count))
+            self._entered(self._filters, self._contexts, t, signals, results, (0, 0, count))
             if self._entered is self._kernel:
                 self._entered = entry_point(
                     self._kernel
@@ -104,7 +105,7 @@ class EstimatorBank:
             return _pack_estimates(values, evidence, closes)
         if threads > len(self._contexts):
             self._contexts = np.repeat(self._contexts[:1], threads)
-        whole = (self._filters, self._contexts, t, signals, values, *visits)
+        whole = (self._filters, self._contexts, t, signals, results)
         in_shares(
             lambda share, first, last: self._kernel(*whole, (share, first, last)), count, threads
         )

@@ -44,7 +44,7 @@ from edge_agent.estimators.common.tyre_option import TyreOption
 from edge_agent.estimators.elements import Element
 from edge_agent.estimators.estimates import Column
 from edge_agent.filters.cholesky import variance
-from edge_agent.filters.householder import predict, update
+from edge_agent.filters.householder import Measurement, predict, update
 from edge_agent.filters.points import centred_deviations, sigma_points, weighted_mean
 from edge_agent.filters.sigma import cubature_rule
 from schemas.numeric import FloatArray
@@ -170,20 +170,20 @@ def _compensated_forces(
     use: FloatArray,
     mu: FloatArray,
     observed: FloatArray,
-    force_x: FloatArray,
-    force_y: FloatArray,
+    forces: tuple[FloatArray, FloatArray],
 ) -> None:
     """Compute the compensated longitudinal forces (4,) [N] at the motion x (3,) (equation 33).
 
     The result is a blend of the forces of the tyre model and of the forces `observed` by WCKF-A. It
-    is written into `force_x`; the lateral forces of the tyre model are written into `force_y`.
+    is written into the first array of `forces`; the lateral forces of the tyre model are written
+    into the second.
     """
     X = DriveWheelState
     motion = np.array([x[X.VX], x[X.VY], x[X.YAW_RATE], use[S.AX], use[S.AY]])
     delta = use[S.DELTA : S.DELTA + 4]
     omega = use[S.OMEGA : S.OMEGA + 4]
     share = np.empty(4)
-    tyre_forces(row, motion, wheel_inputs(delta, omega), mu, SHAPE, force_x, force_y)
+    tyre_forces(row, motion, wheel_inputs(delta, omega), mu, SHAPE, forces)
     for wheel in range(4):
         along, _ = wheel_velocity(row, wheel, x[X.VX], x[X.VY], x[X.YAW_RATE], delta[wheel])
         # a wheel whose speed is missing has no slip to judge by: its force is the observed one
@@ -192,7 +192,7 @@ def _compensated_forces(
             if math.isnan(omega[wheel])
             else slip_share(row[Parameter.RADIUS], omega[wheel], along)
         )
-    blend_forces(share, force_x, observed, force_x)
+    blend_forces(share, forces[0], observed, forces[0])
 
 
 @compiled
@@ -212,7 +212,12 @@ def _step_wheel_filter(memory: CompensatedMemory, context: FrictionSet, dt: floa
     force_y = np.empty(4)
     noise = np.zeros((A_STATES, A_STATES))
     _compensated_forces(
-        row, memory.fused, use, context.friction, mean[X.FORCE : X.FORCE + 4], force_x, force_y
+        row,
+        memory.fused,
+        use,
+        context.friction,
+        mean[X.FORCE : X.FORCE + 4],
+        (force_x, force_y),
     )
     delta = use[S.DELTA : S.DELTA + 4]
     sigma_points(mean, root, A_XI, points)
@@ -232,7 +237,7 @@ def _step_wheel_filter(memory: CompensatedMemory, context: FrictionSet, dt: floa
             x[X.TORQUE + w], x[X.OMEGA + w], x[X.FORCE + w], x[X.SLOPE + w] = state
     for i in range(A_STATES):
         noise[i, i] = A_PROCESS[i] * math.sqrt(dt)
-    predict(points, A_WEIGHT, A_WEIGHT, noise, mean, root, work)
+    predict(points, (A_WEIGHT, A_WEIGHT), noise, mean, root, work)
     innovation = np.empty(A_ROWS)
     std = np.empty(A_ROWS)
     rows = np.empty((A_ROWS, A_STATES))
@@ -248,7 +253,7 @@ def _step_wheel_filter(memory: CompensatedMemory, context: FrictionSet, dt: floa
         std[r] = math.sqrt(
             weighted_noise(memory.window[r], variance(root, place), A_NOISE[r], LEAST, LARGEST)
         )
-    update(mean, root, root.copy(), rows, innovation, std, work)
+    update(mean, root, root.copy(), Measurement(rows, innovation, std), work)
 
 
 @compiled
@@ -286,8 +291,7 @@ def _step_motion_filter(memory: CompensatedMemory, context: FrictionSet, dt: flo
                 track.inputs_before if act == 0 else use,
                 context.friction,
                 observed,
-                force_x,
-                force_y,
+                (force_x, force_y),
             )
             ax, ay, turn = planar_accelerations(row, force_x, force_y, delta)
             if act == 0:
@@ -301,7 +305,7 @@ def _step_motion_filter(memory: CompensatedMemory, context: FrictionSet, dt: flo
         if act == 0:
             for i in range(B_STATES):
                 noise[i, i] = B_PROCESS[i] * math.sqrt(dt)
-            predict(points, B_WEIGHT, B_WEIGHT, noise, mean, root, context.work)
+            predict(points, (B_WEIGHT, B_WEIGHT), noise, mean, root, context.work)
     weighted_mean(outcomes, B_WEIGHT, predicted)
     centred_deviations(points, mean, B_WEIGHT, state, 0)
     centred_deviations(outcomes, predicted, B_WEIGHT, measured, 0)
@@ -317,9 +321,9 @@ def _step_motion_filter(memory: CompensatedMemory, context: FrictionSet, dt: flo
         std[r] = math.sqrt(adapted)
         largest = max(largest, adapted / B_NOISE[r])
     used, log_likelihood, square = update(
-        mean, root, state, measured, innovation, std, context.work
+        mean, root, state, Measurement(measured, innovation, std), context.work
     )
-    _compensated_forces(row, mean, use, context.friction, observed, memory.compensated, force_y)
+    _compensated_forces(row, mean, use, context.friction, observed, (memory.compensated, force_y))
     memory.nis = square / max(used, 1)
     memory.log_likelihood = log_likelihood
     memory.adaptation = largest

@@ -57,7 +57,7 @@ from edge_agent.estimators.gaussian.wheel_friction import (
 )
 from edge_agent.filters.cholesky import variance
 from edge_agent.filters.federated import fuse_estimates, share_information
-from edge_agent.filters.householder import update
+from edge_agent.filters.householder import Measurement, update
 from edge_agent.filters.points import axis_points, centred_deviations, weighted_mean
 from edge_agent.filters.sigma import cubature_rule
 from schemas.mugrid import LOWER, UPPER
@@ -205,7 +205,7 @@ def _update_sub_filter(
     std[1] = math.hypot(std[1], inflation * AY_SHARE * use[S.AY])
     if sub == 1:
         innovation[0] = math.nan
-    update(mean, root, state, measured, innovation, std, work)
+    update(mean, root, state, Measurement(measured, innovation, std), work)
 
 
 @compiled

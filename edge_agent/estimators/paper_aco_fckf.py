@@ -20,7 +20,7 @@ from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 
-from edge_agent.adaptation.fuzzy import adapted_within
+from edge_agent.adaptation.fuzzy import FactorLimits, adapted_within
 from edge_agent.adaptation.lower_vertices import LowerVertices
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.estimators.bank import EstimatorBank
@@ -37,7 +37,12 @@ from edge_agent.estimators.common.run import PaperMemory, kernel_of, new_filters
 from edge_agent.estimators.common.tyre_option import TyreOption
 from edge_agent.estimators.elements import Element
 from edge_agent.estimators.estimates import Column
-from edge_agent.estimators.gaussian.planar import POINTS, PlanarState, propagate_points
+from edge_agent.estimators.gaussian.planar import (
+    POINTS,
+    PlanarState,
+    PlanarStep,
+    propagate_points,
+)
 from edge_agent.filters.cholesky import variance
 from edge_agent.filters.columns import gather_points, spread_points
 from edge_agent.filters.householder import LOG_TWO_PI
@@ -182,7 +187,8 @@ def _step_filter(memory: FuzzyMemory, context: FuzzyContext, dt: float) -> bool:
     noise = context.adapted
     pace = dt / STEP_S
     spread_points(mean, root, points)
-    propagate_points(memory.row, points, memory.factor, memory.track, dt, False, context.dual_motor)
+    step = PlanarStep(dt, False, context.dual_motor)
+    propagate_points(memory.row, points, memory.factor, memory.track, step)
     gather_points(points, context.process, math.sqrt(pace), mean, root)
     _adapt_noise(memory, context, pace, math.exp(-math.log(2.0) * dt / WINDOW_S))
     used = 0
@@ -222,8 +228,7 @@ def _adapt_noise(memory: FuzzyMemory, context: FuzzyContext, pace: float, keep: 
                 memory.theoretical[r],
                 context.fuzzy_inputs,
                 context.fuzzy_outputs,
-                pace,
-                (LEAST_FACTOR, LARGEST_FACTOR),
+                FactorLimits(pace, LEAST_FACTOR, LARGEST_FACTOR),
             )
     memory.adaptation = max(memory.factor[0], memory.factor[1], memory.factor[2])
 

@@ -65,7 +65,7 @@ from edge_agent.estimators.gaussian.wheel_friction import (
 )
 from edge_agent.filters.cholesky import variance
 from edge_agent.filters.downdate import update_by_downdate
-from edge_agent.filters.householder import predict
+from edge_agent.filters.householder import Measurement, predict
 from edge_agent.filters.points import centred_deviations, sigma_points, weighted_mean
 from edge_agent.filters.sigma import unscented_rule
 from schemas.mugrid import LOWER, UPPER
@@ -207,7 +207,7 @@ def _step_filter(memory: UnscentedMemory, nothing: EmptyRecord, dt: float) -> bo
     for i in range(3):
         noise[i, i] = DRIFT[i] * math.sqrt(dt)
     noise[first:, first:] = math.sqrt(max(1.0 - keep * keep, 0.0)) * PRIOR_ROOT
-    predict(points, W_MEAN, W_COV, noise, mean, root, work)
+    predict(points, (W_MEAN, W_COV), noise, mean, root, work)
     sigma_points(mean, root, XI, points)
     _update_filter(memory, dt, share, points, work)
     for wheel in range(4):
@@ -246,7 +246,7 @@ def _update_filter(
         _point_friction(points[p], middle, share, mu)
         outcomes[p, 2], _ = _tyre_accelerations(row, points[p], track, mu)
         motion[:3] = points[p, :3]
-        tyre_forces(row, motion, wheels, mu, DUGOFF, outcomes[p, 3:], force_y)
+        tyre_forces(row, motion, wheels, mu, DUGOFF, (outcomes[p, 3:], force_y))
     weighted_mean(outcomes, W_MEAN, predicted)
     centred_deviations(points, mean, W_COV, state, 0)
     centred_deviations(outcomes, predicted, W_COV, measured, 0)
@@ -270,7 +270,7 @@ def _update_filter(
         innovation[r] -= predicted[r]
     std[0] = widened_speed_std(std[0], innovation[0])
     used, log_likelihood, square, refused = update_by_downdate(
-        mean, root, state, measured, innovation, std, work
+        mean, root, state, Measurement(measured, innovation, std), work
     )
     memory.nis = square / max(used, 1)
     memory.log_likelihood = log_likelihood

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from edge_agent.filters.householder import LOG_TWO_PI, triangularize, update
+from edge_agent.filters.householder import LOG_TWO_PI, Measurement, triangularize, update
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
@@ -55,9 +55,7 @@ def update_by_downdate(
     mean: FloatArray,
     sqrt_cov: FloatArray,
     state_deviations: FloatArray,
-    measured_deviations: FloatArray,
-    innovation: FloatArray,
-    noise_std: FloatArray,
+    measurement: Measurement,
     work: FloatArray,
 ) -> tuple[int, float, float, bool]:
     """Run the measurement update in place as in paper 003: the covariance factor is reduced by the
@@ -68,6 +66,7 @@ def update_by_downdate(
     fail, performs the step instead.
     """
     n, points = state_deviations.shape
+    measured_deviations, innovation, noise_std = measurement
     rows = innovation.shape[0]
     place = np.empty(rows, np.int64)
     used = 0
@@ -106,7 +105,7 @@ def update_by_downdate(
         if not downdate(sqrt_cov, gain[a], white):
             sqrt_cov[:, :], mean[:] = kept, start
             used, log_likelihood, square = update(
-                mean, sqrt_cov, state_deviations, measured_deviations, innovation, noise_std, work
+                mean, sqrt_cov, state_deviations, measurement, work
             )
             return used, log_likelihood, square, True
     return used, log_likelihood - 0.5 * square, square, False

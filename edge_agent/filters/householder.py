@@ -18,6 +18,7 @@ and allocate nothing.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from edge_agent.filters.points import centred_deviations, weighted_mean
 from schemas.numeric import FloatArray
@@ -62,8 +63,7 @@ def triangularize(a: FloatArray, rows: int, columns: int) -> None:
 @compiled
 def predict(
     points: FloatArray,
-    w_mean: FloatArray,
-    w_cov: FloatArray,
+    weights: tuple[FloatArray, FloatArray],
     sqrt_noise: FloatArray,
     mean: FloatArray,
     sqrt_cov: FloatArray,
@@ -72,9 +72,11 @@ def predict(
     """Compute mean (n,) and sqrt_cov (n, n) of propagated points (points, n) with process noise
     factor sqrt_noise (n, n).
 
-    `work` is scratch, (n, points + n) or larger.
+    `weights` (points,) are those of the points for the mean and for the covariance. `work` is
+    scratch, (n, points + n) or larger.
     """
     count, n = points.shape
+    w_mean, w_cov = weights
     weighted_mean(points, w_mean, mean)
     centred_deviations(points, mean, w_cov, work, 0)
     for i in range(n):
@@ -86,22 +88,29 @@ def predict(
             sqrt_cov[i, j] = work[i, j] if j <= i else 0.0
 
 
+class Measurement(NamedTuple):
+    """Measurement of k quantities: deviations Z (k, points) of the predicted readings, innovation
+    nu (k,), and standard deviations r (k,) of the noise.
+    """
+
+    deviations: FloatArray
+    innovation: FloatArray
+    noise_std: FloatArray
+
+
 @compiled
 def update(
     mean: FloatArray,
     sqrt_cov: FloatArray,
     state_deviations: FloatArray,
-    measured_deviations: FloatArray,
-    innovation: FloatArray,
-    noise_std: FloatArray,
+    measurement: Measurement,
     work: FloatArray,
 ) -> tuple[int, float, float]:
     """Run the measurement update in place; rows whose innovation is NaN are skipped.
 
     Args:
         mean: m, (n,), changed. sqrt_cov: L, (n, n), changed.
-        state_deviations: X, (n, points). measured_deviations: Z, (k, points).
-        innovation: nu, (k,). noise_std: r, (k,).
+        state_deviations: X, (n, points). measurement: Z, nu and r.
         work: (k + n, points + k) or larger.
 
     Returns:
@@ -111,6 +120,7 @@ def update(
     The array [[Z, diag(r)], [X, 0]] becomes [[S^1/2, 0], [P_xz*S^-T/2, L_new]].
     """
     n, points = state_deviations.shape
+    measured_deviations, innovation, noise_std = measurement
     used = 0
     for k in range(innovation.shape[0]):
         if not math.isnan(innovation[k]):

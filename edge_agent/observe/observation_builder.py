@@ -132,34 +132,37 @@ class OpenVisits:
         return OpenVisits(visits, np.full(vehicles, np.iinfo(np.int64).min))
 
 
+class BlockReadings(NamedTuple):
+    """Signals of a block of samples, as far as they are known.
+
+    Without `signals` (T, N, channels), observations do not contain the direction in which grip was
+    used. Without `context` (T, N, len(CONTEXT)), they contain no data of controllers and
+    surroundings.
+    """
+
+    signals: FloatArray | None = None
+    context: FloatArray | None = None
+
+
+NO_READINGS: Final = BlockReadings()
+
+
 def build_records(
     before: OpenVisits,
     time: IntArray,
     located: Located,
     estimates: Estimates,
     config: AgentConfig,
-    signals: FloatArray | None = None,
-    context: FloatArray | None = None,
+    readings: BlockReadings = NO_READINGS,
 ) -> tuple[OpenVisits, RecordBlock, RecordBlock]:
     """Build the records of a block of samples with times (T, N) [ns UTC]; return (open visits,
     observations, states).
-
-    Without `signals` (T, N, channels) observations do not contain the direction in which grip was
-    used. Without `context` (T, N, len(CONTEXT)) they contain no data of controllers and
-    surroundings.
     """
     after = OpenVisits(before.visits.copy(), before.slot.copy())
     ended = records(Visit, int(np.count_nonzero(located.closes)))
-    notes = _sample_notes(estimates, context)
-    count = _advance_visits(
-        time,
-        located,
-        _visit_samples(estimates, signals),
-        notes,
-        after.visits,
-        ended,
-        config.position_std,
-    )
+    notes = _sample_notes(estimates, readings.context, config.position_std)
+    samples = _visit_samples(estimates, readings.signals)
+    count = _advance_visits(time, located, samples, notes, after.visits, ended)
     ended = ended[:count]
     return (
         after,
@@ -174,21 +177,25 @@ class SampleNotes(NamedTuple):
     `row` (T, N): index of a row of `told` at a sample where friction changed within a visit, else
     -1. `told` (k, 32): evidence (log-likelihood of friction) from the part of the visit before that
     change. `context` (T, N, len(CONTEXT)): controllers and surroundings; empty if unknown.
+    `position_std`: standard deviation of the position [m].
     """
 
     row: IntArray  # -1: nowhere
     told: FloatArray
     context: FloatArray
+    position_std: float
 
 
-def _sample_notes(estimates: Estimates, context: FloatArray | None) -> SampleNotes:
+def _sample_notes(
+    estimates: Estimates, context: FloatArray | None, position_std: float
+) -> SampleNotes:
     heard = np.zeros((0, 0, len(CONTEXT))) if context is None else np.ascontiguousarray(context)
     row = np.full(estimates.mu.shape, -1)
     if estimates.jumps is None or estimates.evidence is None:
-        return SampleNotes(row, np.zeros((0, mugrid.BINS)), heard)
+        return SampleNotes(row, np.zeros((0, mugrid.BINS)), heard, position_std)
     told = estimates.evidence[estimates.jumps]
     row[estimates.jumps] = np.arange(len(told))
-    return SampleNotes(row, told, heard)
+    return SampleNotes(row, told, heard, position_std)
 
 
 def _visit_samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
@@ -212,7 +219,6 @@ def _advance_visits(
     notes: SampleNotes,
     visits: Records[Visit],
     ended: Records[Visit],
-    position_std: float,
 ) -> int:
     """Add each sample to its visit (passage of a map cell), and write a visit to `ended` when the
     next one begins; return the number of ended visits.
@@ -233,7 +239,7 @@ def _advance_visits(
                     visit.from_fix = 0.0
                 elif located.outside[k, n]:
                     visit.from_fix = np.inf
-                _add_sample(visit, time[k, n], samples[k, n], position_std)
+                _add_sample(visit, time[k, n], samples[k, n], notes.position_std)
                 if k < len(notes.context):
                     _add_context(visit, notes.context[k, n])
                 if located.inside[k, n]:

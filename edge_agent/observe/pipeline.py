@@ -13,7 +13,12 @@ import numpy as np
 from edge_agent.inputs.block import Block
 from edge_agent.observe.cell_tracker import NOWHERE, locate_vehicles, new_tracks
 from edge_agent.observe.controller_flags import doubted_flags, new_flag_records, trusted_context
-from edge_agent.observe.observation_builder import OpenVisits, RecordBlock, build_records
+from edge_agent.observe.observation_builder import (
+    BlockReadings,
+    OpenVisits,
+    RecordBlock,
+    build_records,
+)
 from edge_agent.observe.trip_privacy import TripEnds
 from schemas.grid import SECTORS
 from schemas.numeric import FloatArray, IntArray
@@ -78,7 +83,12 @@ class Pipeline:
         if context is not None:
             self._flags, context = trusted_context(self._flags, block.t, block.signals, context)
         self._open, observations, states = build_records(
-            self._open, block.time, located, estimates, self._config, block.signals, context
+            self._open,
+            block.time,
+            located,
+            estimates,
+            self._config,
+            BlockReadings(block.signals, context),
         )
         self._last = block
         self.seen = Seen(

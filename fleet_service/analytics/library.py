@@ -26,14 +26,14 @@ def ask_archive(
     archive: Path | str,
     question: str,
     *,
-    since: str | None = None,
-    until: str | None = None,
+    period: tuple[str | None, str | None] = (None, None),
     bbox: Box | None = None,
     options: Options | None = None,
     engine: str = "duckdb",
 ) -> pa.Table:
     """Return the answer to one of the predefined questions about the compacted files
-    (`fleet-service compact`). Times are ISO 8601, UTC.
+    (`fleet-service compact`). `period` is begin and end of the observations, ISO 8601, UTC; None
+    for an open end.
 
     Raises:
         InputError: there is no such question or archive, no data in the selected part, or an option
@@ -43,7 +43,7 @@ def ask_archive(
     require_archive(root)
     asked = question_of(question)
     return asked.ask(
-        QueryEngine(engine, root, _make_extract(since, until, bbox)),
+        QueryEngine(engine, root, _make_extract(*period, bbox)),
         options or Options(report=lambda _: None),
     )
 

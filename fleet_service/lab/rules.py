@@ -78,14 +78,17 @@ def fuse_by_rules(
     place: IntArray,
     seconds: FloatArray,
     sent: FloatArray,
-    reading: FloatArray,
-    std: FloatArray,
+    readings: tuple[FloatArray, FloatArray],
     asked: FloatArray,
     cells: int,
 ) -> FloatArray:
     """Return mean and variance of μ by the first five rules (see module) in each cell at each time
     in `asked` [s], (times, 5, cells, 2).
+
+    A visit k is at the cell `place[k]` at the time `seconds[k]`. Its vehicle believes in mean and
+    variance `sent[k]`; it reads `readings[0][k]` with standard deviation `readings[1][k]`.
     """
+    reading, std = readings
     mean = np.full((5, cells), PRIOR_MEAN)
     variance = np.full((5, cells), PRIOR_VAR)
     last = np.zeros(cells)
@@ -151,7 +154,8 @@ def score_rules(
     """
     sent = vehicle_posteriors(v.vehicle, v.reports.reading, v.reports.std, vehicles)
     asked = 60.0 * np.array(at, float)
-    found = fuse_by_rules(v.place, v.seconds, sent, v.reports.reading, v.reports.std, asked, CELLS)
+    readings = (v.reports.reading, v.reports.std)
+    found = fuse_by_rules(v.place, v.seconds, sent, readings, asked, CELLS)
     out: list[list[Scores]] = [[] for _ in RULES]
     for k, minute in enumerate(at):
         n = excited_vehicles(v, town, minute, vehicles)
@@ -164,6 +168,6 @@ def score_rules(
                 np.clip(mean + sign * half, mugrid.LOWER, mugrid.UPPER) for sign in (-1.0, 0.0, 1.0)
             )
             nothing = np.full(CELLS, np.nan)
-            answers = of_intervals(lower, mid, upper, town.mu[minute], n, nothing, nothing)
+            answers = of_intervals((lower, mid, upper), town.mu[minute], n, nothing, nothing)
             per_rule.append(answers.taken((n >= 1) & where))
     return [join_scores(per_rule) for per_rule in out]

@@ -83,9 +83,7 @@ def earlier_visits(v: Visits, until_s: float, vehicles: int) -> IntArray:
 
 
 def of_intervals(
-    lower: FloatArray,
-    mid: FloatArray,
-    upper: FloatArray,
+    quantiles: tuple[FloatArray, FloatArray, FloatArray],
     truth: FloatArray,
     vehicles: IntArray,
     rank: FloatArray,
@@ -93,9 +91,10 @@ def of_intervals(
 ) -> Scores:
     """Return the scores of 90 % intervals of friction; each argument is an array (k,).
 
-    The interval score is the width plus 20 times the distance by which the interval misses the true
-    value.
+    `quantiles` are the 5 %, 50 % and 95 % quantiles. The interval score is the width plus 20 times
+    the distance by which the interval misses the true value.
     """
+    lower, mid, upper = quantiles
     missed = np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0)
     interval = upper - lower + 2.0 / ALPHA * missed
     nothing: FloatArray = np.full(len(truth), np.nan)
@@ -117,7 +116,11 @@ def of_beliefs(belief: FloatArray, truth: FloatArray, vehicles: IntArray) -> Sco
     widths of their intervals. `rank` is P(μ ≤ true value), which is uniformly distributed for
     calibrated beliefs.
     """
-    lower, mid, upper = (mugrid.quantiles(belief, q) for q in (0.05, 0.5, 0.95))
+    quantiles = (
+        mugrid.quantiles(belief, 0.05),
+        mugrid.quantiles(belief, 0.5),
+        mugrid.quantiles(belief, 0.95),
+    )
     place = np.clip(
         (truth - mugrid.LOWER) / (mugrid.UPPER - mugrid.LOWER) * mugrid.BINS,
         0.0,
@@ -127,7 +130,7 @@ def of_beliefs(belief: FloatArray, truth: FloatArray, vehicles: IntArray) -> Sco
     bin_ = place.astype(np.int64)
     mass = np.take_along_axis(belief, bin_[:, None], axis=1)[:, 0]
     rank = np.take_along_axis(cdf, bin_[:, None], axis=1)[:, 0] - mass * (1.0 - (place - bin_))
-    scores = of_intervals(lower, mid, upper, truth, vehicles, rank, belief @ SLIPPERY_SHARE)
+    scores = of_intervals(quantiles, truth, vehicles, rank, belief @ SLIPPERY_SHARE)
     return replace(scores, crps=crps_of(belief, truth))
 
 

@@ -43,7 +43,12 @@ def sliding_flag(row: FloatArray, track: InputTrack, vx: float, vy: float, mu: f
     yaw_rate = track.inputs[S.YAW_RATE]
     for wheel in range(4):
         along = along_wheel(
-            row, wheel, vx, vy, yaw_rate, track.steering[0, wheel], track.steering[1, wheel]
+            row,
+            wheel,
+            vx,
+            vy,
+            yaw_rate,
+            (track.steering[0, wheel], track.steering[1, wheel]),
         )
         gliding = (
             abs(row[Parameter.RADIUS] * track.inputs[S.OMEGA + wheel] - along)

@@ -27,18 +27,16 @@ PRIOR_MU_STD = (UPPER - LOWER) / math.sqrt(12.0)
 @compiled
 def write_motion(
     output: FloatArray,
-    vx: float,
-    vy: float,
-    yaw_rate: float,
-    var_x: float,
-    var_y: float,
-    var_rate: float,
+    motion: tuple[float, float, float],
+    variances: tuple[float, float, float],
 ) -> None:
     """Write velocity [m/s], yaw rate [rad/s] and sideslip [rad] with their standard deviations to
     `output`, the estimates of one sample.
 
-    `var_x`, `var_y` and `var_rate` are the variances of v_x, v_y and the yaw rate.
+    `motion` is v_x, v_y [m/s] and yaw rate [rad/s]; `variances` are theirs.
     """
+    vx, vy, yaw_rate = motion
+    var_x, var_y, var_rate = variances
     speed = max(abs(vx), SLOWEST_M_S)
     output[Column.VX], output[Column.VY], output[Column.YAW_RATE] = vx, vy, yaw_rate
     output[Column.SIDESLIP] = math.atan2(vy, speed)
@@ -54,12 +52,8 @@ def write_states(output: FloatArray, mean: FloatArray, root: FloatArray, yaw_rat
     """
     write_motion(
         output,
-        mean[0],
-        mean[1],
-        mean[yaw_rate],
-        variance(root, 0),
-        variance(root, 1),
-        variance(root, yaw_rate),
+        (mean[0], mean[1], mean[yaw_rate]),
+        (variance(root, 0), variance(root, 1), variance(root, yaw_rate)),
     )
 
 
@@ -111,7 +105,7 @@ def write_unknown(output: FloatArray) -> None:
     """Write the output before the first usable sample: the friction prior, and zero motion with a
     large standard deviation.
     """
-    write_motion(output, 0.0, 0.0, 0.0, UNKNOWN_V_STD**2, 1.0, 1.0)
+    write_motion(output, (0.0, 0.0, 0.0), (UNKNOWN_V_STD**2, 1.0, 1.0))
     output[Column.SIDESLIP_STD] = 1.0
     write_quality(output, 0.0, 0.0, 1.0, 0.0)
     write_prior(output, Column.MU)

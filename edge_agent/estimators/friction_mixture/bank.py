@@ -62,11 +62,10 @@ def _advance_filters(
     contexts: Records[MixtureContext],
     t: FloatArray,
     signals: FloatArray,
-    outputs: FloatArray,
-    visits: tuple[BoolArray, FloatArray],
+    results: tuple[FloatArray, BoolArray, FloatArray],
     part: Part,
 ) -> None:
-    (closes, evidence) = visits
+    (outputs, closes, evidence) = results
     (share, first, last) = part
     context = contexts[share]
     design = context.design
@@ -127,7 +126,7 @@ def write_estimates(memory: MixtureMemory, design: MixtureDesign, output: FloatA
     ) ** 2  # what no sensor tells
     var_y = memory.overall_covariance[NodeState.VY, NodeState.VY]
     var_rate = last.yaw_rate_var + YAW_RATE_OFFSET_STD**2
-    write_motion(output, vx, vy, last.yaw_rate, var_x, var_y, var_rate)
+    write_motion(output, (vx, vy, last.yaw_rate), (var_x, var_y, var_rate))
     _report_friction(
         memory.friction, reported_upper(memory.grip, memory.friction), output, Column.MU
     )

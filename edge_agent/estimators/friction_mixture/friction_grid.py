@@ -11,6 +11,7 @@ Legend
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,24 +33,33 @@ def node_table(count: int) -> tuple[FloatArray, FloatArray]:
     return middle**2, np.diff(edges**2) / (UPPER - LOWER)
 
 
+class RoadChange(NamedTuple):
+    """Probabilities that the road changes: to any friction (`hazard`), from a node without
+    neighbours to any friction (`leaving`, in addition), and to a neighbouring node (`drift`,
+    approximately).
+    """
+
+    hazard: float
+    leaving: float
+    drift: float
+
+
 @compiled
 def change_road(
     w: FloatArray,
     prior: FloatArray,
     chain: int,
-    hazard: float,
-    leaving: float,
-    drift: float,
+    change: RoadChange,
     out: FloatArray,
 ) -> None:
     """Compute the probabilities `out` (K,) of K nodes (assumed friction values), which were `w`,
     after a possible road change.
 
-    The road changes to any friction with probability `hazard`, and to a neighbouring node with
-    probability of about `drift`. Only the first `chain` nodes have neighbours; the other nodes
-    change to any friction also with probability `leaving`. The exchange between neighbours is in
-    detailed balance with the prior: probabilities equal to the prior do not change.
+    Only the first `chain` nodes have neighbours, with which they exchange probability; only the
+    other nodes change with probability `change.leaving`. The exchange is in detailed balance with
+    the prior: probabilities equal to the prior do not change.
     """
+    hazard, leaving, drift = change
     count = w.shape[0]
     left = 0.0
     for j in range(count):

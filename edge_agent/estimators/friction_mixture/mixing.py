@@ -22,7 +22,7 @@ import numpy as np
 from edge_agent.estimators.common.arrays import clear_rows, clear_vector, copy_vector, put_square
 from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.friction_grid import SMALLEST, change_road
+from edge_agent.estimators.friction_mixture.friction_grid import SMALLEST, RoadChange, change_road
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.restart import put_split_to_sleep
 from edge_agent.estimators.friction_mixture.trust import used_evidence_share
@@ -97,9 +97,10 @@ def apply_road_change(
     predicted = scratch.predicted[:count]
     weight = memory.weight[:count]
     visit = memory.visit_weight[:count]
-    change_road(visit, prior, NODES, hazard, leaving, drift, predicted)
+    change = RoadChange(hazard, leaving, drift)
+    change_road(visit, prior, NODES, change, predicted)
     copy_vector(visit, predicted)
-    change_road(weight, prior, NODES, hazard, leaving, drift, predicted)
+    change_road(weight, prior, NODES, change, predicted)
     for j in range(count):
         zeta = min(hazard * prior[j] / predicted[j], 1.0)
         memory.penalty[j] *= 1.0 - zeta

@@ -26,9 +26,14 @@ from edge_agent.estimators.common.inputs import InputTrack, wheel_force
 from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD
 from edge_agent.estimators.common.readings import rolling_speed
 from edge_agent.estimators.common.run import PaperMemory
-from edge_agent.estimators.gaussian.planar import POINTS, PlanarState, propagate_points
+from edge_agent.estimators.gaussian.planar import (
+    POINTS,
+    PlanarState,
+    PlanarStep,
+    propagate_points,
+)
 from edge_agent.filters.federated import fuse_estimates, share_information
-from edge_agent.filters.householder import predict, update
+from edge_agent.filters.householder import Measurement, predict, update
 from edge_agent.filters.points import axis_points, centred_deviations, weighted_mean
 from edge_agent.filters.sigma import cubature_rule
 from schemas.numeric import FloatArray
@@ -166,11 +171,11 @@ def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> Non
         share_information(motion.root, beta, root)
         axis_points(motion.mean, root, XI, points)
         columns[:] = points.T
-        propagate_points(row, columns, friction, track, dt, True)
+        propagate_points(row, columns, friction, track, PlanarStep(dt, True, False))
         points[:] = columns.T
         for i in range(STATES):
             process[i, i] = motion.process[i] * math.sqrt(dt / STEP_S / beta)
-        predict(points, WEIGHT, WEIGHT, process, mean, root, work)
+        predict(points, (WEIGHT, WEIGHT), process, mean, root, work)
         _update_sub_filter(memory, SubFilter(sub, mean, root, points, work), dt)
         if sub == 0:
             first_mean[:], first_root[:] = mean, root
@@ -215,7 +220,9 @@ def _update_sub_filter(memory: FederatedMemory, at: SubFilter, dt: float) -> Non
         motion.expected[sub, r] = std[r] ** 2 / (motion.factor[sub] if r < 3 else 1.0)
         for p in range(points.shape[0]):
             motion.expected[sub, r] += measured[r, p] ** 2
-    used, log_likelihood, square = update(mean, root, state, measured, innovation, std, at.work)
+    used, log_likelihood, square = update(
+        mean, root, state, Measurement(measured, innovation, std), at.work
+    )
     motion.gamma[sub] = square / max(used, 1)
     memory.nis += 0.5 * motion.gamma[sub]
     memory.log_likelihood += log_likelihood

@@ -55,6 +55,16 @@ class HeunInputs(NamedTuple):
     by_torque: bool  # whether forces come from the wheels' torque and z is the yaw acceleration
 
 
+class PlanarStep(NamedTuple):
+    """Step of the process model: its length `dt` [s], and the source of the longitudinal forces,
+    see `propagate_points`.
+    """
+
+    dt: float
+    by_torque: bool
+    by_motor: bool = False
+
+
 @compiled
 def stable_steps(speed: float, dt: float) -> int:
     """Return the number of equal Heun steps needed for a stable integration over `dt` [s] at
@@ -70,11 +80,9 @@ def propagate_points(
     columns: FloatArray,
     friction: FloatArray,
     track: InputTrack,
-    dt: float,
-    by_torque: bool,
-    by_motor: bool = False,
+    step: PlanarStep,
 ) -> None:
-    """Advance the states in the columns (6, POINTS) by `dt` [s], in place.
+    """Advance the states in the columns (6, POINTS) by one step, in place.
 
     Inputs change linearly from the previous sample to this one. With `by_torque`, longitudinal
     forces come from the wheels' torque, z is the yaw acceleration, and friction (4,) is given. The
@@ -86,6 +94,7 @@ def propagate_points(
     slowest = abs(columns[0, 0])
     for p in range(1, POINTS):
         slowest = min(slowest, abs(columns[0, p]))
+    dt, by_torque, by_motor = step
     times = stable_steps(slowest, dt)
     unknown = (math.nan, math.nan, math.nan, math.nan)
     force_x = _torque_forces(row, track, dt) if by_torque else unknown

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -50,6 +51,25 @@ MOST_IDENTITY: Final = 64  # bytes of a publisher's identity that matter
 MOST_PUBLISHERS: Final = 1000  # whose sequence numbers are followed
 
 
+@dataclass(frozen=True)
+class RosTopics:
+    """Topics that a ROS 2 source receives, and their decoding.
+
+    Attributes:
+        domain: ROS_DOMAIN_ID.
+        signals: needed signals; each name begins with its topic.
+        decoder: decoder for topics of CAN frames, if there is a CAN database.
+        buses: topics of CAN frames.
+        types: folder of PACKAGE/NAME.msg files, for message types that no ROS distribution has.
+    """
+
+    domain: int
+    signals: Sequence[str]
+    decoder: Decoder | None = None
+    buses: Sequence[str] = ()
+    types: Path | None = None
+
+
 class Ros2Feed(Feed):
     """Live source for topics of one ROS domain.
 
@@ -57,11 +77,7 @@ class Ros2Feed(Feed):
         name: name of the source.
         clock: clock of the host.
         settings: Zenoh settings to reach the router.
-        domain: ROS_DOMAIN_ID.
-        signals: needed signals; each name begins with its topic.
-        decoder: decoder for topics of CAN frames, if there is a CAN database.
-        buses: topics of CAN frames.
-        types: folder of PACKAGE/NAME.msg files, for message types that no ROS distribution has.
+        topics: topics to receive.
 
     Raises:
         InputError: rosbags is not installed, no signal names a topic, or a message type is invalid.
@@ -72,26 +88,22 @@ class Ros2Feed(Feed):
         name: str,
         clock: HostClock,
         settings: ZenohSettings,
-        *,
-        domain: int,
-        signals: Sequence[str],
-        decoder: Decoder | None = None,
-        buses: Sequence[str] = (),
-        types: Path | None = None,
+        topics: RosTopics,
     ) -> None:
         super().__init__(name, clock)
         self._settings = settings
-        self._domain = domain
-        self._decoder = decoder
-        self._wanted = {signal for signal in signals if signal.startswith("/")}
-        self._topics = sorted({signal.partition(".")[0] for signal in self._wanted} | set(buses))
+        self._domain = topics.domain
+        self._decoder = topics.decoder
+        self._wanted = {signal for signal in topics.signals if signal.startswith("/")}
+        named = {signal.partition(".")[0] for signal in self._wanted}
+        self._topics = sorted(named | set(topics.buses))
         if not self._topics:
             raise InputError(
                 "profile",
                 "names no topic",
                 "call its signals /topic.field, as import drafts them from a bag",
             )
-        self._store = _load_typestore(types)
+        self._store = _load_typestore(topics.types)
         self._leaves: dict[str, list[Leaf]] = {}
         self._after: dict[bytes, int] = {}  # publisher -> the sequence number that is next
 

@@ -26,7 +26,7 @@ from edge_agent.inputs.live.can_bus import CanFeed, Decoder
 from edge_agent.inputs.live.databroker import DatabrokerFeed
 from edge_agent.inputs.live.feed import Feed, HostClock
 from edge_agent.inputs.live.gpsd import GpsdFeed
-from edge_agent.inputs.live.ros2 import Ros2Feed
+from edge_agent.inputs.live.ros2 import Ros2Feed, RosTopics
 from edge_agent.inputs.profile import Profile, load_profile
 from edge_agent.inputs.readers.can_log import no_database
 from edge_agent.inputs.readers.dbc import Database
@@ -158,11 +158,13 @@ def _open_ros2(
         source,
         clock,
         settings,
-        domain=int(domain),
-        signals=sorted(profile.needed_signals()),
-        decoder=None if database is None else Decoder(profile, database),
-        buses=options.get("frames", "").split(),
-        types=Path(folder) if folder else None,
+        RosTopics(
+            int(domain),
+            sorted(profile.needed_signals()),
+            None if database is None else Decoder(profile, database),
+            options.get("frames", "").split(),
+            Path(folder) if folder else None,
+        ),
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from edge_agent.estimators import Estimates, EstimatorBank
-from edge_agent.lab.simulation import Fault, simulate_manoeuvre
+from edge_agent.lab.simulation import DriveSetup, Fault, simulate_manoeuvre
 from edge_agent.lab.simulation.manoeuvres import Friction
 from edge_agent.lab.simulation.presets import TrueVehicle
 from edge_agent.lab.simulation.sensors import Sensors
@@ -99,13 +99,15 @@ def _simulate_drive(
         mu=scenario.mu,
         speed=scenario.speed,
         seed=seed,
-        rate_hz=scenario.rate_hz,
         duration_s=scenario.duration_s,
-        vehicle=scenario.vehicle,
-        sensors=sensors,
-        road=scenario.road,
-        slope=scenario.slope,
-        faults=() if scenario.torque else (Fault("missing", "torque"),),
+        setup=DriveSetup(
+            rate_hz=scenario.rate_hz,
+            vehicle=scenario.vehicle,
+            sensors=sensors,
+            road=scenario.road,
+            slope=scenario.slope,
+            faults=() if scenario.torque else (Fault("missing", "torque"),),
+        ),
     )
     return log.take(np.arange(0, len(log), step)), vehicle
 

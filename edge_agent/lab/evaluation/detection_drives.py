@@ -19,7 +19,7 @@ from edge_agent.estimators import Estimates, EstimatorBank
 from edge_agent.lab.evaluation.slip_flag import friction_flagged
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.observe.cell_tracker import locate_vehicles, new_tracks
-from edge_agent.observe.observation_builder import OpenVisits, build_records
+from edge_agent.observe.observation_builder import BlockReadings, OpenVisits, build_records
 from schemas import mugrid
 from schemas.config import AgentConfig
 from schemas.numeric import BoolArray, FloatArray, IntArray
@@ -103,7 +103,7 @@ def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> D
         estimates, favoured = _estimate_chunk(bank, t, signals, located.closes)
         time = np.rint(t * NS).astype(np.int64)
         open_visits, observations, _ = build_records(
-            open_visits, time, located, estimates, config, signals
+            open_visits, time, located, estimates, config, BlockReadings(signals)
         )
         columns = observations.columns
         visits.append(

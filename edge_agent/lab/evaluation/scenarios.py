@@ -21,11 +21,9 @@ SEDAN: Final = PRESETS["sedan"]  # paper 004, table 1
 LIGHT: Final = TrueVehicle(
     car(
         "light",
-        830.0,
-        1110.0,
+        (830.0, 1110.0, 0.54),
         (1.17, 1.17),
         (1.416, 1.416),
-        cg_height=0.54,
         radius=0.278,
         drive_front=0.5,
     ),
@@ -35,11 +33,9 @@ LIGHT: Final = TrueVehicle(
 SMALL: Final = TrueVehicle(
     car(
         "in-wheel",
-        710.0,
-        1000.0,
+        (710.0, 1000.0, 0.50),
         (0.795, 0.975),
         (1.55, 1.55),
-        cg_height=0.50,
         radius=0.245,
         drive_front=0.5,
     ),

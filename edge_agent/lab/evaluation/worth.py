@@ -31,7 +31,7 @@ from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.design import MixtureDesign, design_of
 from edge_agent.lab.evaluation.batch import DriveSet, join_drives
 from edge_agent.lab.evaluation.real_world import interval_score, town
-from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
+from edge_agent.lab.simulation import PRESETS, DriveSetup, simulate_manoeuvre
 from edge_agent.lab.simulation.relief import ROADS
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
@@ -133,11 +133,13 @@ def manoeuvres(seed: int, seconds: float) -> DriveSet:
                 manoeuvre,
                 mu=float(rng.uniform(0.15, 1.0)),
                 seed=1000 * seed + k,
-                rate_hz=RATE_HZ,
                 duration_s=seconds,
-                vehicle=list(PRESETS)[int(rng.integers(len(PRESETS)))],
-                sensors="rough",
-                road=list(ROADS)[int(rng.integers(1, len(ROADS)))],
+                setup=DriveSetup(
+                    rate_hz=RATE_HZ,
+                    vehicle=list(PRESETS)[int(rng.integers(len(PRESETS)))],
+                    sensors="rough",
+                    road=list(ROADS)[int(rng.integers(1, len(ROADS)))],
+                ),
             )
         )
     return join_drives(drives)

@@ -9,7 +9,7 @@ from edge_agent.lab.simulation.presets import PRESETS
 from edge_agent.lab.simulation.relief import ROADS, Relief, Wave
 from edge_agent.lab.simulation.scenarios import SCENARIOS, Scenario
 from edge_agent.lab.simulation.sensors import SENSORS
-from edge_agent.lab.simulation.simulate import simulate_manoeuvre
+from edge_agent.lab.simulation.simulate import DriveSetup, simulate_manoeuvre
 
 __all__ = [
     "FAULTS",
@@ -18,6 +18,7 @@ __all__ = [
     "ROADS",
     "SCENARIOS",
     "SENSORS",
+    "DriveSetup",
     "Fault",
     "Relief",
     "Scenario",

@@ -256,12 +256,18 @@ def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
 
 @compiled
 def wished_acceleration(
-    x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float, key: Key
+    x: FloatArray,
+    driver: tuple[FloatArray, IntArray],
+    lanes: Lanes,
+    p: FloatArray,
+    t: float,
+    key: Key,
 ) -> float:
     """Return the longitudinal acceleration [m/s^2] that the driver demands at time `t` [s]. `x` is
-    the vehicle's state, `d` the driver's, `g` the place on the route, `p` the vehicle's parameters,
-    and `key` the random key of the traffic.
+    the vehicle's state, `driver` the driver's state and place on the route, `p` the vehicle's
+    parameters, and `key` the random key of the traffic.
     """
+    d, g = driver
     vx = x[Motion.VX]
     q = budget(d)
     reach = max(2.0, 0.5 * vx)
@@ -289,9 +295,8 @@ def wished_acceleration(
     wish = (max(aim, SLOWEST**2) - vx * vx) / (2.0 * reach)
     across = min(abs(vx * x[Motion.YAW_RATE]) / q, 1.0)
     longitudinal = math.sqrt(1.0 - across * across)  # what cornering leaves of the budget
-    driven = max(
-        p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT]
-    )  # share of the pull on an axle that carries half the vehicle
+    # share of the pull on an axle that carries half the vehicle
+    driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
     gas = min(
         PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven),
         0.8 * q,
@@ -351,21 +356,20 @@ def wished_steer(
 
 @compiled
 def drive(
-    x: FloatArray,
+    vehicle: tuple[FloatArray, FloatArray, FloatArray],
     driver: tuple[FloatArray, IntArray],
     world: tuple[Lanes, FloatArray],
-    p: FloatArray,
-    w: FloatArray,
     now: tuple[float, float, float],
     keys: tuple[Key, Key],
 ) -> None:
     """Advance a driver's state and place on the route, `driver` = (d, g), by one sample. Afterwards
     d[STEER] and d[FORCE] are the actual controls.
 
-    `world` contains lanes and friction table; `w` the wheels at the last sample; `now` time [s],
-    length of the sample [s] and acceleration by gravity along the road [m/s^2]; `keys` the random
-    keys of route and traffic.
+    `vehicle` contains its state, parameters and wheels at the last sample; `world` lanes and
+    friction table; `now` time [s], length of the sample [s] and acceleration by gravity along the
+    road [m/s^2]; `keys` the random keys of route and traffic.
     """
+    x, p, w = vehicle
     d, g = driver
     lanes, friction = world
     t, dt, along = now
@@ -377,7 +381,7 @@ def drive(
     if heeds_warning(d) and d[Driver.WARNED_START] <= PREPARED_S * x[Motion.VX]:
         looks = min(looks, d[Driver.WARNED_MU])
     update_belief(d, looks, w, dt)
-    acceleration = wished_acceleration(x, d, g, lanes, p, t, keys[1])
+    acceleration = wished_acceleration(x, driver, lanes, p, t, keys[1])
     force = wished_force(p, d, x[Motion.VX], acceleration, along)
     if x[Motion.VX] < RESTING and is_stopping(t, d[Driver.STOPS], keys[1]):
         force = -p[Parameter.MASS] * (STOPPING * budget(d) + abs(along))

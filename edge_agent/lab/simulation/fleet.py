@@ -39,7 +39,6 @@ from edge_agent.lab.simulation.scenarios import Scenario, scenario_named
 from edge_agent.lab.simulation.sensors import (
     ROUGH_FLEET,
     ErrorColumn,
-    Sensors,
     error_row,
     noise_keys,
     sense,
@@ -50,6 +49,7 @@ from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
 
+ORDINARY = "mems-patchy"  # sensors of vehicles that are not rough, a key of SENSORS
 TURN_OVER_M = 6.0  # in which a road turns over from one crossfall to another
 VEHICLE_STREAM = 0
 WINTER_STREAM = 4
@@ -58,9 +58,8 @@ STOPS = 0.3
 # from a warning to the foot on the brake (Green, Transportation Human Factors 2, 2000: 1.2 to 1.5
 # s)
 TOLD_S = 1.5
-GOLDEN = (
-    math.sqrt(5.0) - 1.0
-) / 2.0  # multiples of it, modulo 1, are spread evenly however many there are
+# multiples of it, modulo 1, are spread evenly however many there are
+GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 @dataclass(frozen=True)
@@ -98,19 +97,20 @@ def run(
     parameters: FloatArray,
     ground: tuple[Lanes, FloatArray, FloatArray],
     keys: tuple[KeyArray, KeyArray],
-    first: int,
-    steps: int,
+    samples: tuple[int, int],
     timing: tuple[float, int],
 ) -> FloatArray:
-    """Simulate the next `steps` samples; return records with the true values (T, N, RECORD). The
-    states are advanced in place.
+    """Simulate the next samples; return records with the true values (T, N, RECORD). The states
+    are advanced in place.
 
     states: vehicles (N, STATES), drivers (N, len(Driver)), routes (N, 4), wheels (N, 8, 4); ground:
     lanes, tables of friction and of relief; keys: random keys of routes and of traffic (N,);
-    `first`: number of the first sample; timing: sample period [s] and integration steps per sample.
+    samples: number of the first sample, and of samples; timing: sample period [s] and integration
+    steps per sample.
     """
     vehicles, drivers, routes, wheels = states
     lanes, friction, relief = ground
+    first, steps = samples
     period, substeps = timing
     records = np.empty((steps, vehicles.shape[0], RECORD))
     u = np.zeros((INPUTS, 4))
@@ -133,7 +133,7 @@ def run(
             )
             u[Control.TILT, 0], u[Control.TILT, 1] = slope_in_body(east, north, x[Motion.YAW])
             now = (t, period, gravity(u)[0])
-            drive(x, (d, g), (lanes, friction), p, w, now, (keys[0][n], keys[1][n]))
+            drive((x, p, w), (d, g), (lanes, friction), now, (keys[0][n], keys[1][n]))
             command(p, u, d[Driver.STEER], d[Driver.FORCE])
             if p[TrueParameter.REGENERATION] > 0.0:
                 regenerate(x, p, u)
@@ -154,9 +154,8 @@ class SimulatedFleet:
         vehicles: number of vehicles; the drive of vehicle k does not depend on it.
         seed: non-negative.
         rate_hz: sampling rate [Hz].
-        sensors: a key of SENSORS.
-        rough: share of the vehicles with realistic errors: ROUGH_FLEET sensors, and drivers who
-            stop now and then.
+        rough: share of the vehicles with realistic errors: ROUGH_FLEET sensors instead of
+            ORDINARY ones, and drivers who stop now and then.
         winter: share of the vehicles with `winter_equipped` tyres and controllers. If half of all
             vehicles are rough (inaccurate), so are half of the winter vehicles.
 
@@ -170,7 +169,6 @@ class SimulatedFleet:
         vehicles: int,
         seed: int,
         rate_hz: float,
-        sensors: str | Sensors = "mems-patchy",
         rough: float = 0.0,
         winter: float = 0.0,
     ) -> None:
@@ -200,7 +198,7 @@ class SimulatedFleet:
             )
         self._parameters = np.stack([truth.row() for truth in truths])
         self.rough = rough_ones(vehicles, rough)
-        ordinary = sensors_named(sensors)
+        ordinary = sensors_named(ORDINARY)
         origin = self.scenario.origin
         self._errors = np.stack(
             [
@@ -239,7 +237,8 @@ class SimulatedFleet:
         lanes = (network.points, network.first, network.size, network.spacing, network.ways)
         timing = (1.0 / self.rate_hz, substeps_of(self.rate_hz))
         ground = (lanes, self.scenario.table, self._relief)
-        records = run(self._states, self._parameters, ground, self._keys, self._next, steps, timing)
+        samples = (self._next, steps)
+        records = run(self._states, self._parameters, ground, self._keys, samples, timing)
         place = np.array([origin.latitude, origin.longitude, *origin.per_metre])
         known = np.concatenate([self._before, records])
         lead = len(self._before)

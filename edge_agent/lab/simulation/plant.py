@@ -216,15 +216,15 @@ def turn_wheels(
     u: FloatArray,
     w: FloatArray,
     dt: float,
-    gain: float,
-    yaw_acceleration: float,
+    change: tuple[float, float],
 ) -> None:
     """Apply one linearly implicit Euler step of `dt` [s] to the wheel speeds in the vehicle's state
     `x`: every torque that decreases with ω acts as damping.
 
-    `gain` is dv_x/dt [m/s^2], and `yaw_acceleration` is in rad/s^2. They give the change of the
+    `change` is dv_x/dt [m/s^2] and the yaw acceleration [rad/s^2]. They give the change of the
     ground's speed under the wheels.
     """
+    gain, yaw_acceleration = change
     radius = p[Parameter.RADIUS]
     for i in range(4):
         ground = gain - wheel_position(p, i)[1] * yaw_acceleration
@@ -300,7 +300,7 @@ def advance(
         vx = x[Motion.VX]
         vy = x[Motion.VY]
         r = x[Motion.YAW_RATE]
-        turn_wheels(x, p, u, w, dt, ax + r * vy + along, yaw_acceleration)
+        turn_wheels(x, p, u, w, dt, (ax + r * vy + along, yaw_acceleration))
         if p[TrueParameter.RELAXATION] > 0.0:
             relax_slip(x, p, u, dt)
         if p[TrueParameter.ABS_HZ] > 0.0:

@@ -111,18 +111,20 @@ class TrueVehicle:
 
 def car(
     name: str,
-    mass: float,
-    yaw_inertia: float,
+    body: tuple[float, float, float],
     axles: tuple[float, float],
     tracks: tuple[float, float],
     *,
-    cg_height: float,
     radius: float,
     drive_front: float,
 ) -> Vehicle:
     """Return a vehicle whose tyres have the usual stiffness for their load: 20 per unit of
     longitudinal slip, and 17 per radian of slip angle.
+
+    `body` is mass [kg], yaw inertia [kg m^2] and height of the centre of gravity [m]; `axles` are
+    the distances [m] from the centre of gravity to the front and rear axle.
     """
+    mass, yaw_inertia, cg_height = body
     load = mass * GRAVITY / 4.0
     return Vehicle(
         name=name,
@@ -145,11 +147,9 @@ PRESETS: Final = {
     "small": TrueVehicle(  # a front-driven hatchback
         car(
             "small",
-            1180.0,
-            1420.0,
+            (1180.0, 1420.0, 0.52),
             (1.02, 1.53),
             (1.48, 1.48),
-            cg_height=0.52,
             radius=0.305,
             drive_front=1.0,
         ),
@@ -160,11 +160,9 @@ PRESETS: Final = {
     "sedan": TrueVehicle(
         car(
             "sedan",
-            1643.0,
-            1954.0,
+            (1643.0, 1954.0, 0.545),
             (1.287, 1.403),
             (1.581, 1.586),
-            cg_height=0.545,
             radius=0.359,
             drive_front=0.5,
         ),
@@ -174,11 +172,9 @@ PRESETS: Final = {
     "van": TrueVehicle(  # a rear-driven, half-laden delivery van
         car(
             "van",
-            2350.0,
-            4600.0,
+            (2350.0, 4600.0, 0.74),
             (1.55, 1.75),
             (1.70, 1.68),
-            cg_height=0.74,
             radius=0.345,
             drive_front=0.0,
         ),

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -78,20 +78,40 @@ STEERING_LAG_S: Final = 0.1  # from the wish to the road wheel
 PEDAL_LAG_S: Final = 0.15
 
 
+@dataclass(frozen=True)
+class DriveSetup:
+    """Vehicle, sensors and road of a simulated manoeuvre.
+
+    Attributes:
+        rate_hz: sampling rate [Hz].
+        vehicle: a key of PRESETS, or the true vehicle itself.
+        sensors: a key of SENSORS, or a sensor set.
+        faults: sensor faults that are applied to the readings.
+        road: a key of ROADS, drawn by the seed, or a relief.
+        slope: rise per metre along the track [1] that is added to the road.
+        origin: position of the start on earth.
+    """
+
+    rate_hz: float = 100.0
+    vehicle: str | Vehicle | TrueVehicle = "sedan"
+    sensors: str | Sensors = "mems"
+    faults: tuple[Fault, ...] = ()
+    road: str | Relief = "level"
+    slope: float = 0.0
+    origin: Origin = GOTHENBURG
+
+
+USUAL_SETUP: Final = DriveSetup()
+
+
 def simulate_manoeuvre(
     name: str,
     *,
     mu: Friction | None = None,
     speed: float | None = None,
     seed: int = 0,
-    rate_hz: float = 100.0,
     duration_s: float | None = None,
-    vehicle: str | Vehicle | TrueVehicle = "sedan",
-    sensors: str | Sensors = "mems",
-    faults: tuple[Fault, ...] = (),
-    road: str | Relief = "level",
-    slope: float = 0.0,
-    origin: Origin = GOTHENBURG,
+    setup: DriveSetup = USUAL_SETUP,
 ) -> tuple[pa.Table, Vehicle]:
     """Simulate a manoeuvre and return (log, vehicle file).
 
@@ -105,35 +125,29 @@ def simulate_manoeuvre(
         mu: friction; by default that of the manoeuvre.
         speed: initial speed [m/s]; by default that of the manoeuvre.
         seed: seed of all random numbers, not negative.
-        rate_hz: sampling rate [Hz].
         duration_s: duration [s]; by default that of the manoeuvre.
-        vehicle: a key of PRESETS, or the true vehicle itself.
-        sensors: a key of SENSORS, or a sensor set.
-        faults: sensor faults that are applied to the readings.
-        road: a key of ROADS, drawn by the seed, or a relief.
-        slope: rise per metre along the track [1] that is added to the road.
-        origin: position of the start on earth.
+        setup: vehicle, sensors and road.
 
     Raises:
         InputError: an argument is out of range or unknown.
     """
     manoeuvre = _manoeuvre_of(name)
-    chosen = sensors_named(sensors)
-    truth = true_vehicle(vehicle)
+    chosen = sensors_named(setup.sensors)
+    truth = true_vehicle(setup.vehicle)
     seed = checked_seed(seed)
-    _check_positive(speed=speed, rate_hz=rate_hz, duration_s=duration_s)
+    _check_positive(speed=speed, rate_hz=setup.rate_hz, duration_s=duration_s)
     speed = manoeuvre.speed if speed is None else speed
     duration = manoeuvre.duration if duration_s is None else duration_s
     world = ProvingGround(
         _friction_field(manoeuvre.friction if mu is None else mu),
-        road_named(road, seed, slope).table,
+        road_named(setup.road, seed, setup.slope).table,
     )
     records = _drive_manoeuvre(
-        manoeuvre, truth, world, speed, rate_hz, max(1, round(duration * rate_hz))
+        manoeuvre, truth, world, speed, setup.rate_hz, max(1, round(duration * setup.rate_hz))
     )
-    signals = _sense_records(records, chosen, origin, seed, rate_hz)
-    t = np.arange(len(records)) / rate_hz
-    signals = apply_faults(t, signals, faults)
+    signals = _sense_records(records, chosen, setup.origin, seed, setup.rate_hz)
+    t = np.arange(len(records)) / setup.rate_hz
+    signals = apply_faults(t, signals, setup.faults)
     file = (
         truth.vehicle
         if chosen == SENSORS["ideal"]

@@ -23,7 +23,7 @@ the objective does not matter, and the colony cannot stagnate (rank-based, eliti
 systems).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -152,14 +152,12 @@ def optimise(
     iterations: int,
     rng: np.random.Generator,
     progress: Progress | None = None,
-    visibility: Sequence[FloatArray] | None = None,
     habits: Habits | None = None,
 ) -> Result:
     """Search for the vector with the largest objective.
 
-    Each vertex (variable) has a list of positions (possible values). `visibility` is, per vertex,
-    the preference η > 0 of each position; without it all positions are equally preferred. The
-    objective is called at most ants·iterations times, once per vector.
+    Each vertex (variable) has a list of positions (possible values), which `problem.visibility` may
+    prefer. The objective is called at most ants·iterations times, once per vector.
 
     Raises:
         InputError: a vertex has no position, or there are no ants or no iterations.
@@ -170,8 +168,8 @@ def optimise(
     ledger = Ledger(problem.objective, graph, problem.admissible)
     eta = (
         np.ones(reachable.shape)
-        if visibility is None
-        else np.nan_to_num(Graph.from_choices(visibility).positions, nan=1.0)
+        if problem.visibility is None
+        else np.nan_to_num(Graph.from_choices(problem.visibility).positions, nan=1.0)
     )
     pheromone = np.where(reachable, HIGHEST, 0.0)
     weights = _rank_weights(ants, habits)

@@ -31,7 +31,7 @@ import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.estimators import create
-from edge_agent.lab.simulation import SimulatedFleet, simulate_manoeuvre
+from edge_agent.lab.simulation import DriveSetup, SimulatedFleet, simulate_manoeuvre
 from edge_agent.lab.simulation.scenarios import drawn_town
 from edge_agent.lab.tuning.search import Objective
 from schemas.errors import InputError
@@ -162,11 +162,10 @@ def record(drives: Sequence[TuningDrive], duration_s: float) -> TuningSet:
             drive.manoeuvre,
             mu=drive.mu,
             seed=drive.seed,
-            rate_hz=RATE_HZ,
             duration_s=duration_s,
-            vehicle=drive.vehicle,
-            sensors=drive.sensors,
-            road=drive.road,
+            setup=DriveSetup(
+                rate_hz=RATE_HZ, vehicle=drive.vehicle, sensors=drive.sensors, road=drive.road
+            ),
         )
         signals.append(
             np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(np.float64)

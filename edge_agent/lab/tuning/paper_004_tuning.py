@@ -163,11 +163,10 @@ def tune(
 
     start = LowerVertices().to_vector()
     result = optimise(
-        Problem(value, [POSITIONS] * len(start), start),
+        Problem(value, [POSITIONS] * len(start), start, visibility=visibility()),
         ants=ants,
         iterations=iterations,
         rng=np.random.default_rng([seed, 7]),
-        visibility=visibility(),
         habits=replace(habits or Habits(), trace=laid.append),
     )
     return PaperTuning(LowerVertices.from_vector(result.best), result, laid[-1])

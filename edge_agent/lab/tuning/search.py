@@ -50,13 +50,15 @@ class Problem:
     objective: function that returns the value of a vector (V,), one number per vertex (variable).
     choices: per vertex its positions (possible values), in ascending order. start (V,): the vector
     that is evaluated first, so that the result is never worse than it. admissible: returns True for
-    vectors that may be evaluated; others are replaced by new draws.
+    vectors that may be evaluated; others are replaced by new draws. visibility: per vertex the
+    preference η > 0 of each position, which the ant colony uses; None: all are equally preferred.
     """
 
     objective: Objective
     choices: Sequence[FloatArray]
     start: FloatArray | None = None
     admissible: Admissible = is_always_allowed
+    visibility: Sequence[FloatArray] | None = None
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import numpy as np
 
 from edge_agent.adaptation.memberships import CHANNELS, SETS, Memberships
 from edge_agent.estimators.paper_aco_fckf import AT_THE_TRUTH, Setting, make_bank
-from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
+from edge_agent.lab.simulation import PRESETS, DriveSetup, simulate_manoeuvre
 from edge_agent.lab.simulation.manoeuvres import kmh
 from edge_agent.lab.simulation.presets import matched_to_papers
 from edge_agent.lab.simulation.white import add_white, scheduled_variance
@@ -120,10 +120,12 @@ def record(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> Stud
             drive.manoeuvre,
             mu=MU,
             speed=drive.speed,
-            rate_hz=FINE * RATE_HZ,
             duration_s=duration_s,
-            vehicle=matched_to_papers(PRESETS[drive.vehicle]),
-            sensors="ideal",
+            setup=DriveSetup(
+                rate_hz=FINE * RATE_HZ,
+                vehicle=matched_to_papers(PRESETS[drive.vehicle]),
+                sensors="ideal",
+            ),
         )
         log = log.take(np.arange(0, len(log), FINE))
         exact.append(
@@ -213,25 +215,27 @@ def objective_on(drives: StudySet) -> Objective:
     return lambda vector: overall(memberships_of(vector), drives)
 
 
+def problem_on(drives: StudySet, positions: int) -> Problem:
+    """Return the problem of the search on the given drives, with the number of positions (possible
+    values) per vertex. Every search starts at the untuned vertices (corners of the fuzzy sets).
+    """
+    return Problem(
+        objective_on(drives), choices(positions)[:VERTICES], Memberships().to_vector()[:VERTICES]
+    )
+
+
 def search(
     way: str,
-    drives: StudySet,
+    problem: Problem,
     *,
     ants: int,
     iterations: int,
-    positions: int,
     seed: int,
     progress: Progress | None = None,
 ) -> Result:
-    """Search for the best vertices (corners of the fuzzy sets) by a method of WAYS. Every search
-    starts at the untuned vertices.
-    """
+    """Search for the best vertices (corners of the fuzzy sets) by a method of WAYS."""
     return WAYS[way](
-        Problem(
-            objective_on(drives),
-            choices(positions)[:VERTICES],
-            Memberships().to_vector()[:VERTICES],
-        ),
+        problem,
         ants=ants,
         iterations=iterations,
         rng=np.random.default_rng([seed, list(WAYS).index(way)]),

@@ -88,14 +88,14 @@ def run(
     a search and returns the function that reports its progress.
     """
     done = Study(study.record(study.TRAIN, duration_s), study.record(study.HELD_OUT, duration_s))
+    problem = study.problem_on(done.train, positions)
     for seed in seeds:
         for way in WAYS:
             result = study.search(
                 way,
-                done.train,
+                problem,
                 ants=ants,
                 iterations=iterations,
-                positions=positions,
                 seed=seed,
                 progress=reporter(f"{way} {seed}"),
             )

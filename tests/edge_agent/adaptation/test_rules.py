@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from edge_agent.adaptation.fuzzy import adapted_factor, adapted_within
+from edge_agent.adaptation.fuzzy import FactorLimits, adapted_factor, adapted_within
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.adaptation.rules import ALPHA, PRINTED, RATE, infer_two, rule_table
 from edge_agent.adaptation.windows import push_innovation, weighted_noise
@@ -46,11 +46,13 @@ def test_bounds_and_pace_of_the_adaptation_matter() -> None:
     sets = Memberships()
     inputs = np.array(sets.inputs)
     outputs = np.array(sets.outputs)
-    one = adapted_within(1.0, 3.0, 1.0, inputs, outputs, 1.0, (0.1, 20.0))
+    one = adapted_within(1.0, 3.0, 1.0, inputs, outputs, FactorLimits(1.0, 0.1, 20.0))
     assert one == adapted_factor(1.0, 3.0, 1.0, inputs, outputs)
-    assert adapted_within(1.0, 3.0, 1.0, inputs, outputs, 2.0, (0.1, 20.0)) == pytest.approx(one**2)
-    assert adapted_within(1.0, 3.0, 1.0, inputs, outputs, 1.0, (0.1, 1.01)) == 1.01
-    assert adapted_within(1.0, 0.1, 1.0, inputs, outputs, 1.0, (0.99, 20.0)) == 0.99
+    assert adapted_within(
+        1.0, 3.0, 1.0, inputs, outputs, FactorLimits(2.0, 0.1, 20.0)
+    ) == pytest.approx(one**2)
+    assert adapted_within(1.0, 3.0, 1.0, inputs, outputs, FactorLimits(1.0, 0.1, 1.01)) == 1.01
+    assert adapted_within(1.0, 0.1, 1.0, inputs, outputs, FactorLimits(1.0, 0.99, 20.0)) == 0.99
 
 
 def test_the_weighted_window_finds_the_variance_of_white_noise() -> None:

@@ -38,7 +38,7 @@ UNKNOWN = np.full(4, np.nan)
 def forces(shape: float, mu: float, omega: FloatArray) -> tuple[FloatArray, FloatArray]:
     x = np.empty(4)
     y = np.empty(4)
-    tyre_forces(ROW, MOTION, wheel_inputs(DELTA, omega), np.full(4, mu), shape, x, y)
+    tyre_forces(ROW, MOTION, wheel_inputs(DELTA, omega), np.full(4, mu), shape, (x, y))
     return x, y
 
 

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from edge_agent.lab.simulation import simulate_manoeuvre
+from edge_agent.lab.simulation import DriveSetup, simulate_manoeuvre
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
 from schemas.vehicle import Vehicle
@@ -22,7 +22,9 @@ def drive(
     """Return times t (T,) [s], signals (T, 18) and nominal vehicle of a manoeuvre with ordinary
     sensors. If `mu` is None, the road has the friction that the manoeuvre defines.
     """
-    log, vehicle = simulate_manoeuvre(name, mu=mu, seed=seed, duration_s=seconds, sensors="mems")
+    log, vehicle = simulate_manoeuvre(
+        name, mu=mu, seed=seed, duration_s=seconds, setup=DriveSetup(sensors="mems")
+    )
     return (
         log["t"].to_numpy(),
         np.stack([log[c].to_numpy() for c in CHANNELS], axis=-1).astype(float),

@@ -16,7 +16,7 @@ from edge_agent.estimators.estimates import Estimates
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.constants import NODES, Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import design_of
-from edge_agent.lab.simulation import simulate_manoeuvre
+from edge_agent.lab.simulation import DriveSetup, simulate_manoeuvre
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
 from schemas.vehicle import Vehicle
@@ -217,7 +217,11 @@ def make_drive(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
         return *join_drives(turn, drive("straight", 0.5, seconds=40.0)), turn[2]
     if name == "rough acceleration":
         log, vehicle = simulate_manoeuvre(
-            "acceleration", mu=0.8, seed=1, duration_s=12.0, sensors="rough", road="hilly"
+            "acceleration",
+            mu=0.8,
+            seed=1,
+            duration_s=12.0,
+            setup=DriveSetup(sensors="rough", road="hilly"),
         )
         return (
             log["t"].to_numpy(),

@@ -56,7 +56,7 @@ def test_tyres_are_those_of_the_compiled_model(proportional: bool) -> None:
     wheels = wheel_inputs(
         given.signals[0, S.DELTA : S.DELTA + 4], given.signals[0, S.OMEGA : S.OMEGA + 4]
     )
-    tyre_forces(row, np.array([15.0, 0.3, 0.2, 1.0, 2.0]), wheels, mu, DUGOFF, x, y)
+    tyre_forces(row, np.array([15.0, 0.3, 0.2, 1.0, 2.0]), wheels, mu, DUGOFF, (x, y))
     found = WheelForces.for_drive(given, proportional=proportional, single=False).tyre_forces(
         0, mu[None]
     )[0]

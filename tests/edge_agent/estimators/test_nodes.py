@@ -13,6 +13,7 @@ import pytest
 
 from edge_agent.estimators.friction_mixture.constants import NODES, Constants
 from edge_agent.estimators.friction_mixture.friction_grid import (
+    RoadChange,
     change_road,
     multiply_likelihood,
     node_table,
@@ -32,7 +33,7 @@ def test_the_prior_of_the_nodes_is_uniform_in_mu_and_its_quantiles_say_so() -> N
 
 def test_road_change_leaves_the_prior_as_it_is() -> None:
     out = np.empty(NODES)
-    change_road(PRIOR, PRIOR, NODES, 0.1, 0.0, 0.3, out)
+    change_road(PRIOR, PRIOR, NODES, RoadChange(0.1, 0.0, 0.3), out)
     assert out == pytest.approx(PRIOR, abs=1e-12)
 
 
@@ -41,7 +42,7 @@ def test_road_change_keeps_the_mass_and_converges_to_the_prior() -> None:
     w[3] = 1.0
     out = np.empty(NODES)
     for _ in range(400):
-        change_road(w, PRIOR, NODES, 0.02, 0.0, 0.05, out)
+        change_road(w, PRIOR, NODES, RoadChange(0.02, 0.0, 0.05), out)
         w[:] = out
         assert w.sum() == pytest.approx(1.0)
     assert w == pytest.approx(PRIOR, abs=1e-3)

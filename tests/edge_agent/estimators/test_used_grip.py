@@ -10,7 +10,7 @@ import pytest
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
 from edge_agent.estimators.friction_mixture.used_grip import MOST_USED
-from edge_agent.lab.simulation import simulate_manoeuvre
+from edge_agent.lab.simulation import DriveSetup, simulate_manoeuvre
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
 from schemas.thresholds import GRAVITY
@@ -27,7 +27,7 @@ def stop(mu: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return times (T,) [s], signals (T, 18) and true v_x (T,) [m/s] of a stop with anti-lock
     brakes.
     """
-    log, _ = simulate_manoeuvre("braking", mu=mu, seed=2, sensors="mems")
+    log, _ = simulate_manoeuvre("braking", mu=mu, seed=2, setup=DriveSetup(sensors="mems"))
     signals = np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(float)
     return log["t"].to_numpy(), signals, log["true_vx"].to_numpy()
 

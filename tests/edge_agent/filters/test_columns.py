@@ -41,8 +41,7 @@ def test_gathering_is_the_square_root_prediction(offset: float) -> None:
     expected_root = np.empty((N, N))
     householder.predict(
         np.ascontiguousarray(points.T),
-        RULE.w_mean,
-        RULE.w_cov,
+        (RULE.w_mean, RULE.w_cov),
         0.5 * np.diag(std),
         expected,
         expected_root,

@@ -9,7 +9,7 @@ import pytest
 
 from edge_agent.filters.downdate import downdate, update_by_downdate
 from edge_agent.filters.federated import fuse_estimates, share_information
-from edge_agent.filters.householder import predict, update
+from edge_agent.filters.householder import Measurement, predict, update
 from edge_agent.filters.points import axis_points, sigma_points
 from edge_agent.filters.sigma import cubature_rule
 from schemas.numeric import FloatArray
@@ -116,8 +116,7 @@ def _federated_turn(
         axis_points(mean, own_root, xi, points)
         predict(
             np.ascontiguousarray(points @ f.T),
-            weight,
-            weight,
+            (weight, weight),
             root_of(q / part),
             own,
             own_root,
@@ -131,9 +130,7 @@ def _federated_turn(
             own,
             own_root,
             own_root.copy(),
-            np.ascontiguousarray(h @ own_root),
-            innovation,
-            std,
+            Measurement(np.ascontiguousarray(h @ own_root), innovation, std),
             work,
         )
         parts.append((own, own_root))
@@ -187,9 +184,7 @@ def _make_update(
     innovation[1] = np.nan
     args = (
         root.copy(),
-        np.ascontiguousarray(h @ root),
-        innovation,
-        np.full(3, noise),
+        Measurement(np.ascontiguousarray(h @ root), innovation, np.full(3, noise)),
         np.empty((12, 12)),
     )
     other = mean.copy()
@@ -228,10 +223,19 @@ def test_downdate_filter_is_the_textbook_filter_on_a_linear_system() -> None:
         mean, cov = textbook(mean, cov, (f, q, h, noise), z)
         sigma_points(x, root, rule.xi, points)
         predict(
-            np.ascontiguousarray(points @ f.T), rule.w_mean, rule.w_cov, root_of(q), x, root, work
+            np.ascontiguousarray(points @ f.T),
+            (rule.w_mean, rule.w_cov),
+            root_of(q),
+            x,
+            root,
+            work,
         )
         told = update_by_downdate(
-            x, root, root.copy(), np.ascontiguousarray(h @ root), z - h @ x, noise, work
+            x,
+            root,
+            root.copy(),
+            Measurement(np.ascontiguousarray(h @ root), z - h @ x, noise),
+            work,
         )
         assert not told[3]
         assert x == pytest.approx(mean, abs=1e-12)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from edge_agent.filters import householder
+from edge_agent.filters.householder import Measurement
 from edge_agent.filters.points import centred_deviations, sigma_points
 from edge_agent.filters.sigma import SigmaRule, cubature_rule, unscented_rule
 from schemas.errors import InputError
@@ -77,7 +78,7 @@ def test_a_covariance_keeps_a_centimetre_at_an_offset_of_5400_kilometres(rule: S
     work = np.zeros((2, 8))
     root = np.zeros((2, 2))
     sigma_points(np.array([5.4e6, -5.4e6]), 0.01 * np.eye(2), rule.xi, points)
-    householder.predict(points, rule.w_mean, rule.w_cov, np.zeros((2, 2)), mean, root, work)
+    householder.predict(points, (rule.w_mean, rule.w_cov), np.zeros((2, 2)), mean, root, work)
     assert np.diag(root) == pytest.approx([0.01, 0.01], rel=1e-6)
 
 
@@ -97,7 +98,7 @@ def _predict_moments(
     root = np.zeros((n, n))
     noise = factor_of(q)
     householder.predict(
-        points @ f.T, rule.w_mean, rule.w_cov, noise, new, root, np.zeros((n, count + n))
+        points @ f.T, (rule.w_mean, rule.w_cov), noise, new, root, np.zeros((n, count + n))
     )
     return new, root
 
@@ -123,7 +124,7 @@ def _update_moments(
     new = mean.copy()
     factor = root.copy()
     work = np.zeros((rows + n, count + rows))
-    said = householder.update(new, factor, x, y, z - rule.w_mean @ seen, std, work)
+    said = householder.update(new, factor, x, Measurement(y, z - rule.w_mean @ seen, std), work)
     return new, factor, said
 
 
@@ -177,9 +178,7 @@ def test_square_root_filter_is_textbook_for_a_nonlinear_measurement() -> None:
         new,
         root,
         (points - mean).T / math.sqrt(6),
-        (seen - centre).T / math.sqrt(6),
-        nu,
-        r,
+        Measurement((seen - centre).T / math.sqrt(6), nu, r),
         np.zeros((5, 8)),
     )
     assert np.allclose(new, mean + k @ nu, rtol=0, atol=1e-9)
@@ -230,14 +229,16 @@ def test_square_root_filter_is_textbook_for_a_nonlinear_system() -> None:
         z = rng.normal(0.3, 0.3, size=2)
         mean, cov = _textbook(rule, mean, cov, q, r, z)
         sigma_points(ours, root, rule.xi, points)
-        householder.predict(swing(points), rule.w_mean, rule.w_cov, factor_of(q), ours, root, work)
+        householder.predict(
+            swing(points), (rule.w_mean, rule.w_cov), factor_of(q), ours, root, work
+        )
         sigma_points(ours, root, rule.xi, points)
         seen = look(points)
         x = np.empty((2, 4))
         y = np.empty((2, 4))
         centred_deviations(points, ours, rule.w_cov, x, 0)
         centred_deviations(seen, rule.w_mean @ seen, rule.w_cov, y, 0)
-        householder.update(ours, root, x, y, z - rule.w_mean @ seen, r, work)
+        householder.update(ours, root, x, Measurement(y, z - rule.w_mean @ seen, r), work)
         assert np.allclose(ours, mean, rtol=0, atol=1e-9)
         assert np.allclose(root @ root.T, cov, rtol=0, atol=1e-9)
 

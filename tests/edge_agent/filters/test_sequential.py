@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edge_agent.filters.cholesky import covariance_of_factor, factorize, variance
-from edge_agent.filters.householder import update
+from edge_agent.filters.householder import Measurement, update
 from edge_agent.filters.sequential import apply_projection, carlson_update, potter_factors
 from schemas.numeric import FloatArray
 
@@ -95,9 +95,7 @@ def test_carlson_s_update_by_a_state_is_the_orthogonal_one(state: int) -> None:
         mean,
         root,
         root.copy(),
-        root[state : state + 1].copy(),
-        np.array([0.7]),
-        np.array([0.2]),
+        Measurement(root[state : state + 1].copy(), np.array([0.7]), np.array([0.2])),
         np.zeros((9, 9)),
     )
     assert ours == pytest.approx(mean, abs=1e-12)

@@ -21,7 +21,7 @@ from edge_agent.cli import main
 from edge_agent.inputs import live
 from edge_agent.inputs.live.feed import HostClock
 from edge_agent.inputs.live.gpsd import GpsdFeed
-from edge_agent.inputs.live.ros2 import MOST_MESSAGE, MOST_PUBLISHERS, Ros2Feed, type_of
+from edge_agent.inputs.live.ros2 import MOST_MESSAGE, MOST_PUBLISHERS, Ros2Feed, RosTopics, type_of
 from edge_agent.inputs.live.rows import LiveRows
 from edge_agent.inputs.live.sources import is_live, open_sources
 from edge_agent.inputs.profile import Channel, Profile
@@ -105,7 +105,7 @@ def test_hostile_bytes_on_a_topic_are_counted_and_the_next_message_is_read(tmp_p
 
     router = Router()
     feed = Ros2Feed(
-        "ros2:", HostClock(), router.settings, domain=0, signals=["/imu.angular_velocity.z"]
+        "ros2:", HostClock(), router.settings, RosTopics(0, ["/imu.angular_velocity.z"])
     )
     feed.start()
     session = open_session(ZenohSettings(connect=[router.endpoint]))

@@ -15,6 +15,7 @@ from edge_agent.observe.cell_tracker import NOWHERE, locate_vehicles
 from edge_agent.observe.observation_builder import (
     FELT_STD,
     WHEEL_SHARE,
+    BlockReadings,
     OpenVisits,
     RecordBlock,
     build_records,
@@ -181,7 +182,12 @@ def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
         _, located = locate_vehicles(Watch.of(1).tracks, block.t, block.signals)
         reading = cast("Estimates", used)
         _, records, _ = build_records(
-            OpenVisits.before_any(1), block.time, located, reading, AgentConfig(), signals
+            OpenVisits.before_any(1),
+            block.time,
+            located,
+            reading,
+            AgentConfig(),
+            BlockReadings(signals),
         )
         told.append(float(records.columns["mu_utilised"][0]))
     assert told == pytest.approx([WHEEL_SHARE * 0.1 + FELT_STD, 0.8, 0.8])
@@ -199,7 +205,12 @@ def observe_grip(observed: np.ndarray, east: np.ndarray) -> list[float]:
     _, located = locate_vehicles(Watch.of(1).tracks, block.t, signals)
     reading = cast("Estimates", type(reported)(**{**vars(reported), "vx": flat + 10.0, "vy": flat}))
     _, records, _ = build_records(
-        OpenVisits.before_any(1), block.time, located, reading, AgentConfig(), signals
+        OpenVisits.before_any(1),
+        block.time,
+        located,
+        reading,
+        AgentConfig(),
+        BlockReadings(signals),
     )
     return [float(used) for used in records.columns["mu_utilised"]]
 
@@ -313,8 +324,7 @@ def test_observation_contains_controller_flags_and_context_of_its_visit() -> Non
         located,
         reading,
         AgentConfig(),
-        block.signals,
-        context,
+        BlockReadings(block.signals, context),
     )
     columns = told.columns
     assert columns["abs_active"][:2].tolist() == [1, -1]
@@ -328,7 +338,12 @@ def test_observation_contains_controller_flags_and_context_of_its_visit() -> Non
     assert columns["wiper"][0] == 0.5
     assert np.isnan(columns["wiper"][1])
     _, plain, _ = build_records(
-        OpenVisits.before_any(1), block.time, located, reading, AgentConfig(), block.signals
+        OpenVisits.before_any(1),
+        block.time,
+        located,
+        reading,
+        AgentConfig(),
+        BlockReadings(block.signals),
     )
     same = columns.keys() - {"abs_active", "air_temperature", "wiper"}
     for name in same:

@@ -194,7 +194,7 @@ def test_federated_reset_is_inverse_variance_and_newest_is_the_last() -> None:
     reading = np.array([0.5, 0.7, np.nan])
     std = np.array([0.1, 0.1, np.nan])
     sent = np.array([[0.5, 0.01], [0.7, 0.01], [0.6, 0.05]])
-    found = rules.fuse_by_rules(place, seconds, sent, reading, std, np.array([10.0]), 1)[0, :, 0]
+    found = rules.fuse_by_rules(place, seconds, sent, (reading, std), np.array([10.0]), 1)[0, :, 0]
     federated, newest = (
         found[rules.RULES.index(name)] for name in ("federated reset", "newest report")
     )

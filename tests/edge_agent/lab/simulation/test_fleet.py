@@ -22,7 +22,9 @@ def drive() -> tuple[SimulatedFleet, FloatArray, FloatArray, Truth]:
     """Return two minutes of thirty vehicles in the demonstration with ideal sensors: fleet, times
     (T, N), signals (T, N, 18), and true states.
     """
-    fleet = SimulatedFleet("demo", 30, seed=11, rate_hz=50.0, sensors="ideal")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("edge_agent.lab.simulation.fleet.ORDINARY", "ideal")
+        fleet = SimulatedFleet("demo", 30, seed=11, rate_hz=50.0)
     t, signals = fleet.step(120 * 50)
     return fleet, t, signals, fleet.truth
 

@@ -6,7 +6,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from edge_agent.lab.simulation import MANOEUVRES, PRESETS, jump, simulate_manoeuvre, split
+from edge_agent.lab.simulation import (
+    MANOEUVRES,
+    PRESETS,
+    DriveSetup,
+    jump,
+    simulate_manoeuvre,
+    split,
+)
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, per_wheel
@@ -22,7 +29,7 @@ def wheels(log: pa.Table, name: str) -> FloatArray:
 
 @pytest.mark.parametrize("name", MANOEUVRES)
 def test_a_log_has_every_signal_and_its_truth_fits(name: str) -> None:
-    log, vehicle = simulate_manoeuvre(name, sensors="ideal")
+    log, vehicle = simulate_manoeuvre(name, setup=DriveSetup(sensors="ideal"))
     row = MANOEUVRES[name]
     assert log.column_names[: 1 + len(CHANNELS)] == ["t", *CHANNELS]
     assert log.num_rows == round(row.duration * 100)
@@ -43,14 +50,14 @@ def test_a_log_has_every_signal_and_its_truth_fits(name: str) -> None:
 @pytest.mark.parametrize("name", MANOEUVRES)
 @pytest.mark.parametrize("vehicle", PRESETS)
 def test_position_is_the_integral_of_speed(name: str, vehicle: str) -> None:
-    log, _ = simulate_manoeuvre(name, vehicle=vehicle, sensors="ideal")
+    log, _ = simulate_manoeuvre(name, setup=DriveSetup(vehicle=vehicle, sensors="ideal"))
     speed = np.hypot(column(log, "true_vx"), column(log, "true_vy"))
     path = np.hypot(np.diff(column(log, "true_x")), np.diff(column(log, "true_y"))).sum()
     assert path == pytest.approx(np.trapezoid(speed, dx=0.01), rel=1e-3)
 
 
 def test_straight_driving_at_constant_speed_excites_nothing() -> None:
-    log, _ = simulate_manoeuvre("straight", sensors="ideal")
+    log, _ = simulate_manoeuvre("straight", setup=DriveSetup(sensors="ideal"))
     assert wheels(log, "true_utilisation").max() < 0.05
 
 
@@ -95,9 +102,9 @@ def test_the_same_seed_drives_the_same_and_another_does_not() -> None:
         ("manoeuvre", {"name": "wheelie"}),
         ("mu", {"name": "sine", "mu": -0.1}),
         ("speed", {"name": "sine", "speed": 0.0}),
-        ("rate_hz", {"name": "sine", "rate_hz": float("nan")}),
+        ("rate_hz", {"name": "sine", "setup": DriveSetup(rate_hz=float("nan"))}),
         ("duration_s", {"name": "sine", "duration_s": -1.0}),
-        ("vehicle", {"name": "sine", "vehicle": "tram"}),
+        ("vehicle", {"name": "sine", "setup": DriveSetup(vehicle="tram")}),
         ("seed", {"name": "sine", "seed": -1}),
     ],
 )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edge_agent.dynamics.tyres import combined_dugoff, dugoff
-from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
+from edge_agent.lab.simulation import PRESETS, DriveSetup, simulate_manoeuvre
 from edge_agent.lab.simulation.manoeuvres import TimedFriction
 from edge_agent.lab.simulation.motor import Pmsm, at_rest, speed_demand, turn_motor
 from edge_agent.lab.simulation.presets import TrueVehicle, as_printed
@@ -33,7 +33,10 @@ def slip_per_force(vehicle: TrueVehicle, mu: float) -> float:
     friction `mu`.
     """
     log, file = simulate_manoeuvre(
-        "throttle", mu=mu, vehicle=replace(vehicle, power=400e3), sensors="ideal", duration_s=2.0
+        "throttle",
+        mu=mu,
+        duration_s=2.0,
+        setup=DriveSetup(vehicle=replace(vehicle, power=400e3), sensors="ideal"),
     )
     speed = log["true_vx"].to_numpy()[-1]
     slip = file.wheel_radius * log["omega_fl"].to_numpy()[-1] / speed - 1.0
@@ -50,7 +53,10 @@ def test_stiffness_of_the_plant_is_proportional_to_friction_if_asked() -> None:
 
 def test_friction_jumps_in_time_under_all_wheels_at_once() -> None:
     log, _ = simulate_manoeuvre(
-        "straight", mu=TimedFriction(0.8, 0.4, 1.0), duration_s=2.0, sensors="ideal"
+        "straight",
+        mu=TimedFriction(0.8, 0.4, 1.0),
+        duration_s=2.0,
+        setup=DriveSetup(sensors="ideal"),
     )
     for wheel in ("fl", "fr", "rl", "rr"):
         mu = log[f"true_mu_{wheel}"].to_numpy()
@@ -85,7 +91,10 @@ def test_car_with_motors_holds_its_speed_against_drag() -> None:
     ends = []
     for vehicle in (dragged, replace(dragged, motors=Pmsm())):
         log, _ = simulate_manoeuvre(
-            "straight", vehicle=vehicle, speed=15.0, duration_s=20.0, sensors="ideal"
+            "straight",
+            speed=15.0,
+            duration_s=20.0,
+            setup=DriveSetup(vehicle=vehicle, sensors="ideal"),
         )
         ends.append(abs(log["true_vx"].to_numpy()[-1] - 15.0))
     assert ends[1] < 0.02 < ends[0]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edge_agent.dynamics.parameters import Parameter
-from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
+from edge_agent.lab.simulation import PRESETS, DriveSetup, simulate_manoeuvre
 from edge_agent.lab.simulation.motor import Pmsm
 from edge_agent.lab.simulation.plant import (
     advance,
@@ -210,7 +210,7 @@ def test_without_slip_control_the_wheels_lock_and_brake_less() -> None:
 
 
 def test_a_steady_circle_has_its_centripetal_acceleration() -> None:
-    log, _ = simulate_manoeuvre("constant-radius", mu=0.8, sensors="ideal")
+    log, _ = simulate_manoeuvre("constant-radius", mu=0.8, setup=DriveSetup(sensors="ideal"))
     truth = {
         name: log[name].to_numpy()[-500:]
         for name in ("true_vx", "true_vy", "true_ay", "true_yaw_rate")
@@ -279,12 +279,16 @@ def test_every_parameter_of_the_true_vehicle_matters(name: str) -> None:
     logs = []
     for vehicle in (usual, changed):
         drives = [
-            simulate_manoeuvre(m, mu=mu, vehicle=vehicle, sensors="mems-leak")[0]
+            simulate_manoeuvre(m, mu=mu, setup=DriveSetup(vehicle=vehicle, sensors="mems-leak"))[0]
             for m in ("acceleration", "braking")
         ]
-        drives.append(simulate_manoeuvre("j-turn", mu=mu, vehicle=vehicle, sensors="mems-leak")[0])
+        drives.append(
+            simulate_manoeuvre(
+                "j-turn", mu=mu, setup=DriveSetup(vehicle=vehicle, sensors="mems-leak")
+            )[0]
+        )
         drives += (
-            [simulate_manoeuvre("double-lane-change", mu=mu, vehicle=vehicle)[0]]
+            [simulate_manoeuvre("double-lane-change", mu=mu, setup=DriveSetup(vehicle=vehicle))[0]]
             if of_controllers
             else []
         )

@@ -16,6 +16,7 @@ from edge_agent.lab.simulation import (
     ROADS,
     SCENARIOS,
     SENSORS,
+    DriveSetup,
     Relief,
     SimulatedFleet,
     Wave,
@@ -69,7 +70,7 @@ def still(
 
 @pytest.mark.parametrize("slope", SLOPES)
 def test_a_standing_car_feels_the_sine_of_the_slope_and_stays_where_it_is(slope: float) -> None:
-    log, _ = simulate_manoeuvre("standing", sensors="ideal", slope=slope)
+    log, _ = simulate_manoeuvre("standing", setup=DriveSetup(sensors="ideal", slope=slope))
     np.testing.assert_allclose(column(log, "ax"), GRAVITY * sine(slope), rtol=1e-12)
     for name in ("true_vx", "true_vy", "true_x", "true_y", "true_yaw", *per_wheel("omega")):
         assert not column(log, name).any(), name
@@ -85,7 +86,9 @@ def test_a_standing_car_feels_the_sine_of_the_slope_and_stays_where_it_is(slope:
 @pytest.mark.parametrize("slope", SLOPES)
 def test_climbing_at_constant_speed_takes_the_torque_of_the_slope(slope: float) -> None:
     light = replace(PRESETS["sedan"], drag=0.0, rolling=0.0)
-    log, _ = simulate_manoeuvre("straight", sensors="ideal", slope=slope, vehicle=light)
+    log, _ = simulate_manoeuvre(
+        "straight", setup=DriveSetup(sensors="ideal", slope=slope, vehicle=light)
+    )
     vehicle = light.vehicle
     torque = sum(column(log, name)[-500:].mean() for name in per_wheel("torque"))
     assert torque == pytest.approx(
@@ -97,7 +100,9 @@ def test_climbing_at_constant_speed_takes_the_torque_of_the_slope(slope: float) 
 
 @pytest.mark.parametrize("bank", [-0.06, 0.04])
 def test_straight_driving_on_a_bank_feels_its_sine(bank: float) -> None:
-    log, _ = simulate_manoeuvre("straight", sensors="ideal", road=Relief(crossfall=bank))
+    log, _ = simulate_manoeuvre(
+        "straight", setup=DriveSetup(sensors="ideal", road=Relief(crossfall=bank))
+    )
     assert column(log, "ay")[-500:].mean() == pytest.approx(GRAVITY * sine(bank), rel=0.01)
     assert column(log, "true_bank")[-1] == pytest.approx(bank, rel=1e-3)
     assert abs(column(log, "true_vy")[-1]) > 0.01  # the tyres hold against it with a slip angle
@@ -164,7 +169,7 @@ def test_brakes_hold_what_they_can_and_tyres_what_the_road_allows() -> None:
 
 @pytest.mark.parametrize("slope", [-0.08, 0.0, 0.08])
 def test_traffic_lights_stop_it_hold_it_and_let_it_go(slope: float) -> None:
-    log, _ = simulate_manoeuvre("stop-and-go", sensors="ideal", slope=slope)
+    log, _ = simulate_manoeuvre("stop-and-go", setup=DriveSetup(sensors="ideal", slope=slope))
     speed = column(log, "true_vx")
     stands = speed == 0.0
     assert np.diff(stands.astype(int)).tolist().count(1) == 4
@@ -267,8 +272,10 @@ def two(
     """Simulate a drive twice: with ideal sensors and with misaligned sensors. Return the channels
     of the first drive, the channels of the second, and the parameters of the misalignment.
     """
-    exact, _ = simulate_manoeuvre(manoeuvre, sensors="ideal")
-    reported, _ = simulate_manoeuvre(manoeuvre, sensors=Sensors(mounted=mounted), seed=5)
+    exact, _ = simulate_manoeuvre(manoeuvre, setup=DriveSetup(sensors="ideal"))
+    reported, _ = simulate_manoeuvre(
+        manoeuvre, seed=5, setup=DriveSetup(sensors=Sensors(mounted=mounted))
+    )
     named = [{name: column(log, name) for name in CHANNELS} for log in (exact, reported)]
     return named[0], named[1], misalignment_row(mounted, 5, 0)
 
@@ -324,7 +331,9 @@ def test_misalignments_are_independent_with_the_sizes_of_the_table() -> None:
 
 
 def test_a_wheel_that_stands_reads_zero_and_one_that_turns_reads_steps() -> None:
-    log, _ = simulate_manoeuvre("stop-and-go", sensors="rough-coarse", road="hilly", seed=3)
+    log, _ = simulate_manoeuvre(
+        "stop-and-go", seed=3, setup=DriveSetup(sensors="rough-coarse", road="hilly")
+    )
     stands = column(log, "true_vx") == 0.0
     step = misalignment_row(SENSORS["rough-coarse"].mounted, 3, 0)[Misaligned.STEP]
     for name in per_wheel("omega"):
@@ -387,9 +396,9 @@ def test_a_town_by_number_is_the_drawn_one_and_another_number_another_town() -> 
 
 def test_unknown_roads_and_slopes_no_road_has_are_refused() -> None:
     with pytest.raises(InputError, match="^road: .*hilly"):
-        simulate_manoeuvre("straight", road="moonscape")
+        simulate_manoeuvre("straight", setup=DriveSetup(road="moonscape"))
     with pytest.raises(InputError, match="^slope: "):
-        simulate_manoeuvre("straight", slope=0.3)
+        simulate_manoeuvre("straight", setup=DriveSetup(slope=0.3))
     with pytest.raises(InputError, match="^slope: "):
         Wave(0.05, length=0.0)
     with pytest.raises(InputError, match="^rough: "):

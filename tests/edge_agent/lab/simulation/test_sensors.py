@@ -6,7 +6,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from edge_agent.lab.simulation import FAULTS, PRESETS, SENSORS, Fault, simulate_manoeuvre
+from edge_agent.lab.simulation import (
+    FAULTS,
+    PRESETS,
+    SENSORS,
+    DriveSetup,
+    Fault,
+    simulate_manoeuvre,
+)
 from edge_agent.lab.simulation.counter_rng import key_of, normal, uniform
 from edge_agent.lab.simulation.faults import apply_faults
 from edge_agent.lab.simulation.place import GOTHENBURG
@@ -40,7 +47,7 @@ def test_hashed_numbers_are_normal_and_uniform_and_streams_are_unrelated() -> No
 
 
 def test_ideal_sensors_say_the_truth() -> None:
-    log, vehicle = simulate_manoeuvre("sine", sensors="ideal")
+    log, vehicle = simulate_manoeuvre("sine", setup=DriveSetup(sensors="ideal"))
     for name in ("ax", "ay", "yaw_rate"):
         np.testing.assert_array_equal(error(log, name), 0.0)
     assert vehicle == PRESETS["sedan"].vehicle
@@ -57,7 +64,7 @@ def test_white_noise_has_the_size_of_the_table() -> None:
 
 def test_offsets_and_gain_are_constant_in_a_drive_and_vary_between_drives() -> None:
     logs = [simulate_manoeuvre("pulses", seed=seed)[0] for seed in range(30)]
-    exact, _ = simulate_manoeuvre("pulses", sensors="ideal")
+    exact, _ = simulate_manoeuvre("pulses", setup=DriveSetup(sensors="ideal"))
     offsets = np.array([error(log, "ax").mean() for log in logs])
     assert offsets.std() == pytest.approx(0.03, rel=0.4)
     torque = column(exact, "torque_fl")
@@ -91,8 +98,8 @@ def test_metres_go_to_degrees_and_back() -> None:
 
 
 def test_a_rolling_body_lets_gravity_into_the_accelerometer() -> None:
-    level, _ = simulate_manoeuvre("constant-radius", sensors="mems")
-    leaky, _ = simulate_manoeuvre("constant-radius", sensors="mems-leak")
+    level, _ = simulate_manoeuvre("constant-radius", setup=DriveSetup(sensors="mems"))
+    leaky, _ = simulate_manoeuvre("constant-radius", setup=DriveSetup(sensors="mems-leak"))
     leak = (column(leaky, "ay") - column(level, "ay"))[-500:].mean() / column(level, "true_ay")[
         -500:
     ].mean()
@@ -124,7 +131,9 @@ def test_a_fault_changes_its_channel_in_its_time_and_nothing_else(kind: str) -> 
 
 
 def test_a_fault_may_name_the_four_wheels_at_once() -> None:
-    log, _ = simulate_manoeuvre("straight", duration_s=1.0, faults=(Fault("missing", "torque"),))
+    log, _ = simulate_manoeuvre(
+        "straight", duration_s=1.0, setup=DriveSetup(faults=(Fault("missing", "torque"),))
+    )
     assert [n for n in CHANNELS if log[n].null_count == 100] == [
         "torque_fl",
         "torque_fr",
@@ -139,4 +148,4 @@ def test_unknown_faults_channels_and_sensors_are_refused_with_the_choice() -> No
     with pytest.raises(InputError, match="yaw_rate"):
         Fault("stuck", "tyre_pressure")
     with pytest.raises(InputError, match=next(iter(SENSORS))):
-        simulate_manoeuvre("straight", sensors="perfect")
+        simulate_manoeuvre("straight", setup=DriveSetup(sensors="perfect"))

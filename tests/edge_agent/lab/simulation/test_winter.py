@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from edge_agent.lab.simulation import PRESETS, SimulatedFleet, simulate_manoeuvre, split
+from edge_agent.lab.simulation import PRESETS, DriveSetup, SimulatedFleet, simulate_manoeuvre, split
 from edge_agent.lab.simulation.fleet import rough_ones, winter_ones
 from edge_agent.lab.simulation.friction import SNOW
 from edge_agent.lab.simulation.presets import TrueVehicle, winter_equipped
@@ -37,9 +37,8 @@ def test_anti_lock_brakes_work_in_cycles_and_use_most_of_the_grip_of_snow(preset
         "braking",
         mu=0.3,
         speed=20.0,
-        vehicle=equip_vehicle(preset),
-        sensors="ideal",
         duration_s=6.0,
+        setup=DriveSetup(vehicle=equip_vehicle(preset), sensors="ideal"),
     )
     works = np.flatnonzero((column(log, "true_abs_active") > 0.0) & (column(log, "true_vx") > 4.0))
     torque = column(log, "torque_fl")[works]
@@ -55,7 +54,11 @@ def test_traction_control_ends_a_spin_which_is_endless_without_it() -> None:
     for tcs in (0.0, 1.0):
         vehicle = equip_vehicle("small", tcs=tcs)
         log, _ = simulate_manoeuvre(
-            "acceleration", mu=0.2, speed=3.0, vehicle=vehicle, sensors="ideal", duration_s=6.0
+            "acceleration",
+            mu=0.2,
+            speed=3.0,
+            duration_s=6.0,
+            setup=DriveSetup(vehicle=vehicle, sensors="ideal"),
         )
         rim = column(log, "omega_fl") * vehicle.vehicle.wheel_radius
         faster[tcs] = np.median(rim - column(log, "true_vx"))
@@ -71,8 +74,7 @@ def test_stability_control_keeps_a_lane_change_on_snow_from_spinning() -> None:
             "double-lane-change",
             mu=0.3,
             speed=16.0,
-            vehicle=equip_vehicle("small", esc=esc),
-            sensors="ideal",
+            setup=DriveSetup(vehicle=equip_vehicle("small", esc=esc), sensors="ideal"),
         )
         drift[esc] = np.abs(np.arctan2(column(log, "true_vy"), column(log, "true_vx"))).max()
         assert (column(log, "true_esc_active").max() > 0.0) == (esc > 0.0)
@@ -82,7 +84,7 @@ def test_stability_control_keeps_a_lane_change_on_snow_from_spinning() -> None:
 def test_no_controller_works_in_ordinary_driving_on_dry_road() -> None:
     for manoeuvre in ("gentle-braking", "straight", "stop-and-go", "j-turn"):
         log, _ = simulate_manoeuvre(
-            manoeuvre, mu=0.9, vehicle=equip_vehicle("van"), sensors="ideal"
+            manoeuvre, mu=0.9, setup=DriveSetup(vehicle=equip_vehicle("van"), sensors="ideal")
         )
         assert not any(
             column(log, f"true_{name}_active").any() for name in ("abs", "tcs", "esc")
@@ -93,9 +95,8 @@ def test_regeneration_brakes_the_driven_axle_alone() -> None:
     log, _ = simulate_manoeuvre(
         "gentle-braking",
         mu=0.9,
-        vehicle=equip_vehicle("van", regeneration=3.0),
-        sensors="ideal",
         duration_s=9.0,
+        setup=DriveSetup(vehicle=equip_vehicle("van", regeneration=3.0), sensors="ideal"),
     )
     fast = (column(log, "true_vx") > 5.0) & (column(log, "t") > 3.0)
     assert np.abs(column(log, "torque_fl")[fast]).max() < 1.0
@@ -106,7 +107,9 @@ def test_a_tyre_builds_up_its_side_force_over_its_relaxation_length() -> None:
     rises = []
     for length in (0.0, 0.6):
         vehicle = replace(PRESETS["sedan"], relaxation=length)
-        log, _ = simulate_manoeuvre("j-turn", mu=0.9, speed=10.0, vehicle=vehicle, sensors="ideal")
+        log, _ = simulate_manoeuvre(
+            "j-turn", mu=0.9, speed=10.0, setup=DriveSetup(vehicle=vehicle, sensors="ideal")
+        )
         lateral = np.abs(column(log, "true_ay"))
         rises.append(int(np.argmax(lateral > 0.5 * lateral.max())))
         ends = lateral[-50:].mean()
@@ -116,7 +119,9 @@ def test_a_tyre_builds_up_its_side_force_over_its_relaxation_length() -> None:
 
 def test_split_road_makes_unlike_brake_torques() -> None:
     log, _ = simulate_manoeuvre(
-        "split-braking", mu=split(0.8, 0.15), vehicle=equip_vehicle("sedan"), sensors="ideal"
+        "split-braking",
+        mu=split(0.8, 0.15),
+        setup=DriveSetup(vehicle=equip_vehicle("sedan"), sensors="ideal"),
     )
     works = np.flatnonzero(column(log, "true_abs_active"))
     left, right = (np.abs(column(log, f"torque_{side}")[works].mean()) for side in ("fl", "fr"))

@@ -51,7 +51,7 @@ def decoy(seed: int) -> Objective:
 
 def run(search: object, objective: Objective, seed: int, **options: object) -> Result:
     of_the_problem = {
-        name: options.pop(name) for name in ("start", "admissible") if name in options
+        name: options.pop(name) for name in ("start", "admissible", "visibility") if name in options
     }
     problem = Problem(objective, CHOICES, **of_the_problem)  # type: ignore[arg-type]
     return search.optimise(  # type: ignore[attr-defined, no-any-return]

@@ -90,10 +90,9 @@ def test_adaptation_recovers_most_of_what_a_wrong_noise_costs(drives: StudySet) 
 def test_search_is_reproducible_and_never_worse_than_untuned_sets(
     drives: StudySet,
 ) -> None:
+    problem = study.problem_on(drives, positions=7)
     for way in study.WAYS:
-        first, again = (
-            search(way, drives, ants=3, iterations=2, positions=7, seed=5) for _ in range(2)
-        )
+        first, again = (search(way, problem, ants=3, iterations=2, seed=5) for _ in range(2))
         assert first.value >= overall(Memberships(), drives)
         assert np.array_equal(first.best, again.best)
         assert first.history == again.history
