@@ -38,8 +38,8 @@ REPORT_S = 30.0
 
 
 def drive_fleet(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
-    """Simulate the drive. Return the columns of all observations, with the column `vehicle`; write
-    the true values to the file `truth`.
+    """Simulate a drive of the fleet for `duration_s` [s]. Return the columns of all observations,
+    with the column `vehicle`; write the true values to the file `truth`.
     """
     vehicles = len(fleet.vehicles)
     config = AgentConfig()
@@ -65,8 +65,8 @@ def drive_fleet(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Column
 
 
 def write_drive(fleet: SimulatedFleet, duration_s: float, folder: Path) -> None:
-    """Simulate the drive, and write the observations and the true friction as two files into an
-    existing folder.
+    """Simulate a drive of the fleet, and write the observations and the true friction as two files
+    into an existing folder.
     """
     columns = drive_fleet(fleet, duration_s, folder / "truth.parquet")
     arrays = {
@@ -77,7 +77,7 @@ def write_drive(fleet: SimulatedFleet, duration_s: float, folder: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line: simulate the drive, and write the observations and the true
+    """Run the command line: simulate a drive of a fleet, and write the observations and the true
     friction.
     """
     parser = argparse.ArgumentParser(

@@ -99,7 +99,9 @@ class ListeningTown:
         self._true: dict[int, float] = {}  # friction of the places, as it was driven over last
 
     def run(self, duration_s: float) -> Drive:
-        """Simulate the drive, and evaluate the map at its end; return the result."""
+        """Simulate a drive of the town's cars for `duration_s` [s], and evaluate the map at its
+        end. Return how many cars lost grip, and how well the map fits.
+        """
         for second in range(int(duration_s)):
             parts = [self._block() for _ in range(round(RATE_HZ / BLOCK))]
             self._fuse([part for part in parts if len(part["cell"])])
@@ -169,8 +171,8 @@ class ListeningTown:
             self.heard.store_alert(decode_alert_message(key, wire.encode_alert(alert), now), now)
 
     def _hear(self, second: int) -> None:
-        """Pass the active alerts, and at intervals the tiles of the map, to the cars that receive
-        the map.
+        """At the given second, pass the active alerts, and at intervals the tiles of the map, to
+        the cars that receive the map.
         """
         now = self._now()
         for alert in self.alerts.standing_alerts:

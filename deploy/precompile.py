@@ -36,7 +36,9 @@ DEFAULT: Final = "aco-fckf"
 
 
 def main(words: list[str]) -> int:
-    """Compile the functions with one process per core; always return 0."""
+    """Compile the frequently used functions of service and agent, with one process per core; always
+    return 0.
+    """
     began = time.monotonic()
     papers = words == ["papers"]
     print(

@@ -106,7 +106,9 @@ def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], floa
 
 
 def write_truth(visits: pa.Table, changed_ns: int, path: Path) -> None:
-    """Write the final true friction as a file that the live page can draw over the map."""
+    """Write the true friction of each cell at the end of the demo as a file that the live page can
+    draw over the map.
+    """
     truth = final_truth(visits, changed_ns)
     cell, sector = zip(*truth, strict=True)
     table = pa.table(
@@ -198,7 +200,9 @@ class DemoRun(NamedTuple):
 def demo_figures(
     comparison: MapComparison, run: DemoRun, archive: Path, wall_s: float
 ) -> list[Figure]:
-    """Return all figures of the demo, each with its target. `wall_s` [s] is its duration."""
+    """Return all figures of the demo (about map, alerts and archive), each with its target.
+    `wall_s` [s] is the duration of the demo.
+    """
     visits, alerts, changed_ns, counts = run
     several = comparison.has_several_vehicles
     value = comparison.has_several_vehicles & comparison.is_measured

@@ -51,8 +51,9 @@ class Listener:
         self.session.close()
 
     def progress(self) -> str:
-        """Return one line of text: the number of known cells, how many of them are measured, how
-        many cells more than one vehicle visited, and the number of active alerts.
+        """Return one line of text about the received map: the number of known cells, how many of
+        them are measured, how many cells more than one vehicle visited, and the number of active
+        alerts.
         """
         with self._lock:
             cells = pa.concat_tables(self.tiles.values()) if self.tiles else None

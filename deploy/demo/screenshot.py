@@ -15,7 +15,7 @@ SETTLED_MS: Final = 2_000  # for what is still on its way after the first pictur
 
 
 def take_screenshot(address: str, path: Path) -> None:
-    """Open the page in the system's Chromium and save a screenshot.
+    """Open the live page in the system's Chromium and save a screenshot.
 
     Raises:
         InputError: Chromium or Playwright is missing.

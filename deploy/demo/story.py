@@ -32,8 +32,8 @@ REPORT_S = 5.0
 def drive_fleet(
     folder: Path, endpoint: str, args: argparse.Namespace
 ) -> tuple[Listener, dict[str, float]]:
-    """Let the fleet drive; return the listener with the received data, and the counts that the
-    fleet's process printed.
+    """Let the simulated fleet drive; return the listener with the received data, and the counts
+    that the fleet's process printed.
     """
     session = open_session(ZenohSettings(connect=[endpoint]))
     if session is None:
@@ -74,8 +74,8 @@ def report_figures(
     grip: compare.LostGrip,
     seed: int,
 ) -> list[figures.Figure]:
-    """Write and print all figures, and draw the map with the passes that lost grip; return the
-    figures.
+    """Write and print all figures of the demo, and draw the map with the passes that lost grip;
+    return the figures.
     """
     found = [*measured, *grip.figures()]
     figures.write(folder / "figures.json", "demo", [seed], found)
@@ -93,7 +93,7 @@ def report_figures(
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the demo; return 1 if a figure misses a target that the demo must meet.
+    """Run the whole demo; return 1 if a figure misses a target that the demo must meet.
 
     The delay of the first alert, the number of passes and the duration are only goals: a miss is
     reported but does not make the demo fail.

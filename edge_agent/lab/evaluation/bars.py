@@ -1,4 +1,4 @@
-"""List of the figures of the evaluation campaign: first those with a target ("bar"), then all other
+"""List of the figures of the evaluation campaign: first those with a target, then all other
 measures for context.
 """
 
@@ -34,8 +34,8 @@ class EstimatorBar(NamedTuple):
 
 
 def mean_of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[Results], float]:
-    """Return a function that reads a measure from the results of the campaign: its mean over all
-    seeds, with ordinary sensors.
+    """Return a function that reads a measure of an estimator in a scenario from the results of the
+    campaign: its mean over all seeds, with ordinary sensors.
     """
 
     def read_mean(results: Results) -> float:
@@ -52,16 +52,17 @@ def noise_mean(experiment: str, measure: str) -> Callable[[Results], float]:
 
 
 def in_the_world(name: str) -> Callable[[Results], float]:
-    """Return a function that reads, from the results of the campaign, the default estimator's
-    figure called `name`. It belongs to the towns with inaccurate cars, or to cars on a slope.
+    """Return a function that reads, from the results of the campaign, a figure of the default
+    estimator by its name. The figure describes either the towns with inaccurate cars, or cars on a
+    slope.
     """
     return lambda results: results.world.get(DEFAULT, {}).get(name, math.nan)
 
 
 def worth_of(name: str) -> Callable[[Results], float]:
-    """Return a function that reads, from the results of the campaign, the ratio called `name` of
-    two interval scores of friction: for example the score with fuzzy sets divided by the score
-    without fuzzy sets.
+    """Return a function that reads the ratio called `name` from the results of the campaign. It is
+    a ratio of two interval scores of friction, for example the score with fuzzy sets divided by the
+    score without them.
     """
     return lambda results: worth.ratio(results.worth, name)
 
@@ -201,7 +202,9 @@ UNITS: Final = {
 
 
 def unit_of(measure: str) -> str:
-    """Return the unit of a measure; it follows from the end of the measure's name."""
+    """Return the unit of a measure as text, for example m/s; it follows from the end of the
+    measure's name.
+    """
     if measure.startswith("coverage90"):
         return SHARE
     whole = (

@@ -47,7 +47,9 @@ class Cells(NamedTuple):
 
 
 def cells_of(rows: Rows) -> Cells:
-    """Return the state of cells, stored as rows, as the columns of `Cells`."""
+    """Return the state of n cells, given as an array of records, as `Cells`: one column (n,) or (n,
+    k) per field.
+    """
     return Cells(rows.belief, *(rows.cells[name] for name in CELL.names or ()))
 
 
@@ -80,8 +82,8 @@ def begin_slot(live: Rows, slot: int, key: int) -> None:
 
 @refcount_free_inlined
 def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
-    """Copy the state of a cell from one row to another. The target row keeps its own references to
-    recent observations and recent reporters.
+    """Copy the state of a cell from row `at` of `source` to row `to` of `target`. The target row
+    keeps its own references to recent observations and recent reporters.
     """
     for i in range(mugrid.BINS):
         target.belief[to, i] = source.belief[at, i]
@@ -93,7 +95,9 @@ def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
 
 @refcount_free_inlined
 def copy_sources(source: RecordArray, at: int, target: RecordArray, to: int) -> None:
-    """Copy, from one row to another, the vehicles that corroborate ice or grip in a cell."""
+    """Copy the vehicles that corroborate ice or grip in a cell, from row `at` of `source` to row
+    `to` of `target`.
+    """
     for side in range(2):
         for k in range(SOURCES):
             target[to].source[side, k] = source[at].source[side, k]

@@ -19,8 +19,9 @@ _FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its
 
 @refcount_free_inlined
 def comes_before(entries: RecordArray, a: int, b: int) -> bool:
-    """Return True if observation `a` comes before observation `b` in the order of fusion: by time,
-    then by vehicle, start of the vehicle, and sequence number. Both are row numbers of `entries`.
+    """Return True if observation `a` comes before observation `b` in the order in which they change
+    the belief: by time, then by vehicle, start of the vehicle, and sequence number. Both are row
+    numbers of `entries`.
     """
     if entries[a].time != entries[b].time:
         return bool(entries[a].time < entries[b].time)
@@ -100,7 +101,9 @@ def _must_stay(pairs: RecordArray, place: int, least: int) -> bool:
 
 @compiled
 def count_staying(pairs: RecordArray, least: int) -> int:
-    """Return the number of pairs (vehicle and cell) that must stay, see `_must_stay`."""
+    """Return the number of records of a vehicle in a cell that must stay in memory, see
+    `_must_stay`.
+    """
     count = 0
     for place in range(len(pairs)):
         count += pairs[place].slot != NONE and _must_stay(pairs, place, least)
@@ -109,8 +112,8 @@ def count_staying(pairs: RecordArray, least: int) -> int:
 
 @compiled
 def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: int) -> IntArray:
-    """Move the pairs (vehicle and cell) that must stay to another table, see `_must_stay`. Return
-    the row numbers of the other pairs in the old table, one array.
+    """Move the records of a vehicle in a cell that must stay (see `_must_stay`) to another table.
+    Return the row numbers of the other pairs in the old table, one array.
     """
     dropped = np.empty(len(old), np.int64)
     count = 0

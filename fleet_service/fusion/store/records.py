@@ -1,5 +1,5 @@
-"""The records of a fusion. Data that are used together are adjacent in memory. Compiled functions
-see a row as an object.
+"""The records in which a fusion (beliefs about all cells) is stored. Data that are used together
+are adjacent in memory. Compiled functions see a row as an object.
 
 The state consists of record arrays instead of columns for two reasons. A visit to a cell that was
 not used recently costs two memory accesses instead of one per column. Compiled functions receive a
@@ -87,8 +87,8 @@ class CellRecord:
 
 class EntryRecord:
     """Entry of the lateness window (the observations younger than the checkpoint): one observation
-    in one cell. A commit moves an entry into the final state; the fields that it reads are in the
-    first of the entry's two cache lines.
+    in one cell. A commit moves an entry that has become older than the checkpoint into the final
+    state; the fields that it reads are in the first of the entry's two cache lines.
 
     Attributes:
         previous, following: neighbouring entries of the slot's window, in order of time.
@@ -150,8 +150,8 @@ class WindowRecord:
 
     Attributes:
         slot: the slot; NONE if the window is not in use.
-        head, tail: first and last entry (observation).
-        stale: 1 if the live row must be computed again.
+        head, tail: first and last entry (observation) in the list.
+        stale: 1 if the current belief of the slot must be computed again.
         first: time of the first entry [ns].
         values: number of entries that are values (not only lower bounds).
     """
@@ -166,8 +166,8 @@ class WindowRecord:
 
 class PairRecord:
     """Summary of the older reports of one vehicle in one slot (cell and sector), called a pair: the
-    reports that the checkpoint has passed. A record is half a cache line long, so that no record
-    crosses the border of a line.
+    reports that are older than the checkpoint and therefore final. A record is half a cache line
+    long, so that no record crosses the border of a line.
 
     Attributes:
         slot, vehicle: the pair; a free place of the table has slot NONE.
@@ -225,7 +225,8 @@ class PeersRecord:
         agreed, met: summed agreement, and number of comparisons.
         used_squares: weighted squares of the differences in grip used between two visits of the
             vehicle to one cell.
-        used_products: weighted products of these differences with the differences in value.
+        used_products: weighted products of these differences with the differences in reported
+            friction.
         flags_confirmed, flags_contradicted: how often values of other vehicles confirmed and
             contradicted the vehicle's slip controllers.
     """
@@ -281,8 +282,8 @@ class State(NamedTuple):
 
     Attributes:
         live: the current slots.
-        base: the slots (cells and sectors) in the state before the observations in their windows,
-            one row per row of `windows`; of the reporters only the sources are copied.
+        base: the slots (cells and sectors) in the state before the recent observations in their
+            windows, one row per row of `windows`; of the reporters only the sources are copied.
         windows, entries: pools (arrays with free rows) of `WindowRecord` and `EntryRecord`.
         free_windows, free_entries: stacks of the pools' free rows.
         pairs: hash table that contains the pair records.

@@ -1,5 +1,5 @@
-"""The store of a fusion: the memory for its state, which consists of tables and pools that grow.
-Compiled code receives all arrays as one `State`.
+"""The store of a fusion (beliefs about all cells): the memory for its state, which consists of
+tables and pools that grow. Compiled code receives all arrays as one `State`.
 """
 
 from __future__ import annotations
@@ -181,8 +181,8 @@ class Store:
         return index
 
     def reserve(self, rows: int) -> None:
-        """Enlarge every array of records so that it has space for `rows` more votes (effects of one
-        observation on one cell).
+        """Enlarge every array of records so that each has space for `rows` more votes (effects of
+        one observation on one cell).
         """
         used = self.state.used
         if used[FREE_ENTRIES] < rows:
@@ -291,9 +291,9 @@ class Store:
 
 @compiled
 def find_due_windows(windows: RecordArray, before: int) -> tuple[IntArray, IntArray]:
-    """Return the lateness windows that contain observations older than `before` [ns], as two arrays
-    of row numbers: windows in which all observations are lower bounds, and windows with at least
-    one value of friction.
+    """Return the lateness windows (recent observations of a cell) that contain observations older
+    than `before` [ns], as two arrays of row numbers: windows in which all observations are lower
+    bounds of friction, and windows with at least one measured value.
     """
     plain = np.empty(len(windows), np.int64)
     valued = np.empty(len(windows), np.int64)

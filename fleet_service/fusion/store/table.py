@@ -45,30 +45,32 @@ def _hash_key(key: int | np.int64) -> np.uint64:
 
 @refcount_free_inlined
 def _first_place(mixed: np.uint64, places: int) -> int:
-    """Return the place of the table at which the search for a key begins; `mixed` is the key's
-    hash.
+    """Return the place (index) of a hash table with `places` places at which the search for a key
+    begins; `mixed` is the key's hash.
     """
     return int(np.int64(((mixed >> np.uint64(32)) * np.uint64(places)) >> np.uint64(32)))
 
 
 @refcount_free_inlined
 def _row_at(held: int) -> int:
-    """Return the row number that a place of the table contains; NONE if the place is free."""
+    """Return the row number that a place of a hash table contains, from the place's content `held`;
+    NONE if the place is free.
+    """
     return int(np.int32(held & _LOWER))
 
 
 @refcount_free_inlined
 def _place_content(mixed: np.uint64, row: int) -> int:
-    """Return the integer that represents a key and its row in the table: the row number, and a part
-    of the key's hash `mixed`. It never equals NONE, which marks a free place.
+    """Return the integer that represents a key and its row in a hash table: the row number, and a
+    part of the key's hash `mixed`. It never equals NONE, which marks a free place.
     """
     return int((np.int64(mixed & np.uint64(_TAG)) << 32) | row)
 
 
 @refcount_free_inlined
 def locate_key(table: IntArray, rows: RecordArray, key: int) -> int:
-    """Return the place of the table that refers to the row with `key`; if there is no such row, the
-    free place where it belongs.
+    """Return the place (index) of a hash table that refers to the row with `key`; if there is no
+    such row, the free place where it belongs.
     """
     mixed = _hash_key(key)
     place = _first_place(mixed, len(table))
@@ -126,8 +128,8 @@ def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int) -> tuple
 def assign_rows(
     table: IntArray, rows: RecordArray, wanted: IntArray, used: int
 ) -> tuple[IntArray, int]:
-    """Return the row of each key, (n,), and the number of rows in use afterwards. An unknown key is
-    written to the next free row.
+    """Return the row of each of the keys `wanted` (n,) and the number of rows in use afterwards. An
+    unknown key is written to the next free row.
     """
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
@@ -151,17 +153,17 @@ def fill_table(table: IntArray, rows: RecordArray, used: int) -> None:
 
 @refcount_free_inlined
 def first_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
-    """Return the place of the table at which the search for a pair of slot (cell and sector) and
-    vehicle begins.
+    """Return the place (index) of the hash table `pairs` at which the search for a slot (cell and
+    sector) and a vehicle begins.
     """
     return _first_place(_hash_key((np.int64(slot) << np.int64(32)) | np.int64(vehicle)), len(pairs))
 
 
 @refcount_free_inlined
 def pair_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
-    """Return the place of a pair of slot (cell and sector) and vehicle in a table that contains the
-    pair records themselves. If the pair is unknown, return the free place (slot NONE) where it
-    belongs.
+    """Return the place (index) of a slot (cell and sector) and a vehicle in a hash table that
+    contains the pair records themselves. If both together are unknown, return the free place (slot
+    NONE) where it belongs.
     """
     place = first_place(pairs, slot, vehicle)
     while pairs[place].slot != NONE and (
@@ -189,7 +191,7 @@ def places_for(entries: int, most: float) -> int:
 
 
 def is_full(entries: int, places: int, most: float) -> bool:
-    """Return True if the number of row numbers in a table exceeds the share `most` of its
+    """Return True if the number of row numbers in a hash table exceeds the share `most` of its
     places.
     """
     return entries > most * places

@@ -1,4 +1,4 @@
-"""Tests of mathematical properties of the belief about one cell: how time and votes (effects of
+"""Tests of the mathematical properties of the belief about one cell: how time and votes (effects of
 single visits) may change it.
 """
 

@@ -31,7 +31,9 @@ UNTESTED = at_least([0.3] * 4)  # four gentle drivers
 
 
 def east(steps: int, north: int = 0) -> int:
-    """Return the cell `steps` east and `north` north of CELL."""
+    """Return the number of the cell that lies `steps` cells east and `north` cells north of
+    CELL.
+    """
     return int(grid.interleave(np.array([X + steps]), np.array([Y - north]))[0])
 
 

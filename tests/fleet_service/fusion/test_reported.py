@@ -16,7 +16,9 @@ from tests.fleet_service.examples import CELL, observations, value
 
 
 def encode_value(mu: float, std: float = 0.05) -> np.ndarray:
-    """Return the encoded log-likelihood (1, 32) of a measurement of `mu`."""
+    """Return the encoded log-likelihood (1, 32) of a measurement `mu` of friction with standard
+    deviation `std`.
+    """
     return mugrid.encode_log_likelihood(-0.5 * np.square((mugrid.CENTRES - mu) / std))[None]
 
 

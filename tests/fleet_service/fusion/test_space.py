@@ -1,4 +1,6 @@
-"""Tests that a visit with an uncertain position is divided among cells and never counted twice."""
+"""Tests that the report of a visit (passage of a cell) with an uncertain position is divided among
+cells and never counted twice.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests of the fusion's memory: hash tables of any length find every stored key, and unused rows
-are freed.
+"""Tests of the memory of a fusion (beliefs about all cells): hash tables of any length find every
+stored key, and unused rows are freed.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of learned parameters of the fusion: the weights of vehicles, and how much their values
-fall with the grip left unused.
+"""Tests of parameters that the service learns from its vehicles: the weights of vehicles, and how
+much their values fall with the grip left unused.
 """
 
 from __future__ import annotations
@@ -63,9 +63,10 @@ def test_shape_of_nobody_is_the_prior() -> None:
 
 @pytest.mark.parametrize("gain_std", [0.05, 0.1])
 def test_gain_error_common_to_value_and_use_is_no_shape(gain_std: float) -> None:
-    """A gain error that changes a vehicle's values and its used grip alike must not be learned as a
-    slope. In a comparison between vehicles it looks like a slope cov(value, use)/var(use) ≥ .3; in
-    a comparison of one vehicle's visits it cancels.
+    """A gain error (relative error) that changes a vehicle's friction values and its used grip
+    alike must not be learned as a slope, the error of a value per unit of unused grip. In a
+    comparison between vehicles it looks like a slope cov(value, use)/var(use) ≥ .3; in a comparison
+    of one vehicle's visits it cancels.
     """
     assert learned_slope(make_acquainted(0.0, gain_std, gain_in_use=True)) < 0.12
 
@@ -101,8 +102,8 @@ def test_shape_is_the_slope_and_a_doubt() -> None:
 
 
 def test_doubt_of_an_alarm_ends_once_the_shape_is_known() -> None:
-    """Before an alert, the service assumes a larger error for values measured with little grip use.
-    This extra error must become small once the service knows its fleet.
+    """Before it raises an alert, the service assumes a larger error for values measured with little
+    grip use. This extra error must become small once the service knows its fleet.
     """
     unknown = shared.UNKNOWN_SHAPE
     assert unknown.alarm == pytest.approx(0.5, abs=0.01)
@@ -140,8 +141,9 @@ def test_gentle_value_a_little_below_grip_may_be_a_soft_tyre(used: float, witnes
 
 
 def count_witnesses(mu: float, used: float, tail: float) -> int:
-    """Fuse one vehicle's value of `mu`, and return the number of vehicles (0 or 1) whose report
-    then supports an alert of ice. `tail` is the value's log-likelihood of dry road [nat].
+    """Process one vehicle's value `mu` of friction, and return the number of vehicles (0 or 1)
+    whose report then supports an alert of ice. `tail` is the value's log-likelihood of dry road
+    [nat].
     """
     fusion = Fusion(120.0)
     tailed = np.maximum(value([mu], 0.03), np.where(mugrid.CENTRES > 0.5, tail, -12.0))
