@@ -126,7 +126,7 @@ class QueryEngine:
         return sum(int(pq.read_metadata(path).num_rows) for path in self.files("observations"))
 
     def answer(self, expression: Table) -> pa.Table:
-        """Evaluate an Ibis expression and return its result as an Arrow table."""
+        """Evaluate an Ibis expression (query) and return its result as an Arrow table."""
         found: pa.Table = expression.to_pyarrow()
         return found
 

@@ -181,13 +181,13 @@ def add_geometry(table: pa.Table, question: Question) -> pa.Table:
 
 
 def _row_cells(table: pa.Table) -> list[list[int]]:
-    """Return the list of map cells that each row of an answer consists of."""
+    """Return, for each row of an answer, the list of the map cells that it describes."""
     found: list[Any] = table[PARTS].to_pylist()
     return found
 
 
 def plot(table: pa.Table, question: Question, path: Path) -> None:
-    """Write an answer as an image.
+    """Write the answer to a question as an image with a plot.
 
     Raises:
         InputError: matplotlib is not installed.

@@ -36,7 +36,9 @@ _MARK = "#d0006f"
 
 
 def draw(table: pa.Table, name: str, about: str, path: Path) -> None:
-    """Draw an answer and write it in the format of the path's ending (png, svg, pdf)."""
+    """Draw the answer to a question as a plot, and write it in the format of the path's ending
+    (png, svg, pdf).
+    """
     figure = Figure(figsize=(8.0, 4.8), layout="constrained")
     if table.num_rows:
         _DRAWN.get(name, _first_two)(figure, table)
@@ -143,7 +145,7 @@ def _draw_worst(figure: Figure, table: pa.Table) -> None:
 
 
 def _make_panels(figure: Figure, count: int) -> list[Axes]:
-    """Return `count` axes (panels) of a matplotlib figure, three per row."""
+    """Return `count` axes (panels for plots) of a matplotlib figure, three per row."""
     columns = min(count, 3) or 1
     rows = -(-count // 3) or 1
     if count > 1:
@@ -299,7 +301,9 @@ def _draw_replay(figure: Figure, table: pa.Table) -> None:
 
 
 def _first_two(figure: Figure, table: pa.Table) -> None:
-    """Plot the first two numeric columns against each other; used for questions of plug-ins."""
+    """Plot the first two numeric columns of an answer against each other; used for questions of
+    plug-ins.
+    """
     numbers = [
         f.name for f in table.schema if pa.types.is_floating(f.type) or pa.types.is_integer(f.type)
     ][:2]

@@ -13,7 +13,8 @@ MOST_WAITING: Final = 1000
 
 
 class AlertQueue:
-    """Queue of texts in an SQLite file; when it is full, the oldest texts are dropped.
+    """Queue of alert messages (texts) in an SQLite file; when it is full, the oldest texts are
+    dropped.
 
     Args:
         path: path of the file, which is created if missing; this queue has exclusive use of it
@@ -51,7 +52,8 @@ class AlertQueue:
             return int(self._file.execute("SELECT count(*) FROM waiting").fetchone()[0])
 
     def append(self, text: str) -> int:
-        """Append a message; return the number of old messages that were dropped to make room.
+        """Append an alert message; return the number of old messages that were dropped to make
+        room.
 
         Raises:
             sqlite3.Error: the message cannot be stored.
@@ -64,7 +66,7 @@ class AlertQueue:
             ).rowcount
 
     def read_first(self) -> tuple[int, str] | None:
-        """Return (number, text) of the oldest message; None if the queue is empty."""
+        """Return (number, text) of the oldest waiting alert message; None if the queue is empty."""
         with self._guard:
             row = self._file.execute(
                 "SELECT number, text FROM waiting ORDER BY number LIMIT 1"
@@ -72,13 +74,15 @@ class AlertQueue:
         return None if row is None else (int(row[0]), str(row[1]))
 
     def remove(self, number: int) -> bool:
-        """Remove the message with this number; return False if it had already been dropped."""
+        """Remove the alert message with this number; return False if it had already been
+        dropped.
+        """
         with self._guard:
             return (
                 self._file.execute("DELETE FROM waiting WHERE number = ?", (number,)).rowcount > 0
             )
 
     def close(self) -> None:
-        """Close the queue's file, so that other processes can use it."""
+        """Close the file of the alert queue, so that other processes can use it."""
         with self._guard:
             self._file.close()

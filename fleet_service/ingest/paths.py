@@ -96,8 +96,11 @@ Paths = tuple[IntArray, Float32Array, BoolArray, IntArray, FloatArray]
 
 @compiled
 def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: Paths) -> BoolArray:
-    """Compute `VehiclePaths.find_implausible` in compiled code, and update the paths; `row` (n,) is
-    the number of the vehicle's path.
+    """Find the rows that are implausible for their vehicle's path, and extend the paths by the
+    others. This is the compiled part of `VehiclePaths.find_implausible`.
+
+    `row` (n,) is the number of the vehicle's path, `time` (n,) in ns, `place` (n, 2) in degrees.
+    Return a mask (n,).
     """
     anchors, places, is_gap, count, leap = paths
     out = np.zeros(len(row), np.bool_)

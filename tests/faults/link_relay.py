@@ -140,7 +140,9 @@ def _read_packets(device: int) -> list[bytes]:
 
 
 def main() -> int:
-    """Create both devices, print `relay: ready`, and move packets until stdin is closed."""
+    """Create the network devices of both ends of the link, print `relay: ready`, and pass packets
+    between them until stdin is closed.
+    """
     given = json.loads(sys.argv[1])
     ends = (
         open_device(given["left"], given["device"]),

@@ -123,8 +123,8 @@ class Feed(ABC):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening. Wait at most LEAVE_S for the thread, because it may hang in a driver; see
-        `listening`.
+        """Stop listening to the live source. Wait at most LEAVE_S for the thread, because it may
+        hang in a driver; see `listening`.
         """
         self.stopping.set()
         self._thread.join(LEAVE_S)

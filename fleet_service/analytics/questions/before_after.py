@@ -76,8 +76,8 @@ def find_difference(row: dict[str, Any]) -> dict[str, float]:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return two rows, before and after: mean of mu; difference between the periods with its 90 %
-    interval; numbers of cells, vehicles and values used.
+    """Return a table with two rows, before and after the given time: mean of mu; difference between
+    the periods with its 90 % interval; numbers of cells, vehicles and values used.
 
     Raises:
         InputError: no time is given, or no cell was measured in both periods.

@@ -56,7 +56,7 @@ def expression(t: Table, maps: Table) -> Table:
 
 
 def ask(engine: QueryEngine, _: Options) -> pa.Table:
-    """Return how often later values lay within the map's intervals, for the selected part of the
-    archive; `expression` describes the rows.
+    """Return how often later values lay within the map's intervals as a table, for the selected
+    part of the archive; `expression` describes the rows.
     """
     return engine.answer(expression(engine.observations(), engine.maps()))

@@ -59,8 +59,8 @@ _ROW: Final[dict[str, pa.DataType]] = {
 
 
 def expression(t: Table, places: Table) -> Table:
-    """Return the mean of each vehicle's values of mu, for each piece of a link and each time slot,
-    with the mean of the variances that the vehicle reported.
+    """Return a table with the mean of each vehicle's values of mu, for each piece of a road link
+    and each time slot, and with the mean of the variances that the vehicle reported.
 
     Args:
         t: observations.
@@ -78,7 +78,8 @@ def expression(t: Table, places: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return one row per measured link and direction, the worst first.
+    """Return a table with one row per measured road link and direction, the worst first: how far
+    the friction required by the contract was kept.
 
     Raises:
         InputError: the table of roads, the required level, or the time within which it must be
@@ -105,8 +106,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def slot_intervals(found: pa.Table) -> dict[str, FloatArray]:
-    """Return arrays by name with mean and 90 % interval of mu for each piece of a link and each
-    time slot, computed from the values of its vehicles.
+    """Return arrays by name with mean and 90 % interval of mu for each piece of a road link and
+    each time slot, computed from the values of its vehicles.
 
     The error of a mean is the larger of two estimates: from the spread between vehicles, and from
     the intervals that they reported.
@@ -170,7 +171,7 @@ def _find_runs(is_below: BoolArray, far: BoolArray | None = None) -> tuple[IntAr
 
 
 class _Measured(NamedTuple):
-    """Measurements of one link.
+    """Measurements of one road link.
 
     Attributes:
         pieces: row numbers of each piece of the link.

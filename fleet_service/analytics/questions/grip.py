@@ -42,9 +42,9 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return percentiles of mu per day, cell and sector; `expression` describes the rows. Also
-    report the daily coverage of the network, which is the set of all cells and sectors visited in
-    the selected time.
+    """Return a table of percentiles of mu per day, cell and sector; `expression` describes the
+    rows. Also report the daily coverage of the network, which is the set of all cells and sectors
+    visited in the selected time.
     """
     found = engine.answer(expression(engine.observations()))
     for line in coverage_lines(found):

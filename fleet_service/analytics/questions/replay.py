@@ -27,8 +27,8 @@ REPORT_ROWS: Final = 1_000_000  # between two lines of progress
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return the cells of the map at the time `at`; with `step_s`, the cells of each frame during
-    the selected period. `frame` is the time of the frame.
+    """Return a table of the map's cells at the time `at`; with `step_s`, the cells of each frame
+    during the selected period. `frame` is the time of the frame.
 
     Raises:
         InputError: the step is not valid, or makes too many frames.

@@ -18,8 +18,8 @@ from schemas.thresholds import SLIPPERY_MU
 
 
 def expression(t: Table, least_vehicles: int) -> Table:
-    """Return a table with one row per spell. If a spell has not ended (`lasts`), `end` is null and
-    `duration_s` is a minimum.
+    """Return a table with one row per slippery spell: its place, begin, end, duration and vehicles.
+    If a spell has not ended (`lasts`), `end` is null and `duration_s` is a minimum.
     """
     t = t.filter(has_value(t)).select(
         "cell", "sector", "time", "vehicle", "boot", "seq", "row", "mu"
@@ -68,7 +68,7 @@ def expression(t: Table, least_vehicles: int) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return one row per slippery spell in the selected part of the archive; `expression` describes
-    the rows.
+    """Return a table with one row per slippery spell (time during which a cell was slippery) in the
+    selected part of the archive; `expression` describes the rows.
     """
     return engine.answer(expression(engine.observations(), options.least_vehicles))

@@ -47,8 +47,8 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:  # noqa: ARG001 as all questions have it
-    """Return one row per month. The difference is null if no cell has values of two vehicles in
-    both months.
+    """Return a table with one row per month: its friction, and the difference from the previous
+    month. The difference is null if no cell has values of two vehicles in both months.
     """
     t = engine.observations()
     months = sorted(engine.answer(expression(t)).to_pylist(), key=lambda row: row["month"])
@@ -66,7 +66,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:  # noqa: ARG001 as a
 
 
 def _as_date(month: date) -> date:
-    """Return a month's first day as a date; one engine returns a date, the other a date with
-    time.
+    """Convert a month's first day to a date, because one query engine returns a date, the other a
+    date with time.
     """
     return month.date() if isinstance(month, datetime) else month

@@ -14,8 +14,9 @@ HOUR_S = 3600
 
 
 def expression(t: Table) -> Table:
-    """Return a table with one row per vehicle. `bias` is null if the vehicle never measured in the
-    same cell and hour as another.
+    """Return a table with one row per vehicle: the deviation (`bias`) of its values from those of
+    other vehicles. `bias` is null if the vehicle never measured in the same cell and hour as
+    another.
 
     `bias` is the mean of (own mean - mean of the others) over cells and hours. `bias_std` is its
     standard error, and `z` is |bias| / bias_std.
@@ -62,7 +63,7 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, _: Options) -> pa.Table:
-    """Return one row per vehicle in the selected part of the archive; `expression` describes the
-    rows.
+    """Return a table with one row per vehicle in the selected part of the archive: the deviation of
+    its values from those of others; `expression` describes the rows.
     """
     return engine.answer(expression(engine.observations()))

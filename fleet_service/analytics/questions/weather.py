@@ -74,8 +74,8 @@ def _join_stations(t: Table, stations: Table, readings: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return one row per temperature band for the selected part of the archive; `expression`
-    describes the rows.
+    """Return a table of the measured friction with one row per band of air temperature, for the
+    selected part of the archive; `expression` describes the rows.
 
     Raises:
         InputError: the table of stations is missing, or lacks a column.

@@ -24,7 +24,7 @@ SHARE: Final = 0.1
 
 def expression(t: Table, least_vehicles: int) -> Table:
     """Return a table of the cells and sectors in which at least the share SHARE of the values is
-    slippery, reported by enough vehicles.
+    slippery, reported by at least `least_vehicles` vehicles.
     """
     reported = has_value(t)
     cells = t.group_by(["cell", "sector"]).aggregate(
@@ -44,16 +44,16 @@ def expression(t: Table, least_vehicles: int) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return slippery stretches, the worst first. The score is the length times the lower
-    confidence bound of the share of slippery values.
+    """Return a table of slippery stretches of road, the worst first. The score is the length times
+    the lower confidence bound of the share of slippery values.
     """
     cells = engine.answer(expression(engine.observations(), options.least_vehicles))
     return join_stretches(cells)
 
 
 def join_stretches(cells: pa.Table) -> pa.Table:
-    """Return one row per stretch: a stretch is a group of touching cells of one sector. `members`
-    are its cells, and the box encloses them.
+    """Return a table with one row per slippery stretch: a stretch is a group of touching cells of
+    one sector. `members` are its cells, and the box encloses them.
     """
     column = {name: cells[name].to_numpy() for name in cells.schema.names}
     label = _label_components(column["cell"], column["sector"].astype(np.int64))
@@ -93,7 +93,9 @@ def join_stretches(cells: pa.Table) -> pa.Table:
 
 
 def wilson_lower(hits: FloatArray, of: FloatArray) -> FloatArray:
-    """Return the lower 95 % confidence bound (Wilson 1927) of the share `hits` / `of`, (n,)."""
+    """Return the lower 95 % confidence bound (Wilson 1927) of a share: of `of` observations (n,),
+    `hits` (n,) had a property.
+    """
     n = np.maximum(of, 1.0)
     p = hits / n
     spread = Z_95 * np.sqrt(p * (1 - p) / n + Z_95**2 / (4 * n * n))

@@ -78,7 +78,9 @@ def _find_snapshot(root: Path, part: Extract) -> Path:
 
 
 def with_vehicles(table: pa.Table, vehicles: int) -> pa.Table:
-    """Return the rows of a map snapshot whose cells at least `vehicles` vehicles have visited."""
+    """Return the rows of a map snapshot whose cells were visited by at least `vehicles`
+    vehicles.
+    """
     return table.filter(pc.greater_equal(table["vehicles"], pa.scalar(vehicles, pa.int32())))
 
 

@@ -143,8 +143,8 @@ class Listing:
             return False
 
     def load(self, path: Path, where: Where | None = None) -> pa.Table | None:
-        """Return the rows of one file that match the selection and the filter `where`. Return None
-        if the file is damaged, or its day has been removed.
+        """Return the rows of one file of the archive that match the selection and the filter
+        `where`. Return None if the file is damaged, or its day has been removed.
         """
         both = [*(self._wanted.where or ()), *(where or ())]
         try:

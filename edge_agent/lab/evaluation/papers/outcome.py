@@ -135,7 +135,7 @@ class Reproduction:
 
     @property
     def rows(self) -> list[PaperRow]:
-        """Return the rows of all tables of the reproduction."""
+        """Return the rows of all tables of the paper's reproduction."""
         return [row for table in self.tables for row in table.rows]
 
     @property
