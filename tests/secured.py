@@ -179,7 +179,7 @@ def open_network(
     protocol: str = "tls",
     capped: bool = False,
 ) -> Iterator[Network]:
-    """Create certificates in a folder, start both routers, and yield the network."""
+    """Create certificates in a folder, start two routers that check them, and yield the network."""
     open_registry(folder).enrol(fleet or make_enrolment())
     running = Network(folder, guarded, protocol, capped)
     with ExitStack() as stack:

@@ -1,5 +1,5 @@
-"""DATEX II publication as a file: written once, or kept up to date while alerts are raised and
-cleared.
+"""DATEX II publication of the slippery stretches of road as a file: written once, or kept up to
+date while alerts are raised and cleared.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ REFRESH_S: Final = 60.0
 
 
 class DatexFile:
-    """Publication that is stored in a file; each version continues the previous content of the
-    file.
+    """DATEX II publication (message for road authorities) that is stored in a file; each version
+    continues the previous content of the file.
 
     Args:
         supplier: supplier of the publication.
@@ -50,13 +50,13 @@ class DatexFile:
 
     @property
     def is_due(self) -> bool:
-        """Return True if the publication is so old that it must be written again."""
+        """Return True if the DATEX II publication is so old that it must be written again."""
         return time.monotonic() >= self._written + REFRESH_S
 
     def keep_up(
         self, standing: list[StretchAlert], is_heard: Callable[[float, float], bool]
     ) -> None:
-        """Write the publication if its content has changed, or if it is old.
+        """Write the DATEX II publication if its content has changed, or if it is old.
 
         Args:
             standing: every stretch of road with an active alert.
@@ -85,7 +85,7 @@ class StretchOutput(Protocol):
 
     @property
     def is_due(self) -> bool:
-        """Return True if the output must be updated even though no alert has changed."""
+        """Return True if the output must be published again even though no alert has changed."""
 
     def keep_up(
         self, standing: list[StretchAlert], is_heard: Callable[[float, float], bool]
@@ -94,7 +94,7 @@ class StretchOutput(Protocol):
 
 
 class DatexFeed:
-    """Updater that keeps a publication consistent with received alerts.
+    """Updater that keeps a DATEX II publication consistent with received alerts.
 
     Args:
         file: the publication.
@@ -135,7 +135,7 @@ class DatexFeed:
             self._has_news = True
 
     def write_if_due(self) -> None:
-        """Write the publication if alerts have changed, or if it is old.
+        """Write the DATEX II publication if alerts have changed, or if it is old.
 
         Raises:
             InputError: the file cannot be written.
@@ -152,7 +152,8 @@ class DatexFeed:
 def publish_alerts(
     connection: ZenohSettings, feed: DatexFeed, stop: threading.Event | None
 ) -> None:
-    """Write the publication once; with `stop`, keep it up to date until this event is set.
+    """Write the DATEX II publication of alerts once; with `stop`, keep it up to date until this
+    event is set.
 
     Raises:
         InputError: no router answers, or no service answers at the start. Without a service the

@@ -63,8 +63,8 @@ class Updated(NamedTuple):
 
 
 class RecordedResult(NamedTuple):
-    """Columns of `Updated` (n,) as recorded at the first fusion; a replay of the archive uses them
-    again.
+    """Outcome (columns of `Updated`, (n,)) that was recorded when observations were processed
+    first; a replay of the archive uses them again.
     """
 
     late: BoolArray
@@ -78,7 +78,7 @@ class Fusion:
 
     Args:
         lateness_s: allowed lateness L [s]; an observation older than the checkpoint (latest time -
-            L) is late, and is fused with aged evidence.
+            L) is late, and is fused with an aged likelihood.
         enrolled: True if only vehicles of an enrolment file are fused; an unknown vehicle then has
             full weight.
 
@@ -121,7 +121,9 @@ class Fusion:
 
     @property
     def live(self) -> Cells:
-        """Current state of all cells as columns; rows from `size` on are unused."""
+        """Current state of all cells (belief, counts, times) as columns; rows from `size` on are
+        unused.
+        """
         return self.store.live
 
     @property
@@ -148,8 +150,8 @@ class Fusion:
 
     @property
     def checkpoint(self) -> int | None:
-        """Time of the checkpoint [ns]: older observations are final. A later one is fused as if it
-        came from the checkpoint. None before the first observation.
+        """Time of the checkpoint [ns]: observations before it are final. One that arrives later is
+        processed as if it had been made at the checkpoint. None before the first observation.
         """
         return None if self._epoch is None else self._epoch * c.EPOCH_NS - self._lateness_ns
 
@@ -163,8 +165,8 @@ class Fusion:
     def update(self, o: Observations, before: RecordedResult | None = None) -> Updated:
         """Fuse observations in any order and return the outcome for each.
 
-        A late observation is fused at the checkpoint, with its evidence aged to that time
-        (`late.aged_evidence`).
+        A late observation is fused at the checkpoint (the time before which observations are
+        final), with its likelihood aged to that time (`late.aged_evidence`).
 
         Args:
             o: the observations.
@@ -300,7 +302,7 @@ class Fusion:
         (cell and sector), (k, SOURCES), newest first.
 
         Only vehicles count that are still trusted and reported `side` (GRIP or ICE) after `since`
-        [ns]. At most SOURCES vehicles per slot are remembered; time 0 means no vehicle.
+        [ns]. At most SOURCES vehicles per slot are stored; time 0 means no vehicle.
         """
         _, when = self.find_sources(slots, side, since)
         return -np.sort(-when, axis=1)
@@ -435,7 +437,7 @@ def _spread_votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, 
 
 
 def _drop_old_reports(reports: Reports, oldest: int) -> Reports:
-    """Return the weather reports without those that ended before `oldest` [ns]."""
+    """Return the weather reports without those whose validity ended before `oldest` [ns]."""
     return reports.take(reports.time >= oldest - 4 * 3600 * NS)
 
 

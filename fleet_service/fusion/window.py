@@ -1,14 +1,16 @@
-"""The lateness window: observations younger than the checkpoint, stored per cell in order of time.
-They change the belief in this order, whatever their order of arrival.
+"""The lateness window: the recent observations of a cell, stored in order of time. They change the
+belief in this order, whatever their order of arrival. Observations older than the checkpoint
+(latest time minus the allowed delay) are final.
 
 A slot is the storage of one cell and sector. Its live row contains the belief after all
 observations. A slot has a window while it has observations younger than the checkpoint. The window
 contains these observations and the base, which is a copy of the row before them. An observation
 that is newer than all others updates the live row. An older one makes the window stale. After each
-batch, the live rows of all stale windows are computed again from their bases. A commit moves
-observations that the checkpoint has passed into the base. When the last observation has been moved,
-the base equals the live row and the window is freed. Both rows go through the same operations in
-the same order, so that they agree bit for bit.
+batch, the live rows of all stale windows are computed again from their bases.
+
+A commit moves observations that have become older than the checkpoint into the base. When the last
+observation has been moved, the base equals the live row and the window is freed. Both rows go
+through the same operations in the same order, so that they agree bit for bit.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ from schemas.runtime.records import RecordArray
 
 
 class Arrivals(NamedTuple):
-    """A batch of observations, arrays of shape (n,): see `Observations`.
+    """A batch of n observations, arrays of shape (n,) with the fields of `Observations`.
 
     `vehicle` is the index of the vehicle in this service, `number` its permanent number, and
     `weight` the trust in it. The other fields are the same as in `EntryRecord`.
@@ -81,9 +83,9 @@ class Votes(NamedTuple):
 
 
 class Marks(NamedTuple):
-    """Marks that are made while a batch is processed: observations left out (n,), observations
-    accepted (n,), and windows (recent observations of a cell) whose belief must be computed again
-    (k,).
+    """Arrays that are filled while a batch is processed: masks of the observations left out (n,)
+    and accepted (n,), and the rows (k,) of the windows (recent observations of a cell) whose belief
+    must be computed again.
     """
 
     left_out: BoolArray
@@ -166,8 +168,8 @@ def _absorb_votes(
 
 @refcount_free_inlined
 def _fill_entry(state: State, arrivals: Arrivals, row: int) -> int:
-    """Copy an observation (row `row` of `arrivals`) into a free row of the state's entries; return
-    this row.
+    """Copy an observation (row `row` of `arrivals`) into a free row of the store's entries (recent
+    observations); return the number of this row.
     """
     state.used[FREE_ENTRIES] -= 1
     entry = int(state.free_entries[state.used[FREE_ENTRIES]])
@@ -225,8 +227,8 @@ def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, begin: int, 
 
 @refcount_free_inlined
 def _open_window(state: State, slot: int) -> int:
-    """Open a lateness window for a slot (cell and sector) without one, with a copy of the slot's
-    row; return the row of the window.
+    """Open a lateness window (list of recent observations) for a slot (cell and sector) without
+    one. Store in it a copy of the slot's belief, and return the row number of the window.
     """
     state.used[FREE_WINDOWS] -= 1
     window = int(state.free_windows[state.used[FREE_WINDOWS]])
@@ -247,8 +249,8 @@ def _open_window(state: State, slot: int) -> int:
 
 @refcount_free
 def _open_reporters(state: State, slot: int, window: int) -> None:
-    """Allocate a list of recent reporters for a slot (cell and sector) that has a window but no
-    such list yet.
+    """Allocate a list of recent reporters for a slot (cell and sector) that has a window (recent
+    observations) but no such list yet.
     """
     row = state.used[REPORTERS_USED]
     state.used[REPORTERS_USED] += 1
@@ -286,8 +288,9 @@ def commit_windows(
     due_windows: IntArray,
     before: int,
 ) -> None:
-    """Advance the checkpoint to `before` [ns] for the given windows (k,), one after the other.
-    Older observations are moved from the window into the base, the cell's final state.
+    """Advance the checkpoint, before which observations are final, to `before` [ns] for the given
+    windows (k,), one after the other. Older observations are moved from the window into the base,
+    the cell's final state.
     """
     _commit_windows(
         state, weather, peers, names, due_windows, before, np.zeros((3, SCRATCH), np.float32)
@@ -296,8 +299,8 @@ def commit_windows(
 
 @refcount_free_inlined
 def _prefetch_due(state: State, due_windows: IntArray, begin: int, end: int) -> None:
-    """Prefetch the memory that `commit_windows` will access for the windows from `begin` to `end`,
-    in the same way as `_prefetch_votes`.
+    """Prefetch the memory that `commit_windows` will access for the lateness windows (recent
+    observations of cells) from `begin` to `end`, in the same way as `_prefetch_votes`.
     """
     live = state.live
     base = state.base
@@ -366,7 +369,9 @@ def _commit_windows(
 
 @refcount_free_inlined
 def _shorten_window(state: State, slot: int, window: int, entry: int) -> None:
-    """Make `entry` the first observation of a window; free the window if `entry` is NONE."""
+    """Make `entry` the first observation of a lateness window (list of recent observations); free
+    the window if `entry` is NONE.
+    """
     windows = state.windows
     windows[window].head = entry
     if entry == NONE:

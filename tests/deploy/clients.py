@@ -92,8 +92,8 @@ def _run(words: list[str], folder: Path) -> str:
 
 @contextmanager
 def served_map(folder: Path) -> Iterator[str]:
-    """Yield the endpoint of a router to which a service is connected; both run in separate
-    processes.
+    """Yield the endpoint (address) of a router to which a service is connected; both run in
+    separate processes.
     """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     config = folder / "service.json"
@@ -137,7 +137,8 @@ def report_ice(endpoint: str, vehicle: str, place: tuple[float, float]) -> None:
 
 
 def run_client(command: list[str], language: str, endpoint: str) -> dict[str, Any]:
-    """Run a built client at its own place, and return the JSON that it prints.
+    """Run a built client at a place of its own, at which another vehicle reports ice, and return
+    the JSON that the client prints.
 
     Raises:
         RuntimeError: the client failed.

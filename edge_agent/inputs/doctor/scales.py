@@ -1,5 +1,5 @@
 """Search for quantities with a wrong unit, sign or clock: the smallest set of faults that explains
-all identities.
+all identities (quantities that are equal by physics).
 
 Every quantity may be free of faults or have one of a few faults. Each fault is a factor on the
 recorded value and costs FAULT_COST / 2 in log probability, because faulty columns are rare (Occam).
@@ -41,16 +41,18 @@ class Mistake(NamedTuple):
 
 
 class Member(NamedTuple):
-    """A quantity in an identity (equation between two sides), and the power with which its factor
-    enters the gain."""
+    """A quantity in an identity (two sides that are equal by physics), and the power, 1 or -1, with
+    which a wrong factor of this quantity changes the ratio of the sides (gain).
+    """
 
     quantity: str
     power: int
 
 
 class Law(NamedTuple):
-    """Properties of an identity (equation between two sides) on a car without faults: expected
-    gain, standard deviation of the gain's logarithm between cars, and its quantities.
+    """Properties of an identity (equation between two sides) on a car without faults: expected gain
+    (ratio of the sides), standard deviation of the gain's logarithm between cars, and its
+    quantities.
     """
 
     centre: float
@@ -99,7 +101,9 @@ CLOCK_COST: Final = 4.0  # lags have no table of faults that one could hit by ch
 
 
 def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
-    """Return the possible faults of each quantity for this vehicle, by quantity."""
+    """Return the possible faults (wrong units and signs) of each measured quantity for this
+    vehicle, by quantity.
+    """
     g = 1.0 / GRAVITY
     deg = 1.0 / DEG
     ratio = vehicle.steering_ratio or 16.0
@@ -138,7 +142,7 @@ JOINT: Final = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of the search for faults.
+    """Result of the search for faults (wrong units and signs) of measured quantities.
 
     `faults` has the fault of each quantity, None if there is none. `margins` has, for each
     quantity, the extra cost of the best explanation that gives this quantity another fault.
@@ -148,13 +152,16 @@ class Verdict:
     margins: dict[str, float]
 
     def is_settled(self, quantity: str) -> bool:
-        """Return True if every other explanation of the quantity is implausible."""
+        """Return True if the fault found for the quantity (or none) is certain: every other
+        explanation is implausible.
+        """
         return self.margins[quantity] >= SETTLED
 
 
 def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
-    """Return the smallest set of unit and sign faults that explains the fitted identities (pairs of
-    quantities that are equal by physics)."""
+    """Return the smallest set of faults (wrong units and signs) that explains the fitted identities
+    (pairs of quantities that are equal by physics).
+    """
     choices = faults_of(vehicle, found["ground"])
     known = {name: fit for name, fit in found.items() if fit.is_known}
     costs: list[tuple[float, dict[str, Mistake]]] = []

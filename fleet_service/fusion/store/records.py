@@ -86,9 +86,10 @@ class CellRecord:
 
 
 class EntryRecord:
-    """Entry of the lateness window (the observations younger than the checkpoint): one observation
-    in one cell. A commit moves an entry that has become older than the checkpoint into the final
-    state; the fields that it reads are in the first of the entry's two cache lines.
+    """Entry of the lateness window (the recent observations of a cell, in order of time): one
+    observation in one cell. A commit moves an entry that has become older than the checkpoint
+    (latest time minus the allowed delay) into the final state; the fields that it reads are in the
+    first of the entry's two cache lines.
 
     Attributes:
         previous, following: neighbouring entries of the slot's window, in order of time.
@@ -146,7 +147,8 @@ class EntryRecord:
 
 
 class WindowRecord:
-    """The lateness window (observations younger than the checkpoint) of a slot (cell and sector).
+    """The lateness window of a slot (cell and sector): its recent observations, which are not yet
+    final.
 
     Attributes:
         slot: the slot; NONE if the window is not in use.
@@ -166,8 +168,8 @@ class WindowRecord:
 
 class PairRecord:
     """Summary of the older reports of one vehicle in one slot (cell and sector), called a pair: the
-    reports that are older than the checkpoint and therefore final. A record is half a cache line
-    long, so that no record crosses the border of a line.
+    reports that are older than the checkpoint (latest time minus the allowed delay) and therefore
+    final. A record is half a cache line long, so that no record crosses the border of a line.
 
     Attributes:
         slot, vehicle: the pair; a free place of the table has slot NONE.
