@@ -28,9 +28,9 @@ def infer_step(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> floa
     """Return the logarithm of the factor on the measurement noise R [nat] for a mismatch of the
     variance of the innovations (measurement minus prediction) [1].
 
-    It is the mean of `outputs` (5,), weighted by the memberships (degrees, 0 to 1) of the mismatch
-    in triangular fuzzy sets with peaks `inputs` (5,). Each triangle ends at its neighbours' peaks,
-    so the weighted mean is linear between neighbouring peaks.
+    The result is the mean of `outputs` (5,), weighted by the memberships (degrees, 0 to 1) of the
+    mismatch in triangular fuzzy sets with peaks `inputs` (5,). Each triangle ends at its
+    neighbours' peaks, so the weighted mean is linear between neighbouring peaks.
     """
     last = inputs.shape[0] - 1
     if mismatch <= inputs[0]:

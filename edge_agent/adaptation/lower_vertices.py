@@ -78,8 +78,9 @@ class LowerVertices:
             )
 
     def triangle_sets(self) -> tuple[FloatArray, FloatArray]:
-        """Return two arrays (5, 3): the fuzzy sets of the mismatch (of the innovation variance) and
-        those of the step of ln R. The columns are left foot, peak, right foot.
+        """Return two arrays (5, 3): the fuzzy sets of the mismatch (actual over theoretical
+        innovation variance, minus 1) and those of the step of ln R (measurement noise). The columns
+        are left foot, peak, right foot.
         """
         return _triangle_sets(self.peaks, self.feet), _triangle_sets(self.out_peaks, self.out_feet)
 
@@ -111,8 +112,8 @@ class LowerVertices:
 
     @classmethod
     def from_vector(cls, vector: FloatArray) -> LowerVertices:
-        """Return the sets with the free parameters `vector` (16,). Where two neighbouring sets
-        would leave a gap between them, both sets are widened.
+        """Return the fuzzy sets with the free parameters `vector` (16,). Where two neighbouring
+        sets would leave a gap between them, both sets are widened.
         """
         shares = np.asarray(vector, float).copy()
         pairs = shares[:FEET].reshape(-1, 2)
@@ -140,8 +141,9 @@ def _triangle_sets(peaks: tuple[float, ...], feet: tuple[float, ...]) -> FloatAr
 
 
 def _membership_weights(sets: FloatArray, mismatch: float) -> FloatArray:
-    """Return the memberships (5,), degrees from 0 to 1, of a mismatch in the five fuzzy sets.
-    Beyond the outer peaks the membership in the outer set is 1.
+    """Return the memberships (5,), degrees from 0 to 1, of a mismatch (actual over theoretical
+    variance, minus 1) in five fuzzy sets. Beyond the outer peaks the membership in the outer set is
+    1.
     """
     weight = np.zeros(SETS)
     for k, (left, peak, right) in enumerate(sets):

@@ -109,9 +109,9 @@ def wide_noise(rules: RuleBase, angle: float) -> float:
 
 @compiled
 def plain_share(plain: FloatArray, demand: float, new: float) -> float:
-    """Return ln of the share of evidence from a block (0.05 s) that is used if there are no fuzzy
-    rules. `demand` is force over load of an axle [1], `new` the degree (0 to 1) to which the forces
-    are new.
+    """Return ln of the share of the evidence on friction from a block (0.05 s) that is used if
+    there are no fuzzy rules. `demand` is force over load of an axle [1], `new` the degree (0 to 1)
+    to which the forces are new.
 
     The share is (steady + (1 - steady)*new)/(1 + (half/demand)^power), with `plain` = (half, power,
     steady).

@@ -1,4 +1,5 @@
-"""Record type `Element`: how the code implements one equation, table or figure of a paper.
+"""Record type `Element`, which states how the code implements one equation, table or figure of a
+paper.
 
 The module of each paper has its own list. Documentation and reports are generated from these lists.
 """
@@ -31,8 +32,8 @@ class Element(NamedTuple):
 
 
 def elements_without_reason(elements: tuple[Element, ...]) -> list[str]:
-    """Return the `place` of each element that lacks a required reason or a required code
-    location.
+    """Return the `place` (number in the paper) of each equation, table or figure whose entry lacks
+    a required reason or a required code location.
     """
     found = []
     for element in elements:

@@ -17,8 +17,8 @@ from schemas.runtime.jit import compiled, inlined
 @inlined
 def factorize_column(a: FloatArray, j: int, least: float) -> None:
     """Compute column j of the Cholesky factor of the matrix `a` (n, n) in place; the columns before
-    it must be complete. A pivot (diagonal element before its root is taken) is raised to `least` >
-    0 if it is smaller.
+    it must be complete. A pivot (a diagonal element before its root is taken) is raised to `least`
+    > 0 if it is smaller.
 
     Only the lower half is read; entries right of the diagonal become zero.
     """

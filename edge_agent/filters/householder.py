@@ -1,5 +1,5 @@
 """Square-root prediction and update by orthogonal transformations, for use inside larger compiled
-kernels.
+functions.
 
 Legend
     x, m        state, its mean                                            (n,)
@@ -69,11 +69,11 @@ def predict(
     sqrt_cov: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Compute mean (n,) and sqrt_cov (n, n) of propagated points (points, n) with process noise
-    factor sqrt_noise (n, n).
+    """Compute mean (n,) and root of the covariance, sqrt_cov (n, n), of propagated points (points,
+    n). Process noise with the covariance root `sqrt_noise` (n, n) is added.
 
     `weights` (points,) are those of the points for the mean and for the covariance. `work` is
-    scratch, (n, points + n) or larger.
+    scratch memory, (n, points + n) or larger.
     """
     count, n = points.shape
     w_mean, w_cov = weights
@@ -111,7 +111,7 @@ def update(
     Args:
         mean: m, (n,), changed. sqrt_cov: L, (n, n), changed.
         state_deviations: X, (n, points). measurement: Z, nu and r.
-        work: (k + n, points + k) or larger.
+        work: scratch memory (k + n, points + k) or larger.
 
     Returns:
         number of rows used, log-likelihood of the innovation [nat], and nu' S^-1 nu (normalised

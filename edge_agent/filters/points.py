@@ -23,8 +23,8 @@ from schemas.runtime.jit import compiled
 def sigma_points(
     mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray
 ) -> None:
-    """Compute points[j] = mean + sqrt_cov @ xi[j]. Shapes: mean (n,), sqrt_cov (n, n), xi and
-    points (points, n).
+    """Compute the points of a sigma rule with offsets `xi`: points[j] = mean + sqrt_cov @ xi[j].
+    Shapes: mean (n,), sqrt_cov (n, n), xi and points (points, n).
     """
     count, n = xi.shape
     for p in range(count):
@@ -55,7 +55,7 @@ def axis_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: 
 
 @compiled
 def weighted_mean(points: FloatArray, w_mean: FloatArray, mean: FloatArray) -> None:
-    """Compute mean = sum of w_mean[j]*points[j].
+    """Compute the mean (n,) of points (points, n): the sum of w_mean[j]*points[j].
 
     It is computed as the first point plus weighted deviations, so that large offsets lose no
     digits.
@@ -72,9 +72,11 @@ def weighted_mean(points: FloatArray, w_mean: FloatArray, mean: FloatArray) -> N
 def centred_deviations(
     points: FloatArray, mean: FloatArray, w_cov: FloatArray, out: FloatArray, row: int
 ) -> None:
-    """Compute out[row + i, j] = sqrt(w_cov[j])*(points[j, i] - mean[i]).
+    """Write the weighted deviations of points (points, n) from their mean (n,) into `out`: out[row
+    + i, j] = sqrt(w_cov[j])*(points[j, i] - mean[i]).
 
-    These centred deviations are a factor of the covariance.
+    These deviations are a factor of the covariance: their product with their transpose is the
+    covariance.
     """
     count, n = points.shape
     for p in range(count):

@@ -63,9 +63,9 @@ def carlson_update(
 ) -> tuple[float, float]:
     """Update the filter with a `reading` of state i itself with noise `variance` > 0.
 
-    Return (squared innovation divided by a, a), where a is the innovation variance. L stays
-    triangular (Carlson 1973): its rows are rotated by 2 x 2 rotations whose cosines come from sums
-    of squares only. gain (n,) is scratch.
+    Return (squared innovation divided by a, a), where a is the variance of the innovation
+    (measurement minus prediction). L stays triangular (Carlson 1973): its rows are rotated by 2 x 2
+    rotations whose cosines come from sums of squares only. gain (n,) is scratch memory.
     """
     n = mean.shape[0]
     for k in range(n):

@@ -225,7 +225,8 @@ class Fusion:
 
     def drop(self, dropped: BoolArray) -> IntArray:
         """Delete the slots (cells and sectors) that the mask `dropped` (size,) selects; all must be
-        `untouched`. Return the new number of each slot, -1 for deleted ones.
+        `untouched` (not visited recently, and not referred to). Return the new number of each slot,
+        -1 for deleted ones.
         """
         return self.store.drop(dropped)
 

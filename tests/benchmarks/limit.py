@@ -1,5 +1,5 @@
 """Filters in C as a lower limit for the time of an estimator: kernel.c for single filters,
-kernel_simd.c for a bank. They are compiled when the benchmark runs.
+kernel_simd.c for many filters side by side. They are compiled when the benchmark runs.
 """
 
 from __future__ import annotations
@@ -154,7 +154,9 @@ class VectorLimit:
     def __init__(
         self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
     ) -> None:
-        """Create N filters in C, one per vehicle. The arguments are those of `Limit`."""
+        """Create N filters in C, one per vehicle. The arguments are those of `Limit`, for example
+        the readings (N, 11) of the first sample.
+        """
         self._library = compile_library("kernel_simd.c", *VECTORS)
         self._lanes = int(self._library.lanes())
         self._setting = setting_row(memberships)
@@ -176,9 +178,9 @@ class VectorLimit:
         return out
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
-        """Run all filters over the readings, which are `gone` seconds apart and have the layout of
-        `side_by_side`. Return the mean of each filter's state after each reading, (T, N/lanes, 6,
-        lanes).
+        """Run all filters over T successive readings, which are `gone` seconds apart and have the
+        layout of `side_by_side`. Return the mean of each filter's state after each reading, (T,
+        N/lanes, 6, lanes).
         """
         samples, blocks, _, lanes = readings.shape
         out = allocate_aligned(samples, blocks, STATES, lanes)

@@ -1,5 +1,5 @@
-"""The benchmark's filter (same f, h, Q and R) in plain NumPy and in filter libraries, for
-comparison of their speed.
+"""The benchmark's filter in plain NumPy and in filter libraries, for comparison of their speed. All
+have the same process and measurement functions f and h, and the same noise covariances Q and R.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Problem(NamedTuple):
     speed: float  # [m/s] at the first
 
     def start(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return mean (6,) and covariance (6, 6) of the initial state, process noise Q (6, 6) per
-        sample and measurement noise R (3, 3).
+        """Return mean (6,) and covariance (6, 6) of the initial state, covariance Q (6, 6) of the
+        process noise per sample, and covariance R (3, 3) of the measurement noise.
         """
         setting = Setting()
         mean = np.array([self.speed, 0.0, *self.readings[0, :3], setting.mu])
@@ -111,7 +111,9 @@ def by_stonesoup(problem: Problem) -> FloatArray:
     inputs: dict[str, FloatArray] = {}
 
     class Motion(TransitionModel):  # type: ignore[misc]
-        """Transition model of Stone Soup with the function f and the process noise Q."""
+        """Transition model of Stone Soup with the benchmark's process function f and noise
+        covariance Q.
+        """
 
         ndim_state = 6
 

@@ -1,4 +1,6 @@
-"""Process and measurement models of kernel.c in NumPy, for the filters of libraries."""
+"""Process and measurement functions f and h of the filter in C (kernel.c) in NumPy, for the filters
+of libraries.
+"""
 
 from __future__ import annotations
 

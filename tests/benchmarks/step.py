@@ -104,7 +104,9 @@ def same_filter(drive: Drive) -> float:
 
 
 def step() -> list[Figure]:
-    """Compare one filter step with C and with filter libraries, and measure the cost of a call."""
+    """Compare the time of one filter step with that of C code and of filter libraries, and measure
+    the cost of a call.
+    """
     drive = Drive()
     speed = same_filter(drive)
     t, signals, readings = drive.repeat_samples(SAMPLES, 1)

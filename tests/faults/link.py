@@ -48,8 +48,8 @@ TILE: Final = int(grid.tile_of(int(grid.cell_of(LATITUDE, LONGITUDE))))
 
 
 class Namespaces:
-    """Network namespaces of one run: the routers are in `road`, and links connect the
-    cars to it.
+    """Network namespaces of one run: the routers are in the namespace `road`, and simulated links
+    connect the cars' namespaces to it.
     """
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
@@ -79,8 +79,8 @@ class Namespaces:
     def connect_cars(
         self, name: str, terms: LinkTerms, net: str = "10.77.0"
     ) -> tuple[str, subprocess.Popen[str]]:
-        """Return the name of a new namespace of cars that is linked to the road, and the process of
-        the link.
+        """Create a network namespace for cars, linked to the namespace `road` of the routers.
+        Return its name, and the process that simulates the link.
         """
         car = self._add_namespace(name)
         device = f"{DEVICE}{net[3:5]}"
@@ -220,8 +220,8 @@ def open_namespaces(folder: Path) -> Iterator[Namespaces]:
 def change_address(
     site: Site, protocol: str, seconds: float, *, capped: bool = False
 ) -> tuple[int, int, float]:
-    """Return how many messages a car sent and lost while its address changed twice, and the longest
-    gap [s] between received messages.
+    """Return how many messages a car sent and how many were lost while its address changed twice,
+    and the longest gap [s] between received messages.
 
     A router with a rate limit (`capped`) drops a message that arrives within 10 ms of the previous
     one. Then timing jitter of a busy machine would count as loss of the link.
@@ -361,7 +361,7 @@ def measure_flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, f
 
 
 def measure(site: Site) -> list[Figure]:
-    """Run all parts of the link campaign, and return the figures."""
+    """Run all parts of the campaign on the link between car and router, and return its figures."""
     address_s = site.choose_amount(15, 6)
     lossy_s = site.choose_amount(60, 12)
     flood_s = site.choose_amount(20, 5)

@@ -93,8 +93,8 @@ def close_visit(
     """Write the evidence (32,) of the visit (passage of one map cell) that ends, and start the next
     visit from the prior.
 
-    The evidence is the log-likelihood of the visit's measurements on the friction grid, with
-    maximum 0.
+    The evidence on friction is the log-likelihood of the visit's measurements on the friction grid,
+    with maximum 0.
     """
     if not memory.started:
         clear_vector(evidence)

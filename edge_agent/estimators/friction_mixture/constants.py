@@ -1,5 +1,5 @@
 """All constants of the friction mixture with unit and reason, as a table for readers and as a
-record for the compiled kernels.
+record for the compiled functions.
 
 Values marked (vehicle) follow from typical uncertainty of a vehicle and its sensors: mass 3 %,
 inertia 5 %, stiffness 10 to 12 %, torque 3 %, and white noise and offsets of ordinary inertial
@@ -48,7 +48,8 @@ class NodeState(IntEnum):
 
 
 class Constants(NamedTuple):
-    """Constants of the filter. A comment above each one gives its unit and reason.
+    """Constants of the default estimator's filter. A comment above each one gives its unit and
+    reason.
 
     For a study, `Constants(name=value)` replaces one value.
     """

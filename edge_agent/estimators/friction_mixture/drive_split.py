@@ -63,8 +63,8 @@ def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, fl
 
 @compiled
 def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
-    """Update the probabilities of front, rear and all-wheel drive from the slip of the axles in the
-    block (the samples within 0.05 s).
+    """Update the probabilities of front, rear and all-wheel drive of a car from the slip of the
+    axles in the block (the samples within 0.05 s).
     """
     row = memory.row
     odds = memory.drive_odds

@@ -34,9 +34,9 @@ def node_table(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 class RoadChange(NamedTuple):
-    """Probabilities that the road changes: to any friction (`hazard`), from a node without
-    neighbours to any friction (`leaving`, in addition), and to a neighbouring node (`drift`,
-    approximately).
+    """Probabilities that the road changes within a step: to any friction (`hazard`), from a node
+    without neighbours to any friction (`leaving`, in addition), and to a neighbouring node
+    (`drift`, approximately).
     """
 
     hazard: float
@@ -154,8 +154,9 @@ def _segment_mass(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> f
 def visit_evidence(
     mu: FloatArray, prior: FloatArray, w: FloatArray, centres: FloatArray, out: FloatArray
 ) -> None:
-    """Compute the evidence of a visit, out = log(w/prior), at the centres (32,) of the friction
-    bins. It is interpolated between nodes (grid values of friction) and shifted to maximum 0.
+    """Compute the evidence on friction of a visit (passage of a map cell), out = log(w/prior), at
+    the centres (32,) of the friction bins. It is interpolated between nodes (grid values of
+    friction) and shifted to maximum 0.
     """
     count = mu.shape[0]
     top = -math.inf

@@ -103,7 +103,7 @@ def _clear_gain(gain: VelocityGain) -> None:
 
 @compiled
 def _filter_yaw_rate(memory: MixtureMemory, dt: float) -> None:
-    """Run one step of `dt` [s] of a scalar Kalman filter of the yaw rate.
+    """Run one step of `dt` [s] of a scalar Kalman filter of the yaw rate in `memory`.
 
     The model is a random walk. The measurement is the gyroscope or, where it is missing, the speed
     difference of the rear wheels.

@@ -53,7 +53,7 @@ class BlockSums:
 
 
 class LastInputs:
-    """Record of the latest value of each input signal that the next sample needs."""
+    """Record of the latest value of each input signal, which the next sample needs."""
 
     time: float  # of the last sample [s]
     position_time: float  # of the last position [s]
@@ -100,7 +100,7 @@ class RollingMotion:
 
 
 class WheelSlip:
-    """Record of indicators of sliding wheels that are derived from the wheel speeds alone."""
+    """Record of signs of sliding wheels that are derived from the wheel speeds alone."""
 
     held: float  # membership of the last second in "a wheel slides" [1]
     begins: float  # what this block adds to it [1]

@@ -53,7 +53,7 @@ DOUBTED = 0.05  # of distrust_noise, at the brink of it
 
 class NodeUpdate(NamedTuple):
     """Result of the measurement update of one node (friction hypothesis): its log-likelihood, the
-    number of measurement rows (scalar measurements) used, and similar values.
+    number of measurement rows (scalar measurements) used, and related numbers.
     """
 
     log_likelihood: float  # with the inflated R and the price of sliding [nat]

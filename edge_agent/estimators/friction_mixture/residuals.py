@@ -262,8 +262,8 @@ def share_by_sides(mean: float, most: float, most_other: float) -> float:
 
 @compiled
 def _slip_at_force(curve: TyreCurve, mu: float, force: float, other: float) -> float:
-    """Return the slip at which a tyre of friction `mu` has the force over load `force` [1] in one
-    direction, while its force over load at right angles is `other` [1].
+    """Return the slip [1] at which a tyre of friction `mu` has the force over load `force` [1] in
+    one direction, while its force over load at right angles is `other` [1].
 
     The slip is expressed as linear force over load [1]; it is infinite at or beyond the peak.
     """
@@ -282,7 +282,7 @@ def find_residuals(
     node: NodeWorkspace,
     out: FloatArray,
 ) -> None:
-    """Compute out (6,): for each measurement row (four wheels, two axles), the distance e of the
+    """Compute out (6,): for each measurement row (four wheels, two axles), the distance [1] of the
     measured slip and force from the tyre curve; NaN if a reading is missing.
     """
     slip = node.slip

@@ -45,7 +45,9 @@ FARTHEST_FOLLOWED = 0.8  # a_y over g to which the rear axle is then taken to fo
 
 @compiled
 def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
-    """Update memory.rolling with the wheel speeds of the block (the samples within 0.05 s)."""
+    """Update memory.rolling, the motion according to rolling wheels, with the wheel speeds of the
+    block (the samples within 0.05 s).
+    """
     rolling = memory.rolling
     row = memory.row
     time = memory.last.time
@@ -186,7 +188,7 @@ def _take_velocity(
     """Update node j (friction hypothesis) with a measured velocity along `direction` (x, y).
     `reading` is (innovation [m/s], variance, threshold of the Huber function that limits outliers).
 
-    Return half of its normalised squared innovation [nat].
+    Return half of the squared innovation (measurement minus prediction) over its variance [nat].
     """
     root = scratch.root[j]
     row = scratch.velocity_row

@@ -1,5 +1,5 @@
 """Processing of one sample of one vehicle: add the sample to the sums of the block (the samples
-within 0.05 s) and, at the end of the block, run one step of the mixture.
+within 0.05 s) and, at the end of the block, run one step of the friction mixture (all hypotheses).
 
 Order at the end of a block: road change and mixing; measurement update of every node at the state
 of the block's beginning; update of the node weights with evidence that counts more at larger tyre
@@ -68,8 +68,8 @@ def step(
 
 @compiled
 def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Process the block (the samples within 0.05 s) that ends: run one step of the mixture with its
-    sums. The next block begins at the time of the last sample.
+    """Process the block (the samples within 0.05 s) that ends: run one step of the friction mixture
+    (all hypotheses) with its sums. The next block begins at the time of the last sample.
     """
     features = scratch.features
     features.duration = memory.last.time - memory.block.time

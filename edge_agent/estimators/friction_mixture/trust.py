@@ -54,9 +54,10 @@ def update_consistency(
     memory: MixtureMemory, design: MixtureDesign, duration: float, ratio: float, health: int
 ) -> None:
     """Update memory.trust (strain, and evidence against the model) with the states, the innovations
-    and the health flags of the block (0.05 s).
+    (measurement minus prediction) and the health flags of the block (0.05 s).
 
-    `ratio` is the sum of the axles' squared innovations of the block over their stated variance.
+    `ratio` is the sum of the squared innovations of the axles in the block over their stated
+    variance.
     """
     if not design.adaptive:
         return
@@ -97,8 +98,9 @@ def update_consistency(
 
 @compiled
 def unexplained_ratio(memory: MixtureMemory, design: MixtureDesign, ratio: float) -> float:
-    """Return the part of `ratio` (squared innovations of the axles over their variance) that counts
-    as a contradiction of the model, because neither a slide nor slippery road explains it.
+    """Return the part of `ratio` (squared innovations, that is, measurement minus prediction, of
+    the axles over their variance) that counts as a contradiction of the model, because neither a
+    slide nor slippery road explains it.
 
     While a wheel slides, or the road is estimated to be slippery, the axles' forces differ from the
     model for a while. Tight turns at walking pace are outside the model's range.
@@ -171,8 +173,8 @@ def used_evidence_share(trust: Trust, constants: Constants) -> float:
 
 @compiled
 def axles_ratio(ratio: float) -> float:
-    """Return the log-likelihood ratio [nat] of two hypotheses about the axles' innovations: their
-    variance is FACTOR times the stated one, against the stated one. `ratio` is the sum of their
-    squares over the stated variance.
+    """Return the log-likelihood ratio [nat] of two hypotheses about the innovations (measurement
+    minus prediction) of the axles: their variance is FACTOR times the stated one, against the
+    stated one. `ratio` is the sum of their squares over the stated variance.
     """
     return (1.0 - 1.0 / FACTOR) * ratio - math.log(FACTOR)

@@ -67,7 +67,7 @@ def check_curve(curve: Curve) -> Curve:
 
 
 def curve_tables(curve: Curve) -> TyreCurve:
-    """Return the tables of a tyre curve, including the spread of shapes between tyres."""
+    """Return the tables of a tyre curve, including the difference of shape between tyres."""
     u = np.linspace(0.0, 1.0, CELLS + 1)
     theta = u / np.maximum(1.0 - u, 1e-9)
     f = curve(theta)

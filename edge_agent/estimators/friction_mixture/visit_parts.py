@@ -39,7 +39,8 @@ KNOWING = 0.7
 @compiled
 def begin_part(memory: MixtureMemory, design: MixtureDesign) -> None:
     """Begin a new part of the visit (the stretch of the map cell on one surface), without evidence
-    so far."""
+    on friction so far.
+    """
     copy_vector(memory.surest, design.prior)
     memory.information = 0.0
 

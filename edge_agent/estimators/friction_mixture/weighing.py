@@ -54,8 +54,8 @@ def apply_measurement(memory: MixtureMemory, design: MixtureDesign, scratch: Scr
 
 @compiled
 def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Update every active node (filter of one friction hypothesis); store the NIS (normalised
-    squared innovation) and the predictive log-likelihood of the mixture.
+    """Update every active node (filter of one friction hypothesis); store the NIS (squared
+    innovation over its variance) and the predictive log-likelihood of the mixture.
     """
     inflation = max(design.constants.correlation_time / scratch.features.duration, 1.0)
     count = active_nodes(memory)
@@ -198,7 +198,7 @@ def saturation(slip: float, mu: float) -> float:
 
 @compiled
 def advance_usual(usual: FloatArray, i: int, now: float, keep: float) -> float:
-    """Return the absolute difference between the value `now` and its usual value usual[i], and move
+    """Return the absolute difference between a value `now` and its usual value usual[i], and move
     usual[i] towards `now`: it keeps the share `keep`. Return 0 if `now` is NaN.
     """
     if math.isnan(now):
@@ -225,8 +225,9 @@ def axle_slip(row: FloatArray, features: BlockFeatures, vx: float, vy: float, ax
 
 @compiled
 def adapt_noise(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Update the actual and expected variance of the innovations, averaged over the last blocks (of
-    0.05 s). Compute from them the factors on the measurement noise R for the next block.
+    """Update the actual and expected variance of the innovations (measurement minus prediction),
+    averaged over the last blocks (of 0.05 s). Compute from them the factors on the measurement
+    noise R for the next block.
     """
     keep = math.exp(-scratch.features.duration / design.constants.window)
     for group in range(2):

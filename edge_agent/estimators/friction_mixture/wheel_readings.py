@@ -25,8 +25,8 @@ STEP_PACE = 0.1  # share of a new step in the mean
 
 @compiled
 def refuse_jumps(row: FloatArray, now: FloatArray) -> int:
-    """Set wheel speeds in the readings (15,) to NaN where they are far above the other wheels;
-    return the health flags.
+    """Set wheel speeds in the readings `now` (15,) to NaN where they are far above the other
+    wheels; return the health flags.
     """
     slowest = second = math.inf
     for wheel in range(4):

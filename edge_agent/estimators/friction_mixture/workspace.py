@@ -22,9 +22,9 @@ from schemas.numeric import FloatArray
 class BlockFeatures:
     """Inputs of the measurement equations for one block (the samples within 0.05 s).
 
-    The mean velocity of the block is rotation(cos, sin)*v + gains, with v at the block's beginning.
-    The order of wheels is fl, fr, rl, rr, and of axles front, rear. The order of measurement rows
-    is the four wheels (longitudinal), then the two axles (lateral).
+    The mean velocity of the block is rotation(cos, sin)*v + gains, where v is the velocity at the
+    block's beginning. The order of wheels is fl, fr, rl, rr, and of axles front, rear. The order of
+    measurement rows is the four wheels (longitudinal), then the two axles (lateral).
     """
 
     duration: float  # [s]

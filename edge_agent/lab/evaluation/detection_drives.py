@@ -1,8 +1,8 @@
 """Drives through random towns for the detection evaluation: true values, estimates, visits
-(passages of a map cell) with their evidence, and the slip flag (ordinary ABS logic).
+(passages of a map cell) with their likelihoods, and the slip flag (ordinary ABS logic).
 
 The cars are those of `SimulatedFleet`; the agent's own pipeline (`observe`) computes visits and
-evidence. A drive is computed in chunks, so that fifteen minutes of sixteen cars fit in memory.
+likelihoods. A drive is computed in chunks, so that fifteen minutes of sixteen cars fit in memory.
 """
 
 from __future__ import annotations
@@ -161,8 +161,8 @@ def stood_where_it_appeared(
 def _estimate_chunk(
     bank: EstimatorBank, t: FloatArray, signals: FloatArray, closes: BoolArray
 ) -> tuple[Estimates, FloatArray]:
-    """Return three items for one chunk of a drive: the estimates, their evidence on friction, and
-    an array (T, N) of how much [nat] the belief favours a slippery road.
+    """Return three items for one chunk of a drive: the estimates, their likelihoods of friction,
+    and an array (T, N) of how much [nat] the belief favours a slippery road.
     """
     if bank.beliefs() is None:
         return bank.advance(t, signals, closes), np.full(t.shape, np.nan)
@@ -182,8 +182,9 @@ def _estimate_chunk(
 
 
 def slippery_favoured(log_likelihood: FloatArray) -> FloatArray:
-    """Return max ln L(μ < SLIPPERY_MU) - max ln L(μ >= SLIPPERY_MU) for log-likelihoods (…, 32) on
-    the friction grid."""
+    """Return how much a slippery road is favoured [nat]: the largest log-likelihood below
+    SLIPPERY_MU minus the largest above it, for log-likelihoods (…, 32) on the friction grid.
+    """
     low = mugrid.CENTRES < SLIPPERY_MU
     return np.asarray(
         log_likelihood[..., low].max(axis=-1) - log_likelihood[..., ~low].max(axis=-1)

@@ -239,7 +239,8 @@ class Store:
 
     def drop(self, gone: BoolArray) -> IntArray:
         """Delete the slots (cells and sectors) that the mask `gone` (size,) selects; all must be
-        `untouched`. Return the new number of each slot, NONE for deleted ones.
+        `untouched` (not visited recently, and not referred to). Return the new number of each slot,
+        NONE for deleted ones.
         """
         stay = np.flatnonzero(~gone)
         place = np.full(self.size, NONE, np.int64)

@@ -22,7 +22,9 @@ BankMaker: TypeAlias = Callable[[Sequence[Vehicle]], EstimatorBank]
 
 
 def means(batch: DriveSet, reported: Estimates) -> Values:
-    """Return all measures of an estimator's results by name, averaged over the drives."""
+    """Return all measures (such as errors) of an estimator's results by name, averaged over the
+    drives.
+    """
     return {name: float(np.mean(value)) for name, value in measures(batch, reported).items()}
 
 
@@ -35,8 +37,8 @@ def without_noise(spec: DriveSpec, make: BankMaker) -> tuple[DriveSet, Estimates
 
 
 def with_sensors(name: str, estimator: str, seeds: Sequence[int]) -> tuple[Values, Values]:
-    """Return the measures of the paper's estimator and those of the default estimator, on drives
-    with ordinary sensors.
+    """Return the measures (such as errors) of the paper's estimator and of the default estimator,
+    on drives with ordinary sensors.
     """
     batch = realistic(PAPERS[name], seeds)
     found = [

@@ -1,8 +1,8 @@
 """The papers' conditions: vehicle models with the papers' tyres and without drag, and their drives.
 
-A "matched" vehicle is a simulated vehicle ("plant") that has exactly the equations of the paper's
-filter. Only drives at constant speed have drag and rolling resistance, which the filter knows. They
-need them because without a longitudinal force the tyres give no information on friction.
+A "matched" vehicle is a simulated vehicle ("plant") that has exactly the equations of the filter in
+the paper. Only drives at constant speed have drag and rolling resistance, which the filter knows.
+They need them because without a longitudinal force the tyres give no information on friction.
 """
 
 from __future__ import annotations

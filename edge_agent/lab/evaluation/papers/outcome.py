@@ -123,7 +123,7 @@ class PaperTable:
 
 @dataclass
 class Reproduction:
-    """All results of the reproduction of one paper."""
+    """All results of the reproduction of one paper: tables, plots, and further figures."""
 
     paper: str
     title: str

@@ -55,8 +55,8 @@ def limit_text(row: PaperRow) -> str:
 
 
 def summary(done: Reproduction) -> str:
-    """Return one sentence that states how many numbers under the paper's conditions meet their
-    target.
+    """Return one sentence of the report that states how many numbers under the paper's conditions
+    meet their target.
     """
     barred = [row for row in done.rows if row.limit is not None]
     text = f"{len(barred) - len(done.missed_rows)} of {len(barred)} matched numbers meet their bar."

@@ -34,8 +34,8 @@ NEAR: Final = 0.1
 
 
 def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
-    """Return two durations [s] until the estimated mean friction (T,) is within NEAR of the true
-    value: one from the start, and one from the change of friction.
+    """Return two durations [s] until the estimated mean friction `mu` (T,) is within NEAR of the
+    true value: one from the start, and one from the change of friction.
     """
     t = batch.t[:, 0]
     truth = batch.mu[:, 0]

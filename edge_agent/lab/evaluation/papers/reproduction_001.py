@@ -48,13 +48,15 @@ QUADRATIC: Final = 0.15  # e of the stiffness polynomial (14), as degressive as 
 
 @dataclass(frozen=True)
 class MotionRun:
-    """One drive with error-free sensors, and the estimates of the improved filter and of FKF."""
+    """One drive with error-free sensors, and the estimates of the paper's improved filter and of
+    FKF, the filter for comparison.
+    """
 
     batch: DriveSet
     reported: dict[str, Estimates]
 
     def values(self, name: str) -> Values:
-        """Return the measures of the estimates by the filter called `name`."""
+        """Return the measures (such as errors) of the estimates by the filter called `name`."""
         return means(self.batch, self.reported[name])
 
 

@@ -83,7 +83,9 @@ REAL_KEYS: Final = {"v_x": "rmse_vx", "v_y": "rmse_vy", "β": "rmse_beta"}
 
 @dataclass(frozen=True)
 class ForceRun:
-    """One drive: true values and the results of both filters by quantity, (T,) each."""
+    """One drive of paper 002: true values, and the results of its two filters, by quantity, (T,)
+    each.
+    """
 
     batch: DriveSet
     truth: dict[str, FloatArray]
@@ -114,8 +116,8 @@ class ForceRun:
 
 
 def run_drive(spec: DriveSpec, tyre: TyreOption | None) -> ForceRun:
-    """Simulate a drive with error-free sensors; store the states of WCKF-A and the compensated
-    forces after every sample.
+    """Simulate a drive with error-free sensors; store, after every sample, the states of the wheel
+    filter WCKF-A and the compensated tyre forces.
     """
     batch = ideal(spec)
     bank = compensated_wckf.make_bank(batch.vehicles, float(batch.mu[0, 0]), tyre)

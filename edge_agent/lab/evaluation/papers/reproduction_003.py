@@ -45,8 +45,8 @@ WHEEL_SPEED_NOISE: Final = 0.003  # [rad/s]
 
 @dataclass(frozen=True)
 class FrictionCase:
-    """One experiment: the printed errors of SR-UKF and UKF, and the printed time until convergence
-    [s].
+    """One experiment of paper 003: the printed errors of its filters SR-UKF and UKF, and the
+    printed time until convergence [s].
     """
 
     name: str
@@ -84,7 +84,7 @@ FILTERS: Final[dict[str, UnscentedSetting]] = {
 
 @dataclass(frozen=True)
 class CaseRuns:
-    """The drive of one experiment, and the results of each filter."""
+    """The drive of one experiment of paper 003, and the results of each filter."""
 
     batch: DriveSet
     runs: dict[str, FrictionRun]
@@ -333,8 +333,8 @@ def _scale_radius(signals: FloatArray) -> FloatArray:
 
 
 def friction_plot(case: FrictionCase, runs: CaseRuns) -> PaperPlot:
-    """Return a plot of the friction of the four wheels, estimated by SR-UKF and by UKF in single
-    precision.
+    """Return a plot of the friction of the four wheels, estimated by the filters SR-UKF and UKF in
+    single precision.
     """
     t = runs.batch.t[:, 0]
     panels = []

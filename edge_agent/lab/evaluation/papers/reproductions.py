@@ -35,7 +35,7 @@ def write_paper(
     paper: str, seeds: Sequence[int], folder: Path, *, plots: bool = True
 ) -> Reproduction:
     """Reproduce the results of a paper; write figures.json, report.md, and index.html with its
-    plots, and return the reproduction.
+    plots; return the results.
     """
     began = time.monotonic()
     done = REPRODUCTIONS[paper](seeds)
