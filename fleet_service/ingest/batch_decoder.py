@@ -89,7 +89,7 @@ def _reencode_message(kind: Kind, payload: bytes, encoding: str) -> bytes:
 
 
 class _Fields(NamedTuple):
-    """Positions of the fields of k protobuf messages in their bytes."""
+    """Positions of the fields of k protobuf messages (batches of records) in their bytes."""
 
     kind: Kind
     data: NDArray[np.uint8]
@@ -110,7 +110,7 @@ class _Fields(NamedTuple):
         )
 
     def heads(self) -> Heads:
-        """Return the heads (fields other than records) of the messages. A missing field
+        """Return the heads (fields other than records) of all k messages. A missing field
         `first_held` is replaced with 1, the lowest sequence number.
         """
         data = self.data.tobytes()

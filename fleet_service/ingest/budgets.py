@@ -30,8 +30,8 @@ WEEK_HOURS: Final = 168.0
 
 
 class Bucket:
-    """Token buckets, one per vehicle: an amount that may be used at once, and an amount per hour
-    that is refilled.
+    """Token buckets, one per vehicle. A vehicle may use the amount in its bucket at once; the
+    bucket is refilled at a constant rate per hour.
     """
 
     def __init__(self, at_once: float, per_hour: float) -> None:
@@ -62,9 +62,9 @@ class NewCells:
         self._week = Bucket(NEW_CELLS_PER_WEEK, NEW_CELLS_PER_WEEK / WEEK_HOURS)
 
     def beyond(self, vehicle: IntArray, cell: IntArray, now: float) -> BoolArray:
-        """Return a mask of rows (n,): True if the row is beyond its vehicle's limit on new cells.
-        All given rows must be in cells without earlier visits. Rows within the limit use it up.
-        `now` is the time [s].
+        """Return a mask of the rows (n,) of reports: True if the row is beyond its vehicle's limit
+        on new cells. All given rows must be in cells without earlier visits. Rows within the limit
+        reduce what remains of it. `now` is the time [s].
         """
         out = np.zeros(len(vehicle), bool)
         order = np.lexsort((cell, vehicle))

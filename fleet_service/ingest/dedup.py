@@ -36,8 +36,7 @@ class SequenceTracker:
         key: name of the stream.
         vehicle: enrolled name of the sender; empty until it sends.
         boot: identifier of the vehicle's start, as sent; 0 until it sends.
-        witness: number that identifies the vehicle in the map permanently; 0 until the vehicle
-            sends.
+        witness: permanent number that identifies the vehicle in the map; 0 until the vehicle sends.
         low: watermark: every sequence number up to here is accepted, or will never arrive.
         seen: accepted sequence numbers above the watermark.
         newest: newest time of an accepted record [ns]; it decides when the stream is dropped.

@@ -15,9 +15,9 @@ Int32Array = NDArray[np.int32]
 
 @compiled
 def group_rows(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntArray]:
-    """Return the number of the group of each row, (n,), and the index of the first row of each
-    group, (k,). A group is the set of rows with the same (a, b, c); groups are numbered in order of
-    first appearance.
+    """Group n rows by three numbers a, b, c (n,) each. Return the number of the group of each row,
+    (n,), and the index of the first row of each group, (k,). A group is the set of rows with the
+    same (a, b, c); groups are numbered in order of first appearance.
     """
     places = 2 * len(a) + 1
     table = np.full(places, -1, np.int32)

@@ -88,8 +88,8 @@ class Inbox:
         self._guard = Lock()
 
     def callback(self, kind: Kind) -> Callable[[zenoh.Sample], None]:
-        """Return the callback for a Zenoh subscriber that receives batches of one kind
-        (observations or states).
+        """Return the function to be called for each message, for a Zenoh subscriber that receives
+        batches of one kind (observations or states).
         """
 
         def take(sample: zenoh.Sample) -> None:
@@ -113,13 +113,13 @@ class Inbox:
         self._queue.put(message)
 
     def wake(self) -> None:
-        """Let a waiting `drain` return at once."""
+        """Let a thread that waits in `drain` for messages continue at once."""
         self._queue.put(None)
 
     def drain(self, wait_s: float) -> list[Message]:
-        """Return the waiting messages, at most as many as one processing step handles. Wait up to
-        `wait_s` [s] for the first message, then a few milliseconds for more. A call of
-        `wake` ends the wait.
+        """Return the messages in the queue, at most as many as one processing step handles. Wait up
+        to `wait_s` [s] for the first message, then a few milliseconds for more. A call of `wake`
+        ends the wait.
         """
         out: list[Message] = []
         size = 0
@@ -215,7 +215,7 @@ class BatchIntake:
         self._witnesses.sync()
 
     def acknowledge(self, batches: Sequence[BatchId]) -> None:
-        """Acknowledge batches whose rows are on disk."""
+        """Record acknowledgements for batches whose rows are durable on disk."""
         self._pending.difference_update(batches)
         self._acks.record_durable(batches)
 
@@ -275,8 +275,8 @@ class BatchIntake:
                 del known[name]
 
     def _is_erased(self, owners: Sequence[Parsed], time: IntArray) -> BoolArray:
-        """Return a mask of batches (n,): True if the batch's time is in a span that was erased for
-        all vehicles, or for this vehicle.
+        """Return a mask of batches (n,): True if the batch's time is in a time range whose data
+        were erased for all vehicles, or for this vehicle.
         """
         out = erasures.in_spans(self._erased.months, time)
         if self._erased.vehicles:

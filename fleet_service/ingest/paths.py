@@ -1,5 +1,5 @@
-"""Plausibility of each vehicle's path: check that the vehicle can have been at all the places that
-it reports. Pure.
+"""Check of each vehicle's path for plausibility: the vehicle must be able to have been at all the
+places that it reports. Pure.
 
 A vehicle's path is a list of at most ANCHORS "anchors" (time and place), over all its batches,
 starts and regions. A report is plausible if the vehicle could drive from the previous anchor to it,

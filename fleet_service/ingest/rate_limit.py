@@ -24,7 +24,7 @@ _OTHERS: Final = ""
 
 
 class RateLimiter:
-    """Token buckets of one service, one per vehicle.
+    """Token buckets (allowances that refill at a constant rate) of one service, one per vehicle.
 
     Args:
         rate: long-term rate of a vehicle [bytes/s].
@@ -76,8 +76,8 @@ class RateLimiter:
         return len(self._buckets)
 
     def _forget(self, now: float) -> bool:
-        """Drop the token buckets that are full (vehicles that have not sent recently), at most once
-        per refill time. Return True if there is room for another bucket.
+        """Drop the token buckets (allowances) that are full (vehicles that have not sent recently),
+        at most once per refill time. Return True if there is room for another bucket.
         """
         rate = self._rate
         burst = self._burst

@@ -61,8 +61,8 @@ RANGES: Final = {
 
 
 class Clock(NamedTuple):
-    """Time of the service's clock, and how far the time of a record may be before or after it, all
-    in ns.
+    """Time according to the service, and how far the time of a record may be before or after it,
+    all in ns.
     """
 
     now: int
@@ -100,7 +100,7 @@ def check_heads(
         owners: vehicle and region from each batch's key, (k,).
         heads: heads of the batches.
         time: time of each batch's first record [ns], (k,).
-        clock: service time and bounds.
+        clock: time of the service, and how far a record's time may differ from it.
 
     Returns:
         index of the first broken rule of each batch, (k,), -1 for a valid batch; and the rules to
@@ -179,13 +179,13 @@ def owner_of(key: str) -> keys.Parsed | None:
 def check_rows(
     kind: Kind, columns: Columns, region: IntArray, clock: Clock
 ) -> tuple[IntArray, tuple[Refusal, ...]]:
-    """Return the first broken rule of every row.
+    """Check every row (record) of the batches, and return the first rule that it breaks.
 
     Args:
         kind: kind of the batches.
         columns: columns of `wire.Batch`, (n,).
         region: region of each row's batch, (n,).
-        clock: service time and bounds.
+        clock: time of the service, and how far a record's time may differ from it.
 
     Returns:
         index of the first broken rule of each row, (n,), -1 for a valid row; and the rules to which

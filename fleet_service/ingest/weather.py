@@ -1,5 +1,5 @@
-"""Input of road weather from Zenoh and from a Parquet file. Reports are checked and archived, and
-then used by the map.
+"""Input of road weather from Zenoh and from a Parquet file. Weather reports are checked and
+archived, and then used by the map.
 
     weather/NAME-TIME.parquet     reports as received, with the time from which the map used them
 
@@ -80,7 +80,9 @@ class WeatherInbox:
             self._waiting.append(message)
 
     def take(self, now: int) -> Reports | None:
-        """Archive the received reports; return them for the map, or None if there are none."""
+        """Archive the received weather reports; return them for the map, or None if there are
+        none.
+        """
         found: list[tuple[int, Report]] = []
         while self._waiting:
             message = self._waiting.popleft()
@@ -187,7 +189,9 @@ def archived_reports(
 
 
 def weather_files(root: Path) -> list[Path]:
-    """Return the weather files in order of receipt."""
+    """Return the paths of the archive's weather files in the order in which their reports were
+    received.
+    """
     return sorted((root / FOLDER).glob("*.parquet"), key=lambda path: path.stem[-_DIGITS:])
 
 
@@ -220,8 +224,8 @@ def join_daily_files(root: Path, damaged: Damaged = skip_damaged) -> int:
 
 
 def retire_files(root: Path, until_day: int) -> int:
-    """Remove files whose reports took effect only up to the day `until_day` (days since 1970);
-    return the number of removed files.
+    """Remove weather files whose reports took effect only up to the day `until_day` (days since
+    1970); return the number of removed files.
     """
     removed = 0
     for path in weather_files(root):
@@ -241,7 +245,7 @@ def _written_day(path: Path) -> int:
 
 
 def read_file(path: Path) -> list[tuple[int, Report]]:
-    """Return region and report of every row of a Parquet file.
+    """Return region and weather report of every row of a Parquet file.
 
     The file has the columns `region` (quadint, a number, of zoom 10; or quadkey of 10 digits),
     `time` (timestamp, or ns), and any of the weather columns. Null or NaN means unknown.

@@ -106,7 +106,7 @@ class Errors:
 
 
 class Passes(NamedTuple):
-    """Properties of visits (n,).
+    """Properties of n visits (passages of cells), arrays (n,).
 
     Attributes:
         vehicle: number of the vehicle.
@@ -129,8 +129,9 @@ class Passes(NamedTuple):
 
 @dataclass(frozen=True)
 class SimulatedReports:
-    """Reports of visits: reading z and its standard deviation σ (n,), both NaN if too little grip
-    was used to measure the friction; grip used (n,); manoeuvre (n,); log-likelihood (n, 32).
+    """Reports about n visits (passages of cells): reading z of the friction and its standard
+    deviation σ (n,), both NaN if too little grip was used to measure the friction; grip used (n,);
+    manoeuvre (n,); log-likelihood (n, 32).
     """
 
     reading: FloatArray
@@ -141,18 +142,18 @@ class SimulatedReports:
 
 
 def used_shares(rng: Generator, excited: BoolArray, model: ErrorModel = CLEAN) -> FloatArray:
-    """Return the share s of the grip used in each visit, (n,). In an excited visit (one that
-    measures the friction) it is drawn from `model.share`, else from .05 to .5, which is ordinary
-    driving.
+    """Return the share of the grip used in each visit (passage of a cell), (n,). In an excited
+    visit (one that measures the friction) it is drawn from `model.share`, else from .05 to .5,
+    which is ordinary driving.
     """
     ordinary = rng.uniform(0.05, min(0.5, model.share[1]), excited.shape)
     return np.where(excited, rng.uniform(*model.share, excited.shape), ordinary)
 
 
 def reading_noise(rng: Generator, along: IntArray, tails: float = np.inf) -> FloatArray:
-    """Return the correlated noise e of successive visits, (n,), with standard deviation 1. `along`
-    (n,) counts the visits of a drive from 0. If `tails` is finite, the noise follows Student's t
-    with this number of degrees of freedom.
+    """Return the correlated noise of the readings in successive visits (passages of cells), (n,),
+    with standard deviation 1. `along` (n,) counts the visits of a drive from 0. If `tails` is
+    finite, the noise follows Student's t with this number of degrees of freedom.
     """
     e = rng.normal(size=len(along))
     heavy = 1.0 if np.isinf(tails) else np.sqrt((tails - 2.0) / rng.chisquare(tails, len(along)))
@@ -163,7 +164,9 @@ def reading_noise(rng: Generator, along: IntArray, tails: float = np.inf) -> Flo
 
 
 def draw_reports(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
-    """Draw the reports that simulated vehicles send about visits (n,)."""
+    """Draw at random the reports that simulated vehicles with their own `errors` send about the
+    visits `p` (passages of cells), (n,).
+    """
     model = errors.model
     who = p.vehicle
     relative = NOISE_AT_LIMIT + NOISE_PER_SHARE * (1.0 - p.share)
@@ -191,8 +194,8 @@ def draw_reports(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
 def reading_likelihood(
     reading: FloatArray, relative: FloatArray, absolute: float = NOISE_ABSOLUTE
 ) -> FloatArray:
-    """Return ln p(z | μ) on the friction grid, (n, 32), up to a constant, for vehicles' readings z
-    (n,) of the friction μ with relative noise (n,).
+    """Return the log-likelihood of the friction μ on the friction grid, (n, 32), up to a constant,
+    for vehicles' readings of it (n,) with `relative` noise (n,) and `absolute` noise.
     """
     std = np.hypot(absolute, relative[:, None] * mugrid.CENTRES)
     return -0.5 * np.square((reading[:, None] - mugrid.CENTRES) / std) - np.log(std)

@@ -49,7 +49,9 @@ ENOUGH = 5
 
 @dataclass(frozen=True)
 class AttackedDrive:
-    """Simulated drive of the honest fleet, to which the attacks of this module are added."""
+    """Simulated drive of the honest fleet through a town, to which the attacks of this module are
+    added.
+    """
 
     town: Town
     visits: Visits
@@ -79,7 +81,9 @@ def measure(seeds: range) -> dict[str, float]:
 
 
 def count_differing(drive: AttackedDrive, alone: list[BoolArray], attacked: list[BoolArray]) -> int:
-    """Return the number of cells in which the attack raised or suppressed an alert."""
+    """Return the number of cells in which the attack raised or suppressed an alert, compared with
+    the drive without it (`alone`).
+    """
     raised = np.zeros(CELLS, bool)
     suppressed = np.zeros(CELLS, bool)
     for minute in range(BEGIN, MINUTES):
@@ -154,9 +158,9 @@ def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
 
 
 def add_newcomers(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return the visits of the drive and of the attackers: forty additional vehicle names that each
-    pass once and agree with each other. The attackers report ice on the road of the driest cell,
-    and a dry road at the iciest.
+    """Return the visits (passages of cells) of a drive and of the attackers: forty additional
+    vehicle names that each pass once and agree with each other. The attackers report ice on the
+    road of the driest cell, and a dry road at the iciest.
     """
     roads = victim_cells(drive) // LENGTH * LENGTH
     who, which, along = (

@@ -14,8 +14,8 @@ Side = Literal["less", "more", "within"]
 
 
 class MapBar(NamedTuple):
-    """Target (limit) for a figure of the evaluation; if `bar` (the limit) is None, the figure is
-    listed but not judged.
+    """Target (limit) for a figure of the map's evaluation; if `bar` (the limit) is None, the figure
+    is listed but not judged.
     """
 
     bar: float | tuple[float, float] | None

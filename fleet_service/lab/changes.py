@@ -29,7 +29,9 @@ UNREACHED: Final = 99  # passes, where the drive ended before the map had seen i
 
 
 def changing_town(rng: Generator, before: float, after: float) -> Town:
-    """Return a town whose first road changes its friction from `before` to `after`."""
+    """Return a town whose first road changes its friction from `before` to `after`, drawn at
+    random.
+    """
     drawn = town.draw_town(rng, MINUTES, 0.0)
     mu = drawn.mu.copy()
     excitement = drawn.excitement.copy()

@@ -107,8 +107,8 @@ def novel_deliveries(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -
 
 @dataclass
 class AlertWatch:
-    """Fusion of a simulated drive, and its alerts; both are read and stored at some minutes of the
-    drive.
+    """Map made from a simulated drive, and its alerts; both are read and stored at some minutes of
+    the drive.
 
     Attributes:
         beliefs: beliefs about the cells by minute, (cells, 32).
@@ -135,8 +135,8 @@ class AlertWatch:
 
 
 def split_minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Observations]:
-    """Yield the observations that arrive in each of `count` minutes; `at` contains the arrival
-    times [s].
+    """Yield those of the observations `o` that arrive in each of `count` minutes; `at` contains the
+    arrival times [s].
     """
     for rows in np.split(np.arange(len(at)), np.searchsorted(at, 60.0 * np.arange(1, count + 1)))[
         :count

@@ -179,7 +179,7 @@ def mean_or_nan(values: np.ndarray[Any, Any]) -> float:
 
 
 def read_observations(path: Path) -> dict[str, Any]:
-    """Read columns of observations in the form in which the archive returns them."""
+    """Read the columns of a file of observations, in the form in which the archive returns them."""
     table = pq.read_table(path)
     out = {}
     for name, dtype in wire.column_types(wire.Kind.OBSERVATION).items():

@@ -41,8 +41,8 @@ def largest_difference(a: Fusion, b: Fusion) -> float:
 
 
 def drive_town(rng: Generator) -> Visits:
-    """Simulate twenty minutes in a town in which some vehicles report false values, so that
-    vehicles get different weights.
+    """Simulate the reports of twenty minutes in a town in which some vehicles report false values,
+    so that vehicles get different weights.
     """
     visits = town.drive_fleet(
         rng, town.draw_town(rng, MINUTES, 0.3), Errors.draw(rng, VEHICLES), MINUTES
@@ -68,8 +68,8 @@ def order_difference(rng: Generator) -> float:
 
 
 def replay_difference(rng: Generator) -> float:
-    """Return the largest difference of a probability between two services: one received messages,
-    some late or twice, and the other was restarted from its archive.
+    """Return the largest difference of a probability of a belief between two services: one received
+    messages, some late or twice, and the other was restarted from its archive.
     """
     visits = drive_town(rng)
     sent = make_messages(visits)

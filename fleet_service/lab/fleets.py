@@ -38,8 +38,8 @@ EARLIER = 20
 
 
 class Fleet(NamedTuple):
-    """One simulation of `minutes` [min], in which a share of the vehicles always reports the value
-    `claim`.
+    """One simulation of a fleet for `minutes` [min], in which a share of the vehicles always
+    reports the value `claim`.
 
     The service judges vehicles by their earlier reports. Coverage and error are therefore measured
     from minute `begin` on, when every vehicle has about 200 visits, as many as a car makes in a

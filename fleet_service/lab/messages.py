@@ -30,7 +30,7 @@ class SentMessage(NamedTuple):
 
 
 def name_of(vehicle: int) -> str:
-    """Return the enrolled name of a simulated vehicle."""
+    """Return the enrolled name of the simulated vehicle with this number."""
     return f"car-{vehicle:05d}"
 
 

@@ -55,8 +55,8 @@ MODELS: Final[dict[str, ErrorModel]] = {
 def score_town(
     model: ErrorModel, seed: int, ways: DrivenVisits | None = None
 ) -> tuple[Scores, list[Scores]]:
-    """Return the scores of the map, and of the simple rules, in one town. If `ways` is given, the
-    vehicles' reports are drawn from these simulated drives.
+    """Return the scores of the map, and of the simple rules, in one town drawn by the seed. If
+    `ways` is given, the vehicles' reports are drawn from these simulated drives.
     """
     rng = np.random.default_rng([seed, 11])
     place = town.draw_town(rng, MINUTES, 0.0, model)

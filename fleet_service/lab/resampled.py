@@ -1,7 +1,7 @@
 """Errors of the real estimator: its reports on simulated drives, resampled for the visits of a
 town. Pure.
 
-The simulated vehicle of `agent` has the errors that the fusion assumes, which makes the fusion look
+The simulated vehicle of `agent` has the errors that the service assumes, which makes its map look
 too good. Here each vehicle of a town takes its errors from one vehicle of the drives, with all
 errors that persist in it (offsets, a tilted sensor, tyres). Each of its visits gets the report of a
 visit that this vehicle made on a road with nearly the same friction. Both visits are "excited"
@@ -37,8 +37,8 @@ FARTHEST: Final = 0.35
 
 
 class TrueVisits(NamedTuple):
-    """True values of visits, each (m,): number of the vehicle, start [ns], mean friction, and
-    largest share of the friction that was used.
+    """True values of visits (passages of cells), each (m,): number of the vehicle, start [ns], mean
+    friction, and largest share of the friction that was used.
     """
 
     vehicle: IntArray
@@ -48,7 +48,7 @@ class TrueVisits(NamedTuple):
 
 
 class DrivenVisits(NamedTuple):
-    """Visits of simulated drives with the real estimator, each attribute (k,).
+    """Visits (passages of cells) of simulated drives with the real estimator, each attribute (k,).
 
     Attributes:
         vehicle: number of the vehicle.
@@ -137,8 +137,8 @@ def _nearest_friction(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntA
 
 
 def _scale_reports(reports: SimulatedReports, row: IntArray, by: FloatArray) -> SimulatedReports:
-    """Return the rows `row` (n,) of reports, converted to roads with a friction that is `by` (n,)
-    times as large.
+    """Return those reports that `row` (n,) selects, converted to roads with a friction that is `by`
+    (n,) times as large.
     """
     width = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
     place = np.clip(

@@ -1,8 +1,9 @@
-"""Simpler fusion rules for comparison; each stores a mean and a variance per cell. Pure, compiled.
+"""Simple rules by which vehicles' reports are combined into a map, for comparison; each stores a
+mean and a variance per cell. Pure, compiled.
 
 All rules get the reports that an agent of such a system would send: the *posterior* (m, P) of its
 own filter, which also contains information from the previous cell. Between reports, each rule
-increases its variance by the same drift as the fusion.
+increases its variance by the same drift as the service's map.
 
     newest report         the last posterior
     inverse variance      all posteriors: SAMPLES equal ones per pass, information is added
@@ -82,7 +83,7 @@ def fuse_by_rules(
     asked: FloatArray,
     cells: int,
 ) -> FloatArray:
-    """Return mean and variance of μ by the first five rules (see module) in each cell at each time
+    """Return mean and variance of μ by the first five of the simple rules in each cell at each time
     in `asked` [s], (times, 5, cells, 2).
 
     A visit k is at the cell `place[k]` at the time `seconds[k]`. Its vehicle believes in mean and
@@ -128,8 +129,8 @@ def fuse_by_rules(
 
 
 def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
-    """Return the median of the last friction values that the vehicles reported within MEDIAN_MIN
-    minutes, and its standard deviation, (cells,) each.
+    """Return, for each cell, the median of the last friction values that the vehicles reported
+    within MEDIAN_MIN minutes before `minute`, and its standard deviation, (cells,) each.
     """
     recent = (v.seconds < 60.0 * minute) & (v.seconds >= 60.0 * (minute - MEDIAN_MIN))
     rows = np.flatnonzero(np.isfinite(v.reports.reading) & recent)
@@ -148,9 +149,9 @@ def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
 def score_rules(
     v: Visits, town: Town, at: tuple[int, ...], vehicles: int, where: BoolArray | bool = True
 ) -> list[Scores]:
-    """Return the scores of each of the simple fusion rules RULES at the minutes `at`. They include
-    the cells in `where` that were reported by a vehicle with enough grip used to measure the
-    friction.
+    """Return the scores of the maps that the simple rules RULES give at the minutes `at`. They
+    include those cells of the mask `where` that were reported by a vehicle with enough grip used to
+    measure the friction.
     """
     sent = vehicle_posteriors(v.vehicle, v.reports.reading, v.reports.std, vehicles)
     asked = 60.0 * np.array(at, float)

@@ -158,8 +158,8 @@ def score_snapshots(
     vehicles: int,
     where: BoolArray | bool = True,
 ) -> Scores:
-    """Return the scores of the map at the minutes `at`. They include the cells in `where` that were
-    reported by a vehicle with enough grip used to measure the friction.
+    """Return the scores of the map at the minutes `at`. They include those cells of the mask
+    `where` that were reported by a vehicle with enough grip used to measure the friction.
     """
     out = []
     for minute in at:
@@ -178,13 +178,13 @@ def rmse(s: Scores) -> float:
 
 
 def coverage(s: Scores) -> float:
-    """Return the share of answers whose 90 % interval contains the true friction."""
+    """Return the share of the map's answers whose 90 % interval contains the true friction."""
     return float(s.covered.mean()) if len(s.covered) else float("nan")
 
 
 def safe_share(s: Scores) -> float:
-    """Return the share of answers in which the true friction is above the lower end of the 90 %
-    interval. Readers compute a safe deceleration from this lower end.
+    """Return the share of the map's answers in which the true friction is above the lower end of
+    the 90 % interval. Readers compute a safe deceleration from this lower end.
     """
     return float((s.rank >= ALPHA / 2.0).mean()) if len(s.rank) else float("nan")
 
@@ -198,7 +198,7 @@ def of_class(s: Scores, n: int) -> Scores:
 
 
 def by_surface(s: Scores) -> dict[str, float]:
-    """Return the share of true frictions inside the 90 % interval, for each kind of road in
+    """Return the share of true frictions inside the map's 90 % interval, for each kind of road in
     SURFACES separately.
     """
     return {
@@ -210,8 +210,8 @@ def by_surface(s: Scores) -> dict[str, float]:
 def calibration(scores: Sequence[Scores]) -> FloatArray:
     """Return the calibration table of P(slippery), (BINS, 3).
 
-    Columns: number of answers, mean of their P(slippery), and share of them that were truly
-    slippery.
+    Columns: number of the map's answers, mean of their P(slippery), and share of them that were
+    truly slippery.
     """
     given = np.concatenate([s.slippery for s in scores])
     truth = np.concatenate([s.truth for s in scores]) < SLIPPERY_MU
@@ -246,15 +246,15 @@ def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
 
 
 def false_grip(s: Scores) -> float:
-    """Return the share of answers whose 90 % interval lies above the true friction, so that the
-    road is more slippery than the map states.
+    """Return the share of the map's answers whose 90 % interval lies above the true friction, so
+    that the road is more slippery than the map states.
     """
     return _mean_or_nan(s.rank < ALPHA / 2.0)
 
 
 def false_ice(s: Scores) -> float:
-    """Return the share of answers whose 90 % interval lies below the true friction, so that the
-    road has more grip than the map states.
+    """Return the share of the map's answers whose 90 % interval lies below the true friction, so
+    that the road has more grip than the map states.
     """
     return _mean_or_nan(s.rank > 1.0 - ALPHA / 2.0)
 
@@ -264,7 +264,8 @@ def _mean_or_nan(values: FloatArray | BoolArray) -> float:
 
 
 def reliability(s: Scores) -> FloatArray:
-    """Return, as an array, for each quantile level in LEVELS the share of answers in which the true
-    friction is below this quantile of the belief. For calibrated beliefs the result equals LEVELS.
+    """Return, as an array, for each quantile level in LEVELS the share of the map's answers in
+    which the true friction is below this quantile of the belief. For calibrated beliefs the result
+    equals LEVELS.
     """
     return np.asarray((s.rank[:, None] <= LEVELS).mean(axis=0))

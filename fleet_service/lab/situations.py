@@ -103,16 +103,17 @@ def _decode_batch(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
 
 
 def lower_excess() -> float:
-    """Return the largest `bound_excess` (see there) over all values of the grip used in USED, and
-    over all forms of the report: protobuf or JSON, as posterior or as likelihood.
+    """Return how far the lower end of the map's interval can exceed what the reports support
+    (`bound_excess`): the maximum over all values of the grip used in USED, and over all forms of
+    the report: protobuf or JSON, as posterior or as likelihood.
     """
     paths = ("protobuf posterior", "json posterior", "protobuf likelihood", "json likelihood")
     return max(bound_excess(used, path) for used in USED for path in paths)
 
 
 def backlog_fused(rng: Generator) -> float:
-    """Return the share of late rows that are fused in this situation: the rows of an hour arrive
-    after an outage, while one other vehicle was connected all the time.
+    """Return the share of late observations that affect the map in this situation: the rows of an
+    hour arrive after an outage, while one other vehicle was connected all the time.
     """
     place = town.draw_town(rng, 60, 0.0)
     errors = Errors.draw(rng, BACKLOG + 1)

@@ -69,7 +69,9 @@ COLD_GAP_S: Final = 5.0
 
 
 class ForeignDrive(NamedTuple):
-    """Visits of a drive of another maker's fleet, and the grid number of each cell."""
+    """Visits (passages of cells) of a drive of another maker's fleet, and the grid number of each
+    cell.
+    """
 
     visits: Visits
     cells: IntArray
@@ -78,7 +80,9 @@ class ForeignDrive(NamedTuple):
 def make_reports(
     rng: Generator, gain: FloatArray, vehicle: IntArray, mu: FloatArray, excited: BoolArray
 ) -> SimulatedReports:
-    """Return the reports of visits (n,) by vehicles with gain errors `gain` (V,)."""
+    """Return the reports about n visits (passages of cells) by vehicles with gain errors `gain`
+    (V,).
+    """
     n = len(mu)
     share = np.where(excited, rng.uniform(*SHARE, n), rng.uniform(*GENTLE, n))
     seen = mu * (1.0 + gain[vehicle])
@@ -108,8 +112,8 @@ def make_observations(drive: ForeignDrive) -> Observations:
 
 
 def place_fixes(rng: Generator, place: IntArray) -> IntArray:
-    """Return the cells in which visits to the middle of cells (n,) are reported; the position error
-    is FIX_STD_M [m].
+    """Return the cells (n,) that vehicles report when they are in the middle of the cells `place`
+    (n,); the position error is FIX_STD_M [m].
     """
     offset = 0.5 * CELL_M + FIX_STD_M * rng.normal(size=len(place))
     found = place + np.floor(offset / CELL_M).astype(np.int64)
@@ -117,7 +121,9 @@ def place_fixes(rng: Generator, place: IntArray) -> IntArray:
 
 
 def drive_honest(rng: Generator, gain_std: float) -> tuple[ForeignDrive, FloatArray]:
-    """Return a drive of the honest fleet, and the true friction of each cell (CELLS,)."""
+    """Return a drive of the honest fleet of another maker, and the true friction of each cell
+    (CELLS,).
+    """
     mu = np.repeat(rng.choice(FRICTIONS, CELLS // STRETCH), STRETCH)
     n = CELLS * VISITS
     place = np.repeat(np.arange(CELLS), VISITS)
@@ -166,8 +172,8 @@ def split_by(seconds: FloatArray, step: float) -> list[IntArray]:
 
 
 def measure_honest(name: str, gain_std: float, seeds: range) -> dict[str, float]:
-    """Return coverage, false grip, error and alerts (false and missed) of an honest fleet over
-    `seeds`.
+    """Return figures of the map of an honest fleet over `seeds`: coverage, false grip, error, false
+    and missed alerts.
     """
     found = [score_honest(np.random.default_rng([seed, 23]), gain_std) for seed in seeds]
     scores = join_scores([one[0] for one in found])

@@ -78,7 +78,9 @@ class Town:
     usual: IntArray
 
     def at(self, seconds: FloatArray, place: IntArray) -> FloatArray:
-        """Return the true friction of the town's cells at the given times [s] and places, (n,)."""
+        """Return the true friction (n,) of the town's cells at the times `seconds` (n,) and places
+        `place` (n,).
+        """
         return np.asarray(
             self.mu[np.minimum((seconds // 60.0).astype(np.int64), len(self.mu) - 1), place]
         )
@@ -120,8 +122,8 @@ def draw_town(rng: Generator, minutes: int, changing: float, model: ErrorModel =
 
 @dataclass(frozen=True)
 class Visits:
-    """Visits in order of time, (n,): seconds since the start, vehicle, reported place, true μ, mask
-    of excited visits (which used enough grip to measure μ), and reports.
+    """Visits (passages of cells) in order of time, (n,): seconds since the start, vehicle, reported
+    place, true μ, mask of excited visits (which used enough grip to measure μ), and reports.
     """
 
     seconds: FloatArray
@@ -138,8 +140,8 @@ class Visits:
 def drive_fleet(
     rng: Generator, town: Town, errors: Errors, minutes: float, acquainted: float = 0.0
 ) -> Visits:
-    """Simulate the drives of a fleet: each vehicle passes a whole road every minute on average, at
-    random times.
+    """Simulate the drives of a fleet through a town: each vehicle passes a whole road every minute
+    on average, at random times.
 
     If `acquainted` is not 0, only the first half of the roads is driven until this minute, and only
     the other half afterwards. Then the service knows the vehicles, but not the roads.
@@ -186,8 +188,8 @@ def select_visits(v: Visits, rows: IntArray | BoolArray) -> Visits:
 
 
 def claim_falsely(v: Visits, liars: BoolArray, claim: float) -> Visits:
-    """Return the visits with the values of the vehicles `liars` (V,) replaced with `claim`, with
-    high confidence.
+    """Return the visits with the friction values of the vehicles that the mask `liars` (V,) selects
+    replaced with `claim`, with high confidence.
     """
     lying = liars[v.vehicle]
     readings = np.where(lying, claim, v.reports.reading)

@@ -51,15 +51,17 @@ SEEDS: Final = 3
 
 
 class TownTraffic(NamedTuple):
-    """Visits of a town, and a mask of visits in which a slip controller intervened, (n,)."""
+    """Visits (passages of cells) in a town, and a mask of visits in which a slip controller
+    intervened, (n,).
+    """
 
     visits: Visits
     limited: BoolArray
 
 
 class Readings(NamedTuple):
-    """Answers of the map and warnings of the two simple rules at each time at which the map is
-    read, with the true friction; arrays of shape (times, CELLS).
+    """Values at each time at which the map is read, arrays of shape (times, CELLS): true friction;
+    width of the interval, P(slippery) and alerts of the map; warnings of the two simple rules.
     """
 
     truth: FloatArray
@@ -104,8 +106,8 @@ def drive_cars(rng: Generator, place: Town, cars: float, demand: float) -> TownT
 
 
 def make_observations(traffic: TownTraffic) -> Observations:
-    """Return the visits as observations that a `Fusion` accepts, with the flags of the slip
-    controllers.
+    """Return the visits (passages of cells) as observations that a `Fusion` accepts, with the flags
+    of the slip controllers.
     """
     rows = rows_of(traffic.visits)
     rows["abs_active"] = traffic.limited.astype(np.int8)
@@ -198,7 +200,9 @@ def recall(truth: FloatArray, warned: BoolArray) -> float:
 
 
 def measure_rate(cars: int, seeds: range, demand: float = 1.0) -> dict[str, float]:
-    """Return the figures of the map and of both rules for a traffic of `cars` per hour and road."""
+    """Return the figures of the map and of both simple rules for a traffic of `cars` per hour and
+    road.
+    """
     towns = []
     for seed in seeds:
         rng = np.random.default_rng([seed, 37])

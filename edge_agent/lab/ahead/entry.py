@@ -130,8 +130,8 @@ def record_beliefs(
 
 
 def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
-    """Return the absolute error of the median friction within FIRST_S of entering a cell that the
-    map knows, (n, 2): with and without the map as a prior.
+    """Return the absolute errors of the estimated median friction within FIRST_S of entering a cell
+    that the map knows, (n, 2): with and without the map as a prior.
     """
     with_prior = with_map(trace, known, now)
     alone = _median_friction(np.exp(trace.own))
@@ -170,8 +170,8 @@ def arrival_times(
 
 
 def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) -> float:
-    """Return the largest change [nat] of a published likelihood that a completely wrong map causes.
-    The expected value is 0.
+    """Return the largest change [nat] of a published likelihood of friction that a completely wrong
+    map causes. The expected value is 0.
     """
     seed = int(fleet.scenario.name.split("-")[1])
     again = SimulatedFleet(fleet.scenario, len(fleet.vehicles), seed, RATE_HZ, rough=0.5)

@@ -22,8 +22,8 @@ from schemas.wire import Alert
 
 
 def tile_payload(key: IntArray, friction: float | FloatArray, now: int, **changes: object) -> bytes:
-    """Return the payload of a map tile in the form that a service sends; `changes` replace columns
-    of the table.
+    """Return the payload of a map tile in the form that a service sends, with the cells `key`
+    (cell·4 + sector) and their friction; `changes` replace columns of the table.
     """
     n = len(key)
     mu = np.broadcast_to(friction, len(key))

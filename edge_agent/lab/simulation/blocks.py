@@ -17,7 +17,7 @@ def blocks(
     fleet: SimulatedFleet, rate_hz: float, recorder: TruthRecorder | None = None
 ) -> Iterator[Block]:
     """Yield blocks of simulated samples, each BLOCK_S [s] long, without end. Simulated time starts
-    when the first block is requested.
+    when the first block is requested. `recorder` receives the true values.
     """
     steps = max(1, round(BLOCK_S * rate_hz))
     start_ns = 0

@@ -134,7 +134,9 @@ def delayed_record(records: FloatArray, now: int, samples: float, record: FloatA
 
 @compiled
 def misalign(mounted: FloatArray, signals: FloatArray) -> None:
-    """Convert true readings (18,) to those of misaligned sensors, in place."""
+    """Convert true readings (18,) to those of misaligned sensors, in place; `mounted` are the
+    vehicle's sensor errors.
+    """
     ax = signals[S.AX]
     ay = signals[S.AY]
     signals[S.AX] = ax + mounted[Misaligned.AX] + mounted[Misaligned.TURN] * ay

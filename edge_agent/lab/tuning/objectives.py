@@ -229,8 +229,8 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
 
 
 def scores_of(memberships: Memberships, drives: TuningSet, estimator: str) -> TuningScores:
-    """Run the estimator on the drives, and return the scores of its output after the
-    first second.
+    """Run the estimator on the drives, and return the scores (such as interval score and missed
+    ice) of its output after the first second.
     """
     estimates = create(estimator, drives.vehicles, memberships=memberships).advance(
         drives.t, drives.signals, threads=2

@@ -134,8 +134,8 @@ def visibility() -> list[FloatArray]:
 
 @dataclass(frozen=True)
 class PaperTuning:
-    """Result of the tuning: the tuned fuzzy sets, the history of the search, and the final
-    pheromone of the ant colony (16 vertices, 7 positions).
+    """Result of the tuning: the tuned fuzzy sets, the objective's values over the iterations, and
+    the final pheromone of the ant colony (16 vertices, 7 positions).
     """
 
     sets: LowerVertices

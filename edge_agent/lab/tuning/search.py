@@ -32,7 +32,7 @@ REDRAWS = 32
 
 @dataclass(frozen=True)
 class Iteration:
-    """One iteration in the history of a search: values of the objective (larger is better)."""
+    """One iteration of a search: values of the objective (larger is better)."""
 
     iteration: int
     best: float  # best value so far
@@ -169,7 +169,7 @@ class Ledger:
             progress(self.history[-1])
 
     def result(self) -> Result:
-        """Return the result of the search.
+        """Return the best vector found, its value, and the objective's values over the iterations.
 
         Raises:
             InputError: nothing was evaluated.

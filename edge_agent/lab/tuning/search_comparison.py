@@ -6,11 +6,11 @@
     aco_r        ants over continuous variables                 (`continuous_colony`)
     evolution    (1+1) evolution strategy                       (`evolution_strategy`)
 
-The objective is the mean log-likelihood of the innovations over four conditions of R [nat/s]
-(`study`), on four drives. Each seed gives one search of each kind, and one set of held-out drives
-with its own noise. The results of all searches are scored on these drives, together with the
-untuned sets and a filter with constant R (measurement noise) for comparison. Differences are paired
-by seed; `.se` is the standard error over seeds.
+The objective is the mean log-likelihood of the innovations (measurement minus prediction) over four
+conditions of the measurement noise R [nat/s] (`study`), on four drives. Each seed gives one search
+of each kind, and one set of held-out drives with its own noise. The results of all searches are
+scored on these drives, together with the untuned sets and a filter with constant R for comparison.
+Differences are paired by seed; `.se` is the standard error over seeds.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def _mean(name: str, values: Sequence[float]) -> list[Figure]:
 
 
 def comparison_markdown(figures: Sequence[Figure]) -> str:
-    """Return the report of the comparison as Markdown, from the figures only."""
+    """Return the report of the comparison of search methods as Markdown, from the figures only."""
     return (
         "# Search methods with equal budgets on the filter of paper 004\n\n"
         "Mean log-likelihood of the innovations [nat/s] ± standard error over seeds; more is "

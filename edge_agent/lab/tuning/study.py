@@ -1,5 +1,5 @@
-"""Study of paper 004's tuning with its own filter and noise, for correct and wrong R: untuned sets,
-random search, ant colony.
+"""Study of paper 004's tuning with its own filter and noise, for correct and wrong measurement
+noise R: untuned sets, random search, ant colony.
 
 The filter is `paper-aco-fckf` as in the paper's experiments: white noise only on a_x, a_y and r,
 exact inputs, start at the true state. R can therefore be exactly right, ten times too small or ten
@@ -111,7 +111,9 @@ class StudyScores(NamedTuple):
 
 
 def record(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> StudySet:
-    """Simulate the drives, each `duration_s` [s] long, and add the noise of every condition."""
+    """Simulate the drives, each `duration_s` [s] long, and add the measurement noise of every
+    condition.
+    """
     exact = []
     truth = []
     vehicles = []
@@ -147,7 +149,7 @@ def record(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> Stud
 def _noisy(
     exact: FloatArray, t: FloatArray, seeds: Sequence[int], condition: Condition
 ) -> FloatArray:
-    """Return a copy of the signals `exact` (T, N, 18) with white noise on a_x, a_y and r."""
+    """Return a copy of the signals `exact` (T, N, 18) with white noise on a_x, a_y and yaw rate."""
     variance = scheduled_variance(t) if condition.schedule else np.full(len(t), VARIANCE)
     noisy = exact.copy()
     for n, seed in enumerate(seeds):
@@ -156,7 +158,7 @@ def _noisy(
 
 
 def setting(condition: Condition) -> Setting:
-    """Return the setting of paper 004's filter for a condition of R."""
+    """Return the setting of paper 004's filter for a condition of the measurement noise R."""
     return AT_THE_TRUTH._replace(noise=(condition.scale * VARIANCE,) * 3)
 
 
@@ -179,8 +181,8 @@ def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudySco
 
 
 def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[float, float]:
-    """Return (interval score, coverage) of the 90 % friction interval under the condition called
-    `name`.
+    """Return (interval score, coverage) of the 90 % friction interval under the condition of the
+    measurement noise called `name`.
     """
     reported = make_bank(drives.vehicles, memberships, setting(CONDITIONS[name])).advance(
         drives.t, drives.signals[name]

@@ -84,8 +84,8 @@ def run(
     duration_s: float,
     reporter: Callable[[str], Progress],
 ) -> Study:
-    """Run every search with every seed and return the study. `reporter` is called with the name of
-    a search and returns the function that reports its progress.
+    """Run every kind of search with every seed, and return the study with all results. `reporter`
+    is called with the name of a search and returns the function that reports its progress.
     """
     done = Study(study.record(study.TRAIN, duration_s), study.record(study.HELD_OUT, duration_s))
     problem = study.problem_on(done.train, positions)
