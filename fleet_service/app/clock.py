@@ -49,7 +49,7 @@ class TimeNow(NamedTuple):
 
 
 class SteadyClock:
-    """Clock of the service [ns UTC].
+    """Clock of the service [ns UTC], which follows no jumps of the wall clock.
 
     Args:
         seen: latest time of a report before this start; 0 if there was none.
@@ -75,8 +75,8 @@ class SteadyClock:
         self._votes: dict[str, bool] = {}  # of vehicles, for the wall clock
 
     def now(self) -> int:
-        """Return the time [ns]. It follows small forward steps of the wall clock at once, and
-        larger steps only when reports confirm them.
+        """Return the service's time [ns UTC]. It follows small forward steps of the wall clock at
+        once, and larger steps only when reports confirm them.
         """
         even = self._zero + self._steady()
         wall = self._wall()
@@ -90,7 +90,7 @@ class SteadyClock:
         return even
 
     def moment(self) -> TimeNow:
-        """Return the service's time, with its bounds and its certainty (see `TimeNow`)."""
+        """Return the service's time, with its bounds and its certainty, as a `TimeNow`."""
         now = self.now()
         wall = self._wall()
         seen = self._seen + self._steady() - self._began

@@ -68,8 +68,8 @@ def handle_requests(
 
 
 def _erase_in_copy(copy: BucketReplica) -> str | None:
-    """Remove the erased data from the archive's bucket copy too. Return None, or the reason why the
-    erasure there is incomplete; a background job then completes it later.
+    """Remove the erased data from the archive's copy in a bucket (object store) too. Return None,
+    or the reason why the erasure there is incomplete; a background job then completes it later.
     """
     try:
         copy.sync()
@@ -81,7 +81,8 @@ def _erase_in_copy(copy: BucketReplica) -> str | None:
 def _run_erasure(
     engine: Engine, config: ServiceConfig, root: Path, wanted: Erasure, stop: threading.Event
 ) -> dict[str, Any] | None:
-    """Carry out one request and return its result; None if the service stops before the end.
+    """Carry out one request to erase data, and return its result; None if the service stops before
+    the end.
 
     Raises:
         InputError: there is no such month, or a file is damaged.

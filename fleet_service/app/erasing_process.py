@@ -14,7 +14,7 @@ from schemas.runtime.process import limit_memory
 
 
 def main() -> int:
-    """Carry out the erasure and print the result as JSON."""
+    """Carry out an erasure of archived data, and print the result as JSON."""
     limit_memory(*UNUSED)
     from fleet_service.app.erasing import run_erasure_process
 

@@ -48,7 +48,7 @@ class PastQuery(NamedTuple):
     Attributes:
         query: parameters of the query.
         at: the moment [ns].
-        lateness_s: time by which a report may be late and still be fused in order [s].
+        lateness_s: time by which a report may be late and still be used in order of time [s].
         only: the only selected tile; None for any.
         public: smallest number of recent vehicles with which readers may see a cell.
     """
@@ -61,8 +61,8 @@ class PastQuery(NamedTuple):
 
 
 class HistoricalMaps:
-    """Answers to queries about past maps. Starting the process takes a second, so an idle process
-    is kept for IDLE_S.
+    """Answers to queries about past maps. They are computed in a separate process. Starting it
+    takes a second, so an idle process is kept for IDLE_S.
 
     Args:
         root: folder of the archive.
@@ -107,8 +107,8 @@ class HistoricalMaps:
             process.end()
 
     def _ask_process(self, question: PastQuery) -> tuple[_Process, bytes]:
-        """Send the query to an idle or new process. Return this process, and the head (tile number
-        and length) of its first reply.
+        """Send a query about a past map to an idle or new process. Return this process, and the
+        head (tile number and length) of its first reply.
         """
         if process := self._keep_process(None):
             with suppress(BrokenPipeError, ChildProcessError):  # it has just left
@@ -130,8 +130,8 @@ class HistoricalMaps:
 
 
 class _Process:
-    """Process that answers queries one after the other, and exits when no query arrives for a
-    while.
+    """Process that answers queries about past maps one after the other, and exits when no query
+    arrives for a while.
     """
 
     def __init__(self, root: Path) -> None:
@@ -143,8 +143,8 @@ class _Process:
         self.out = self._child.stdout
 
     def ask(self, question: PastQuery) -> bytes:
-        """Send a query to the process; return the head (tile number and length) of the
-        first reply.
+        """Send a query about a past map to the process; return the head (tile number and length) of
+        the first reply.
         """
         self._in.write(encode_question(question))
         self._in.flush()
@@ -169,8 +169,8 @@ class _Process:
 
 
 def box_of(question: PastQuery) -> Box | None:
-    """Return the box (west, south, east, north [deg]) that a query reads; None for the whole
-    map.
+    """Return the box (west, south, east, north [deg]) that a query about a past map reads; None for
+    the whole map.
     """
     query = question.query
     if query.route is not None:

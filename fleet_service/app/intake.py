@@ -77,8 +77,8 @@ class Intake:
             )
 
     def reset(self) -> None:
-        """Continue with a replaced state of the service. The recorded paths of vehicles and their
-        limits on new cells belong to the old state and are discarded.
+        """Continue the intake with a replaced state of the service. The recorded paths of vehicles
+        and their limits on new cells belong to the old state and are discarded.
         """
         self._paths = VehiclePaths()
         self._places = NewCells()
@@ -87,8 +87,8 @@ class Intake:
         self.weather.fusion = self._shared.state.fusion
 
     def ingest(self, messages: Sequence[Message], at: int | TimeNow) -> list[Alert]:
-        """Admit and fuse messages; return the alerts that are raised or cleared. `at` is the time;
-        a plain number [ns] is taken as certain.
+        """Check messages, and update the map with the admitted ones; return the alerts that are
+        raised or cleared. `at` is the time; a plain number [ns] is taken as certain.
         """
         at = at if isinstance(at, TimeNow) else TimeNow(at)
         ahead = int(self._config.clock_ahead_s * NS) + at.slack
@@ -137,9 +137,9 @@ class Intake:
         return raised
 
     def _excluded_from_fusion(self, rows: Rows) -> BoolArray:
-        """Return a mask of rows that are archived but not fused: the vehicle cannot have reached
-        the reported position, or it reports too many new cells. Enrolled publishers (data sources
-        that are no vehicles) have no path and are not checked.
+        """Return a mask of rows that are archived but do not reach the map: the vehicle cannot have
+        reached the reported position, or it reports too many new cells. Enrolled publishers (data
+        sources that are no vehicles) have no path and are not checked.
         """
         witness = rows["witness"]
         beyond = np.zeros(len(witness), bool)

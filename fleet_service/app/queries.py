@@ -35,8 +35,8 @@ class Queries:
         self._past = HistoricalMaps(root)
 
     def tile(self, tile: int, now: int) -> bytes:
-        """Return the cells of a tile that readers may see, as an Arrow stream; empty bytes if there
-        are none.
+        """Return the cells of a tile that readers may see, as an Arrow stream (bytes); empty bytes
+        if there are none.
         """
         shown = self._shared.tiles.make(tile, now)
         return shown.payload if shown.cells.num_rows else b""

@@ -64,14 +64,16 @@ class Settlement:
 
     @property
     def is_full(self) -> bool:
-        """Return True if too many rows wait for the disk, or too many batches for the bucket
-        copy.
+        """Return True if too many rows wait for the disk, or too many batches for the archive's
+        copy in the bucket.
         """
         return self._log.rows >= WAITING_ROWS or self._log.unsettled >= WAITING_BATCHES
 
     @property
     def unsettled(self) -> int:
-        """Return the number of admitted batches that are not on disk yet."""
+        """Return the number of admitted batches (messages with records) that are not on disk
+        yet.
+        """
         return self._log.unsettled
 
     @property
@@ -139,8 +141,8 @@ class Settlement:
         return []
 
     def end_flush(self) -> list[tuple[str, bytes]]:
-        """Return the acknowledgements of a flush (writing to disk) that has ended; empty if no
-        flush has ended.
+        """Return the acknowledgements of a flush (writing of rows to disk) that has ended; empty if
+        no flush has ended.
         """
         return self._acknowledge(self._log.end) if self._log.ended else []
 

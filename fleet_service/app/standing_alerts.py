@@ -81,7 +81,9 @@ class StandingAlerts:
         self._erased += [replace(alert, raised=False, reason=ERASED) for alert in ended]
 
     def expire(self, now: int) -> list[Alert]:
-        """Return the end messages of alerts that have expired by `now` [ns] or were erased."""
+        """Return the messages that end those alerts which have expired by `now` [ns] or were
+        erased.
+        """
         with self._shared.guard:
             ended = [replace(alert, time=now) for alert in self._erased]
             self._erased = []

@@ -85,8 +85,8 @@ class ServiceState(NamedTuple):
         return 0
 
     def image(self, cut: Cut, weather: Iterable[Path]) -> Taken:
-        """Return the content of a checkpoint that includes all rows up to the segment (file of new
-        rows) `cut`, and the given weather files.
+        """Return the content of a checkpoint (saved state) that includes all rows up to the segment
+        (file of new rows) `cut`, and the given weather files.
         """
         tables = image_of(self.fusion, self.alerts.standing_alerts, self.streams)
         if self.public is not None:

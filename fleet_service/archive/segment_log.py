@@ -49,7 +49,7 @@ class _Load(Generic[Batch]):
 
     def write(self, writer: Writer, upload: Upload | None) -> None:
         """Write one segment per kind (observations or states) that has waiting rows. Then make all
-        segments durable, on disk and with `upload`.
+        segments (files of new rows) durable, on disk and with `upload`.
         """
         for kind, waiting in self.waiting.items():
             if waiting:
@@ -121,14 +121,14 @@ class SegmentLog(Generic[Batch]):
 
     @property
     def can_begin(self) -> bool:
-        """Return True if batches wait, and no earlier write still has to be collected with
-        `end`.
+        """Return True if batches wait to be written to disk, and no earlier write still has to be
+        collected with `end`.
         """
         return self._written is None and bool(self._next.batches)
 
     @property
     def ended(self) -> bool:
-        """Return True if a write was begun and has ended, successfully or not."""
+        """Return True if a write to disk was begun and has ended, successfully or not."""
         return self._written is not None and self._written.done()
 
     def add(self, kind: Kind, rows: Rows, batches: Sequence[Batch]) -> None:
@@ -137,8 +137,8 @@ class SegmentLog(Generic[Batch]):
         self._next.batches += batches
 
     def begin(self) -> None:
-        """Start writing the waiting rows, including rows whose write failed before. Do nothing if
-        the result of the previous write has not been collected with `end`.
+        """Start writing the waiting rows to disk, including rows whose write failed before. Do
+        nothing if the result of the previous write has not been collected with `end`.
         """
         if self._written is None:
             self._load.take(self._next)
@@ -157,8 +157,8 @@ class SegmentLog(Generic[Batch]):
                 self.write_s = time.monotonic() - self._began
 
     def end(self) -> list[Batch]:
-        """Wait for the current write; return the batches (messages) that it made durable. Each
-        batch is returned once.
+        """Wait for the current write to disk; return the batches (messages) that it made durable.
+        Each batch is returned once.
 
         Raises:
             OSError: the disk is full or broken, or the second place cannot be reached; rows that
@@ -174,8 +174,8 @@ class SegmentLog(Generic[Batch]):
         return durable
 
     def flush(self) -> list[Batch]:
-        """Write all waiting rows and wait; return the batches that became durable. Each batch is
-        returned once.
+        """Write all waiting rows to disk and wait until this is done; return the batches that
+        became durable. Each batch is returned once.
 
         Raises:
             OSError: the same as for `end`.

@@ -133,7 +133,7 @@ LINE: Final = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command that `argv` names.
+    """Run the `fleet-service` command that `argv` names.
 
     Returns:
         the exit code; 2 after a one-line error that names the field and the fix.

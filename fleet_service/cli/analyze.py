@@ -93,7 +93,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Answer the question, print the answer, and write it to a file if requested."""
+    """Answer the question about an archive, print the answer, and write it to a file if
+    requested.
+    """
     question = _checked_question(arguments)
     progress_messages.set_status(f"{question.name}: loading DuckDB and Ibis")
     from fleet_service.analytics import engines, output

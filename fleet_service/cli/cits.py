@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Send and receive DENM until a signal arrives."""
+    """Send and receive DENM (hazard messages) until a signal arrives."""
     from fleet_service.client.cits import gateway
     from fleet_service.client.cits.properties import Originator
     from fleet_service.client.map_client import connection_settings

@@ -193,8 +193,9 @@ def on_archive(
 
 
 def compact_first(root: Path) -> None:
-    """Compact the waiting segments (files of new rows) of an archive, so that their rows are
-    included in the answer. If that is impossible, print how many segments are left out.
+    """Move the new rows of an archive into its compacted (sorted) files, so that their rows are
+    included in the answer. If that is impossible, print how many segments (files of new rows) are
+    left out.
 
     Raises:
         InputError: the folder is not an archive.

@@ -29,7 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compact the archive, and copy new files to a mirror if requested."""
+    """Compact the archive (move new rows into files sorted by cell), and copy new files to a mirror
+    if requested.
+    """
     return on_archive(arguments, _compact_archive)
 
 

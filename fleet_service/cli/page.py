@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve the page until a signal arrives."""
+    """Serve the live page of the map until a signal arrives."""
     from fleet_service.client import map_client
 
     try:

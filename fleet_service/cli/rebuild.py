@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compute map and hourly statistics, and write them to the output folder."""
+    """Compute map and hourly statistics of an archive, and write them to the output folder."""
     return on_archive(arguments, _rebuild_maps)
 
 

@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Remove the raw rows that are older than the retention limit of the options."""
+    """Remove the raw rows of an archive that are older than the retention limit of the options."""
     return on_archive(arguments, _retire_rows)
 
 

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read the road network, assign cells to links, and write the table.
+    """Read a road network, assign map cells to its road links, and write the table.
 
     Raises:
         InputError: the extract cannot be read, or the file cannot be written.

@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the service; return its exit code."""
+    """Run a fleet service; return its exit code."""
     with progress_messages.show_status("loading"):
         from fleet_service.app.precompile import warm_up
         from fleet_service.app.service import Service

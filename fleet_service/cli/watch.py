@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Watch the map until a signal arrives."""
+    """Watch the map and print its changes until a signal arrives."""
     from fleet_service.client import map_client, watching
 
     stop = stop_on_signals()

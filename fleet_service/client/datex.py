@@ -46,7 +46,7 @@ _BEARINGS: Final = {
 
 @dataclass(frozen=True)
 class Supplier:
-    """Supplier of a publication.
+    """Supplier of a DATEX II publication.
 
     Attributes:
         country: two letters, ISO 3166.
@@ -243,8 +243,8 @@ def _next_version(record: ET.Element, old: ET.Element) -> ET.Element:
 
 
 def _end_record(record: ET.Element, now: int) -> ET.Element | None:
-    """Return a DATEX II record with `now` [ns] as its end time, unless it has one; None if the end
-    has been published long enough.
+    """Return a DATEX II record with `now` [ns] as its end time, unless it has one; None if its end
+    was published long ago and need not be repeated.
     """
     period = _find_element(record, "sit:validity/com:validityTimeSpecification")
     end = period.find("com:overallEndTime", _SPACES)
@@ -288,7 +288,7 @@ def _cell_coordinates(record: ET.Element) -> set[str]:
 
 
 def _parse_records(document: bytes) -> dict[str, ET.Element]:
-    """Return the situation records of a DATEX II publication by id."""
+    """Return the situation records (hazards) of a DATEX II publication by id."""
     problem = InputError("out", "is not a publication of this command", "name another file")
     try:
         root = ET.fromstring(document)

@@ -47,7 +47,7 @@ SHOWN: Final = (
 
 @dataclass(frozen=True)
 class Answer:
-    """All replies to one query, joined.
+    """All replies to one map query, joined.
 
     Attributes:
         table: cells, if the answer is in Arrow format.
@@ -128,7 +128,7 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
 def query_replies(
     session: zenoh.Session, key: str, parameters: Mapping[str, str]
 ) -> Iterator[tuple[str, bytes]]:
-    """Query a key expression of the map, and yield key and payload of every reply.
+    """Query a Zenoh key expression of the map, and yield key and payload of every reply.
 
     Raises:
         InputError: a service refused the query.
@@ -192,7 +192,7 @@ def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
 
 def is_place_served(session: zenoh.Session, latitude: float, longitude: float) -> bool:
     """Return True if a service answers for the tile of a place [deg]. If none does, this takes
-    SERVED_S.
+    SERVED_S [s].
     """
     tile = grid.tile_of(int(grid.cell_of(latitude, longitude)))
     querier: Any = session.declare_querier(keys.map_key(int(tile)))

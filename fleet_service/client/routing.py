@@ -50,7 +50,9 @@ class RoadLine(NamedTuple):
 
 
 class CostLine(NamedTuple):
-    """Part of a road with one cost factor; points are (longitude, latitude) [deg]."""
+    """Part of a road with one cost factor for route planners; points are (longitude, latitude)
+    [deg].
+    """
 
     factor: float
     points: list[tuple[float, float]]
@@ -67,7 +69,7 @@ def cost_factors(mu_lower: FloatArray) -> FloatArray:
 
 
 def cost_lines(table: pa.Table, roads: Iterable[RoadLine]) -> list[CostLine]:
-    """Return the parts of roads with a cost factor above 1.
+    """Return the parts of roads that route planners should avoid, with a cost factor above 1.
 
     Args:
         table: cells of the map, as a query returns them.
@@ -106,7 +108,9 @@ def ice_cells(table: pa.Table) -> list[list[tuple[float, float]]]:
 def valhalla_request(
     lines: Sequence[CostLine], rings: Sequence[list[tuple[float, float]]] = ()
 ) -> dict[str, Any]:
-    """Return the fields that must be merged into a route request to Valhalla."""
+    """Return the fields (edge costs and areas to avoid) that must be merged into a route request to
+    Valhalla.
+    """
     features = [
         {
             "type": "Feature",
@@ -183,8 +187,8 @@ def _sample_road(road: RoadLine) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _find_cost_runs(
     cost: FloatArray, latitude: FloatArray, longitude: FloatArray
 ) -> list[CostLine]:
-    """Return the parts of a road with the same cost factor above 1. A part that is too short is
-    extended at both ends.
+    """Return the parts of a road in which the cost factor (`cost`, one per point) is the same and
+    above 1. A part that is too short is extended at both ends.
     """
     ends = np.flatnonzero(np.r_[True, np.diff(cost) != 0.0, True])
     out = []

@@ -89,7 +89,7 @@ def format_time(ns: int) -> str:
 
 
 class Stretches:
-    """Stretches with an active alert, updated by alerts of single cells."""
+    """Stretches of road with an active alert, updated by alerts of single cells."""
 
     def __init__(self) -> None:
         self._standing: dict[tuple[int, int], Alert] = {}

@@ -23,7 +23,7 @@ GATHER_S: Final = 0.3  # time for which alerts of neighbouring cells are merged
 
 
 class WatchOptions(NamedTuple):
-    """Options that select the changes to print.
+    """Options that select the changes of the map to print.
 
     Attributes:
         bbox: west,south,east,north as text; None for the whole map.
@@ -43,7 +43,8 @@ def watch_map(
     print_line: Callable[[str], None],
     on_alert: Callable[[StretchAlert], None] = lambda _: None,
 ) -> None:
-    """Print one line per change until `stop` is set. If no router is reachable, wait for one.
+    """Print one line per change of the map until `stop` is set. If no router is reachable, wait for
+    one.
 
     `print_line` is called with each line, and `on_alert` with every alert that has changed.
 

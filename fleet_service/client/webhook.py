@@ -133,8 +133,8 @@ class Webhook:
         return self._undelivered if self._is_closed else len(self._queue)
 
     def health_problems(self) -> list[str]:
-        """Return one message per problem; empty if no alert is lost and the receiver can be
-        reached.
+        """Return one message per problem of the webhook; empty if no alert is lost and the receiver
+        can be reached.
         """
         out = (
             [f"webhook: {self._failure}; {self.waiting_count} alerts wait"] if self._failure else []
@@ -208,8 +208,9 @@ class Webhook:
             runner.run(client.aclose())
 
     def _send_first(self, runner: asyncio.Runner, client: httpx.AsyncClient) -> str | None:
-        """Send the oldest message of the queue. Return None if the queue is empty, "" if the
-        message was delivered or refused for good, else the reason of the failure.
+        """Send the oldest alert message of the queue to the webhook's receiver. Return None if the
+        queue is empty, "" if the message was delivered or refused for good, else the reason of the
+        failure.
         """
         try:
             first = self._queue.read_first()
@@ -242,8 +243,8 @@ class Webhook:
             self._failure = ""
 
     async def _post_message(self, client: httpx.AsyncClient, text: str) -> int:
-        """Send a message and return the HTTP status of the answer; the body of the answer is not
-        read.
+        """Send an alert message to the webhook's receiver, and return the HTTP status of the
+        answer; the body of the answer is not read.
         """
         async with asyncio.timeout(self._timeout_s):
             headers = {"Content-Type": "application/json"}
@@ -254,7 +255,9 @@ class Webhook:
 
 
 def check_url(url: str) -> None:
-    """Raise InputError if a URL is not valid, or if the package for HTTP is missing."""
+    """Raise InputError if the URL of a webhook's receiver is not valid, or if the package for HTTP
+    is missing.
+    """
     try:
         parts = urlsplit(url)
         is_valid = (
@@ -275,8 +278,8 @@ def check_url(url: str) -> None:
 
 
 def _failure_of(status: int) -> str | None:
-    """Return the reason why a message must be sent again; None if the status means that it was
-    delivered or refused for good.
+    """Return the reason, from an HTTP status, why a message must be sent again; None if the status
+    means that it was delivered or refused for good.
     """
     if 200 <= status < 300 or status in REFUSALS:
         return None

@@ -123,7 +123,9 @@ def _rate_cap(name: str, where: Section) -> Section:
 
 
 def access_control(fleet: Enrolment) -> Section:
-    """Return the access list for an enrolment, which is the same at all routers."""
+    """Return the access list (who may publish and read what) for an enrolment; it is the same at
+    all routers.
+    """
     rules = [
         _allow_rule("everything", ("ingress", "egress"), MESSAGES, [EVERYTHING]),
         _allow_rule("private", ("ingress", "egress"), MESSAGES, keys.private_keys("*"))

@@ -30,14 +30,14 @@ Key = ec.EllipticCurvePrivateKey
 
 
 class KeyPair(NamedTuple):
-    """Certificate together with its private key."""
+    """X.509 certificate together with its private key."""
 
     certificate: x509.Certificate
     key: Key
 
     def write(self, stem: Path) -> None:
-        """Write STEM.pem and STEM.key. If the machine fails after the first file, `read_pair`
-        detects this.
+        """Write the certificate to STEM.pem and its private key to STEM.key. If the machine fails
+        after the first file, `read_pair` detects this.
         """
         secret = self.key.private_bytes(
             serialization.Encoding.PEM,
@@ -54,7 +54,9 @@ def to_pem(certificate: x509.Certificate) -> bytes:
 
 
 def write_atomically(path: Path, data: bytes, mode: int) -> None:
-    """Replace a file atomically; its permissions are never wider than `mode`."""
+    """Replace the content of a file atomically (a reader sees the old or the new content); its
+    permissions are never wider than `mode`.
+    """
     with open_durably(path, mode) as file:
         file.write(data)
 
@@ -98,7 +100,9 @@ def read_certificate(path: Path) -> x509.Certificate | None:
 
 
 def new_authority(days: float, now: datetime) -> KeyPair:
-    """Return a new self-signed authority, valid for `days`, that cannot sign other authorities."""
+    """Return a new self-signed certificate authority, valid for `days`, that cannot sign other
+    authorities.
+    """
     key = ec.generate_private_key(ec.SECP256R1())
     name = _subject_name(f"gripmap authority {now:%Y-%m-%d} {x509.random_serial_number():x}"[:64])
     certificate = (
@@ -145,7 +149,7 @@ def issue_certificate(
 
 
 def alternative_names(name: str, hosts: Sequence[str]) -> list[x509.GeneralName]:
-    """Return the names and addresses for which a certificate is valid."""
+    """Return the names and addresses for which a certificate for `name` is valid."""
     found: list[x509.GeneralName] = [x509.DNSName(name)]
     for host in hosts:
         try:
@@ -156,7 +160,7 @@ def alternative_names(name: str, hosts: Sequence[str]) -> list[x509.GeneralName]
 
 
 def is_signed_by(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
-    """Return True if the authority issued the certificate."""
+    """Return True if the certificate authority issued the certificate."""
     try:
         certificate.verify_directly_issued_by(authority)
     except (

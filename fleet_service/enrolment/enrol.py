@@ -124,8 +124,8 @@ class Registry:
         return signer
 
     def _switch(self) -> None:
-        """Make the next authority the one that signs certificates. An interrupted call can be
-        repeated.
+        """Make the next certificate authority the one that signs certificates. An interrupted call
+        can be repeated.
         """
         following = ca.read_pair(self._authority / "next")
         leaving = ca.read_certificate(self._authority / "ca.pem")

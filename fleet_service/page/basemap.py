@@ -37,20 +37,20 @@ _TAG: Final = re.compile(r"<[^>]*>")
 
 
 class TileSource(Protocol):
-    """Interface of a file with map tiles."""
+    """Interface of a file with tiles of a base map."""
 
     kind: str
     zooms: tuple[int, int]
 
     def picture(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return the bytes of a tile, with rows counted from the north; None if there is no such
-        tile.
+        """Return the bytes of a base map tile, with rows counted from the north; None if there is
+        no such tile.
         """
         ...
 
 
 class TileFile:
-    """Tiles of an MBTiles file; thread-safe.
+    """Base map tiles of an MBTiles file; thread-safe.
 
     Args:
         path: path that ends in .mbtiles.
@@ -84,8 +84,8 @@ class TileFile:
         self.zooms = (int(least), int(most))
 
     def picture(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return the bytes of a tile after decompression, with rows counted from the north; None if
-        there is no such tile.
+        """Return the bytes of a base map tile after decompression, with rows counted from the
+        north; None if there is no such tile.
         """
         if not 0 <= zoom <= DEEPEST or not 0 <= max(x, y) < 1 << zoom:
             return None
@@ -105,7 +105,7 @@ class TileFile:
 
 
 class _Pmtiles:
-    """Tiles of a PMTiles file."""
+    """Base map tiles of a PMTiles file."""
 
     def __init__(self, path: Path) -> None:
         self._file = PmtilesFile(path)
@@ -114,8 +114,8 @@ class _Pmtiles:
         self.metadata = self._file.metadata
 
     def picture(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return the bytes of a tile, with rows counted from the north; None if there is no such
-        tile.
+        """Return the bytes of a base map tile, with rows counted from the north; None if there is
+        no such tile.
         """
         if not 0 <= zoom <= DEEPEST or not 0 <= max(x, y) < 1 << zoom:
             return None
@@ -139,7 +139,7 @@ class BaseMap(NamedTuple):
 
     @property
     def is_vector(self) -> bool:
-        """Return True if the tiles are vector tiles, False if they are images."""
+        """Return True if the base map's tiles are vector tiles, False if they are images."""
         return self.file is not None and self.file.kind == KINDS[VECTOR]
 
 

@@ -34,7 +34,9 @@ DARK_ALERT: Final = "#ff6b86"
 
 
 def as_json() -> dict[str, Any]:
-    """Return the palette for the page, for light and for dark backgrounds."""
+    """Return the palette of map colours for the page as JSON, for light and for dark
+    backgrounds.
+    """
     light = {"four": FOUR, "two": TWO, "little": LITTLE, "ground": GROUND, "alert": ALERT}
     dark = {
         "four": DARK_FOUR,

@@ -53,8 +53,8 @@ class BoundedProtocol(H11Protocol):
             super().connection_lost(exc)
 
     def _make_place(self) -> bool:
-        """Make room for a new connection: close a connection without a request, or one of the
-        address with the most connections. Return False if no connection may be closed.
+        """Make room for a new connection of a browser: close a connection without a request, or one
+        of the address with the most connections. Return False if no connection may be closed.
         """
         others = [one for one in self.connections if isinstance(one, BoundedProtocol)]
         found = [one for one in others if one.is_silent]
@@ -78,8 +78,8 @@ class BoundedProtocol(H11Protocol):
         self._head_timer = self.loop.call_later(HEAD_S, self._close_silent, self.cycle)
 
     def _close_silent(self, before: object) -> None:
-        """Close the connection if no request has come since the request `before`, which was the
-        last one when the time limit began.
+        """Close the browser's connection if no request has come since the request `before`, which
+        was the last one when the time limit began.
         """
         if not self.is_silent:
             return

@@ -77,7 +77,7 @@ def _make_link(href: str, rel: str, kind: str, title: str) -> dict[str, str]:
 
 
 def landing_document(base: str) -> dict[str, Any]:
-    """Return the landing page of the interface as a JSON document; `base` is the address without a
+    """Return the landing page of the OGC API as a JSON document; `base` is the address without a
     final slash.
     """
     return {
@@ -94,19 +94,19 @@ def landing_document(base: str) -> dict[str, Any]:
 
 
 def conformance_document() -> dict[str, Any]:
-    """Return the list of conformance classes as a JSON document."""
+    """Return the list of the OGC conformance classes of the interface as a JSON document."""
     return {"conformsTo": list(CONFORMANCE)}
 
 
 def collections_document(base: str, extent: Box | None) -> dict[str, Any]:
-    """Return the list of collections, which has one entry, as a JSON document."""
+    """Return the list of the OGC API's collections, which has one entry, as a JSON document."""
     links = [_make_link(f"{base}/collections", "self", JSON, "this document")]
     return {"links": links, "collections": [collection_document(base, extent)]}
 
 
 def collection_document(base: str, extent: Box | None) -> dict[str, Any]:
-    """Return the description of the collection as a JSON document; `extent` is the box of all
-    cells, or None if there are none.
+    """Return the description of the collection `grip` (the map's cells) as a JSON document;
+    `extent` is the box of all cells, or None if there are none.
     """
     own = f"{base}/collections/{COLLECTION}"
     found: dict[str, Any] = {

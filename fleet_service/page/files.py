@@ -28,7 +28,7 @@ class _File(NamedTuple):
 
 
 class Files:
-    """Static files of a folder.
+    """Static files of a folder, which the page's web server delivers.
 
     Args:
         folder: folder, which is read once.

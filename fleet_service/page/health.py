@@ -19,7 +19,7 @@ _LINE: Final = re.compile(rf'{PREFIX}(\w+?)(_total)?(?:\{{\w+="([^"]*)"\}})? (\S
 
 
 class ServiceHealth:
-    """Metrics of services, by address.
+    """Metrics of fleet services, by address.
 
     Args:
         addresses: addresses such as http://127.0.0.1:9464.
@@ -33,7 +33,7 @@ class ServiceHealth:
         self._before: dict[str, tuple[float, float]] = {}
 
     def services(self) -> list[dict[str, Any]]:
-        """Return one entry per service: `address`, `answers` (True if it answered), and its
+        """Return one entry per fleet service: `address`, `answers` (True if it answered), and its
         values.
         """
         with self._lock:

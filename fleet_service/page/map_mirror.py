@@ -59,8 +59,8 @@ class MapMirror:
         self.heard = 0.0  # when any service said anything [s since 1970]
 
     def take_tile(self, tile: int, table: pa.Table, now: float) -> None:
-        """Replace the content of a tile with a received table of its cells; `now` is the time [s
-        since 1970].
+        """Replace the content of a tile of the local copy with a received table of its cells; `now`
+        is the time [s since 1970].
         """
         cells = records.of_table(table)
         with self._lock:
@@ -100,7 +100,7 @@ class MapMirror:
             )
 
     def places(self) -> tuple[IntArray, IntArray]:
-        """Return cell and sector of all records in the mirror, as two arrays (n,)."""
+        """Return cell and heading sector of all records in the local copy, as two arrays (n,)."""
         with self._lock:
             held = [
                 (tile, one.cells["place"].astype(np.int64)) for tile, one in self._tiles.items()
@@ -151,7 +151,7 @@ class MapMirror:
             ]
 
     def tiles(self) -> list[int]:
-        """Return the numbers of all tiles that have cells."""
+        """Return the numbers of all tiles in the local copy that have cells."""
         with self._lock:
             return [tile for tile, held in self._tiles.items() if len(held.cells)]
 

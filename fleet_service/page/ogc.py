@@ -55,7 +55,7 @@ class FeatureRoutes:
         }
 
     async def landing(self, request: Request) -> Response:
-        """Return the landing page of the interface, which lists its addresses for programs."""
+        """Return the landing page of the OGC API, which lists its addresses for programs."""
         return JSONResponse(
             features.landing_document(_base_address(request)), headers={"Vary": "Accept"}
         )
@@ -190,7 +190,7 @@ class FeatureRoutes:
 
 
 def wants_json(request: Request) -> bool:
-    """Return True if the request comes from a program, which gets the landing page of the interface
+    """Return True if the request comes from a program, which gets the landing page of the OGC API
     instead of the live page.
     """
     form = request.query_params.get("f")

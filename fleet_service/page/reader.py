@@ -36,7 +36,7 @@ REGIONS: Final = 256  # that are watched for a service
 
 
 class Reader:
-    """Zenoh session of the page.
+    """Zenoh session of the live page.
 
     Args:
         connection: connection settings for the router.

@@ -18,8 +18,8 @@ THINNED_S: Final = 60
 
 
 class RecentMoments:
-    """Records of all tiles at several recent moments [s since 1970], oldest first. The arrays are
-    shared with the live map and never copied.
+    """Map at several recent moments: records of all tiles [s since 1970], oldest first. The arrays
+    are shared with the live map and never copied.
     """
 
     def __init__(self) -> None:

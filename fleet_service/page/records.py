@@ -164,8 +164,8 @@ def aggregate_worst(records: Records, level: int) -> Records:
 
 
 def changed_records(before: Records, after: Records) -> Records:
-    """Return the records that must be applied to the records `before` to obtain `after`; all are
-    ordered by place.
+    """Return the records (map cells) that must be applied to the records `before` to obtain
+    `after`; all are ordered by place.
     """
     places = np.union1d(before["place"], after["place"])
     old, new = (np.zeros(len(places), RECORD) for _ in range(2))

@@ -22,12 +22,14 @@ WORLD: Final = (-180.0, -90.0, 180.0, 90.0)
 
 
 def parse_moment(request: Request) -> int | None:
-    """Return the parameter `at` [s since 1970]; None if absent, which means now."""
+    """Return the parameter `at` of a request, a time [s since 1970]; None if absent, which means
+    now.
+    """
     return _parse_number(request, "at", 0, 1 << 33) if "at" in request.query_params else None
 
 
 def parse_level(request: Request) -> int:
-    """Return the parameter `level`: the zoom of the records, 14 to 21."""
+    """Return the parameter `level` of a request: the zoom of the records (cells), 14 to 21."""
     return (
         _parse_number(request, "level", LEAST_LEVEL, CELL_LEVEL)
         if "level" in request.query_params
@@ -36,8 +38,8 @@ def parse_level(request: Request) -> int:
 
 
 def parse_tiles(request: Request) -> list[int]:
-    """Return the parameter `tiles` as quadints (numbers) of zoom 14; at most MOST_TILES are
-    allowed.
+    """Return the parameter `tiles` of a request as quadints (numbers) of zoom 14; at most
+    MOST_TILES are allowed.
     """
     words = request.query_params.get("tiles", "").split(",")
     if len(words) > MOST_TILES:
@@ -71,7 +73,7 @@ def parse_features(request: Request, now: int) -> FeatureQuestion:
 
 
 def parse_feature_id(text: str) -> int:
-    """Return the key (cell · 4 + sector) from a feature's id."""
+    """Return the key (cell · 4 + sector) from the id of a feature (map cell with heading)."""
     cell, _, sector = text.partition("-")
     found = _parse_whole("feature", cell, 0, 4**grid.CELL_ZOOM - 1) * grid.SECTORS
     return found + _parse_whole("feature", sector, 0, grid.SECTORS - 1)
@@ -111,13 +113,15 @@ def _parse_instant(text: str) -> int | None:
 
 
 def parse_place(request: Request) -> tuple[int, int]:
-    """Return cell and sector from the path of a request."""
+    """Return the cell and the heading sector that the path of a request names."""
     cell = _parse_whole("cell", request.path_params["cell"], 0, 4**grid.CELL_ZOOM - 1)
     return cell, _parse_whole("sector", request.path_params["sector"], 0, grid.SECTORS - 1)
 
 
 def parse_route(request: Request) -> tuple[list[tuple[float, float]], str]:
-    """Return the points (longitude, latitude) of a route, and the same points as text."""
+    """Return the points (longitude, latitude) [deg] of the route in a request, and the same points
+    as text.
+    """
     text = request.query_params.get("points", "")
     found = query.parse({"route": text}).route
     return list(found or ()), text

@@ -142,8 +142,8 @@ def _merge_side_by_side(cells: list[tuple[int, int]], heading: int) -> dict[int,
 
 
 def _chain_cells(cells: list[tuple[int, int]], heading: int) -> Iterable[list[tuple[float, float]]]:
-    """Yield chains of positions in the order of travel. After each position follows the nearest
-    position ahead that is not yet in a chain.
+    """Yield chains of road positions in the order of travel. After each position follows the
+    nearest position ahead that is not yet in a chain.
     """
     dx, dy = _STEP[heading]
     here = _merge_side_by_side(cells, heading)

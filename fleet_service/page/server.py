@@ -70,7 +70,8 @@ class PageSettings:
 
 
 def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None]) -> None:
-    """Serve the page until `stop` is set; call `say` with `page: ADDRESS` when the server listens.
+    """Serve the live page until `stop` is set; call `say` with `page: ADDRESS` when the server
+    listens.
 
     Raises:
         InputError: the port is in use.

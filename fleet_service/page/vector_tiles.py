@@ -132,8 +132,8 @@ def _bytes_field(number: int, body: bytes) -> bytes:
 
 
 def unpack_tile(tile: bytes) -> bytes | None:
-    """Return a tile after decompression, if it is compressed; None if it is damaged or larger than
-    MOST_UNPACKED.
+    """Return a base map tile after decompression, if it is compressed; None if it is damaged or
+    larger than MOST_UNPACKED.
     """
     if not tile.startswith(_GZIP):
         return tile if len(tile) <= MOST_UNPACKED else None
@@ -181,8 +181,8 @@ class PmtilesFile:
         self.metadata: dict[str, Any] = about_map if isinstance(about_map, dict) else {}
 
     def tile(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return a tile after decompression, with rows counted from the north; None if there is no
-        such tile, or if its part of the file is damaged.
+        """Return a base map tile after decompression, with rows counted from the north; None if
+        there is no such tile, or if its part of the file is damaged.
         """
         try:
             return self._find_tile(zoom, x, y)
@@ -217,8 +217,8 @@ class PmtilesFile:
 
 
 def _find_entry(directory: bytes, wanted: int) -> tuple[int, int, int] | None:
-    """Return offset, size and run length of the last directory entry whose tile number is at most
-    `wanted`. A run length of 0 means that the entry refers to a further directory.
+    """Return offset, size and run length of the last entry of a PMTiles directory whose tile number
+    is at most `wanted`. A run length of 0 means that the entry refers to a further directory.
     """
     numbers = _decode_varints(directory)
     count = next(numbers)

@@ -35,7 +35,7 @@ class TooManyWatchersError(Exception):
 
 class View(NamedTuple):
     """Part of the map that a browser shows: west, south, east, north [deg], and the zoom level of
-    its records.
+    the records (cells).
     """
 
     box: Box
@@ -70,7 +70,8 @@ class Watchers:
         return len(self._watchers)
 
     def enter(self, view: View, client: str = "") -> AsyncIterator[bytes]:
-        """Return the stream of events for a view, from now on, until the browser disconnects.
+        """Return the stream of events (changes of the map) for a view, from now on, until the
+        browser disconnects.
 
         Streams are shared fairly: if the maximum is reached, the client with the most streams loses
         one to a client with fewer.

@@ -126,7 +126,7 @@ class Routes:
         return found
 
     async def settings(self, _: Request) -> Response:
-        """Return constants and colours that the page's scripts need."""
+        """Return the constants and colours that the page's scripts need as JSON."""
         base = self._of.base_map
         return JSONResponse(
             {
@@ -315,8 +315,8 @@ class Routes:
 def with_turns(
     turns: RequestTurns, answer: Callable[[Request], Awaitable[Response]]
 ) -> Callable[[Request], Awaitable[Response]]:
-    """Return the handler `answer` with a limit: it runs only when `turns` allows another request of
-    the client. An invalid request is answered with the problem and the fix.
+    """Return the request handler `answer` with a limit: it runs only when `turns` allows another
+    request of the client. An invalid request is answered with the problem and the fix.
     """
 
     async def answer_or_refuse(request: Request) -> Response:
@@ -354,8 +354,8 @@ class Guarded:
         ]
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Process a request: refuse a foreign host name, otherwise forward the request and add the
-        headers to the answer.
+        """Process a request to the page: refuse a foreign host name, otherwise forward the request
+        and add the headers to the answer.
         """
 
         async def send_with_headers(message: Message) -> None:

@@ -33,7 +33,9 @@ def tables_of(fusion: Fusion) -> dict[str, pa.Table]:
 
 
 def _to_list(column: NDArray[Any]) -> pa.Array[Any]:
-    """Return a table column as an Arrow list array with one item: the list of all values."""
+    """Return a column of a checkpoint's table as an Arrow list array with one item: the list of all
+    values.
+    """
     return pa.LargeListArray.from_arrays(pa.array([0, len(column)], pa.int64()), pa.array(column))
 
 

@@ -83,7 +83,7 @@ def restore_streams(
     begin: Begin = Begin(),  # noqa: B008 immutable
     damaged: Damaged = skip_damaged,
 ) -> None:
-    """Record every archived batch as accepted, file by file.
+    """Record every archived batch as accepted, so that duplicates are detected after a restart.
 
     Args:
         root: folder of the archive.
@@ -156,7 +156,9 @@ class Since(NamedTuple):
         )
 
     def where(self) -> list[ValueRange] | None:
-        """Return the filters on columns that select the rows of a replay; None for all rows."""
+        """Return the filters on columns that select the archived rows of a replay; None for all
+        rows.
+        """
         found = (
             [] if self.until is None else [ValueRange("received_at", most=self.until // US_STEP)]
         )
@@ -284,7 +286,7 @@ def replay(
 
 def _recorded_result(rows: segments.Rows) -> RecordedResult:
     """Return lateness (True if late) and vote weight (trust in the vehicle) of archived rows, as
-    the service recorded them when it first fused these rows.
+    the service recorded them when it first processed these rows.
     """
     return RecordedResult(rows["late"].astype(bool), rows["late_by"], rows["weight"])
 
@@ -292,8 +294,8 @@ def _recorded_result(rows: segments.Rows) -> RecordedResult:
 def _join_parts(
     parts: list[tuple[Observations, RecordedResult]],
 ) -> tuple[Observations, RecordedResult]:
-    """Return several parts of archived observations, each with its recorded results, joined in the
-    given order.
+    """Return several parts of archived observations, each with its recorded results, joined into
+    one in the given order.
     """
     of = Observations(
         **{
@@ -312,7 +314,7 @@ def _join_parts(
 def _select_rows(
     o: Observations, before: RecordedResult, rows: BoolArray | IntArray | slice
 ) -> tuple[Observations, RecordedResult]:
-    """Return the selected rows of the observations and of their recorded results."""
+    """Return those of the archived observations and their recorded results that `rows` selects."""
     return o.take(rows), RecordedResult(
         before.late[rows], before.late_by[rows], before.weight[rows]
     )
@@ -322,7 +324,7 @@ def _fuse_epochs(
     fusion: Fusion, o: Observations, before: RecordedResult, heard: Heard
 ) -> Iterator[Updated]:
     """Add archived observations to the beliefs epoch by epoch (minute by minute), in order of the
-    time at which they were first fused.
+    time at which they were first processed.
     """
     time = o.time + before.late_by
     order = np.argsort(time, kind="stable")
@@ -357,8 +359,8 @@ def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.T
 
 
 def _prefetch_parts(parts: Iterator[_Held]) -> Iterator[_Held]:
-    """Yield the given parts unchanged. A thread prepares each part while the previous one is used,
-    because reading takes a third of the start time.
+    """Yield the given parts of the archive's rows unchanged. A thread prepares each part while the
+    previous one is used, because reading takes a third of the start time.
     """
     with ThreadPoolExecutor(1, "reads ahead") as thread:
         coming = thread.submit(next, parts, None)
@@ -460,8 +462,8 @@ class _Held:
 
 
 def _time_borders(low: int, high: int, rows: int, most: int) -> list[int]:
-    """Return times from `low` to `high` [ns] that divide the interval at epoch borders. If rows are
-    evenly distributed in time, about `most` rows lie between two times.
+    """Return times from `low` to `high` [ns] that divide this interval at full minutes (epoch
+    borders). If rows are evenly distributed in time, about `most` rows lie between two times.
     """
     epochs = (high - low) // EPOCH_NS
     parts = max(1, min(-(-rows // most), epochs))

@@ -31,7 +31,9 @@ _TEXT: Final = 160  # characters of an error; what the server says as XML may na
 
 
 class CopyError(OSError):
-    """Error of the bucket: it does not accept or return an object. The request may be repeated."""
+    """Error of the bucket (object store): it does not accept or return an object. The request may
+    be repeated.
+    """
 
 
 class ObjectBucket:
@@ -96,7 +98,8 @@ class ObjectBucket:
             ) from error
 
     def put(self, name: str, content: bytes | Path) -> None:
-        """Upload an object; an existing object of this name is replaced.
+        """Upload an object to the bucket (object store); an existing object of this name is
+        replaced.
 
         Raises:
             CopyError: it is unknown whether the upload succeeded.
@@ -106,8 +109,9 @@ class ObjectBucket:
             self._do.put(self._store, name, content)
 
     def put_new(self, name: str, content: bytes) -> None:
-        """Upload an object whose name must be new. An existing object with the same content is
-        accepted, because an earlier upload may have timed out although it succeeded.
+        """Upload an object to the bucket (object store); its name must be new. An existing object
+        with the same content is accepted, because an earlier upload may have timed out although it
+        succeeded.
 
         Raises:
             CopyError: it is unknown whether the upload succeeded, or the existing object has other
@@ -123,8 +127,8 @@ class ObjectBucket:
                     ) from None
 
     def create(self, name: str, content: bytes) -> bool:
-        """Create an object if its name is new. Return True if it was created, or exists with the
-        same content.
+        """Create an object in the bucket (object store) if its name is new. Return True if it was
+        created, or exists with the same content.
 
         Raises:
             CopyError: it is unknown whether the upload succeeded.
@@ -137,7 +141,8 @@ class ObjectBucket:
         return True
 
     def list_names(self, folder: str) -> list[str]:
-        """Return the names of the objects in a folder and its subfolders.
+        """Return the names of the objects in a folder of the bucket (object store) and its
+        subfolders.
 
         Raises:
             CopyError: the objects cannot be listed.
@@ -148,7 +153,7 @@ class ObjectBucket:
             ]
 
     def get(self, name: str) -> bytes | None:
-        """Return the content of an object; None if it does not exist.
+        """Return the content of an object in the bucket; None if it does not exist.
 
         Raises:
             CopyError: the object cannot be read.
@@ -160,7 +165,7 @@ class ObjectBucket:
                 return None
 
     def read_parts(self, name: str) -> Iterator[bytes]:
-        """Yield the content of an object in pieces.
+        """Yield the content of an object in the bucket in pieces.
 
         Raises:
             CopyError: the object cannot be read or does not exist.
@@ -170,7 +175,7 @@ class ObjectBucket:
                 yield bytes(part)
 
     def list_sizes(self) -> dict[str, int]:
-        """Return names and sizes [bytes] of all objects.
+        """Return names and sizes [bytes] of all objects in the bucket (object store).
 
         Raises:
             CopyError: the objects cannot be listed.
@@ -181,7 +186,7 @@ class ObjectBucket:
             }
 
     def delete(self, name: str) -> None:
-        """Delete an object if it exists.
+        """Delete an object in the bucket if it exists.
 
         Raises:
             CopyError: the object may still exist.
@@ -207,8 +212,8 @@ class ObjectBucket:
 
 
 def error_summary(error: BaseException) -> str:
-    """Return the beginning of an error's message, without headers, response body and duration, so
-    that the same problem always gives the same line.
+    """Return the beginning of the message of a bucket's error, without headers, response body and
+    duration, so that the same problem always gives the same line.
     """
     line = (str(error).splitlines() or [type(error).__name__])[0]
     return _TOOK.sub("", line.partition("<")[0]).strip()[:_TEXT]

@@ -28,8 +28,8 @@ FOLDER: Final = "fence"
 
 
 class Term(NamedTuple):
-    """Term: ownership of the copy by one service. It consists of the lease number and the epoch, a
-    number in the names of all files that the service writes.
+    """Term: ownership of the archive's copy by one service. It consists of the lease number and the
+    epoch, a number in the names of all files that the service writes.
     """
 
     number: int
@@ -37,8 +37,8 @@ class Term(NamedTuple):
 
 
 class Fence(NamedTuple):
-    """Fence of a bucket: the list of valid objects. Objects are valid if they have the epoch
-    `epoch` or a later one, or if they are in `names`.
+    """Fence of a bucket (object store): the list of valid objects. Objects are valid if they have
+    the epoch `epoch` or a later one, or if they are in `names`.
     """
 
     epoch: int

@@ -57,8 +57,8 @@ class FencedBucket:
 
     def raise_fence(self, term: Term, names: Iterable[str]) -> None:
         """Write a fence (list of valid objects) for this term of ownership: objects that appear
-        later are valid only if their names contain the epoch of the term. Delete objects that are
-        not valid.
+        later are valid only if their names contain the epoch of the term. Delete objects in the
+        bucket that are not valid.
 
         `names` are the names of the archive's files.
         """
@@ -71,8 +71,8 @@ class FencedBucket:
                 self.objects.delete(name)
 
     def admit_objects(self, names: Iterable[str]) -> None:
-        """Add uploaded objects to the fence if they would not be valid without it: files that were
-        compacted by a service that started before.
+        """Add uploaded objects to the fence (list of valid objects) if they would not be valid
+        without it: files that were compacted by a service that started before.
         """
         if strays := [name for name in names if not self._fence.counts_object(name)]:
             fence = self._fence._replace(names=self._fence.names.union(strays))
@@ -85,9 +85,9 @@ class FencedBucket:
         self._fence = fence
 
     def create_key(self, name: str, content: bytes, bucket: ObjectBucket) -> None:
-        """Upload a file of keys whose name must be new. The exception is a file that a former
-        service uploaded after it had lost its lease: it belongs to rows that are not valid, and is
-        replaced.
+        """Upload a file of keys to the bucket (object store); its name must be new. The exception
+        is a file that a former service uploaded after it had lost its lease: it belongs to rows
+        that are not valid, and is replaced.
         """
         if self.assert_alone is None or bucket.create(name, content):
             bucket.put_new(name, content)

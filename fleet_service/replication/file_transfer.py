@@ -18,7 +18,9 @@ from schemas.runtime.durable import open_durably
 
 
 class FileTransfer:
-    """Transfer of files between the folder and the bucket, several at once in `pool`."""
+    """Transfer of files between the archive's folder and its bucket (object store), several at once
+    in the threads of `pool`.
+    """
 
     def __init__(
         self,
@@ -33,7 +35,7 @@ class FileTransfer:
         self._pool = pool
 
     def upload_file(self, path: Path, bucket: ObjectBucket) -> None:
-        """Upload a file through `bucket`, whose requests have their own time limit.
+        """Upload a file through `bucket`, whose requests have a time limit of their own.
 
         Raises:
             CopyError: it is unknown whether the upload succeeded.
@@ -64,8 +66,8 @@ class FileTransfer:
         return True
 
     def download_missing(self, there: Mapping[str, int]) -> int:
-        """Download the files that only the bucket has; return their number. Also remove from the
-        journal (list of uploaded files) the entries of files that the bucket lacks.
+        """Download the files that only the bucket (object store) has; return their number. Also
+        remove from the journal (list of uploaded files) the entries of files that the bucket lacks.
 
         `there` are the names and sizes of the valid objects.
         """

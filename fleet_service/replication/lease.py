@@ -169,8 +169,8 @@ class Lease:
 
     @property
     def term(self) -> Term:
-        """Return the lease number (1 for the first holder) and the epoch used in this holder's
-        file names.
+        """Return the number of the lease (1 for the first owner of the archive), and the epoch, a
+        number in this owner's file names.
         """
         return Term(0, 0) if self._mine is None else Term(self._mine.number, self._mine.epoch)
 
@@ -194,7 +194,9 @@ class Lease:
 
     @property
     def may_acknowledge(self) -> bool:
-        """Return True if the service may acknowledge data in the bucket now."""
+        """Return True if the service may now acknowledge data that are in the bucket (object
+        store).
+        """
         return self.left_s > 0.0
 
     def assert_not_superseded(self) -> None:
@@ -310,8 +312,8 @@ class Lease:
         return Lease(self._holder, self._bucket, self.service, self._lease_s)
 
     def renew(self) -> None:
-        """Renew the lease: write its object with the next turn number. The renewal is valid if no
-        higher lease number exists afterwards.
+        """Renew the lease (ownership of the archive): write its object in the bucket with the next
+        turn number. The renewal is valid if no higher lease number exists afterwards.
 
         Raises:
             CopyError: it is unknown whether the renewal is valid.
@@ -335,8 +337,8 @@ class Lease:
                 return
 
     def _was_held_here(self, found: LeaseRecord) -> bool:
-        """Return True if this folder's service held the lease record `found` before its last
-        restart.
+        """Return True if this folder's service had the lease (ownership of the archive) with the
+        record `found` before its last restart.
         """
         return found.holder == self._holder
 
@@ -438,8 +440,8 @@ def _check_settings(found: LeaseRecord, lease_s: float) -> None:
 
 
 def _parse_record(name: str, content: bytes) -> LeaseRecord | None:
-    """Return the lease record from the content of an object; None if it is damaged. Unknown fields
-    are ignored.
+    """Return the lease record (who owns the archive) from the content of an object; None if it is
+    damaged. Unknown fields are ignored.
     """
     try:
         record: dict[str, Any] = json.loads(content)

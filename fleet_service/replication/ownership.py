@@ -261,8 +261,8 @@ class _BusyError(Exception):
 
 
 def _wait_for_compaction(root: Path) -> BinaryIO:
-    """Lock the compacted (merged) files of the folder. A compaction that the folder's former
-    service started may still be running, and may have read rows that are no longer valid.
+    """Lock the compacted (merged) files of the archive's folder. A compaction that the folder's
+    former service started may still be running, and may have read rows that are no longer valid.
 
     Raises:
         _BusyError: such a compaction is running; try again later.

@@ -67,13 +67,13 @@ class BucketReplica:
         self._transfer = FileTransfer(self._files, self.bucket, self._journal, self._pool)
 
     def close(self) -> None:
-        """Close the replica; the bucket is not changed."""
+        """Close the archive's bucket replica; the bucket is not changed."""
         self._pool.shutdown(cancel_futures=True)
         self._journal.close()
 
     def sync_without_lease(self, service: str) -> int:
-        """Synchronise folder and bucket in both directions; return the number of downloaded files.
-        No other process may use the archive meanwhile.
+        """Synchronise the archive's folder and the bucket in both directions; return the number of
+        downloaded files. No other process may use the archive meanwhile.
 
         Raises:
             InputError: the bucket cannot be reached, or belongs to another service.
@@ -170,8 +170,8 @@ class BucketReplica:
             self._upload_in_time([*keys, *missing])
 
     def sync(self) -> int:
-        """Upload new and rewritten files, then delete removed ones; return the number of changed
-        objects.
+        """Upload new and rewritten files of the archive to the bucket, then delete removed ones;
+        return the number of changed objects.
 
         Segments (files of new rows) in the inbox folder are excluded; only `upload_segments`
         uploads them.
@@ -252,8 +252,8 @@ class BucketReplica:
 
 
 def open_replica(config: ServiceConfig, root: Path) -> BucketReplica | None:
-    """Open the bucket replica named in the configuration and synchronise it with the folder `root`;
-    return None if the configuration names no replica.
+    """Open the bucket replica (copy of the archive in an object store) named in the configuration
+    and synchronise it with the folder `root`; return None if the configuration names no replica.
 
     Raises:
         InputError, OSError: as for `BucketReplica` and its `sync_without_lease`.

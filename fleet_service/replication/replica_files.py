@@ -47,13 +47,15 @@ class ReplicaFiles:
         return self.root / name
 
     def set_aside_path(self, name: str) -> Path:
-        """Return the path to which the damaged file `name` is renamed, so that it is not read
-        again.
+        """Return the path to which the damaged file `name` of the archive is renamed, so that it is
+        not read again.
         """
         return self.root / f"{name}{BAD}"
 
     def list_files(self, folders: Iterable[str] = FOLDERS) -> dict[str, Stamp]:
-        """Return names and stamps (size and time) of the files, in the order of the folders."""
+        """Return names and stamps (size and time) of the archive's files, in the order of the
+        folders.
+        """
         found: dict[str, Stamp] = {}
         paths = (path for one in folders for path in sorted((self.root / one).rglob("*")))
         for path in paths:
@@ -66,7 +68,9 @@ class ReplicaFiles:
 
 
 def is_copied(name: str) -> bool:
-    """Return True if a file of this name belongs into the copy; drafts and damaged files do not."""
+    """Return True if a file of this name belongs into the archive's copy; drafts and damaged files
+    do not.
+    """
     folder, *rest = name.split("/")
     hidden = any(part.startswith(".") for part in rest)
     return (

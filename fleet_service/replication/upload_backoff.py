@@ -14,8 +14,8 @@ MOST_BACK_OFF_S: Final = 8.0
 
 
 class UploadBackoff:
-    """Record of failing uploads to the bucket at `url`. After a failure there is a pause, which
-    grows with each further failure.
+    """Record of failing uploads to the bucket (object store) at `url`. After a failure there is a
+    pause, which grows with each further failure.
 
     Attributes:
         failures: number of failed uploads.
@@ -31,7 +31,7 @@ class UploadBackoff:
 
     @property
     def away_s(self) -> float:
-        """Return the time [s] for which the bucket has not accepted data on which an
+        """Return the time [s] for which the bucket (object store) has not accepted data on which an
         acknowledgement depends; 0 if it accepts them.
         """
         since = self._since
@@ -39,7 +39,9 @@ class UploadBackoff:
 
     @property
     def trouble(self) -> str | None:
-        """Return a message to the operator about failing uploads; None if there is no problem."""
+        """Return a message to the operator about failing uploads to the bucket; None if there is no
+        problem.
+        """
         if self._since is None:
             return None
         waits = f"nothing is acknowledged for {self.away_s:.0f} s"
@@ -47,7 +49,7 @@ class UploadBackoff:
 
     @contextmanager
     def try_upload(self) -> Iterator[None]:
-        """Run an upload in this context, and record whether it succeeds.
+        """Run an upload to the bucket in this context, and record whether it succeeds.
 
         Raises:
             CopyError: the upload failed, or the pause after a failure has not ended.

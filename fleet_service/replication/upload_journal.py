@@ -40,8 +40,8 @@ def stamp_of(path: Path) -> Stamp:
 
 
 class UploadJournal:
-    """Upload journal of one archive and one copy; an existing journal about another copy is
-    ignored.
+    """Upload journal (list of uploaded files) of one archive and one copy; an existing journal
+    about another copy is ignored.
 
     Args:
         root: folder of the archive.
@@ -69,8 +69,8 @@ class UploadJournal:
         self._file = path.open("ab", buffering=0)
 
     def copy_stamps(self) -> dict[str, Stamp]:
-        """Return the stamp (size and time) at the upload of each file in the copy, by name. The
-        result does not change with later uploads.
+        """Return the stamp (size and time) at the upload of each file in the archive's copy, by
+        name. The result does not change with later uploads.
         """
         with self._guard:
             return dict(self._stamps)
@@ -88,13 +88,13 @@ class UploadJournal:
             self._stamps[name] = stamp
 
     def remove(self, name: str) -> None:
-        """Record that a file was deleted from the copy."""
+        """Record that a file was deleted from the archive's copy."""
         with self._guard:
             self._file.write(f"{json.dumps([name])}\n".encode())
             self._stamps.pop(name, None)
 
     def sync(self) -> None:
-        """Write the recorded lines of the journal durably to disk (fsync)."""
+        """Write the recorded lines of the upload journal durably to disk (fsync)."""
         os.fsync(self._file.fileno())
 
     def close(self) -> None:

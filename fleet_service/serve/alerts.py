@@ -44,7 +44,7 @@ QUIET_NS: Final = 1800 * NS  # an alert whose ice nobody confirmed for so long m
 
 
 class Alerts:
-    """Cells that have an active alert.
+    """Cells that have an active alert, and the rules by which alerts begin and end.
 
     Args:
         fusion: owner of the cells.
@@ -82,9 +82,9 @@ class Alerts:
         }
 
     def renumber(self, place: IntArray) -> None:
-        """Update the slot numbers of active alerts after the fusion renumbered its slots (cells and
-        sectors); `place` contains the new number of each slot. The fusion must not have removed a
-        slot with an active alert.
+        """Update the slot numbers of active alerts after the slots (storage of cells and sectors)
+        were renumbered; `place` contains the new number of each slot. No slot must have been
+        removed that has an active alert.
         """
         self._standing = {int(place[slot]): alert for slot, alert in self._standing.items()}
 
@@ -154,7 +154,7 @@ class Alerts:
     def _own_sources(self, slots: IntArray, side: int) -> IntArray:
         """Return the report times [ns] of the vehicles that support one `side` (ice or grip) in
         each slot (cell and sector), (k, SOURCES). Only reports within the hour before the slot's
-        last report count; see `Fusion.sources`.
+        last report count.
         """
         return self._fusion.sources(slots, side, self._fusion.live.time[slots] - SOURCE_NS)
 

@@ -91,8 +91,8 @@ def encode_tile(cells: pa.RecordBatch, form: Format, tile: int) -> bytes:
 
 
 def _encode_rows(rows: Iterable[dict[str, Any]]) -> str:
-    """Return rows as JSON text. They are encoded one by one, because a single call for thousands of
-    rows would hold the interpreter lock too long.
+    """Return rows (cells) as JSON text. They are encoded one by one, because a single call for
+    thousands of rows would hold the interpreter lock too long.
     """
     return ", ".join(json.dumps(row, allow_nan=False) for row in rows)
 
@@ -103,8 +103,8 @@ def arrow_stream(cells: pa.RecordBatch) -> bytes:
 
 
 def _json_rows(table: pa.RecordBatch) -> list[dict[str, Any]]:
-    """Return rows as dictionaries for JSON: times as ISO 8601 text, floats rounded to single
-    precision.
+    """Return rows (cells) of a table as dictionaries for JSON: times as ISO 8601 text, floats
+    rounded to single precision.
     """
     columns: dict[str, list[Any]] = {}
     for f in table.schema:

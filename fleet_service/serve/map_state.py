@@ -76,7 +76,7 @@ class MapState:
 
     def rebuild(self) -> None:
         """Discard the index from tiles to cells, so that it is built again. Call this after the
-        fusion renumbered its slots (cells and sectors).
+        slots (storage of cells and sectors) were renumbered.
         """
         self._slots.clear()
         self._indexed = 0

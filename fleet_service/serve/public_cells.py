@@ -106,8 +106,8 @@ class PublicCells:
 
     @contextmanager
     def follow(self, o: Observations) -> Iterator[None]:
-        """Provide a context in which the caller fuses the observations `o`; at the end of the
-        context, update the public copy of the cells.
+        """Provide a context in which the caller adds the observations `o` to the beliefs; at the
+        end of the context, update the public copy of the cells.
         """
         now = int(o.time.max(initial=0))
         self.publish(now)
@@ -143,7 +143,7 @@ class PublicCells:
         return found
 
     def renumber(self, place: IntArray) -> None:
-        """Update the slot numbers after the fusion renumbered its slots (cells and sectors);
+        """Update the slot numbers after the slots (storage of cells and sectors) were renumbered;
         `place` contains the new numbers, -1 for removed slots.
         """
         self.visitors.renumber(place)
@@ -240,8 +240,8 @@ class PublicCells:
         self._rows.cells[slots] = live.cells[slots]
 
     def _add_slots(self) -> None:
-        """Add the fusion's new slots (cells and sectors), in the state of an unvisited cell. The
-        memory is doubled when it is full, so that this is rare.
+        """Add new slots (cells and sectors) to the public copy, in the state of an unvisited cell.
+        The memory is doubled when it is full, so that this is rare.
         """
         if self._size == self._fusion.size:
             return
@@ -255,7 +255,7 @@ class PublicCells:
         self._size = self._fusion.size
 
     def _take_rows(self, slots: IntArray, room: int | None = None) -> None:
-        """Keep only the given rows of the public copy, in arrays with room for `room` rows."""
+        """Keep only the rows `slots` of the public copy, in arrays with room for `room` rows."""
         room = len(slots) if room is None else room
         rows = Rows(no_beliefs(room), rows_of_lines(room, CELL), self._rows.reporters)
         rows.belief[: len(slots)] = self._rows.belief[slots]

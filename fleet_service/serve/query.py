@@ -52,7 +52,7 @@ def answer_query(
 
 
 class AnswerSize(NamedTuple):
-    """Upper bounds of the size of an answer: number of cells and number of tiles."""
+    """Upper bounds of the size of an answer to a map query: number of cells and number of tiles."""
 
     cells: int
     tiles: int
@@ -61,8 +61,8 @@ class AnswerSize(NamedTuple):
 def size_asked(
     cache: TileCache, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None
 ) -> AnswerSize:
-    """Return an upper bound of an answer's size: all tiles that it must read. Arguments and errors
-    are the same as for `answer_query`.
+    """Return an upper bound of the size of a query's answer: that of all tiles that must be read.
+    Arguments and errors are the same as for `answer_query`.
     """
     route = keys_along(query.route) if query.route else None
     tiles = [
@@ -147,7 +147,9 @@ def _select_rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
 def _encode_tile(
     shown: ShownTile, rows: slice | BoolArray, form: Format, tile: int
 ) -> bytes | None:
-    """Return the selected cells of a tile in encoded form; None if no cell is selected."""
+    """Return the selected cells of a tile as bytes (Arrow, JSON or GeoJSON); None if no cell is
+    selected.
+    """
     if isinstance(rows, slice):
         count = max(rows.stop - rows.start, 0)
         if form is Format.ARROW and shown.payload and count == len(shown.cells):

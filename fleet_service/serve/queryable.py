@@ -60,7 +60,7 @@ def _past_is_busy() -> InputError:
 
 
 class Answering(NamedTuple):
-    """Functions that produce answers to queries.
+    """Functions that produce answers to map queries.
 
     Attributes:
         size: returns an upper bound of the number of cells and tiles of an answer.
@@ -74,7 +74,7 @@ class Answering(NamedTuple):
 
 @dataclass(order=True)
 class _QueuedQuery:
-    """Expensive query that waits in the queue, or that has received a part of its replies.
+    """Expensive map query that waits in the queue, or that has received a part of its replies.
 
     Attributes:
         rank: time [s] at which the query would be finished on an idle service.
@@ -241,7 +241,7 @@ class MapQueryable:
             time.sleep(min(REST * (time.monotonic() - began), LONGEST_REST_S))
 
     def _goes_on(self, heavy: _QueuedQuery) -> bool:
-        """Answer a queued query with one more tile; return True if further tiles may follow."""
+        """Answer a queued map query with one more tile; return True if further tiles may follow."""
         request = heavy.request
         with self._reply_to(request) as answered:
             if heavy.tiles is None:
@@ -265,7 +265,7 @@ class MapQueryable:
 
     @contextmanager
     def _reply_to(self, request: zenoh.Query) -> Iterator[_Answered]:
-        """Provide a context in which a request is answered. At the end, close the request unless
+        """Provide a context in which a map query is answered. At the end, close the request unless
         more replies follow. An exception becomes an error reply.
         """
         answered = _Answered()

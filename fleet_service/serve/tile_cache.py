@@ -87,13 +87,13 @@ class TileCache:
         self._acknowledged = 0  # change up to which all must be seen
 
     def acknowledge(self) -> None:
-        """Record that everything in the map has been acknowledged or alerted. Tiles made before
-        this are no longer shown.
+        """Record that everything in the map has been acknowledged or alerted. Cached tiles made
+        before this are no longer shown.
         """
         self._acknowledged = self.state.change
 
     def shown(self, tile: int, now: int) -> ShownTile:
-        """Return a tile that is fresh enough for a query at `now` [ns]: from the cache, or newly
+        """Return a tile that is recent enough for a query at `now` [ns]: from the cache, or newly
         made.
         """
         kept = self._kept.get(tile)

@@ -47,12 +47,14 @@ class TileRounds:
 
     @property
     def waiting(self) -> int:
-        """Return the number of tiles of the current round that are not published yet."""
+        """Return the number of tiles of the current publication round that are not published
+        yet.
+        """
         return len(self._left)
 
     def begin(self) -> bool:
-        """Begin a round if its time has come. Return True if the time has come, even if the
-        previous round is continued instead.
+        """Begin a publication round if its time has come. Return True if the time has come, even if
+        the previous round is continued instead.
         """
         passed = int((self._clock() - self._due) // self._every_s) + 1
         if passed <= 0:

@@ -108,7 +108,7 @@ def coarse_counts(counts: IntArray) -> IntArray:
 
 
 def join_views(*views: CellView) -> CellView:
-    """Return several views of cells joined into one."""
+    """Return several views (copies of the state of some cells) joined into one."""
     return CellView(*(np.concatenate(columns) for columns in zip(*views, strict=True)))
 
 

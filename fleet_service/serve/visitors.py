@@ -66,7 +66,7 @@ class Visitors:
         return np.asarray(np.bitwise_count(np.bitwise_or.reduce(within, axis=1)), np.int64)
 
     def renumber(self, place: IntArray) -> None:
-        """Update the slot numbers after the fusion renumbered its slots (cells and sectors);
+        """Update the slot numbers after the slots (storage of cells and sectors) were renumbered;
         `place` contains the new numbers, -1 for removed slots.
         """
         stay = np.flatnonzero(place >= 0)
@@ -97,8 +97,8 @@ class Visitors:
         return made
 
     def _grow(self) -> None:
-        """Enlarge the memory for the fusion's new slots (cells and sectors). The memory is doubled
-        when it is full, so that this is rare.
+        """Enlarge the memory for new slots (cells and sectors). The memory is doubled when it is
+        full, so that this is rare.
         """
         if len(self._bits) < self._fusion.size:
             longer = np.zeros((2 * self._fusion.size, PARTS), np.uint64)

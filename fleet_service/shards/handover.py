@@ -31,7 +31,7 @@ FIX: Final = "start it with --standby, the same settings and a name of its own"
 
 class HandoverResult(NamedTuple):
     """Result of a hand-over between services: the name of the service that stopped, and the time
-    [s] during which no service served the region.
+    [s] for which no service served the region.
     """
 
     service: str
@@ -109,7 +109,9 @@ def _find_server(there: presence.PresenceTracker, region: str) -> str | None:
 
 
 def _request_handover(session: zenoh.Session, service: str, to: str) -> str:
-    """Send the hand-over request to a service; return the regions that it hands over, as text."""
+    """Send a request to hand over its regions to a service; return the regions that it hands over,
+    as text.
+    """
     for reply in session.get(f"{keys.shard_key(service)}?to={to}", timeout=ANSWER_S):
         if reply.ok is not None:
             return reply.ok.payload.to_string().replace(",", ", ")

@@ -53,9 +53,9 @@ def claim_regions(
 
 @contextmanager
 def announce_regions(session: zenoh.Session, mine: frozenset[ServiceToken]) -> Iterator[None]:
-    """Announce that regions are served while the block runs. The service must be able to answer
-    queries before the block begins and until after it ends: an empty answer from an announced
-    region means that no data exist there.
+    """Announce to all clients that regions are served while the block runs. The service must be
+    able to answer queries before the block begins and until after it ends: an empty answer from an
+    announced region means that no data exist there.
     """
     with _hold_tokens(_declare_tokens(session, mine, SERVES)):
         yield

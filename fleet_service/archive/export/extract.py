@@ -43,8 +43,8 @@ class Extract(NamedTuple):
 
 
 def read_observations(root: Path, part: Extract) -> pa.Table:
-    """Return the selected observations as points; new rows in the inbox (files that are not yet
-    sorted by cell) are included.
+    """Return the selected observations of an archive as a GeoParquet table of points; new rows in
+    the inbox (files that are not yet sorted by cell) are included.
     """
     where = [_time_filter("leave_time", part)]
     if part.bbox is not None:
@@ -86,7 +86,7 @@ def with_vehicles(table: pa.Table, vehicles: int) -> pa.Table:
 
 def map_then(root: Path, part: Extract) -> pa.Table:
     """Return the last map snapshot before the end of the selected time range, limited to the
-    selected box, with cell polygons.
+    selected box, as a table with cell polygons.
     """
     path = _find_snapshot(root, part)
     table = load(path, tables.MAP_ARCHIVE)
@@ -113,7 +113,7 @@ def mask_unmeasured(table: pa.Table, names: Sequence[str], known: BoolArray) -> 
 
 
 def cell_hours(root: Path, part: Extract) -> pa.Table:
-    """Return the selected hourly statistics per cell (roll-up), with cell polygons."""
+    """Return the selected hourly statistics per cell (roll-up) as a table with cell polygons."""
     where = [_time_filter("hour", part)]
     days = layout.day_folders(
         root, rollup.TABLE, part.since // layout.DAY_NS, part.until // layout.DAY_NS

@@ -124,7 +124,9 @@ def put_in_place(
 
 
 def sync_tree(root: Path, folders: Iterable[Path]) -> None:
-    """Make new files in `folders`, and these folders themselves, durable (fsync up to `root`)."""
+    """Make new files in `folders`, and these folders themselves, durable on disk (fsync up to
+    `root`).
+    """
     above = {
         parent
         for folder in folders

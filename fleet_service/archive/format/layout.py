@@ -75,8 +75,9 @@ class Partition(NamedTuple):
     zone: int
 
     def folder(self, root: Path, table: str) -> Path:
-        """Return the partition's folder. A letter precedes the digits of the zone (map square of
-        zoom 7) in the name, so that readers do not parse them as a number.
+        """Return the folder of the partition (day and zone) in the archive. A letter precedes the
+        digits of the zone (map square of zoom 7) in the name, so that readers do not parse them as
+        a number.
         """
         zone = f"zone=q{grid.quadkey(self.zone, grid.ZONE_ZOOM)}"
         return root / table / f"date={date_of(self.day)}" / zone

@@ -178,8 +178,8 @@ def _read_batches(file: pq.ParquetFile, group: int, names: list[str]) -> Iterato
 
 
 def _read_row_groups(file: pq.ParquetFile, names: list[str] | None, where: Where) -> pa.Table:
-    """Return the rows of a Parquet file that match the filter `where`. Only Parquet row groups that
-    may contain such rows are read, one after the other.
+    """Return the rows of a Parquet file that match the filter `where`. Only Parquet row groups
+    (parts of the file) that may contain such rows are read, one after the other.
     """
     own = file.schema_arrow
     known = [one for one in where if one.column in own.names]
@@ -233,8 +233,8 @@ def _read_verified(
 
 
 def conform_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
-    """Return the table with the columns of `schema`: null where the table has no such column, cast
-    where the type differs.
+    """Return a table of the archive with the columns of `schema`: null where the table has no such
+    column, cast where the type differs.
 
     Raises:
         InputError: a value does not fit the type, or a required column is missing.

@@ -55,8 +55,8 @@ class Wanted(NamedTuple):
     box: tuple[float, float, float, float] | None = None
 
     def newer(self, path: Path) -> bool:
-        """Return True if a file was written after the position `after`. The file is a segment, or a
-        compacted file, which is named after its newest segment.
+        """Return True if a file was written after the position `after` in the sequence of segments.
+        The file is a segment, or a compacted file, which is named after its newest segment.
         """
         return self.after is None or layout.age_key(path.name)[:2] > self.after
 
@@ -154,8 +154,8 @@ class Listing:
 
 
 def files_near(files: Sequence[Path], box: tuple[float, float, float, float] | None) -> list[Path]:
-    """Return the compacted files of zones (map squares of zoom 7) that touch a box [deg]; all files
-    if the box is None.
+    """Return those of the compacted (sorted) files in zones (map squares of zoom 7) that touch a
+    box [deg]; all files if the box is None.
     """
     if box is None or not files:
         return list(files)
@@ -188,7 +188,7 @@ def _read_inbox(
 
 def compacted_partitions(files: Iterable[Path], names: set[str]) -> dict[str, set[Partition]]:
     """Return, for each segment (file of new rows), the partitions whose rows from this segment are
-    already in compacted files.
+    already in compacted (sorted) files.
 
     A compacted file is named after its newest segment. Therefore files older than all given
     segments need not be opened.
@@ -205,8 +205,8 @@ def compacted_partitions(files: Iterable[Path], names: set[str]) -> dict[str, se
 
 
 def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Table:
-    """Return the rows that do not belong to the partitions `done`, because compacted files already
-    contain the rows of these partitions (day and map square).
+    """Return the rows of a table of new rows that do not belong to the partitions `done`, because
+    compacted files already contain the rows of these partitions (day and map square).
     """
     if not done or not table.num_rows:
         return table
@@ -220,8 +220,8 @@ def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Tabl
 
 
 def sources_of(path: Path) -> set[str]:
-    """Return the names of the segments (files of new rows) from which a compacted file contains
-    rows; empty if the file is missing or damaged.
+    """Return the names of the segments (files of new rows) from which a compacted (sorted) file
+    contains rows; empty if the file is missing or damaged.
 
     Raises:
         InputError: the file has a newer major version.

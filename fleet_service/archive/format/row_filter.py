@@ -31,7 +31,7 @@ Where = Sequence[ValueRange]
 
 
 def filter_table(table: pa.Table, where: Where) -> pa.Table:
-    """Return the rows of a table that match all ranges, with all columns."""
+    """Return the rows of a table that match all value ranges in `where`, with all columns."""
     for column, least, most in where:
         values = table[column]
         if pa.types.is_timestamp(values.type):
@@ -45,8 +45,8 @@ def filter_table(table: pa.Table, where: Where) -> pa.Table:
 
 
 def matching_row_groups(footer: pq.FileMetaData, where: Where) -> list[int]:
-    """Return the indices of a Parquet file's row groups that may contain matching rows, according
-    to the statistics in the file's footer.
+    """Return the indices of a Parquet file's row groups (parts) that may contain rows that match
+    the filter `where`, according to the statistics in the file's footer.
     """
     places = {footer.schema.column(at).path: at for at in range(footer.num_columns)}
     known = [(places[one.column], one) for one in where if one.column in places]

@@ -144,7 +144,9 @@ def to_nanoseconds(times: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
 
 
 def table_of(kind: Kind, rows: Rows) -> pa.Table:
-    """Return columns as an Arrow table with the archive's schema for observations or states."""
+    """Return columns of rows as an Arrow table with the archive's schema for observations or
+    states.
+    """
     return pa.Table.from_arrays(
         [_make_column(f, rows) for f in SCHEMAS[kind]], schema=SCHEMAS[kind]
     )

@@ -61,8 +61,8 @@ class DamagedError(Exception):
 
 
 def make_footer(schema: pa.Schema, entries: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return key-value pairs for the footer of a file: `entries`, the digest, and the current
-    version unless `entries` contains one.
+    """Return key-value pairs for the footer of an archive file: `entries`, the digest (checksum),
+    and the current version unless `entries` contains one.
     """
     own = {KEY: str(VERSION), **(entries or {})}
     own = {key: value for key, value in own.items() if key != DIGEST}
@@ -81,14 +81,14 @@ def entries_of(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
 
 
 def is_newer(entries: Mapping[str, str]) -> bool:
-    """Return True if a file states a newer major version. This is only a quick check;
-    `check_version` decides.
+    """Return True if an archive file states a newer major version of the format. This is only a
+    quick check; `check_version` decides.
     """
     return entries.get(KEY, "0").partition(".")[0] > str(VERSION.major)
 
 
 def check_version(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
-    """Return the version of a file, given its columns and key-value pairs.
+    """Return the format version of an archive file, given its columns and key-value pairs.
 
     Raises:
         DamagedError: the columns or the key-value pairs are not those that were written.
@@ -115,7 +115,7 @@ def check_version(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> 
 
 
 def parse_version(text: str) -> Version:
-    """Return a version from its text.
+    """Return a format version from its text.
 
     Raises:
         InputError: the text is not of the form MAJOR.MINOR.
@@ -131,8 +131,8 @@ def parse_version(text: str) -> Version:
 
 
 def schema_digest(schema: pa.Schema, entries: Mapping[str, str]) -> str:
-    """Return a hash (16 hexadecimal digits) over names and types of the columns, and over key-value
-    pairs.
+    """Return a hash (16 hexadecimal digits) over names and types of a file's columns, and over the
+    key-value pairs of its footer.
     """
     state = _hash_columns(tuple(schema.names), tuple(schema.types)).copy()
     for key in sorted(entries):
@@ -147,8 +147,8 @@ def _hash_columns(names: tuple[str, ...], types: tuple[pa.DataType, ...]) -> bla
 
 
 def _type_name(kind: pa.DataType) -> str:
-    """Return the name of a type. The name of a list's item differs between versions of Arrow and is
-    omitted.
+    """Return the name of the type of a column. The name of a list's item differs between versions
+    of Arrow and is omitted.
     """
     if pa.types.is_list(kind):
         return f"list<{_type_name(kind.value_type)}>"

@@ -37,7 +37,7 @@ class Erasure:
 
 
 def write_request(root: Path, wanted: Erasure) -> Path:
-    """Write a request; return the path of its file.
+    """Write a request to erase data; return the path of its file.
 
     Raises:
         OSError: the file cannot be written.
@@ -57,7 +57,8 @@ def write_request(root: Path, wanted: Erasure) -> Path:
 
 
 def answer_to(question: Path) -> dict[str, Any] | None:
-    """Return the answer to a request and remove it; None if the service has not answered yet.
+    """Return the answer to a request to erase data, and remove the answer; None if the service has
+    not answered yet.
 
     Raises:
         InputError: the request was refused.
@@ -74,8 +75,8 @@ def answer_to(question: Path) -> dict[str, Any] | None:
 
 
 def open_requests(root: Path) -> list[Path]:
-    """Return the requests without an answer, oldest first. Also remove answers that nobody has
-    collected for a day.
+    """Return the requests to erase data that have no answer yet, oldest first. Also remove answers
+    that nobody has collected for a day.
     """
     for path in (root / FOLDER).glob(f"*{_ANSWER}"):
         if time.time() - path.stat().st_mtime > _KEPT_S:
@@ -86,7 +87,7 @@ def open_requests(root: Path) -> list[Path]:
 
 
 def read_request(question: Path) -> Erasure:
-    """Return the content of a request.
+    """Return the content of a request to erase data.
 
     Raises:
         InputError: the request is not valid.
@@ -103,7 +104,7 @@ def read_request(question: Path) -> Erasure:
 
 
 def answer_request(question: Path, outcome: dict[str, Any] | InputError) -> None:
-    """Answer a request and remove it.
+    """Answer a request to erase data, and remove the request.
 
     Raises:
         OSError: the answer cannot be written; the request stays.

@@ -65,7 +65,8 @@ class Pseudonyms:
         return pseudonym
 
     def boot(self, vehicle: str, boot: int, time: int) -> int:
-        """Return the pseudonymous number (63 bits) of a vehicle's start at a time [ns].
+        """Return the pseudonymous number (63 bits) that stands for a vehicle's start (`boot`) at a
+        time [ns].
 
         Raises:
             OSError: a key can neither be read nor written.
@@ -91,7 +92,7 @@ class Pseudonyms:
 
 
 def load_or_create_key(path: Path) -> bytes:
-    """Return a key from a file of mode 600; create the file if it does not exist.
+    """Return a secret key from a file of mode 600; create the file if it does not exist.
 
     Raises:
         OSError: the file can neither be read nor written, or is damaged.
@@ -108,8 +109,8 @@ def load_or_create_key(path: Path) -> bytes:
 
 
 def _read_key(path: Path) -> bytes:
-    """Return a key after verification; keys of an earlier version have no digest and are not
-    verified.
+    """Return a secret key from a file after verification; keys of an earlier version have no digest
+    and are not verified.
 
     Raises:
         OSError: the key is damaged. With a wrong key all pseudonyms would differ, and every batch

@@ -39,7 +39,7 @@ _MONTH: Final = re.compile(r"(\d{4}-\d{2})(\.\d{10})?")
 
 
 class VehicleIds:
-    """Permanent numbers of vehicles.
+    """Permanent numbers of vehicles, by which the map distinguishes them.
 
     Args:
         folder: folder of the keys.
@@ -114,8 +114,8 @@ def read_numbers(folder: Path) -> dict[int, int]:
 
 
 def remove_damaged_lines(folder: Path) -> int:
-    """Remove damaged lines and other text from the files, if the disk allows it; return the number
-    of damaged lines.
+    """Remove damaged lines and other text from the files with the permanent vehicle numbers, if the
+    disk allows it; return the number of damaged lines.
 
     Raises:
         OSError: a file cannot be read.
@@ -132,12 +132,14 @@ def remove_damaged_lines(folder: Path) -> int:
 
 
 def _month_files(folder: Path) -> list[Path]:
-    """Return the files with the permanent vehicle numbers of all months."""
+    """Return the paths of the files with the permanent vehicle numbers of all months."""
     return [path for path in sorted(folder.glob(f"*{ENDING}")) if _MONTH.fullmatch(path.stem)]
 
 
 def _undamaged_lines(data: bytes) -> Iterator[tuple[int, int]]:
-    """Yield (pseudonym, permanent number) for each undamaged line of a file's content `data`."""
+    """Yield (pseudonym, permanent number) for each undamaged line of the content `data` of a file
+    with permanent vehicle numbers.
+    """
     for at in range(0, len(data) - _LINE + 1, _LINE):
         pseudonym, number = (int.from_bytes(data[at + k : at + k + 8], signed=True) for k in (0, 8))
         if data[at : at + _LINE] == _encode_line(pseudonym, number):
@@ -145,8 +147,8 @@ def _undamaged_lines(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def numbers_of(known: Mapping[int, int], pseudonyms: IntArray) -> IntArray:
-    """Return the permanent numbers of pseudonyms (n,), according to the result of `read_numbers`.
-    An unknown pseudonym is returned unchanged.
+    """Return the permanent numbers of vehicles (n,), given by pseudonyms (n,), according to the
+    result of `read_numbers`. An unknown pseudonym is returned unchanged.
     """
     if not known or not len(pseudonyms):
         return pseudonyms
@@ -155,8 +157,8 @@ def numbers_of(known: Mapping[int, int], pseudonyms: IntArray) -> IntArray:
 
 
 def forget_vehicles(folder: Path, month: str, pseudonym: int | None = None) -> None:
-    """Remove one vehicle's line of a month; if `pseudonym` is None, remove all lines of the
-    month.
+    """Remove the line that links one vehicle's pseudonym of a month to its permanent number; if
+    `pseudonym` is None, remove all lines of the month.
     """
     for path in _month_files(folder):
         if path.name.partition(".")[0] != month:

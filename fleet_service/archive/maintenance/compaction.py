@@ -35,8 +35,8 @@ ROUND_ROWS: Final = 1_000_000
 
 
 class CompactionResult(NamedTuple):
-    """Result of a compaction: numbers of rows moved, of segments (files of new rows) deleted, and
-    of files added.
+    """Result of a compaction (move of new rows into sorted files): numbers of rows moved, of
+    segments (files of new rows) deleted, and of files added.
     """
 
     rows: int
@@ -45,7 +45,8 @@ class CompactionResult(NamedTuple):
 
 
 def lock_compacted(root: Path) -> BinaryIO:
-    """Lock the compacted files for this process until the returned handle is closed.
+    """Lock the compacted (sorted) files of an archive for this process until the returned handle is
+    closed.
 
     Raises:
         InputError: another process has the lock, because it adds or rewrites compacted files.
@@ -59,7 +60,8 @@ def lock_compacted(root: Path) -> BinaryIO:
 
 @contextmanager
 def hold_compaction_lock(root: Path) -> Iterator[None]:
-    """Lock the compacted files while the block runs, and remove drafts of interrupted runs.
+    """Lock the compacted (sorted) files of an archive while the block runs, and remove drafts of
+    interrupted runs.
 
     Raises:
         InputError: the folder is not an archive, or another process has the lock.
@@ -74,7 +76,8 @@ def hold_compaction_lock(root: Path) -> Iterator[None]:
 
 
 def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
-    """Move all rows of the inbox into the compacted files.
+    """Move all rows of the inbox (new rows) into the compacted files, which are sorted by cell and
+    time.
 
     Args:
         root: folder of the archive; a service may be running on it.
@@ -113,8 +116,9 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
 
 
 class _Rest(NamedTuple):
-    """Segments (files of new rows) that are not compacted yet, oldest first. Each has a set of
-    partitions (date and map square) to which an earlier, interrupted run already moved its rows.
+    """Segments (files of new rows) whose rows are not yet in compacted (sorted) files, oldest
+    first. Each has a set of partitions (date and map square) to which an earlier, interrupted run
+    already moved its rows.
     """
 
     root: Path
@@ -125,8 +129,8 @@ class _Rest(NamedTuple):
 
 
 def _compact_round(rest: _Rest, most: int) -> CompactionResult:
-    """Move the rows of the next segments into compacted files: about `most` rows, but at least one
-    segment.
+    """Move the rows of the next segments (files of new rows) into compacted (sorted) files: about
+    `most` rows, but at least one segment.
     """
     sources: list[Path] = []
     tables: list[pa.Table] = []
@@ -170,8 +174,8 @@ def join_versions(tables: list[pa.Table], known: pa.Schema) -> pa.Table:
 def _place_files(
     root: Path, kind: Kind, name: str, table: pa.Table, footer: Mapping[str, str]
 ) -> int:
-    """Write the compacted files of a round as drafts, then rename them into place; return their
-    number.
+    """Write the compacted (sorted) files of a round as drafts, then rename them into place; return
+    their number.
     """
     drafts: list[tuple[Path, Path]] = []
     for partition, part in split_by_partition(table, kind):

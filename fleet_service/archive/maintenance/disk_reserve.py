@@ -16,7 +16,9 @@ _LEAST_FREE: Final = 4 * SIZE
 
 
 def allocate(root: Path) -> None:
-    """Allocate the reserved space (a file) if the disk has plenty of free space."""
+    """Allocate the reserved space (a large file) on the archive's disk if the disk has plenty of
+    free space.
+    """
     path = root / NAME
     with suppress(OSError):
         if not path.exists() and shutil.disk_usage(root).free > _LEAST_FREE:
@@ -25,8 +27,8 @@ def allocate(root: Path) -> None:
 
 
 def release(root: Path) -> bool:
-    """Release the reserved space (delete its file) if the disk is full; return True if it was
-    released.
+    """Release the reserved space on the archive's disk (delete its file) if the disk is full;
+    return True if it was released.
     """
     path = root / NAME
     if not path.exists() or shutil.disk_usage(root).free > SIZE:

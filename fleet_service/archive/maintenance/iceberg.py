@@ -64,8 +64,8 @@ class RegistrationResult(NamedTuple):
 
 
 def register(root: Path, place: Place) -> RegistrationResult:
-    """Register the compacted files of an archive in the Iceberg tables; a repeated call changes
-    nothing.
+    """Register the compacted (sorted) files of an archive in the Iceberg tables; a repeated call
+    changes nothing.
 
     Files of other archives in the same tables stay registered.
 

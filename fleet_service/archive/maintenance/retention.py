@@ -75,7 +75,7 @@ def retire_rows(root: Path, raw_days: int, today: date) -> RetirementResult:
 
 
 def due_folders(root: Path, raw_days: int, today: date) -> list[Path]:
-    """Return the day folders whose raw rows `retire_rows` would remove.
+    """Return the folders of the days whose raw rows `retire_rows` would remove.
 
     Raises:
         InputError: `raw_days` is too small.
@@ -260,7 +260,8 @@ def _thin_snapshot(root: Path, path: Path, cells: set[int]) -> bool:
 
 
 def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
-    """Return the number of rows that `forget_vehicle` would remove, without removing them.
+    """Return the number of rows of a vehicle in a month that `forget_vehicle` would remove, without
+    removing them.
 
     Raises:
         InputError: the month's key does not exist.
@@ -289,7 +290,9 @@ def drop_checkpoints(root: Path) -> None:
 
 
 def _may_hold_vehicle(kind: Kind, path: Path, pseudonym: str) -> bool:
-    """Return True if a file may contain rows of a vehicle."""
+    """Return True if a file contains rows of the vehicle with this pseudonym; raise an error if the
+    file is damaged.
+    """
     found = load(path, SCHEMAS[kind], ["vehicle"], damaged=_refuse_damaged)
     return found is not None and pseudonym in pc.unique(found["vehicle"]).to_pylist()
 

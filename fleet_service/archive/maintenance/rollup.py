@@ -54,7 +54,8 @@ def part_of(path: Path, below: Path | None = None) -> Path:
 
 
 def complete_parts(root: Path, until_day: int | None = None) -> int:
-    """Compute the missing hourly statistics (roll-up parts); return the number of files written.
+    """Compute the missing hourly statistics (roll-up parts) of an archive; return the number of
+    files written.
 
     Raises:
         OSError: a file cannot be read or written.

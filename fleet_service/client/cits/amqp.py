@@ -28,7 +28,9 @@ log = logging.getLogger(__name__)
 
 
 class Parcel(NamedTuple):
-    """Message to send. Its name is passed to `on_accepted` when the interchange has accepted it."""
+    """Message (DENM) to send to the interchange. Its name is passed to `on_accepted` when the
+    interchange has accepted it.
+    """
 
     name: str
     body: bytes
@@ -36,7 +38,9 @@ class Parcel(NamedTuple):
 
 
 class _AmqpEvents(MessagingHandler):
-    """Handler of connection events; all methods run on the thread of the AMQP container."""
+    """Handler of events of the AMQP connection; all methods run on the thread of the AMQP
+    container.
+    """
 
     def __init__(self, link: AmqpLink) -> None:
         super().__init__(prefetch=CREDIT, auto_accept=True)

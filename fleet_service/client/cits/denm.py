@@ -101,7 +101,7 @@ class Denm:
 
 
 def encode_denm(denm: Denm) -> bytes:
-    """Return the bytes of a DENM, encoded directly from the record.
+    """Return the bytes of a DENM (hazard message), encoded directly from the record.
 
     The layout is that of `denm.asn`. A general encoder takes three times as long, mostly because of
     the names of the fields.
@@ -123,7 +123,7 @@ def encode_denm(denm: Denm) -> bytes:
 
 
 def decode_denm(data: bytes) -> Denm:
-    """Return the DENM that is encoded in `data`.
+    """Return the DENM (hazard message) that is encoded in `data`.
 
     Raises:
         InputError: the bytes are not a DENM.
@@ -144,18 +144,20 @@ def decode_denm(data: bytes) -> Denm:
 
 
 def its_time(ns: int) -> int:
-    """Return a time [ns since 1970, UTC] as ITS timestamp [ms]."""
+    """Return a time [ns since 1970, UTC] as an ITS timestamp [ms since 2004, with leap seconds]."""
     return (ns - EPOCH_NS) // 1_000_000 + LEAP_MS
 
 
 def utc_of(its_ms: int) -> int:
-    """Return an ITS timestamp as time [ns since 1970, UTC]."""
+    """Return an ITS timestamp [ms since 2004, with leap seconds] as time [ns since 1970, UTC]."""
     return (its_ms - LEAP_MS) * 1_000_000 + EPOCH_NS
 
 
 @cache
 def compiled_denm() -> Any:  # noqa: ANN401 the library has no types
-    """Return a general encoder and decoder of DENM, compiled from the specification `denm.asn`."""
+    """Return a general encoder and decoder of DENM (hazard messages), compiled from the
+    specification `denm.asn`.
+    """
     try:
         import asn1tools
     except ImportError as error:
@@ -218,9 +220,9 @@ def _write_location(out: BitWriter, denm: Denm) -> None:
 
 
 def _encode_deltas(origin: Point, points: Iterable[Point]) -> list[int]:
-    """Return the encoded offsets of points from `origin`. Each point has the offsets to the north
-    and to the east, both encoded with the same number of bits, and a height that is marked as
-    unavailable. Points that are too far away for these bits are left out.
+    """Return the offsets of points from `origin` in the encoding of a DENM. Each point has the
+    offsets to the north and to the east, both encoded with the same number of bits, and a height
+    that is marked as unavailable. Points that are too far away for these bits are left out.
     """
     found = list[int]()
     height = 12_800 - LEAST["height"]
@@ -287,8 +289,8 @@ def _decode_delta(origin: Point, delta: Mapping[str, int]) -> Point:
 def approach_points(
     position: Point, heading: float, metres: tuple[float, ...] = (100.0, 300.0, 600.0)
 ) -> tuple[Point, ...]:
-    """Return points on the approach to an event along its heading [deg from north], at the given
-    distances [m], nearest first.
+    """Return points (latitude, longitude) on the road before a hazard event, for traffic with the
+    given heading [deg from north], at the given distances [m], nearest first.
     """
     north = math.cos(math.radians(heading))
     east = math.sin(math.radians(heading))

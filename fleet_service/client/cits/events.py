@@ -51,7 +51,7 @@ class OpenEvent:
 
 
 class EventBook:
-    """All events of a station that sends DENM.
+    """All hazard events of a station that sends DENM (hazard messages).
 
     Args:
         station: identifier of the originating station.
@@ -80,7 +80,7 @@ class EventBook:
 
     @property
     def content(self) -> dict[str, Any]:
-        """Return all events in a form that JSON supports, to be saved to a file."""
+        """Return all hazard events in a form that JSON supports, to be saved to a file."""
         return {
             "station": self.station,
             "next": self._next,
@@ -150,8 +150,8 @@ class EventBook:
         )
 
     def _common_fields(self, event: OpenEvent, now: int, termination: Termination | None) -> Denm:
-        """Return a message with the fields that all messages of an event have; its detection time
-        is `now` [ns UTC].
+        """Return a message with the fields that all messages (DENM) of a hazard event have; its
+        detection time is `now` [ns UTC].
         """
         return Denm(
             self.station,

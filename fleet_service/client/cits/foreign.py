@@ -37,8 +37,8 @@ POSITION_STD: Final = 10.0  # [m] where a message does not say
 def encode_reports(
     denm: Denm, name: str, boot: int, first_seq: int, now: int
 ) -> list[tuple[str, bytes]]:
-    """Return keys and JSON payloads of the batches for a DENM; empty if the DENM says nothing about
-    friction at present.
+    """Return keys and JSON payloads of the batches of reports that stand for a DENM (hazard
+    message); empty if it says nothing about friction at present.
 
     Args:
         denm: received message.
@@ -79,7 +79,7 @@ def encode_reports(
 
 
 def _headings(denm: Denm) -> tuple[float, ...]:
-    """Return the headings [deg from north] of the traffic concerned.
+    """Return the headings [deg from north] of the traffic that a DENM (hazard message) concerns.
 
     If the DENM states no heading, both directions of the road are concerned. Then the nearest other
     point of a trace or of the history gives the road's axis. If there is no such point, return all

@@ -28,8 +28,8 @@ log = logging.getLogger(__name__)
 
 
 class Sending(NamedTuple):
-    """Settings for sending DENM: address at the interchange, identifier of the station, publisher,
-    and file in which the state is saved.
+    """Settings for sending DENM (hazard messages): address at the interchange, identifier of the
+    station, publisher, and file in which the state is saved.
     """
 
     target: str
@@ -39,8 +39,8 @@ class Sending(NamedTuple):
 
 
 class Receiving(NamedTuple):
-    """Settings for receiving DENM: address at the interchange, filter on the messages, and the
-    vehicle name under which reports are made from received DENM.
+    """Settings for receiving DENM (hazard messages): address at the interchange, filter on the
+    messages, and the vehicle name under which reports are made from received DENM.
     """
 
     source: str
@@ -49,8 +49,8 @@ class Receiving(NamedTuple):
 
 
 class Witness:
-    """Publisher that converts received DENM to reports of one vehicle name and publishes them on
-    Zenoh.
+    """Publisher that converts received DENM (hazard messages) to reports of one vehicle name and
+    publishes them on Zenoh.
 
     Attributes:
         refused: number of messages that are not a DENM.
@@ -96,7 +96,7 @@ def run_gateway(
     receiving: Receiving | None,
     stop: threading.Event,
 ) -> None:
-    """Send and receive DENM until `stop` is set.
+    """Send and receive DENM (hazard messages) until `stop` is set.
 
     Raises:
         InputError: no service answers, the state file has other content, or a package is missing.

@@ -64,7 +64,7 @@ class DenmOutput:
 
     @property
     def is_due(self) -> bool:
-        """Return True if it is time to check whether events must be sent again before their
+        """Return True if it is time to check whether hazard events must be sent again before their
         validity ends.
         """
         return time.monotonic() >= self._checked + CHECK_S
@@ -75,8 +75,8 @@ class DenmOutput:
         return len(self._book.open_events)
 
     def mark_accepted(self, name: str) -> None:
-        """Record that the interchange accepted the DENM with this name, so that it is not sent
-        again.
+        """Record that the interchange accepted the DENM (hazard message) with this name, so that it
+        is not sent again.
         """
         with self._lock:
             self._pending.pop(name, None)

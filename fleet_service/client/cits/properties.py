@@ -73,7 +73,7 @@ def message_properties(denm: Denm, originator: Originator) -> dict[str, Any]:
 
 
 def quadtree_keys(denm: Denm) -> str:
-    """Return the quadkeys of all squares that an event touches, separated and enclosed by
+    """Return the quadkeys of all squares that a hazard event touches, separated and enclosed by
     commas.
     """
     latitude, longitude = zip(denm.position, *denm.history, strict=True)
