@@ -67,7 +67,9 @@ class Horizon(NamedTuple):
 
 
 def horizon_length(speed: float) -> float:
-    """Return the length of the horizon [m]: the stopping distance on an unknown road."""
+    """Return how far to look ahead at `speed` [m/s]: the stopping distance on an unknown road
+    [m].
+    """
     stop = speed * (REACTION_S + 2.0) + MARGIN_M + speed**2 / (2.0 * UNKNOWN_LOWER * GRAVITY)
     return float(min(max(stop, SHORTEST_M), LONGEST_M))
 

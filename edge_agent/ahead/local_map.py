@@ -117,11 +117,13 @@ class LocalMap:
 
     @property
     def alerts(self) -> list[Alert]:
-        """Return the active alerts known to the car."""
+        """Return the active alerts of slippery places that the car knows."""
         return [alert for alert, _ in self._alerts.values()]
 
     def store_cells(self, tile: int, cells: ReceivedCells, now: int) -> None:
-        """Store the received cells of a tile. They replace stored cells only if they are newer."""
+        """Store the received cells of a map tile in the local map. They replace stored cells only
+        if they are newer.
+        """
         before = self._tiles.pop(tile, NOTHING)
         both = _concatenate_cells([_select_cells(before, now - before.heard < HELD_S * NS), cells])
         latest_first = np.lexsort((both.heard, both.key))[::-1]
@@ -147,8 +149,8 @@ class LocalMap:
         return self._alerts.pop(key, None) is not None
 
     def store_standing_alerts(self, tile: int, alerts: list[Alert], now: int) -> list[int]:
-        """Replace the active alerts of a tile by `alerts`; return the keys (cell·4 + sector) of the
-        places whose alerts changed.
+        """Replace the active alerts of a map tile by `alerts`; return the keys (cell·4 + sector) of
+        the places whose alerts changed.
         """
         stand = {alert.cell * grid.SECTORS + alert.sector: alert for alert in alerts}
         news = [

@@ -62,8 +62,7 @@ class LookoutCounts:
     subscribers: dict[str, MapSubscriber] = field(default_factory=dict)
 
     def total_of(self, what: str) -> int:
-        """Return the sum of the counter with the name `what` over the map subscribers of all
-        vehicles."""
+        """Return the sum of the counter with the name `what` over all vehicles."""
         return sum(one.counts[what] for one in self.subscribers.values())
 
     def values(self) -> dict[str, float]:
@@ -132,8 +131,8 @@ class Lookout:
             watcher.subscriber = self.counts.subscribers[name] = subscriber
 
     def see(self, poses: Sequence[Pose]) -> None:
-        """Store the present poses (position, heading, speed) of the vehicles; row k is vehicle
-        k.
+        """Store the present poses (position, heading, speed) of the vehicles; item k belongs to
+        vehicle k.
         """
         self._poses = poses
 
@@ -163,7 +162,9 @@ class Lookout:
         self._here = np.column_stack([mugrid.quantiles(informed, q) for q in (0.5, 0.05, 0.95)])
 
     def outlook(self, name: str) -> Outlook | None:
-        """Return the last result of looking ahead for a vehicle; None before the first one."""
+        """Return the last result of looking ahead for the vehicle `name`, with its warnings and the
+        road ahead; None before the first one.
+        """
         return self._watchers[self._number[name]].outlook
 
     def close(self, within_s: float = 1.0) -> None:
@@ -272,8 +273,8 @@ def paths_ahead(
 
 
 def runs_of_places(horizon: Horizon) -> Runs:
-    """Return the runs of consecutive metres of a horizon that lie in the same place (cell and
-    sector).
+    """Return the parts of a horizon (values of the map for each metre ahead) that lie in the same
+    place (cell and sector), as runs of consecutive metres.
     """
     key = horizon.key
     starts = np.append(

@@ -82,7 +82,7 @@ class MapSubscriber:
 
     @property
     def tiles(self) -> list[int]:
-        """Return the tiles whose alerts are subscribed to."""
+        """Return the map tiles whose alerts the vehicle has subscribed to."""
         return self._tiles.subscribed_tiles
 
     @property

@@ -71,7 +71,7 @@ class Path(NamedTuple):
     y: FloatArray
 
     def first_metres(self, length: float) -> Path:
-        """Return the part of the path that covers its first `length` metres."""
+        """Return the first part of this path ahead of the car, `length` metres long."""
         n = max(int(length), 1)
         return Path(
             self.kind,
@@ -130,7 +130,7 @@ def path_along(
 
 
 def straight_path(pose: Pose, length: float) -> Path:
-    """Return a straight path in the direction of the car's heading."""
+    """Return a straight path of `length` metres in the direction of the car's heading."""
     reach = min(length, CORRIDOR_M)
     end = [reach * np.cos(pose.yaw), reach * np.sin(pose.yaw)]
     return path_along("corridor", np.array([[0.0, 0.0], end]), pose, length)
@@ -150,7 +150,9 @@ class GivenRoute:
         self._metre = 0.0
 
     def ahead(self, pose: Pose, length: float) -> Path | None:
-        """Return the path ahead along the route; None if the car has left the route."""
+        """Return the next `length` metres of the route as a path ahead of the car; None if the car
+        has left the route.
+        """
         x, y = to_plane(self._latitude, self._longitude, pose)
         line = np.column_stack([x, y])
         run = _distance_along(line)

@@ -72,8 +72,8 @@ def cautious_bound(mu: FloatArray, mu_lower: FloatArray) -> FloatArray:
 
 
 def limit_of(horizons: list[Horizon]) -> float:
-    """Return the lowest speed limit over all possible paths ahead [m/s]; inf if there is
-    no limit.
+    """Return the lowest speed limit [m/s] that the friction on any of the possible paths ahead
+    requires; inf if there is no limit.
     """
     found = []
     for one in horizons:

@@ -59,7 +59,7 @@ class MapPrior:
 
     def entered_vehicles(self, keys: IntArray) -> list[int]:
         """Return the indices of the vehicles that entered another place (map cell with heading
-        sector) since the last step. `step` needs the map's beliefs for them.
+        sector) since the last step. The method `step` needs the map's beliefs about these places.
         """
         return np.flatnonzero(keys != self._key).tolist()
 

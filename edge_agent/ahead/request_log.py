@@ -46,19 +46,22 @@ class Box(NamedTuple):
 
 
 class RequestLog:
-    """Log of the last MOST_BOXES requested boxes, with the time of each request."""
+    """Log of the last MOST_BOXES boxes (rectangles of the map) that were requested, with the time
+    of each request.
+    """
 
     def __init__(self) -> None:
         self._boxes: deque[tuple[Box, int]] = deque(maxlen=MOST_BOXES)
 
     def request_again(self) -> None:
-        """Clear the log of requested boxes, so that everything is requested again after a session
-        has been reopened.
+        """Clear the log of requested boxes (rectangles of the map), so that everything is requested
+        again after a session has been reopened.
         """
         self._boxes.clear()
 
     def missing_boxes(self, path: Path, pose: Pose, within: float) -> list[Box]:
-        """Return the boxes to request now along a path, and record them as requested.
+        """Return the boxes (rectangles of the map) to request now along a path, and record them as
+        requested.
 
         The result is empty while recently requested boxes cover the first `within` metres of the
         path. Otherwise the boxes cover all parts of the path that no recently requested box covers.
@@ -86,11 +89,13 @@ class Tiles:
 
     @property
     def subscribed_tiles(self) -> list[int]:
-        """Return the tiles to which the vehicle subscribes."""
+        """Return the map tiles to whose alerts the vehicle subscribes."""
         return list(self._wanted)
 
     def update_subscriptions(self, paths: list[Path], pose: Pose) -> tuple[list[int], list[int]]:
-        """Update the set of tiles; return (tiles to subscribe to, tiles to unsubscribe from)."""
+        """Update the set of map tiles whose alerts are needed; return (tiles to subscribe to, tiles
+        to unsubscribe from).
+        """
         here = int(grid.tile_of(grid.cell_of(pose.latitude, pose.longitude)))
         ahead: list[int] = [here]
         for path in paths:
@@ -114,7 +119,7 @@ class Tiles:
 
 
 def keys_of(box: Box) -> list[int]:
-    """Return the regions (z10 quadints) that a box touches, each once."""
+    """Return the regions (z10 quadints) that a box (rectangle of the map) touches, each once."""
     corners = grid.cell_of(
         np.array([box.south, box.south, box.north, box.north]),
         np.array([box.west, box.east, box.west, box.east]),
@@ -127,7 +132,7 @@ def _in_order(tiles: IntArray) -> list[int]:
 
 
 def _split_path(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
-    """Return parts of the path as pairs (first metre, last metre). Together they contain every
+    """Return parts of a path ahead as pairs (first metre, last metre). Together they contain every
     metre of the mask `wanted`, and each has a small bounding box.
     """
     found: list[tuple[int, int]] = []

@@ -33,8 +33,8 @@ SLOWEST: Final = 0.5  # [m/s] who stands has no time to a stretch
 
 @dataclass(frozen=True)
 class Active:
-    """A current warning: the reported hazard, its places (cell·4 + sector), and the time and
-    distance at which it was last confirmed.
+    """A current warning about a slippery stretch: the reported hazard, its places (cell·4 +
+    sector), and the time and distance at which it was last confirmed.
     """
 
     warning: GripWarning
@@ -56,7 +56,8 @@ class _Stretch:
 def update_warnings(
     active: tuple[Active, ...], horizons: list[Horizon], pose: Pose, known: LocalMap
 ) -> tuple[tuple[Active, ...], list[GripWarning]]:
-    """Update the active warnings from new horizons; return them, and the warnings to report now.
+    """Update the active warnings from new horizons (values of the map for each metre ahead); return
+    them, and the warnings to report now.
 
     Args:
         active: active warnings before the update.

@@ -90,7 +90,7 @@ class AgentPart(Protocol):
         """Give this part of the agent the opened Zenoh session of the vehicle `name`."""
 
     def start_part(self) -> None:
-        """Start this part of the agent, before the agent processes the first block of samples."""
+        """Start this part of the agent, before the agent processes the first samples."""
 
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:
         """Update this part of the agent from the pipeline after a block of samples; `admitted` is

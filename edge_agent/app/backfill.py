@@ -25,8 +25,9 @@ from schemas.vehicle import load_vehicle
 
 
 class Task(NamedTuple):
-    """Task of the estimation: a signal log, the vehicle that recorded it, and the path for its
-    estimates."""
+    """Task of estimating one recorded drive: a signal log, the vehicle that recorded it, and the
+    path for its estimates.
+    """
 
     log: Path
     vehicle: Path

@@ -70,7 +70,9 @@ PANELS: Final = (
 
 @dataclass(frozen=True)
 class RecordedDrive:
-    """Recorded drive with its estimates by estimator; `title` is the headline of the report."""
+    """Recorded drive with the estimates of several estimators; `title` is the headline of the
+    report.
+    """
 
     log: SignalLog
     estimates: Mapping[str, pa.Table]
@@ -97,7 +99,7 @@ def write_report(drive: RecordedDrive, path: Path) -> None:
 def curve_of(
     table: pa.Table, panel: Panel
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return, for a plot of one estimated quantity, its time, value, and lower and upper end of its
+    """Return, for a plot of one estimated quantity, times, values, and lower and upper end of its
     interval, (n,) each. The ends are NaN for a quantity without interval.
     """
     t, value = (table[name].to_numpy().astype(np.float64) for name in ("t", panel.column))
@@ -183,8 +185,8 @@ def _health_spans(drive: RecordedDrive) -> list[dict[str, Any]]:
 
 
 def _track_of(drive: RecordedDrive) -> dict[str, Any] | None:
-    """Return the track of the drive: x and y [m from the mean position], time, and a colour for the
-    mu of the first estimator.
+    """Return the track of a recorded drive: x and y [m from the mean position], time, and a colour
+    for the mu of the first estimator.
 
     Return None if the log has fewer than two positions.
     """

@@ -117,7 +117,9 @@ class KuksaProvider:
                 return
 
     def _write_one(self, publish: Any, path: str, value: Any, time_ns: int) -> bool:  # noqa: ANN401
-        """Write one value to the databroker; return False if the broker is unavailable."""
+        """Write one value to the databroker at VSS path `path`; return False if the broker is
+        unavailable.
+        """
         messages = self._connection.messages
         point = messages.Datapoint(value=value)
         point.timestamp.seconds, point.timestamp.nanos = divmod(time_ns, NS)

@@ -31,8 +31,8 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Progress:
-    """Progress of the live loop: duration of the signals [s], number of blocks (of samples), number
-    of late blocks, the longest and the last delay [s].
+    """Progress of the live loop (estimation in real time): duration of the signals [s], number of
+    blocks (of samples), number of late blocks, the longest and the last delay [s].
 
     `held` counts records that were not published, because their signals were not verified.
     """
@@ -46,7 +46,7 @@ class Progress:
 
 
 class LoopOptions(NamedTuple):
-    """Options of the loop.
+    """Options of the live loop (estimation in real time).
 
     Attributes:
         on_status: receives the progress every STATUS_EVERY_S.

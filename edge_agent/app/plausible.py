@@ -79,7 +79,7 @@ class Plausibility:
 
     @property
     def seconds(self) -> float:
-        """Return the length of the replayed drive [s]."""
+        """Return the duration of the replayed drive [s]."""
         return max(self.last - self.first, 0.0)
 
     @property

@@ -31,7 +31,7 @@ def open_publisher(
     estimator: str,
     on_open: Callable[[str, zenoh.Session], None] = lambda *_: None,
 ) -> Publisher:
-    """Return a started publisher with the configured outbox (store of unsent records).
+    """Return a started publisher with the configured outbox (file of unsent records).
     `on_open(name, session)` is called with each vehicle's session.
 
     Raises:
@@ -58,8 +58,8 @@ def open_publisher(
 def close_publisher(
     publisher: Publisher, progress: Progress, drain_s: float, **more: float
 ) -> None:
-    """Wait at most `drain_s` seconds for acknowledgements and close the publisher. Print counts and
-    the values `more` as one line of JSON on stdout.
+    """Wait at most `drain_s` seconds for acknowledgements and close the publisher. Print the counts
+    of records and the values `more` as one line of JSON on stdout.
 
     Records without an acknowledgement stay in the outbox (store on disk) and are sent after the
     next start.
@@ -76,7 +76,9 @@ def close_publisher(
 
 
 def print_status(progress: Progress, publisher: Publisher, log_line: Callable[[str], None]) -> None:
-    """Print one line with the progress of the loop and the counts of the publisher."""
+    """Print one line with the progress of the estimation loop and the publisher's counts of
+    records.
+    """
     from edge_agent.app.live_loop import final_counts
 
     counts = publisher.counts

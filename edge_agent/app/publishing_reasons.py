@@ -47,8 +47,8 @@ class PublisherState(Protocol):
 
 
 class SignalWatch:
-    """Observer of a signal source: it records when the source's blocks of samples last contained a
-    position, a wheel speed and a turning wheel.
+    """Observer of a source of signals: it records when the source last delivered a position, a
+    wheel speed and a turning wheel.
 
     Args:
         clock: monotonic clock [s].

@@ -93,7 +93,9 @@ class Trip:
         return self._trusted or self._known.passed
 
     def health_problems(self) -> list[str]:
-        """Return the reason why nothing is published; an empty list if records are published."""
+        """Return the reason why nothing is published, as a list; the list is empty if records are
+        published.
+        """
         if self.is_admitted():
             return []
         return [f"the signal doctor: {', '.join(self._faults) or 'has not passed the signals yet'}"]
@@ -144,8 +146,8 @@ class Trip:
             self._start_examination(final=False)
 
     def _start_examination(self, *, final: bool) -> None:
-        """Start an examination of the current part on another thread. With `final`, the part ends
-        and the next one begins.
+        """Start an examination of the signals of the current part of the trip on another thread.
+        With `final`, the part ends and the next one begins.
         """
         if not self._blocks:
             return

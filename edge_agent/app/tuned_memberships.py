@@ -69,7 +69,9 @@ class SplitScores(Record):
 
 
 class Budget(Record):
-    """Limits of the search, and the number of parameter vectors that each search evaluated."""
+    """Limits of the search for fuzzy sets: ants, iterations, and the number of parameter vectors
+    that each search evaluated.
+    """
 
     ants: Count
     iterations: Count

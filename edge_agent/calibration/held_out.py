@@ -143,7 +143,7 @@ def restrict_groups(calibration: Calibration, groups: Sequence[str]) -> Calibrat
 
 def is_worse(tried: Sequence[Prediction], best: Sequence[Prediction]) -> bool:
     """Return True if the predictions `tried` are worse than `best`: their mean log-likelihood is
-    lower, or one drive has the flag CONTRADICTION for longer.
+    lower, or one drive has the flag CONTRADICTION (measurements contradict the model) for longer.
     """
     lost = _mean_prediction(best).log_likelihood - _mean_prediction(tried).log_likelihood
     longer = max(new.contradicted - old.contradicted for new, old in zip(tried, best, strict=True))

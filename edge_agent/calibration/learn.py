@@ -131,8 +131,8 @@ def learn_calibration(
 
 
 def weigh_estimates(drives: Sequence[DriveEstimates], vehicle: Vehicle) -> Calibration | None:
-    """Return a calibration with means and standard deviations over several drives; None if no drive
-    has an estimate.
+    """Return a calibration (sensor errors of a car) with means and standard deviations over several
+    drives; None if no drive has an estimate.
     """
     estimates: dict[str, list[float]] = {}
     for drive in drives:
@@ -152,8 +152,8 @@ def weigh_estimates(drives: Sequence[DriveEstimates], vehicle: Vehicle) -> Calib
 
 
 def surer_values(one: Calibration | None, other: Calibration | None) -> Calibration | None:
-    """Return a calibration that combines two of the same car: for each quantity, the value with the
-    smaller standard deviation.
+    """Return a calibration (sensor errors) that combines two of the same car: for each quantity,
+    the value with the smaller standard deviation.
     """
     if one is None or other is None:
         return one or other
@@ -169,8 +169,8 @@ def surer_values(one: Calibration | None, other: Calibration | None) -> Calibrat
 def _posterior_of(
     kind: str, values: FloatArray, bias: float, unknown: float
 ) -> tuple[float, float]:
-    """Return the posterior (mean, standard deviation) of a quantity from the estimates of several
-    drives (n,).
+    """Return the posterior (mean, standard deviation) of a quantity of the calibration from the
+    estimates of several drives (n,).
 
     `unknown` is the standard deviation stated by the best drive. If it is not 0, the estimates
     already include the prior; their median is then not moved towards the prior mean again.

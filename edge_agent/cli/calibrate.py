@@ -91,8 +91,8 @@ def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:
 
 
 def report_lines(found: HeldOut) -> list[str]:
-    """Return the lines of the report: learned values with units, groups of quantities that were
-    left out, and the scores on held-out drives.
+    """Return the lines of the report on a learned calibration: learned values with units, groups of
+    quantities that were left out, and the scores on held-out drives.
     """
     lines = []
     for name, estimate in found.calibration.model_dump(exclude_none=True).items():

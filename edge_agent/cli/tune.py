@@ -191,8 +191,8 @@ def run(args: argparse.Namespace) -> int:
 def _tuning_drives(
     args: argparse.Namespace, objective: str, duration_s: float
 ) -> tuple[TuningSet, TuningSet]:
-    """Return (drives for the search, held-out drives): simulated drives, or parts of the given
-    logs.
+    """Return (drives for the search, held-out drives): simulated drives, or parts of the recorded
+    logs that the options name.
     """
     if not args.log:
         return record_all("train", duration_s), record_all("held_out", duration_s)
@@ -229,7 +229,9 @@ def _search_worth(score: Score, objective: str) -> float:
 
 
 def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
-    """Run the study of paper 004's filter, and write its results into a folder; return 0."""
+    """Run the study of paper 004's filter, a comparison of searches for fuzzy sets, and write its
+    results into a folder; return 0.
+    """
     from edge_agent.lab.tuning import study_report
 
     if importlib.util.find_spec("matplotlib") is None:
@@ -280,8 +282,8 @@ def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
 
 
 def _run_searches(objective: Objective, ants: int, iterations: int, seed: int) -> dict[str, Result]:
-    """Run random search and ant colony from the same start vector, with the same candidate values
-    and budget; return the results by search.
+    """Run a random search and an ant colony for the best fuzzy sets from the same start vector,
+    with the same candidate values and budget; return the results by search.
     """
     problem = Problem(objective, choices(POSITIONS), Memberships().to_vector())
     results = {}

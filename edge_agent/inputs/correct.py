@@ -40,7 +40,8 @@ class Corrector:
         self._rows = np.empty((0, len(CHANNELS)))
 
     def advance(self, t: FloatArray, signals: FloatArray) -> FloatArray:
-        """Return the next rows corrected: times t (T,) [s] and signals (T, 18).
+        """Return the next rows (samples) of a log, corrected for known sensor errors: times t (T,)
+        [s] and signals (T, 18).
 
         If there is nothing to correct, the result is the same array.
         """
@@ -80,7 +81,9 @@ class Corrector:
 
 
 def correct_log(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> FloatArray:
-    """Return all signals (T, 18) of a log with times t (T,) [s], corrected by a `Corrector`."""
+    """Return all signals (T, 18) of a log with times t (T,) [s], corrected for the known sensor
+    errors of the vehicle.
+    """
     return Corrector(vehicle).advance(t, signals)
 
 

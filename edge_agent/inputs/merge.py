@@ -136,8 +136,8 @@ def merge_recordings(
 
 
 def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tuple[int, Channel]]:
-    """Return, for each channel of the signal log, a pair: the index of the recording that contains
-    its signals, and the profile's rule for converting these signals to the channel.
+    """Return, for each channel of the signal log, a pair (index, rule): the index of the recording
+    that contains its signals, and the profile's rule for converting these signals to the channel.
 
     A recording of a position receiver provides those position channels for which the profile names
     no signal.
@@ -283,8 +283,8 @@ def make_channel(
 
 
 def _hold_last(series: Series, t: FloatArray) -> FloatArray:
-    """Return, for each time in `t` (n,), the last reading of a series at or before it; for times
-    before the first reading, the first reading.
+    """Return, for each time in `t` (n,), the last reading of a series (recorded signal) at or
+    before it; for times before the first reading, the first reading.
     """
     return series.values[
         np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, len(series.t) - 1)
@@ -364,16 +364,16 @@ def _build_rows(
 
 
 def _row_rate(dense: Mapping[str, Series]) -> float:
-    """Return the rate [Hz] at which the merged log gets rows: that of the fastest channel, rounded
-    up to a usual rate.
+    """Return the rate [Hz] at which the merged log gets rows (samples): that of the fastest
+    channel, rounded up to a usual rate.
     """
     fastest = max(1.0 / max(float(np.median(np.diff(one.t))), 1e-3) for one in dense.values())
     return next((rate for rate in RATES if rate >= 0.95 * fastest), RATES[-1])
 
 
 def sample_at_rows(series: Series, t: FloatArray, *, sparse: bool) -> FloatArray:
-    """Return a series sampled at the times `t` (n,) of the log's rows; NaN in rows that have no
-    reading near enough in time.
+    """Return a series (recorded signal) sampled at the times `t` (n,) of the log's rows; NaN in
+    rows that have no reading near enough in time.
     """
     good = np.isfinite(series.values)
     known = series.t[good]

@@ -28,13 +28,15 @@ Text = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class Part(BaseModel):
-    """Base class of the records in a profile; unknown field names are rejected."""
+    """Base class of the records in a profile (assignment of signals to channels); unknown field
+    names are rejected.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Sign(Part):
-    """Separate signal that gives the sign of a channel's value: the value is negative where
+    """Recorded signal that gives the sign of another signal's value: the value is negative where
     `signal` equals `negative`.
     """
 
@@ -43,7 +45,9 @@ class Sign(Part):
 
 
 class Channel(Part):
-    """Source signals of a channel, and their conversion to SI units."""
+    """Recorded signals from which a channel of the signal log is computed, and their conversion to
+    SI units.
+    """
 
     signal: Annotated[list[Text] | Text, Field(description="name, or names whose values are added")]
     message: Annotated[
@@ -88,8 +92,8 @@ class Channel(Part):
 
     @property
     def signals(self) -> list[str]:
-        """Return the full names of the signals whose values are added to give the
-        channel's value.
+        """Return the full names of the signals whose values are added to give the value of this
+        channel of the signal log.
         """
         names = [self.signal] if isinstance(self.signal, str) else self.signal
         return [self.full_name(name) for name in names]
@@ -117,7 +121,9 @@ class Channel(Part):
 
 
 class Profile(Part):
-    """Profile of one car or recorder: maps its signals to channels."""
+    """Profile of one car or recorder: assigns its recorded signals to the channels of a signal
+    log.
+    """
 
     version: Literal[1] = 1
     name: Annotated[str, Field(min_length=1, max_length=64)]

@@ -50,8 +50,8 @@ class SignalLog:
     context: FloatArray | None = None  # (T, len(CONTEXT)), where a column of it is there
 
     def blocks(self, start_ns: int, rows: int = BLOCK_ROWS) -> Iterator[Block]:
-        """Yield the samples of the log in order, in blocks of at most `rows` samples. `start_ns` is
-        the [ns UTC] of t = 0.
+        """Yield the samples of the signal log in order, in blocks of at most `rows` samples.
+        `start_ns` is the [ns UTC] of t = 0.
         """
         for first in range(0, len(self.t), rows):
             t = self.t[first : first + rows, None]
@@ -109,7 +109,9 @@ def _read_table(path: Path) -> pa.Table:
 
 
 def _read_context(table: pa.Table) -> FloatArray | None:
-    """Return the context signals (T, len(CONTEXT)); None if the log has no context column."""
+    """Return the context signals (flags and surroundings), (T, len(CONTEXT)); None if the log has
+    no context column.
+    """
     if not set(CONTEXT) & set(table.column_names):
         return None
     context = np.full((table.num_rows, len(CONTEXT)), np.nan)

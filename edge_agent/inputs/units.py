@@ -99,15 +99,16 @@ def standard_spelling(text: str) -> str:
 
 
 def unit_of_channel(channel: str, text: str) -> str | None:
-    """Return the unit of a channel as stated by the recording; None if the stated unit does not fit
-    the channel.
+    """Return the unit of a channel as the recording states it in `text`; None if the stated unit
+    does not fit the channel.
     """
     unit = standard_spelling(text)
     return unit if unit in QUANTITY[channel] else None
 
 
 def to_si(channel: str, unit: str, wheel_radius: float | None) -> float | None:
-    """Return the factor that converts values from a unit to the signal log's unit.
+    """Return the factor that converts values of a channel from the recorded unit to the unit of the
+    signal log.
 
     Return None if a speed at the rim requires a wheel radius that is not known.
     """

@@ -93,7 +93,7 @@ def _reset_track(track: InputTrack) -> None:
 
 @compiled
 def _store_inputs(track: InputTrack) -> None:
-    """Store the inputs of this sample; the next sample uses them as the previous inputs."""
+    """Store the input signals of this sample; the next sample uses them as the previous inputs."""
     for k in range(INPUTS):
         track.inputs_before[k] = track.inputs[k]
     for wheel in range(4):
@@ -103,8 +103,8 @@ def _store_inputs(track: InputTrack) -> None:
 
 @compiled
 def _fill_inputs(track: InputTrack, row: FloatArray, anew: bool) -> None:
-    """Fill `track.inputs` from the readings, and replace missing values. If the last argument is
-    True, values of earlier samples are not used as replacements.
+    """Fill the inputs of the vehicle model, `track.inputs`, from the readings, and replace missing
+    values. If the last argument is True, values of earlier samples are not used as replacements.
     """
     now = track.now
     use = track.inputs

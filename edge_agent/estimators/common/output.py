@@ -47,8 +47,8 @@ def write_motion(
 
 @compiled
 def write_states(output: FloatArray, mean: FloatArray, root: FloatArray, yaw_rate: int) -> None:
-    """Write the motion estimated by a filter to the output. States 0 and 1 of `mean` are v_x and
-    v_y; `yaw_rate` is the index of the yaw rate.
+    """Write the motion estimated by a filter with its standard deviations to `output`. States 0 and
+    1 of `mean` are v_x and v_y; `yaw_rate` is the index of the yaw rate.
     """
     write_motion(
         output,
@@ -102,8 +102,8 @@ def write_prior(output: FloatArray, first: int) -> None:
 
 @compiled
 def write_unknown(output: FloatArray) -> None:
-    """Write the output before the first usable sample: the friction prior, and zero motion with a
-    large standard deviation.
+    """Write the estimates that are valid before the first usable sample: the friction prior, and
+    zero motion with a large standard deviation.
     """
     write_motion(output, (0.0, 0.0, 0.0), (UNKNOWN_V_STD**2, 1.0, 1.0))
     output[Column.SIDESLIP_STD] = 1.0

@@ -101,7 +101,7 @@ def new_filters(
     kind: type[PaperMemory], vehicles: Sequence[Vehicle], tyre: TyreOption | None = None
 ) -> RecordArray:
     """Return an array of records of type `kind`, one per vehicle, with the vehicle's parameters in
-    `row`.
+    its field `row`.
 
     All other fields are zero, by which the compiled function recognises that no sample has been
     processed.

@@ -112,8 +112,8 @@ class SubFilter(NamedTuple):
 
 
 def set_motion(filters: RecordArray, setting: MotionSetting) -> None:
-    """Write the settings of the motion filter into the filter records of all vehicles; call this
-    once, before the first sample.
+    """Write the settings (variances) of the motion filter into the filter records of all vehicles;
+    call this once, before the first sample.
     """
     motion = filters["motion"]
     # of the rounded squares: the square roots are those of before, bit for bit, where nothing is
@@ -149,8 +149,8 @@ def begin_motion(memory: FederatedMemory) -> None:
 
 @compiled
 def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> None:
-    """Run one step of the motion filter: share the information, predict by `dt` [s], update both
-    sub-filters and fuse them.
+    """Run one step of the motion filter: share the information between both sub-filters, predict by
+    `dt` [s], update and fuse them.
 
     The friction (4,) of the wheels is given.
     """

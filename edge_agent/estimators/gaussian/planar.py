@@ -56,8 +56,8 @@ class HeunInputs(NamedTuple):
 
 
 class PlanarStep(NamedTuple):
-    """Step of the process model: its length `dt` [s], and the source of the longitudinal forces,
-    see `propagate_points`.
+    """Step of the process model: its length `dt` [s], and the source of the longitudinal tyre
+    forces.
     """
 
     dt: float
@@ -122,7 +122,8 @@ def propagate_points(
 def _apply_heun_step(
     vehicle: Body, columns: FloatArray, first: int, last: int, drive: HeunInputs
 ) -> None:
-    """Advance the states in the columns first to last - 1 by one step of Heun's rule, in place.
+    """Advance the vehicle states in the columns first to last - 1 by one step of Heun's rule, in
+    place.
 
     The function is pure arithmetic, so that the compiler can process several points in parallel.
     """

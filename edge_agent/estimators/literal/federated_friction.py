@@ -26,7 +26,9 @@ LEAST_SHARE: Final = 0.01  # of the information of a sub-filter
 
 
 class FederatedSetting(NamedTuple):
-    """Settings of the friction filter of paper 000: variances, initial friction and tyre option."""
+    """Settings of the friction filter of paper 000 as printed: variances, initial friction and tyre
+    option.
+    """
 
     process: float = 1.0  # Q of each friction per sample
     start: float = 1.0  # P_0
@@ -41,8 +43,8 @@ AS_PRINTED: Final = FederatedSetting()
 
 
 def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:
-    """Run the friction filter over a drive; return the friction of the four wheels at each sample,
-    (T, 4).
+    """Run the friction filter of paper 000 as printed over a drive; return the friction of the four
+    wheels at each sample, (T, 4).
     """
     forces = WheelForces.for_drive(given, proportional=setting.proportional, single=False)
     given_x = given.wheel_forces()
@@ -96,8 +98,8 @@ def _update_sub_filter(
     reading: FloatArray,
     noise: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean (4,) and covariance (4, 4) of a sub-filter after its measurement update (42) to
-    (48).
+    """Return mean (4,) and covariance (4, 4) of a sub-filter after its measurement update,
+    equations (42) to (48) of paper 000.
     """
     predicted = outcomes.mean(axis=0)
     apart = outcomes - predicted

@@ -32,7 +32,7 @@ LEAST_MU = 0.02  # of a tyre that is not proportional: its slip over friction ne
 @dataclass(frozen=True)
 class WheelForces:
     """Slips, loads and steering angles of the wheels at each sample of a drive, with the kind of
-    tyre stiffness (see module).
+    tyre stiffness (proportional to friction or not).
     """
 
     free: FloatArray  # (T, 4, 2) k*s of the wheels

@@ -70,8 +70,8 @@ class FrictionRun:
 
 
 def estimate(given: GivenMotion, setting: UnscentedSetting) -> FrictionRun:
-    """Run the friction filter over a drive; return the friction of the four wheels at each sample,
-    and the share of failed factorisations.
+    """Run the friction filter of paper 003 as printed over a drive; return the friction of the four
+    wheels at each sample, and the share of failed factorisations.
     """
     model = _Model(given, setting)
     steps = len(given.t)
@@ -148,8 +148,8 @@ def _root_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _square_root_step(
     model: _Model, k: int, mean: FloatArray, covariance: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
-    """Run one step in square-root form. This form does not use `covariance` and returns it
-    unchanged.
+    """Run one step of the friction filter in square-root form. This form does not use `covariance`
+    and returns it unchanged.
 
     Return (mean, covariance, root, False). The last item tells whether a Cholesky factor was
     missing; in this form it never is.
@@ -185,7 +185,7 @@ def _cholesky_or_last(covariance: FloatArray, last: FloatArray) -> tuple[FloatAr
 def _covariance_step(
     model: _Model, k: int, mean: FloatArray, covariance: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
-    """Run one step of the filter in covariance form, as in textbooks.
+    """Run one step of the friction filter in covariance form, as in textbooks.
 
     Return (mean, covariance, root, True if a Cholesky factor was missing).
     """

@@ -29,8 +29,8 @@ from schemas.vehicle import Vehicle
 
 
 class Adopted(NamedTuple):
-    """A corrected log with its vehicle, the signal doctor's diagnosis of it, and notes that
-    describe the changes.
+    """A signal log after correction, with its vehicle, the signal doctor's diagnosis of it, and
+    notes that describe the changes.
     """
 
     log: SignalLog
@@ -116,8 +116,8 @@ def align_import(
 
 
 def align_devices(t: FloatArray, signals: FloatArray, delays: Mapping[str, float]) -> FloatArray:
-    """Return signals (T, 18) in which the readings of delayed devices are moved earlier by `delays`
-    [s], with linear interpolation between samples.
+    """Return signals (T, 18) with times t (T,) [s], in which the readings of delayed devices are
+    moved earlier by `delays` [s], with linear interpolation between samples.
     """
     signals = signals.copy()
     for device, seconds in delays.items():

@@ -46,7 +46,8 @@ def measure_clocks(
 
 
 def late_devices(diagnosis: Diagnosis) -> dict[str, float]:
-    """Return the delay [s] of each device, from the lags measured in the turns of a drive.
+    """Return the delay [s] of each device (wheel speeds, steering, inertial unit), from the lags
+    measured in the turns of a drive.
 
     If wheels and steering lead the yaw rate by about the same time, the inertial unit has the
     delay; but if its accelerometer is not late compared with the wheels, only the gyroscope has the

@@ -267,9 +267,9 @@ def _find_scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) 
 def _holds_throughout(
     quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenDrive | None
 ) -> bool:
-    """Return True if an identity (two quantities that are equal by physics) has the gain that the
-    fault predicts in all parts of the drive. A slide, during which the gain is not constant, is
-    thus not taken for a fault.
+    """Return True if an identity (two quantities that are equal by physics) has the gain (ratio of
+    the quantities) that the fault predicts in all parts of the drive. A slide, during which the
+    gain is not constant, is thus not taken for a fault.
     """
     fault = verdict.faults[quantity]
     if (
@@ -376,8 +376,8 @@ def _find_radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Fi
 
 
 def _compare_axles(drive: EvenDrive) -> list[Finding]:
-    """Return findings about exchanged axles. In a turn the front wheels travel further: v_f² = v_r²
-    + (L r)².
+    """Return findings (faults) about exchanged axles. In a turn the front wheels travel further:
+    v_f² = v_r² + (L r)².
     """
     front = drive.wheels[:, :2].mean(axis=1)
     rear = drive.wheels[:, 2:].mean(axis=1)
@@ -407,8 +407,8 @@ def _compare_axles(drive: EvenDrive) -> list[Finding]:
 
 
 def _find_offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
-    """Return findings about constant sensor errors that exceed the largest usual error by SURE
-    standard deviations.
+    """Return findings (faults) about constant sensor errors that exceed the largest usual error by
+    SURE standard deviations.
     """
     moving = drive.moving > 0
     lateral = found["lateral"]

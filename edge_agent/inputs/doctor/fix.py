@@ -35,8 +35,8 @@ EXCHANGED: Final = {
 
 
 def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
-    """Return, by device, the delays [s] that are too small to be reported as faults, but too large
-    for the estimator.
+    """Return, by device (wheels, steering, inertial unit), the delays [s] that are too small to be
+    reported as faults, but too large for the estimator.
     """
     if any(finding.kind == "clock" for finding in diagnosis.findings):
         return {}

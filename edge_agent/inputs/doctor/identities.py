@@ -65,8 +65,8 @@ class Fit:
 
     @property
     def is_known(self) -> bool:
-        """Return True if the drive determines the gain of left over right: enough time with
-        excitation, a small error and a clear correlation.
+        """Return True if the drive suffices to determine the gain of left over right: enough time
+        with excitation, a small error and a clear correlation.
         """
         return self.excited_s >= FEWEST_S and self.error < 0.3 and abs(self.correlation) > 0.45
 
@@ -298,8 +298,9 @@ def _fit_with_priors(
 
 
 def _gains_of_parts(x: FloatArray, y: FloatArray, excited: BoolArray) -> tuple[float, ...]:
-    """Return the gain of an identity (left over right side) in each of PARTS consecutive parts of
-    the time with excitation. Parts of the drive that are too short are left out.
+    """Return the gain of an identity (ratio of two quantities that are equal by physics) in each of
+    PARTS consecutive parts of the time with excitation. Parts of the drive that are too short are
+    left out.
     """
     rows = np.flatnonzero(excited)
     found = []

@@ -85,8 +85,8 @@ def find_lags(
 
 
 class _Peak(NamedTuple):
-    """Peak of a cross-correlation: the shift [s] of one series against another at which their
-    correlation is largest, and this correlation.
+    """Peak of a cross-correlation of two signals: the shift [s] of one series against another at
+    which their correlation is largest, and this correlation.
     """
 
     seconds: float

@@ -43,8 +43,8 @@ STYLE: Final = (
 
 
 def report_lines(diagnosis: Diagnosis) -> list[str]:
-    """Return the diagnosis as text lines: one per finding, unknown channel, lag and channel without
-    fault.
+    """Return the diagnosis as text lines: one per finding (fault), unknown channel, lag and channel
+    without fault.
     """
     lines = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in diagnosis.findings]
     lines += [
@@ -64,7 +64,7 @@ def report_lines(diagnosis: Diagnosis) -> list[str]:
 
 def report_document(diagnosis: Diagnosis) -> dict[str, object]:
     """Return the diagnosis as a JSON-compatible document for programs. To correct a channel, apply
-    scale, offset and delay of a finding, in this order.
+    scale, offset and delay of a finding (fault), in this order.
     """
     return {
         "passed": diagnosis.is_passed,
@@ -88,8 +88,9 @@ def _finite_or_none(value: object) -> object:
 
 
 def publishing_advice(diagnosis: Diagnosis) -> str:
-    """Return one line with the verdict: either the log may be published, or it states the steps
-    that are necessary before."""
+    """Return one line with the signal doctor's verdict: either the log may be published, or it
+    states the steps that are necessary before.
+    """
     if diagnosis.is_passed:
         return "passed: units, signs, clocks and offsets agree with each other"
     if diagnosis.findings:

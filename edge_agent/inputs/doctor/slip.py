@@ -164,8 +164,9 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
 
 
 def spread_of_parts(beside: FloatArray) -> float:
-    """Return the standard deviation of a quantity (n,) between parts of a drive. If it is small,
-    the quantity is a constant sensor error such as a tilt; a slide does not last over all parts.
+    """Return the standard deviation of a quantity (n,), one value per part of a drive. If it is
+    small, the quantity is a constant sensor error such as a tilt; a slide does not last over all
+    parts.
     """
     parts = [
         float(np.nanmedian(part))
@@ -183,8 +184,9 @@ def is_steady(fit: Fit) -> bool:
 
 
 def share_of_parts(fit: Fit, gain: float, within: float = STEADY) -> float:
-    """Return the share of a drive's parts whose gain has the same sign as `gain`, and whose
-    logarithm differs from that of `gain` by less than `within`.
+    """Return the share of a drive's parts in which the fitted gain of an identity (ratio of two
+    quantities that are equal by physics) has the same sign as `gain`, and differs from it in
+    logarithm by less than `within`.
     """
     if not fit.parts:
         return 0.0

@@ -38,8 +38,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class HostClock:
-    """The host's clock since its start: it holds the UTC time [ns] of the start, and the reading of
-    a monotonic clock [s] at that moment.
+    """Clock of the host (this computer) since its start: it holds the UTC time [ns] of the start,
+    and the reading of a monotonic clock [s] at that moment.
     """
 
     start_ns: int = field(default_factory=time.time_ns)
@@ -50,7 +50,7 @@ class HostClock:
         return time.monotonic() - self.steady_s
 
     def seconds_of(self, stamp_ns: int) -> float:
-        """Return the time since the start of the clock [s] for a date [ns UTC]."""
+        """Return the time since the start of the clock [s] for an instant given as [ns UTC]."""
         return (stamp_ns - self.start_ns) / NS
 
 
@@ -107,15 +107,17 @@ class Feed(ABC):
 
     @abstractmethod
     def listen(self) -> None:
-        """Open the source, increment `openings`, and call `hear` for each message until `stopping`
-        is set.
+        """Open the live source, increment `openings`, and call `hear` for each message until
+        `stopping` is set.
 
         If this method returns earlier or raises, the source counts as lost and is opened again.
         """
 
     @abstractmethod
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the signals that the received messages `heard` contain, by name."""
+        """Return the signals by name, with times and values, that the received messages `heard`
+        contain.
+        """
 
     def start(self) -> None:
         """Start the thread that listens to the live source."""
@@ -124,7 +126,7 @@ class Feed(ABC):
 
     def close(self) -> None:
         """Stop listening to the live source. Wait at most LEAVE_S for the thread, because it may
-        hang in a driver; see `listening`.
+        hang in a driver.
         """
         self.stopping.set()
         self._thread.join(LEAVE_S)
@@ -150,8 +152,8 @@ class Feed(ABC):
         self.newest = max(self.newest, placed)
 
     def unreadable(self, reason: str) -> None:
-        """Count a message of the source that cannot be read. The first message with this reason is
-        logged.
+        """Count a message of the live source that cannot be read. The first message with this
+        reason is logged.
         """
         self.broken += 1
         self.say(reason)
@@ -163,7 +165,7 @@ class Feed(ABC):
 
     @property
     def trouble(self) -> str | None:
-        """Return the reason why the source delivers nothing; None while it delivers."""
+        """Return the reason why the live source delivers nothing; None while it delivers."""
         silent = self.clock.now() - self.last
         return f"{self.name} has sent nothing for {silent:.0f} s" if silent > SILENT_S else None
 
@@ -181,8 +183,8 @@ class Feed(ABC):
             self.stopping.wait(RETRY_S)
 
     def say(self, reason: str) -> None:
-        """Log the reason of a problem with the source; each different reason is logged
-        only once.
+        """Log the reason of a problem with the live source; each different reason is logged only
+        once.
         """
         if reason not in self._reasons and len(self._reasons) < 50:
             self._reasons.add(reason)

@@ -165,8 +165,8 @@ class LiveRows:
         )
 
     def _recent_recording(self, place: int, feed: Feed, oldest: float) -> Recording:
-        """Return the readings of a live source since the time `oldest` [s], including those from
-        before the current block of rows.
+        """Return the readings of a live source since the time `oldest` [s], including those that
+        were already used.
         """
         kept = self._readings[place]
         fresh_ones = feed.take()

@@ -32,8 +32,8 @@ Key: TypeAlias = tuple[int, int, bool]  # bus, identifier, extended
 
 @dataclass
 class Frames:
-    """Frames of one identifier on one bus: times of arrival [s as logged], and data bytes, padded
-    to LONGEST.
+    """CAN frames of one identifier on one bus: times of arrival [s as logged], and data bytes,
+    padded to LONGEST.
     """
 
     times: list[float] = field(default_factory=list)
@@ -109,8 +109,8 @@ def no_database(path: Path) -> InputError:
 
 
 def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
-    """Return the frames with the wanted identifiers, read by python-can, and the time of the log's
-    first frame [s].
+    """Return the CAN frames of a log with the wanted identifiers, read by python-can, and the time
+    of the log's first frame [s].
     """
     log: Log = defaultdict(Frames)
     first = np.inf

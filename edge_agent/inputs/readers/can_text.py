@@ -39,7 +39,8 @@ def is_bare_trace(path: Path) -> bool:
 
 
 def gvret_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
-    """Return the frames with the wanted identifiers, and the time of the first frame [s].
+    """Return the CAN frames with the wanted identifiers in a GVRET CSV file, and the time of the
+    first frame [s].
 
     Raises:
         InputError: a row has another format; the error names the row.
@@ -73,8 +74,8 @@ def gvret_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
 
 
 def trace_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
-    """Return the frames with the wanted identifiers from a trace without header, and the time of
-    the first frame [s].
+    """Return the CAN frames with the wanted identifiers from a PCAN trace without header, and the
+    time of the first frame [s].
 
     The trace has times in milliseconds.
 

@@ -39,8 +39,8 @@ Bytes: TypeAlias = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Signal:
-    """Position of a signal in a frame (start and size [bit], byte order), and its conversion to a
-    physical value.
+    """Position of a signal in a CAN frame (start and size [bit], byte order), and its conversion to
+    a physical value.
     """
 
     name: str
@@ -54,7 +54,9 @@ class Signal:
     switch: int | None = None  # value of the multiplexer at which it is present
 
     def decode(self, data: Bytes) -> FloatArray:
-        """Return the physical values (n,) of the signal in frames (n, LONGEST)."""
+        """Return the physical values (n,) of the signal in n CAN frames, data bytes (n,
+        LONGEST).
+        """
         raw = self._raw_values(data)
         number: NDArray[np.int64] | NDArray[np.uint64] = (
             raw.view(np.int64) if self.size < 64 or self.signed else raw
@@ -88,7 +90,7 @@ class Signal:
 
     @property
     def last_byte(self) -> int:
-        """Return the index of the last byte that contains bits of the signal."""
+        """Return the index of the last byte of a CAN frame that contains bits of the signal."""
         if self.little:
             return (self.start + self.size - 1) // 8
         return self.start // 8 + max(0, -(-(self.size - self.start % 8 - 1) // 8))
@@ -96,8 +98,8 @@ class Signal:
 
 @dataclass(frozen=True)
 class CanMessage:
-    """A message of a database: identifier without the extended flag, length [byte], and signals by
-    name.
+    """A message of a CAN database: identifier without the extended flag, length [byte], and signals
+    by name.
     """
 
     name: str
@@ -108,8 +110,8 @@ class CanMessage:
     multiplexer: str | None = None
 
     def decode(self, data: Bytes, names: list[str]) -> dict[str, FloatArray]:
-        """Decode the frames of this message: return the physical values (n,) by signal; NaN where a
-        frame does not contain a multiplexed signal.
+        """Decode n CAN frames of this message, data bytes (n, LONGEST): return the physical values
+        (n,) by signal; NaN where a frame does not contain a multiplexed signal.
         """
         found = {name: self.signals[name].decode(data) for name in names}
         switched = [name for name in names if self.signals[name].switch is not None]
@@ -124,7 +126,7 @@ Database: TypeAlias = dict[str, CanMessage]
 
 
 def read_dbc(path: Path) -> Database:
-    """Return the messages of a database by name.
+    """Return the messages of a CAN database file by name.
 
     Raises:
         InputError: the file cannot be read, is too large, or contains no message with a signal.
@@ -148,8 +150,8 @@ def read_dbc(path: Path) -> Database:
 
 
 def parse_dbc(text: str) -> Database:
-    """Return the messages in a database's text, by name. Invalid lines are left out; of two
-    messages with the same name, the last one is used.
+    """Return the messages in the text of a CAN database, by name. Invalid lines are left out; of
+    two messages with the same name, the last one is used.
     """
     database: Database = {}
     message: CanMessage | None = None

@@ -39,7 +39,7 @@ LINKS: Final = {
 
 
 def check_blocks(path: Path) -> None:
-    """Check the links between the blocks of a file by following all chains.
+    """Check the links between the blocks (data structures) of an MDF file by following all chains.
 
     Raises:
         InputError: a link leads out of the file or into a circle, or a group states more records
@@ -96,8 +96,8 @@ def _linked_blocks(file: BinaryIO, address: int, size: int, path: Path) -> list[
 
 
 class MdfContent(NamedTuple):
-    """Content of a file: either frames and the time of the first one [s since 1970 UTC], or the
-    channels of a measurement. The other field is None.
+    """Content of an MDF file: either CAN frames and the time of the first one [s since 1970 UTC],
+    or the channels of a measurement. The other field is None.
     """
 
     frames: tuple[Log, float] | None
@@ -148,8 +148,8 @@ def has_frames(mdf: Any) -> bool:  # noqa: ANN401
 
 
 def mdf_frames(mdf: Any, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
-    """Return the frames with the wanted identifiers, and the start of the log [s since
-    1970 UTC].
+    """Return the CAN frames with the wanted identifiers in an MDF file, and the start of the log [s
+    since 1970 UTC].
     """
     log: Log = {}
     first = np.inf
@@ -179,7 +179,8 @@ def mdf_frames(mdf: Any, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
 
 
 def read_mdf(mdf: Any, path: Path, wanted: set[str] | None) -> Recording:  # noqa: ANN401
-    """Return the channels of a measurement by name; all channels if `wanted` is None.
+    """Return the channels of a measurement in an MDF file by name; all channels if `wanted` is
+    None.
 
     If several channels have the same name, the first one with samples is used.
     """

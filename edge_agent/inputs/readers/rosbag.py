@@ -57,8 +57,8 @@ def open_bag(path: Path) -> Iterator[Any]:
 
 
 def _close_files(part: Any) -> None:  # noqa: ANN401
-    """Close the files that a reader has opened. This is necessary because the library rosbags
-    leaves a file open if it cannot read it as a bag.
+    """Close the files that the reader of a ROS bag has opened. This is necessary because the
+    library rosbags leaves a file open if it cannot read it as a bag.
     """
     for held in (part, *getattr(part, "storages", ()), getattr(part, "storage", None)):
         if (file := getattr(held, "bio", None)) is not None:
@@ -136,8 +136,8 @@ def stamp_of(message: Any) -> int:  # noqa: ANN401
 
 
 def leaves_of(message: Any, prefix: str = "", depth: int = 0) -> Iterator[Leaf]:  # noqa: ANN401
-    """Yield a pair for each number in a message: its signal name, which begins with `prefix`, and a
-    function that reads it from a message of the same type.
+    """Yield a pair for each number in a ROS message: its signal name, which begins with `prefix`,
+    and a function that reads it from a message of the same type.
     """
     for name in getattr(message, "__dataclass_fields__", {}):
         if name.startswith("__") or any(name.endswith(word) for word in SKIPPED):

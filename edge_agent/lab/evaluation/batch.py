@@ -30,8 +30,8 @@ class DriveSpec:
     """A simulated manoeuvre, from a paper or for the default estimator's evaluation: vehicle, speed
     [m/s], friction, sampling rate, duration.
 
-    `road` is the relief by name, and `slope` a constant slope added to it. `torque` is False if
-    wheel torque is not recorded.
+    `road` is the name of the relief (slopes of the road), and `slope` a constant slope added to it.
+    `torque` is False if wheel torque is not recorded.
     """
 
     manoeuvre: str

@@ -71,8 +71,8 @@ def _mass_radius_ratio(seed: int, car: int) -> float:
 
 
 class Narrowed(NamedTuple):
-    """Mean width of the 90 % interval over some cars, and share of true frictions inside it,
-    without and with calibration.
+    """Mean width of the 90 % interval of friction over some cars, and share of true frictions
+    inside it, without and with calibration.
     """
 
     plain_width: float

@@ -36,7 +36,7 @@ FAULTY_SEEDS = 4
 
 @dataclass(frozen=True)
 class PlottedDrive:
-    """The first drive of a scenario and its estimates, stored for plots."""
+    """The first drive of a scenario and the estimates of all estimators, stored for plots."""
 
     batch: DriveSet
     reported: Estimates
@@ -44,8 +44,8 @@ class PlottedDrive:
 
 @dataclass
 class Results:
-    """Results of the campaign: measures of the estimates per drive, by (scenario, estimator);
-    `real` with ordinary sensors, `ideal` with error-free sensors.
+    """Results of the evaluation campaign: measures (such as errors) of the estimates per drive, by
+    (scenario, estimator); `real` with ordinary sensors, `ideal` with error-free sensors.
     """
 
     real: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
@@ -75,7 +75,9 @@ class Results:
 
 
 def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str], None]) -> Results:
-    """Run every scenario and return all measures; `log_line` receives lines with the progress."""
+    """Run every scenario of the evaluation and return all measures (such as errors); `log_line`
+    receives lines with the progress.
+    """
     results = Results(seeds=len(seeds))
     names = QUICK_ESTIMATORS if quick else tuple(ESTIMATORS)
     results.noise, plotted = experiments(seeds)

@@ -88,7 +88,9 @@ class DetectionTally:
         self.count[name] = self.count.get(name, 0) + int(np.size(values))
 
     def add_case(self, name: str, *, holds: bool) -> None:
-        """Count one case in the share called `name`: the share of cases with `holds` True."""
+        """Count one case in the share called `name`: the share of cases in which `holds` is
+        True.
+        """
         self.add(name, np.array([holds]))
 
     def merge(self, other: DetectionTally) -> None:
@@ -181,8 +183,9 @@ def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTall
 
 
 def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
-    """Add to the tally, over all samples of the town: coverage of the interval, false ice, false
-    grip (both as in the module's docstring) and interval score.
+    """Add to the tally, over all samples of the town: coverage of the interval, false ice (grip
+    reported as slippery), false grip (the interval's lower end too far above the true friction) and
+    interval score.
     """
     mu = drive.mu
     apart = ~drive.stood

@@ -85,7 +85,7 @@ def towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
 
 
 def drive_town(town: DetectionTown, make_bank: BankMaker) -> DetectionDrive:
-    """Simulate the cars of a town, and estimate their motion and friction."""
+    """Simulate the drives of the cars of a town, and estimate their motion and friction."""
     scenario = winter(town.seed) if town.winter else drawn_town(town.seed)
     rough = float(town.kind == "rough")
     fleet = SimulatedFleet(
@@ -101,8 +101,9 @@ def judge_towns(
     *,
     oracle: bool = True,
 ) -> DetectionResults:
-    """Simulate and evaluate towns. With `oracle`, also run the oracle (an observer that knows
-    motion and tyre forces) in towns with short drives. `log_line` receives one line per town.
+    """Simulate the drives in some towns, and evaluate the detection of slippery road. With
+    `oracle`, also run the oracle (an observer that knows motion and tyre forces) in towns with
+    short drives. `log_line` receives one line per town.
     """
     results = DetectionResults()
     for town in chosen:
@@ -121,7 +122,7 @@ def judge_towns(
 def campaign(
     seeds: Sequence[int], log_line: Callable[[str], None], *, quick: bool, estimator: str = DEFAULT
 ) -> DetectionResults:
-    """Evaluate an estimator in all towns of the campaign."""
+    """Evaluate the detection of slippery road by an estimator in all towns of the campaign."""
     return judge_towns(
         towns(seeds, quick=quick), lambda vehicles: bank_of(estimator, vehicles), log_line
     )

@@ -37,20 +37,20 @@ DRIVES: Final = {
 
 
 def in_order(t: FloatArray) -> FloatArray:
-    """Return the clock t (T, N) unchanged, for faults that do not affect the time stamps."""
+    """Return the time stamps t (T, N) unchanged, for faults that do not affect the time stamps."""
     return t
 
 
 def kept_samples(t: FloatArray) -> FloatArray:
-    """Return the clock t (T, N) with a gap of three seconds at time BEGINS, as if the samples of
-    that time were missing.
+    """Return the time stamps t (T, N) with a gap of three seconds at time BEGINS, as if the samples
+    of that time were missing.
     """
     return np.where(t < BEGINS, t, t + 3.0)
 
 
 def late_samples(t: FloatArray) -> FloatArray:
-    """Return the clock t (T, N) on which, from BEGINS to ENDS, every tenth sample has a time stamp
-    that is 50 ms too old.
+    """Return the time stamps t (T, N), of which from BEGINS to ENDS, every tenth one is 50 ms too
+    old.
     """
     number = np.arange(len(t))[:, None]
     return np.where((t >= BEGINS) & (t < ENDS) & (number % 10 == 0), t - 0.05, t)
@@ -58,8 +58,8 @@ def late_samples(t: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the table of sensor faults. `flag` is the health flag that estimators must report,
-    or OK if no estimator can detect the fault.
+    """One row of the table of sensor faults. `flag` is the health flag (reason for less reliable
+    estimates) that estimators must report, or OK if no estimator can detect the fault.
     """
 
     faults: tuple[Fault, ...]

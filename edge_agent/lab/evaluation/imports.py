@@ -65,7 +65,7 @@ def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
 
 
 def _recorded_frames(log: Log, message: Any) -> list[bytes]:  # noqa: ANN401 cantools has no types
-    """Return the payloads of a message on all buses of a recorded log."""
+    """Return the data bytes of all frames of a CAN message on all buses of a recorded log."""
     wanted = (message.frame_id, message.is_extended_frame)
     return [
         bytes(row[: message.length])
@@ -184,8 +184,8 @@ def _largest_difference(one: FloatArray, other: FloatArray) -> float:
 
 
 def figures(folder: Path, seed: int, recorded: Path | None, seconds: int = DRIVE_S) -> list[Figure]:
-    """Return the figures of file import, each with the number of values or formats on which it is
-    based.
+    """Return the figures of the import of recorded files (errors, durations), each with the number
+    of values or formats on which it is based.
     """
     wrong, compared = decode_errors(recorded, seed)
     largest, formats = same_estimates(folder, seed, seconds)

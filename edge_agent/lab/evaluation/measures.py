@@ -77,7 +77,7 @@ def nees(batch: DriveSet, reported: Estimates) -> FloatArray:
 
 def bounds(measure: str, drives: int) -> tuple[float, float]:
     """Return the 95 % bounds for the mean of "nees" or "nis" over this number of drives, for a
-    consistent filter.
+    filter whose stated variances are right.
     """
     from scipy.stats import chi2
 
@@ -86,8 +86,8 @@ def bounds(measure: str, drives: int) -> tuple[float, float]:
 
 
 def consistency(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Return the share of instants at which the mean NEES, and the mean NIS, over all drives lies
-    within its bounds, (1,) each.
+    """Return the share of instants at which the mean NEES and the mean NIS (normalised squared
+    errors and innovations) over all drives lie within their bounds, (1,) each.
     """
     found = {}
     for name, value in (("nees", nees(batch, reported)), ("nis", reported.innovation_nis)):

@@ -67,7 +67,9 @@ class OracleSignals(NamedTuple):
 
 
 def speed(seeds: Sequence[int]) -> FloatArray:
-    """Return the RMSE of the oracle's v_x [m/s] in the drive 002.sine, one value per seed."""
+    """Return the RMSE of v_x [m/s] as estimated by the oracle (an ideal observer) in the drive
+    002.sine, one value per seed.
+    """
     scenario = PAPERS["002.sine"]
     car = scenario.vehicle
     batch = realistic(scenario, seeds)
@@ -131,8 +133,9 @@ def _speed(heard: OracleSignals, n: int, rho: float) -> float:
 
 
 def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-    """Return two arrays with one value per seed: the oracle's error |μ − true value| at the end of
-    the drive 003.accel, and the error that the oracle itself expects.
+    """Return two arrays with one value per seed: the friction error |μ − true value| of the oracle
+    (an ideal observer) at the end of the drive 003.accel, and the error that the oracle itself
+    expects.
     """
     scenario = PAPERS["003.accel"]
     exact = realistic(scenario, seeds[:1], "ideal")

@@ -48,8 +48,8 @@ def noisy(batch: DriveSet, variance: FloatArray, seeds: Sequence[int]) -> DriveS
 
 
 def variances(t: FloatArray, experiment: str) -> FloatArray:
-    """Return the noise variance at the times t (T,) [s] of the experiment "constant" or
-    "variable".
+    """Return the noise variance at the times t (T,) [s] in the experiment "constant" or "variable"
+    of paper 004.
     """
     return np.full(len(t), CONSTANT) if experiment == "constant" else scheduled_variance(t)
 
