@@ -93,7 +93,7 @@ page-bench: setup  #= the live page next to MapLibre in the same browser; needs 
 	$(BIN)/python -m tests.benchmarks.page
 
 ahead-bench: setup  #= warnings in the car, and the map as a prior
-	$(BIN)/edge-agent evaluate --only ahead --out .evaluation/ahead; first=$$?; \
+	$(BIN)/python -m tests.benchmarks.ahead; first=$$?; \
 	$(BIN)/python -m deploy.listening --out .evaluation/listening && exit $$first
 
 iov-bench: setup  #= DENM, routes around ice, planner, Kuksa, MCAP, clients in C and TypeScript

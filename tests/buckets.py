@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from schemas.runtime.ports import free_ports
+from tests.ports import free_ports
 from tests.waiting import until
 
 BUCKET = "grip"

@@ -66,14 +66,14 @@ CAMPAIGNS: Final = {
     ),
     "demo": Campaign("make demo", ".demo", "demo"),
     "inputs": Campaign(
-        "edge-agent evaluate --only inputs --recorded tests/data/rav4.blf --out .evaluation/inputs",
+        "python -m tests.benchmarks.inputs --recorded tests/data/rav4.blf",
         ".evaluation/inputs",
-        "edge-agent evaluate --only inputs",
+        "inputs",
     ),
     "ahead": Campaign(
-        "edge-agent evaluate --only ahead --out .evaluation/ahead",
+        "python -m tests.benchmarks.ahead",
         ".evaluation/ahead",
-        "edge-agent evaluate --only ahead",
+        "ahead",
     ),
     "listening": Campaign(
         "python -m deploy.listening --out .evaluation/listening",

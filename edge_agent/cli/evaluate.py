@@ -5,28 +5,16 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import sys
-import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from schemas.errors import InputError
 
-if TYPE_CHECKING:
-    from schemas.runtime.figures import Figure
-
 LEAST_SEEDS: Final = 20  # of a campaign whose bars count
 QUICK_SEEDS: Final = 2
-ONLY: Final = ("inputs", "ahead", "detection", "searches", "worth", "real")
+ONLY: Final = ("detection", "searches", "worth", "real")
 PAPERS: Final = ("000", "001", "002", "003", "004")
-LEARNED_CARS: Final = 20
-LIVE_S: Final = 60.0
-QUICK_S: Final = 10
-# 24 cars drive .2 km/s: 20 towns are 1 200 km, for a bar of one in 1 000
-APPROACHES_S: Final = 300.0
-ENTRY_TOWNS: Final = 4  # of the map as a prior, where the estimator itself drives
-CARS: Final = 5  # smooth ones, and as many rough ones, of the inputs' campaign
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,10 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--only",
         choices=ONLY,
-        help="run one other campaign instead: inputs: readers, signal doctor, calibration, "
-        "live sources; "
-        "ahead: warnings, their cost and delay, the map as a prior; "
-        "detection: slippery road found, missed and falsely reported, in short and long drives; "
+        help="run one other campaign instead: detection: slippery road found, missed and falsely "
+        "reported, in short and long drives; "
         "searches: ant colony, ACO_R, (1+1)-ES and random search with equal budgets; "
         "worth: fuzzy sets against none, the colony's vertices against untuned and random ones; "
         "real: recorded drives of real cars in the folder --logs",
@@ -69,7 +55,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="png",
         help="their format (default %(default)s)",
     )
-    parser.add_argument("--recorded", type=Path, help="CAN log to decode as well (--only inputs)")
     parser.add_argument(
         "--no-plots", action="store_true", help="figures and table only; needs no matplotlib"
     )
@@ -114,14 +99,10 @@ def run(args: argparse.Namespace) -> int:
         return _evaluate_searches(args, count)
     if args.only == "worth":
         return _evaluate_worth(args, count)
-    if args.only == "ahead":
-        return _evaluate_ahead(args, count)
     if args.only == "detection":
         return _evaluate_detection(args, count)
     if args.only == "real":
         return _evaluate_real_logs(args)
-    if args.only:
-        return _evaluate_inputs(args)
     began = time.monotonic()
     seeds = range(FIGURES, FIGURES + count)
     results = campaign(
@@ -192,24 +173,6 @@ def _evaluate_worth(args: argparse.Namespace, count: int) -> int:
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
 
 
-def _evaluate_inputs(args: argparse.Namespace) -> int:
-    from edge_agent.lab.seeds import FIGURES
-    from schemas.runtime.figures import markdown, write
-
-    with tempfile.TemporaryDirectory(dir=args.out) as scratch:
-        figures = _measure_inputs(Path(scratch), args)
-    write(
-        args.out / "figures.json",
-        "edge-agent evaluate --only inputs",
-        [FIGURES, FIGURES + 1],
-        figures,
-    )
-    text = f"# Inputs\n\n{markdown(figures)}\n"
-    (args.out / "report.md").write_text(text, encoding="utf-8")
-    print(text)
-    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
-
-
 def _evaluate_real_logs(args: argparse.Namespace) -> int:
     from edge_agent.lab.evaluation.real_logs import judge_folder, summarise, table
     from schemas.runtime.figures import markdown, write
@@ -224,40 +187,6 @@ def _evaluate_real_logs(args: argparse.Namespace) -> int:
     figures = summarise(found)
     write(args.out / "figures.json", "edge-agent evaluate --only real", [], figures)
     text = f"# Real cars\n\n{table(found)}\n\n{markdown(figures)}\n"
-    (args.out / "report.md").write_text(text, encoding="utf-8")
-    print(text)
-    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
-
-
-def _evaluate_ahead(args: argparse.Namespace, count: int) -> int:
-    from edge_agent.lab.ahead import approaches, cost, entry, latency
-    from edge_agent.lab.seeds import FIGURES
-    from schemas.runtime.figures import markdown, write
-
-    seeds = range(FIGURES, FIGURES + count)
-    quick = args.quick
-    rows: list[Callable[[], list[Figure]]] = [
-        lambda: cost.cost_figures(FIGURES, 2e3 if quick else 20e3),
-        lambda: latency.latency_figures(
-            FIGURES, 20 if quick else 300, 20 if quick else latency.VEHICLES
-        ),
-        lambda: approaches.approach_figures(
-            seeds[:1] if quick else seeds, 60.0 if quick else APPROACHES_S, 6 if quick else 24
-        ),
-        lambda: entry.entry_figures(
-            seeds[:1] if quick else seeds[:ENTRY_TOWNS], 40.0 if quick else 90.0, 6 if quick else 16
-        ),
-    ]
-    figures: list[Figure] = []
-    for row in rows:
-        found = row()
-        figures += found
-        print(markdown(found).partition("|---|---|---|---|\n")[2], file=sys.stderr, flush=True)
-    part = " --quick" if quick else f" --seeds {count}" if count < LEAST_SEEDS else ""
-    write(
-        args.out / "figures.json", f"edge-agent evaluate --only ahead{part}", list(seeds), figures
-    )
-    text = f"# Road ahead\n\n{markdown(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
@@ -295,31 +224,3 @@ def _evaluate_detection(args: argparse.Namespace, count: int) -> int:
         draw_detection(figures, args.out / f"detection.{args.plots}")
     print(text)
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
-
-
-def _measure_inputs(folder: Path, args: argparse.Namespace) -> list[Figure]:
-    from edge_agent.lab.evaluation import calibrated, imports, planted
-    from edge_agent.lab.live import live_benchmark
-    from edge_agent.lab.seeds import FIGURES
-    from schemas.runtime.figures import markdown
-
-    quick = args.quick
-    rows: list[Callable[[], list[Figure]]] = [
-        lambda: imports.figures(
-            folder, FIGURES, args.recorded, QUICK_S if quick else imports.DRIVE_S
-        ),
-        lambda: planted.figures(1 if quick else CARS, FIGURES),
-        lambda: calibrated.figures(1 if quick else LEARNED_CARS, FIGURES),
-        lambda: calibrated.widths(
-            1 if quick else LEARNED_CARS, FIGURES, 2 * QUICK_S if quick else calibrated.JUDGED_S
-        ),
-        lambda: live_benchmark.figures(
-            folder, 1.0 if quick else LIVE_S, 1 if quick else live_benchmark.KILLS
-        ),
-    ]
-    figures: list[Figure] = []
-    for row in rows:
-        found = row()
-        figures += found
-        print(markdown(found).partition("|---|---|---|---|\n")[2], file=sys.stderr, flush=True)
-    return figures

@@ -67,7 +67,7 @@ def serve_metrics(
     handler = type(
         "Handler",
         (_Handler,),
-        {"exposition": staticmethod(_exposition(read)), "troubles": staticmethod(troubles)},
+        {"exposition": staticmethod(_make_exposition(read)), "troubles": staticmethod(troubles)},
     )
     try:
         server = _MetricsServer((host, port), handler)
@@ -86,7 +86,7 @@ def serve_metrics(
         thread.join()
 
 
-def _exposition(read: Read) -> Callable[[], tuple[str, bytes]]:
+def _make_exposition(read: Read) -> Callable[[], tuple[str, bytes]]:
     try:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
         from prometheus_client.openmetrics.exposition import CONTENT_TYPE_LATEST, generate_latest

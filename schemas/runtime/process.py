@@ -120,7 +120,7 @@ def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], No
         event = line.partition(":")[0] if ":" in line else line.partition(" ")[0]
         values = line.values if isinstance(line, LogLine) else {}
         print_line(
-            _record("info", **{"event": event, "message": str(line), **who, **values}), stream
+            _make_record("info", **{"event": event, "message": str(line), **who, **values}), stream
         )
 
     return text if form == "text" else as_json
@@ -146,9 +146,9 @@ class _Formatter(logging.Formatter):
         raised = {"error": self.formatException(record.exc_info)} if record.exc_info else {}
         level = record.levelname.lower()
         event = record.name
-        return _record(level, event=event, message=record.getMessage(), **self._who, **raised)
+        return _make_record(level, event=event, message=record.getMessage(), **self._who, **raised)
 
 
-def _record(level: str, **values: Any) -> str:  # noqa: ANN401 whatever JSON takes
+def _make_record(level: str, **values: Any) -> str:  # noqa: ANN401 whatever JSON takes
     now = datetime.now(UTC).isoformat(timespec="milliseconds")
     return json.dumps({"time": now, "level": level, "pid": os.getpid(), **values}, default=str)

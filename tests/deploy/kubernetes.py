@@ -36,8 +36,8 @@ from ruamel.yaml import YAML
 from fleet_service.cli import main as fleet_service
 from schemas.runtime.figures import Figure, markdown, write
 from schemas.runtime.jit import cache_root
-from schemas.runtime.ports import free_ports
 from tests.buckets import BucketServer, bucket_server
+from tests.ports import free_ports
 from tests.structure import ROOT
 from tests.waiting import until
 

@@ -25,8 +25,8 @@ from ruamel.yaml import YAML
 from fleet_service.client.map_client import query_map
 from fleet_service.enrolment.fleet import Enrolment
 from schemas.config import AgentConfig, ServiceConfig, load
-from schemas.runtime.ports import free_ports
 from schemas.runtime.zenoh_session import configuration
+from tests.ports import free_ports
 from tests.schemas.runtime.test_metrics import fetch_page
 from tests.waiting import until
 

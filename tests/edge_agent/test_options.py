@@ -186,8 +186,7 @@ ELSEWHERE = {
         "--no-plots": SEEDS,
         "--plots": CAMPAIGN,
         "--logs": "test_logs_of_a_folder_are_judged_and_reported",
-        "--recorded": "test_only_the_inputs_are_evaluated_where_so_asked",
-        "--only": "test_only_the_inputs_are_evaluated_where_so_asked",
+        "--only": "test_logs_of_a_folder_are_judged_and_reported",
         "--paper": "test_paper_is_reproduced_and_written",
     },
 }

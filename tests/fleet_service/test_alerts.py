@@ -27,12 +27,12 @@ from fleet_service.client.webhook import Webhook, alert_message, check_url
 from schemas import grid
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
-from schemas.runtime.ports import free_ports
 from schemas.wire import Alert
 from tests.faults.webhook import ALERTS, run_kind
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.conftest import Running
 from tests.fleet_service.examples import SECOND, batch
+from tests.ports import free_ports
 from tests.waiting import until
 
 # of cells near Gothenburg

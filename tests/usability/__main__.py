@@ -26,7 +26,6 @@ import fleet_service.cli
 from deploy.router import open_router
 from edge_agent.inputs.doctor.findings import diagnose
 from edge_agent.inputs.doctor.report import report_page as doctors_page
-from edge_agent.lab.evaluation.planted import drives
 from fleet_service.analytics import synthetic
 from fleet_service.archive.maintenance.compaction import compact
 from schemas.config import ZenohSettings
@@ -34,6 +33,7 @@ from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 from schemas.runtime.palette import ESTIMATORS, GRIP_RANGE, SURFACES, TRUTH, shade
 from tests import reference_pages, results
+from tests.benchmarks.inputs.planted import drives
 from tests.browser import open_page
 from tests.colour_vision import SIGHTS, colour_difference, to_lab
 from tests.faults.processes import Part

@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import edge_agent.cli
-from edge_agent.lab.evaluation.planted import PLANTED, Recorded, drives
 from schemas.signals import CHANNELS
+from tests.benchmarks.inputs.planted import PLANTED, Recorded, drives
 
 TONNES: Final = "mass in tonnes"
 WRONG: Final = (  # those that gave sure ice, or the wrong place, in silence once, and three more

@@ -77,10 +77,10 @@ def speed(seeds: Sequence[int]) -> FloatArray:
     leaked = felt - np.stack([batch.truth["true_ax"][:, 0], batch.truth["true_ay"][:, 0]], axis=-1)
     heard = OracleSignals(batch, leaked[:, 1] / car.roll_leak, leaked[:, 0] / car.pitch_leak, felt)
     known = [vehicle.wheel_radius / car.vehicle.wheel_radius - 1.0 for vehicle in batch.vehicles]
-    return np.array([_speed(heard, n, rho) for n, rho in enumerate(known)])
+    return np.array([_oracle_speed_rmse(heard, n, rho) for n, rho in enumerate(known)])
 
 
-def _speed(heard: OracleSignals, n: int, rho: float) -> float:
+def _oracle_speed_rmse(heard: OracleSignals, n: int, rho: float) -> float:
     """Return the RMSE of the oracle's speed for drive n [m/s].
 
     Each second, the oracle (ideal observer) estimates the error ρ of the wheel radius again from
@@ -172,12 +172,12 @@ def _theta(force: FloatArray, shape: float, curvature: float) -> FloatArray:
     """Return the normalised slips (n,) on the rising branch at which the tyre uses the shares
     `force` (n,) of its grip.
     """
-    curve = _curve(shape, curvature)
+    curve = _force_curve(shape, curvature)
     return np.interp(force, curve, THETA[: len(curve)])
 
 
 @cache
-def _curve(shape: float, curvature: float) -> FloatArray:
+def _force_curve(shape: float, curvature: float) -> FloatArray:
     """Return the tyre's force curve: an array of force over peak force at the normalised slips
     THETA, up to the peak.
     """

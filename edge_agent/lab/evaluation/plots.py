@@ -48,13 +48,13 @@ def draw(
         drives = {name: drive for (of, name), drive in results.drives.items() if of == scenario}
         written.append(_scenario(scenario, drives, seed, folder / f"{scenario}.{form}"))
     if results.rough is not None:
-        written.append(_rough(results.rough, folder / f"rough.{form}"))
+        written.append(_draw_rough_car(results.rough, folder / f"rough.{form}"))
     return [
         *written,
-        _surfaces(figures, folder / f"surfaces.{form}"),
-        _memberships(folder / f"memberships.{form}"),
-        _reliability(figures, folder / f"reliability.{form}"),
-        _consistency(figures, folder / f"consistency.{form}"),
+        _draw_surfaces(figures, folder / f"surfaces.{form}"),
+        _draw_memberships(folder / f"memberships.{form}"),
+        _draw_reliability(figures, folder / f"reliability.{form}"),
+        _draw_consistency(figures, folder / f"consistency.{form}"),
     ]
 
 
@@ -127,7 +127,7 @@ def _true() -> dict[str, Any]:
     return {"color": TRUTH.colour, "linestyle": TRUTH.dash, "lw": 1.6}
 
 
-def _rough(world: RealWorldResults, path: Path) -> Path:
+def _draw_rough_car(world: RealWorldResults, path: Path) -> Path:
     """Plot one inaccurate car in a hilly town: speed and wheel speed, slope, friction with the
     default estimator's interval, health.
     """
@@ -173,7 +173,7 @@ def _rough(world: RealWorldResults, path: Path) -> Path:
     return path
 
 
-def _surfaces(figures: Sequence[Figure], path: Path) -> Path:
+def _draw_surfaces(figures: Sequence[Figure], path: Path) -> Path:
     """Plot the coverage of the 90 % interval by surface, for every estimator in the towns with
     inaccurate cars.
     """
@@ -206,7 +206,7 @@ def _surfaces(figures: Sequence[Figure], path: Path) -> Path:
     return path
 
 
-def _consistency(figures: Sequence[Figure], path: Path) -> Path:
+def _draw_consistency(figures: Sequence[Figure], path: Path) -> Path:
     """Plot NEES and NIS (normalised squared errors and innovations) per scenario and estimator,
     with the 95 % bounds of their mean over the drives at one instant.
     """
@@ -245,7 +245,7 @@ def _consistency(figures: Sequence[Figure], path: Path) -> Path:
     return path
 
 
-def _memberships(path: Path) -> Path:
+def _draw_memberships(path: Path) -> Path:
     """Plot the fuzzy sets before and after the ant colony."""
     from matplotlib import pyplot as plt
 
@@ -276,7 +276,7 @@ def _triangles(axis: Axes, peaks: tuple[float, ...], title: str, name: str) -> N
     axis.legend(fontsize="xx-small")
 
 
-def _reliability(figures: Sequence[Figure], path: Path) -> Path:
+def _draw_reliability(figures: Sequence[Figure], path: Path) -> Path:
     """Plot, over all scenarios, the share of true frictions that lie below each quantile of the
     estimate."""
     from matplotlib import pyplot as plt

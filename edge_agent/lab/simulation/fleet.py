@@ -215,7 +215,7 @@ class SimulatedFleet:
             np.array([key_of(seed, k, ROUTE_STREAM) for k in range(vehicles)]),
             np.array([key_of(seed, k, ALERT_STREAM) for k in range(vehicles)]),
         )
-        self._states = _start(self.scenario.network, self._parameters, rngs)
+        self._states = _start_states(self.scenario.network, self._parameters, rngs)
         self._states[1][:, Driver.STOPS] = np.where(self.rough, STOPS, 0.0)
         self._states[1][:, Driver.CROSS_SLOPE] = self.scenario.relief.crossfall
         self._before = np.empty((0, vehicles, RECORD))  # what late clocks may still speak of
@@ -336,7 +336,7 @@ def _truth(records: FloatArray, air_temperature: float) -> Truth:
     )
 
 
-def _start(
+def _start_states(
     network: Network, parameters: FloatArray, rngs: list[np.random.Generator]
 ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
     """Return the initial states of N vehicles as arrays with N rows: motion, drivers, routes and

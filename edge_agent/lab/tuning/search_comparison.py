@@ -113,7 +113,7 @@ def compare_searches(
             f"seed {seed}: "
             + ", ".join(f"{name} {values[-1]:.2f}" for name, values in judged.items())
         )
-    return _figures(searched, judged)
+    return _comparison_figures(searched, judged)
 
 
 def _problem(train: study.StudySet) -> Problem:
@@ -121,7 +121,9 @@ def _problem(train: study.StudySet) -> Problem:
     return Problem(study.objective_on(train), choices(POSITIONS)[: study.VERTICES], start)
 
 
-def _figures(searched: dict[str, list[float]], judged: dict[str, list[float]]) -> list[Figure]:
+def _comparison_figures(
+    searched: dict[str, list[float]], judged: dict[str, list[float]]
+) -> list[Figure]:
     listed = []
     for name, values in judged.items():
         listed += _mean("searches.train." + name, searched[name])

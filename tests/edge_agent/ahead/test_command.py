@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from edge_agent.cli import main
-from edge_agent.lab.ahead.made_up_service import MadeUpService
 from edge_agent.lab.simulation.scenarios import scenario_named
 from schemas import grid
 from schemas.wire import Alert
+from tests.benchmarks.ahead.made_up_service import MadeUpService
 from tests.edge_agent.ahead.roads import alert
 from tests.edge_agent.service import Router, Service
 

@@ -19,13 +19,13 @@ from edge_agent.ahead.cell_decoder import decode_alert_message, decode_cells, de
 from edge_agent.ahead.lookout import Lookout
 from edge_agent.ahead.path import GivenRoute, Path, Pose, straight_path
 from edge_agent.ahead.request_log import LEAVE_S, MOST_TILES, REFRESH_S, RequestLog, Tiles
-from edge_agent.lab.ahead.made_up_service import MadeUpService, tile_payload
 from schemas import grid, keys, wire
 from schemas.errors import WireError
 from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.zenoh_session import open_session
 from schemas.thresholds import NS
 from schemas.wire.ahead import AHEAD_ENCODING, GripWarning, Outlook, decode_ahead, encode_ahead
+from tests.benchmarks.ahead.made_up_service import MadeUpService, tile_payload
 from tests.edge_agent.ahead.roads import HOME, alert, keys_on, line
 from tests.edge_agent.service import Router
 from tests.waiting import until

@@ -12,10 +12,10 @@ import pytest
 
 from edge_agent.app.kuksa_provider import CONDITION, FRICTION, KuksaProvider, surface_condition
 from edge_agent.cli import main
-from edge_agent.lab.live.databroker import Databroker
 from edge_agent.publish.vss import road_friction
 from schemas.errors import InputError
 from schemas.thresholds import NS
+from tests.benchmarks.inputs.databroker import Databroker
 from tests.edge_agent.service import Router, Service
 from tests.waiting import until
 

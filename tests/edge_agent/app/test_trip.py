@@ -15,9 +15,9 @@ import pytest
 from edge_agent.app.trip import LEAST_S, LOOK_S, Trip, state_path_for
 from edge_agent.inputs.block import Block
 from edge_agent.inputs.profile import Profile
-from edge_agent.lab.evaluation.planted import Recorded, drives, offset_columns, scale_columns
 from schemas.numeric import FloatArray
 from schemas.signals import S
+from tests.benchmarks.inputs.planted import Recorded, drives, offset_columns, scale_columns
 from tests.waiting import until
 
 PROFILE = Profile(name="p", channels={})

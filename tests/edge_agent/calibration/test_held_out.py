@@ -15,10 +15,10 @@ from edge_agent.calibration.held_out import (
 )
 from edge_agent.calibration.learn import trace_steering
 from edge_agent.inputs.doctor.drive import prepare_drive
-from edge_agent.lab.evaluation.planted import Recorded, drives, offset_columns
 from schemas.errors import InputError
 from schemas.signals import S
 from schemas.vehicle import Calibration, Vehicle
+from tests.benchmarks.inputs.planted import Recorded, drives, offset_columns
 
 
 @pytest.fixture(scope="module")

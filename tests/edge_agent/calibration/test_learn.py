@@ -22,11 +22,11 @@ from edge_agent.calibration.learn import (
 )
 from edge_agent.cli import main
 from edge_agent.inputs.correct import Corrector, correct_log
-from edge_agent.lab.evaluation.planted import Recorded, drives, offset_columns, scale_columns
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
 from schemas.vehicle import Calibration, Vehicle, load_vehicle
+from tests.benchmarks.inputs.planted import Recorded, drives, offset_columns, scale_columns
 
 Output = pytest.CaptureFixture[str]
 OFF = {"ax": 0.5, "yaw_rate": 0.012, "steer_offset": 0.012, "radius_fl": 0.012}

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import can
 
-from edge_agent.lab.evaluation.formats import as_bag, as_csv, as_log, as_mf4
+from tests.benchmarks.inputs.formats import as_bag, as_csv, as_log, as_mf4
 
 DATA = Path(__file__).parents[2] / "data"
 BLF = DATA / "rav4.blf"

@@ -13,10 +13,10 @@ import pytest
 from edge_agent.inputs.correct import correct_log
 from edge_agent.inputs.doctor.adopt import adopt_measured, align_devices
 from edge_agent.inputs.signal_log import SignalLog
-from edge_agent.lab.evaluation.planted import DELTA, IMU, OMEGA, Recorded, drives
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
+from tests.benchmarks.inputs.planted import DELTA, IMU, OMEGA, Recorded, drives
 
 RATE_HZ = 100
 

@@ -26,16 +26,16 @@ from edge_agent.inputs.profile import FOLDER, Channel, Profile, load_profile, sh
 from edge_agent.inputs.readers.dbc import read_dbc
 from edge_agent.inputs.recording import Series
 from edge_agent.inputs.signal_log import SignalLog, read_log
-from edge_agent.lab.live.databroker import Databroker
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
-from schemas.runtime.ports import free_ports
 from schemas.signals import CHANNELS, CONTEXT, FLAGS, C
 from schemas.thresholds import NS
+from tests.benchmarks.inputs.databroker import Databroker
 from tests.edge_agent.fakes import a_log
 from tests.edge_agent.inputs import formats
 from tests.edge_agent.inputs.test_live_rows import Scripted, Steered
+from tests.ports import free_ports
 from tests.waiting import until
 
 CAR = PRESETS["sedan"].vehicle

@@ -15,7 +15,12 @@ import pytest
 
 from edge_agent.cli import main
 from edge_agent.inputs.doctor.findings import diagnose
-from edge_agent.lab.evaluation.planted import (
+from edge_agent.lab.simulation import SimulatedFleet, simulate_manoeuvre
+from edge_agent.lab.simulation.friction import ICE, SNOW, WET
+from edge_agent.lab.simulation.scenarios import scenario_named
+from schemas.signals import CHANNELS, S
+from tests.benchmarks.inputs.__main__ import main as evaluate_inputs
+from tests.benchmarks.inputs.planted import (
     DRIVE_S,
     PLANTED,
     RATE_HZ,
@@ -23,10 +28,6 @@ from edge_agent.lab.evaluation.planted import (
     doctor_verdict,
     drives,
 )
-from edge_agent.lab.simulation import SimulatedFleet, simulate_manoeuvre
-from edge_agent.lab.simulation.friction import ICE, SNOW, WET
-from edge_agent.lab.simulation.scenarios import scenario_named
-from schemas.signals import CHANNELS, S
 from tests.edge_agent.inputs.formats import BLF, NMEA, VEHICLE
 from tests.edge_agent.service import Router, Service
 
@@ -210,18 +211,9 @@ def test_estimates_that_are_not_plausible_have_an_exit_code_of_their_own(
 
 @pytest.mark.campaign
 @pytest.mark.timeout(600)  # processes are started, and kernels may have to be compiled
-def test_only_the_inputs_are_evaluated_where_so_asked(tmp_path: Path) -> None:
-    words = [
-        "evaluate",
-        "--only",
-        "inputs",
-        "--quick",
-        "--recorded",
-        str(BLF),
-        "--out",
-        str(tmp_path),
-    ]
-    assert main(words) in (0, 1)
+def test_evaluation_of_the_inputs_writes_its_figures(tmp_path: Path) -> None:
+    words = ["--quick", "--recorded", str(BLF), "--out", str(tmp_path)]
+    assert evaluate_inputs(words) in (0, 1)
     figures = {
         row["name"]: row["value"] for row in json.loads((tmp_path / "figures.json").read_text())[1:]
     }

@@ -25,23 +25,23 @@ from edge_agent.inputs.live.ros2 import MOST_MESSAGE, MOST_PUBLISHERS, Ros2Feed,
 from edge_agent.inputs.live.rows import LiveRows
 from edge_agent.inputs.live.sources import is_live, open_sources
 from edge_agent.inputs.profile import Channel, Profile
-from edge_agent.lab.live.databroker import Databroker
-from edge_agent.lab.live.live_benchmark import (
+from edge_agent.lab.simulation.presets import PRESETS
+from schemas.errors import InputError
+from schemas.signals import CHANNELS as ALL
+from schemas.signals import S
+from schemas.thresholds import NS
+from schemas.wire import Kind
+from tests.benchmarks.inputs.databroker import Databroker
+from tests.benchmarks.inputs.live_benchmark import (
     COUNTED,
     count_lost,
     peer_addresses,
     run_peer,
     write_profile,
 )
-from edge_agent.lab.live.peers import CHANNELS, RADIUS, SPEED
-from edge_agent.lab.simulation.presets import PRESETS
-from schemas.errors import InputError
-from schemas.runtime.ports import free_ports
-from schemas.signals import CHANNELS as ALL
-from schemas.signals import S
-from schemas.thresholds import NS
-from schemas.wire import Kind
+from tests.benchmarks.inputs.peers import CHANNELS, RADIUS, SPEED
 from tests.edge_agent.service import Router, Service
+from tests.ports import free_ports
 from tests.waiting import until
 
 CAR = PRESETS["sedan"].vehicle

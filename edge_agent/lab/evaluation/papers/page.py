@@ -128,7 +128,7 @@ def report_html(done: Reproduction, seconds: float) -> str:
             for plot in done.plots
         ),
         f"<h2>Elements of the paper</h2><p>{counts}.</p>",
-        _elements(done.elements),
+        _elements_table(done.elements),
         "</body></html>",
     ]
     return "\n".join(parts) + "\n"
@@ -153,7 +153,7 @@ def _table(table: PaperTable) -> str:
     return "\n".join(lines) + "</table>"
 
 
-def _elements(elements: Sequence[Element]) -> str:
+def _elements_table(elements: Sequence[Element]) -> str:
     lines = [
         "<table><tr><th>paper</th><th>element</th><th>verdict</th><th>why</th><th>where</th></tr>"
     ]

@@ -102,7 +102,7 @@ def test_exit_code_is_one_if_a_matched_row_misses(
 
 
 def test_paper_and_another_campaign_are_refused(tmp_path: Path) -> None:
-    assert main(["evaluate", "--paper", "004", "--only", "ahead", "--out", str(tmp_path)]) == 2
+    assert main(["evaluate", "--paper", "004", "--only", "worth", "--out", str(tmp_path)]) == 2
 
 
 @pytest.mark.campaign

@@ -17,7 +17,7 @@ import proton
 from proton.handlers import MessagingHandler
 from proton.reactor import ApplicationEvent, Container, EventInjector
 
-from schemas.runtime.ports import free_ports
+from tests.ports import free_ports
 
 
 @dataclass

@@ -20,12 +20,12 @@ from edge_agent.inputs.readers.can_log import Log, log_frames
 from edge_agent.inputs.readers.dbc import LONGEST, Database, parse_dbc, read_dbc
 from edge_agent.inputs.recording import import_optional
 from edge_agent.inputs.signal_log import read_log
-from edge_agent.lab.evaluation.formats import as_bag, as_csv, as_log, as_mf4
-from edge_agent.lab.evaluation.planted import Recorded, drives
-from edge_agent.lab.live.peers import CHANNELS, DBC, STEP, profile_of
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.signals import CHANNELS as ALL
+from tests.benchmarks.inputs.formats import as_bag, as_csv, as_log, as_mf4
+from tests.benchmarks.inputs.peers import CHANNELS, DBC, STEP, profile_of
+from tests.benchmarks.inputs.planted import Recorded, drives
 
 MADE: Final = 200  # frames of each message
 MINUTE_FRAMES: Final = 99_000

@@ -22,11 +22,11 @@ from edge_agent.ahead.path import GivenRoute, Path, Pose, straight_path, to_degr
 from edge_agent.ahead.request_log import FURTHER_M, RequestLog, Tiles, keys_of
 from edge_agent.ahead.roads import ways_on
 from edge_agent.ahead.warnings import Active, update_warnings
-from edge_agent.lab.ahead.made_up_service import tile_payload
 from schemas import grid, keys
 from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.figures import Figure
 from schemas.thresholds import NS
+from tests.benchmarks.ahead.made_up_service import tile_payload
 
 DAY_KM: Final = 40.0  # of a car in Europe: 13 000 km a year on 325 days
 SPEED: Final = 9.0  # [m/s]

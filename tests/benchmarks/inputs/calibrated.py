@@ -14,7 +14,6 @@ import numpy as np
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.calibration.learn import learn_calibration
 from edge_agent.inputs.correct import correct_log
-from edge_agent.lab.evaluation.planted import RATE_HZ, drives
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.simulation.fleet import VEHICLE_STREAM
 from edge_agent.lab.simulation.misaligned import Misaligned
@@ -24,6 +23,7 @@ from edge_agent.lab.simulation.sensors import ROUGH_FLEET, ErrorColumn, error_ro
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.signals import WHEELS, S
+from tests.benchmarks.inputs.planted import RATE_HZ, drives
 
 # of each car; its road goes on from drive to drive
 DRIVES = 10

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.runtime import ports
+from tests import ports
 
 
 def test_ports_lie_below_those_of_outgoing_connections() -> None:

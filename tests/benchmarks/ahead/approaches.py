@@ -27,12 +27,12 @@ from edge_agent.ahead.local_map import LocalMap
 from edge_agent.ahead.path import GivenRoute, Path, Pose, straight_path
 from edge_agent.ahead.roads import ways_on
 from edge_agent.ahead.warnings import Active, update_warnings
-from edge_agent.lab.ahead.known_town import map_of_places, places_of
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.observe.cell_tracker import locate_vehicles, new_tracks
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.thresholds import GRAVITY, NS, REACTION_S
+from tests.benchmarks.ahead.known_town import map_of_places, places_of
 
 RATE_HZ: Final = 50.0
 AFTER_S: Final = 80.0  # of the scenario's clock: all its events have happened

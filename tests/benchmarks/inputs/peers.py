@@ -1,5 +1,5 @@
-"""Test senders ("peers") for live sources, run as processes: `python -m edge_agent.lab.live.peers
-KIND ADDRESS SAMPLES RATE`.
+"""Test senders ("peers") for live sources, run as processes:
+`python -m tests.benchmarks.inputs.peers KIND ADDRESS SAMPLES RATE`.
 
 A peer prints `ready`, waits for a line on its input, sends SAMPLES samples at RATE per second and
 prints the number of messages. It ends when its input ends, so it can be killed and restarted at the
@@ -22,11 +22,11 @@ import numpy as np
 from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.inputs.recording import import_optional
 from edge_agent.inputs.units import DEG
-from edge_agent.lab.live.databroker import Databroker
 from schemas.config import ZenohSettings
 from schemas.runtime.zenoh_session import open_session
 from schemas.signals import per_wheel
 from schemas.thresholds import NS
+from tests.benchmarks.inputs.databroker import Databroker
 
 # [m/s], [m]
 SPEED = 15.0

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge_agent.lab.ahead import approaches, cost, entry, latency
-from edge_agent.lab.ahead.known_town import map_of_places, places_of
 from edge_agent.lab.simulation import SimulatedFleet
 from schemas.mugrid import STEPS_PER_NAT
+from tests.benchmarks.ahead import approaches, cost, entry, latency
+from tests.benchmarks.ahead.known_town import map_of_places, places_of
 
 
 @pytest.mark.campaign

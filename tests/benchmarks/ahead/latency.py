@@ -20,7 +20,6 @@ import zenoh
 
 from edge_agent.ahead.lookout import Lookout
 from edge_agent.ahead.path import Pose, to_degrees
-from edge_agent.lab.ahead.made_up_service import MadeUpService
 from schemas import grid
 from schemas.config import ZenohSettings
 from schemas.numeric import FloatArray
@@ -29,6 +28,7 @@ from schemas.runtime.zenoh_session import open_session
 from schemas.thresholds import NS
 from schemas.wire import Alert
 from schemas.wire.ahead import GripWarning
+from tests.benchmarks.ahead.made_up_service import MadeUpService
 
 VEHICLES: Final = 200
 APART_M: Final = 60.0  # roads, northwards of each other

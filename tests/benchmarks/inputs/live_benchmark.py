@@ -20,12 +20,12 @@ import numpy as np
 
 from edge_agent.inputs.live.rows import LiveRows
 from edge_agent.inputs.live.sources import open_sources
-from edge_agent.lab.live.peers import CHANNELS, DBC, profile_of
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.runtime.figures import Figure
-from schemas.runtime.ports import free_ports
 from schemas.signals import CHANNELS as ALL
 from schemas.vehicle import Vehicle
+from tests.benchmarks.inputs.peers import CHANNELS, DBC, profile_of
+from tests.ports import free_ports
 
 RATE_HZ: Final = 100.0
 MULTICAST: Final = "239.74.163.2"
@@ -76,7 +76,7 @@ def run_peer(kind: str, address: str, samples: int, rate: float = RATE_HZ) -> It
     words = [
         sys.executable,
         "-m",
-        "edge_agent.lab.live.peers",
+        "tests.benchmarks.inputs.peers",
         kind,
         address,
         str(samples),

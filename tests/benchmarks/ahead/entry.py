@@ -20,7 +20,6 @@ from edge_agent.ahead.local_map import LocalMap
 from edge_agent.ahead.prior import NOWHERE, MapPrior
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.block import Block, to_utc_ns
-from edge_agent.lab.ahead.known_town import KnownPlaces, map_of_places, places_of
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.simulation.roads import LanePoint
 from edge_agent.lab.simulation.scenarios import Scenario
@@ -30,6 +29,7 @@ from schemas.config import AgentConfig
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.figures import Figure
 from schemas.thresholds import NS
+from tests.benchmarks.ahead.known_town import KnownPlaces, map_of_places, places_of
 
 RATE_HZ: Final = 100.0
 BLOCK: Final = 10

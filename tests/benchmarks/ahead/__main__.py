@@ -1,0 +1,65 @@
+"""`python -m tests.benchmarks.ahead [--out DIR] [--seeds N] [--quick]`: evaluate the warnings in
+the car, and the map as a prior.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from edge_agent.lab.seeds import FIGURES
+from schemas.runtime.figures import Figure, markdown, write
+from tests.benchmarks.ahead import approaches, cost, entry, latency
+
+TITLE: Final = "ahead"
+SEEDS: Final = 20  # of a campaign whose bars count
+# 24 cars drive .2 km/s: 20 towns are 1 200 km, for a bar of one in 1 000
+APPROACHES_S: Final = 300.0
+ENTRY_TOWNS: Final = 4  # of the map as a prior, where the estimator itself drives
+
+
+def measure_ahead(seeds: range, quick: bool) -> list[Figure]:
+    """Return the figures of all parts; each seed draws a town."""
+    rows: list[Callable[[], list[Figure]]] = [
+        lambda: cost.cost_figures(FIGURES, 2e3 if quick else 20e3),
+        lambda: latency.latency_figures(
+            FIGURES, 20 if quick else 300, 20 if quick else latency.VEHICLES
+        ),
+        lambda: approaches.approach_figures(
+            seeds[:1] if quick else seeds, 60.0 if quick else APPROACHES_S, 6 if quick else 24
+        ),
+        lambda: entry.entry_figures(
+            seeds[:1] if quick else seeds[:ENTRY_TOWNS], 40.0 if quick else 90.0, 6 if quick else 16
+        ),
+    ]
+    figures: list[Figure] = []
+    for row in rows:
+        found = row()
+        figures += found
+        print(markdown(found).partition("|---|---|---|---|\n")[2], file=sys.stderr, flush=True)
+    return figures
+
+
+def main() -> int:
+    """Measure and write the figures. Return 0 if every figure meets its target, otherwise 1."""
+    parser = argparse.ArgumentParser(prog="tests.benchmarks.ahead", description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path(".evaluation/ahead"))
+    parser.add_argument("--seeds", type=int, default=SEEDS, help="number of towns")
+    parser.add_argument("--quick", action="store_true", help="smaller numbers")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    seeds = range(FIGURES, FIGURES + args.seeds)
+    figures = measure_ahead(seeds, args.quick)
+    part = " --quick" if args.quick else f" --seeds {args.seeds}" if args.seeds < SEEDS else ""
+    write(args.out / "figures.json", TITLE + part, list(seeds), figures)
+    text = f"# Road ahead\n\n{markdown(figures)}\n"
+    (args.out / "report.md").write_text(text, encoding="utf-8")
+    print(text)
+    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

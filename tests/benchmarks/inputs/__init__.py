@@ -1,0 +1,1 @@
+"""Evaluation of the inputs: readers, signal doctor, calibration, and live sources."""

@@ -1,0 +1,69 @@
+"""`python -m tests.benchmarks.inputs [--out DIR] [--recorded LOG] [--quick]`: evaluate readers,
+signal doctor, calibration and live sources.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+from edge_agent.lab.seeds import FIGURES
+from schemas.runtime.figures import Figure, markdown, write
+from tests.benchmarks.inputs import calibrated, imports, live_benchmark, planted
+
+TITLE: Final = "inputs"
+LEARNED_CARS: Final = 20
+LIVE_S: Final = 60.0
+QUICK_S: Final = 10
+CARS: Final = 5  # smooth ones, and as many rough ones
+
+
+def measure_inputs(folder: Path, recorded: Path | None, quick: bool) -> list[Figure]:
+    """Return the figures of all parts. Files are written into `folder`; the CAN log `recorded` is
+    decoded as well.
+    """
+    rows: list[Callable[[], list[Figure]]] = [
+        lambda: imports.figures(folder, FIGURES, recorded, QUICK_S if quick else imports.DRIVE_S),
+        lambda: planted.figures(1 if quick else CARS, FIGURES),
+        lambda: calibrated.figures(1 if quick else LEARNED_CARS, FIGURES),
+        lambda: calibrated.widths(
+            1 if quick else LEARNED_CARS, FIGURES, 2 * QUICK_S if quick else calibrated.JUDGED_S
+        ),
+        lambda: live_benchmark.figures(
+            folder, 1.0 if quick else LIVE_S, 1 if quick else live_benchmark.KILLS
+        ),
+    ]
+    figures: list[Figure] = []
+    for row in rows:
+        found = row()
+        figures += found
+        print(markdown(found).partition("|---|---|---|---|\n")[2], file=sys.stderr, flush=True)
+    return figures
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Measure the inputs and write the figures. Return 0 if every figure meets its target,
+    otherwise 1.
+    """
+    parser = argparse.ArgumentParser(prog="tests.benchmarks.inputs", description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path(".evaluation/inputs"))
+    parser.add_argument("--recorded", type=Path, help="CAN log to decode as well")
+    parser.add_argument("--quick", action="store_true", help="smaller numbers")
+    args = parser.parse_args(words)
+    args.out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=args.out) as scratch:
+        figures = measure_inputs(Path(scratch), args.recorded, args.quick)
+    title = TITLE + " --quick" * args.quick
+    write(args.out / "figures.json", title, [FIGURES, FIGURES + 1], figures)
+    text = f"# Inputs\n\n{markdown(figures)}\n"
+    (args.out / "report.md").write_text(text, encoding="utf-8")
+    print(text)
+    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
