@@ -109,9 +109,11 @@ REVISIT_S: Final = 20.0
 # not fused. Six visits of their own fit into it (REVISIT_S), and their votes would be worth
 # nothing.
 WAITING_MOST: Final = 32
-# So long a vehicle's visits to a cell are remembered, to the hour: by then 95 % of its vote count
-# again (1 - e⁻³), and memory is the vehicles of an eighth of a day and not of a year.
+# So long a vehicle's values in a cell are remembered: by then 95 % of its vote count again
+# (1 - e⁻³). Lower bounds are remembered for VOTE_RENEWAL_S only, when 63 % count again: most visits
+# give bounds, so memory is the visits of one hour and the values of three.
 FORGOTTEN_S: Final = 3.0 * VOTE_RENEWAL_S
+FORGOTTEN_EVERY_S: Final = 900  # time between two deletions of what is forgotten
 # For a lower bound, "something else" is this much more grip used.
 NOVELTY_UTILISED: Final = 0.10
 

@@ -83,7 +83,7 @@ def image_of(fusion: Fusion) -> Image:
     image["free_entries"] = {"row": state.free_entries[: int(state.used[FREE_ENTRIES])]}
     image["used"] = {
         "count": state.used,
-        "more": np.array([store.size, store.vehicles, store.hour, fusion.epoch]),
+        "more": np.array([store.size, store.vehicles, store.forgotten_at, fusion.epoch]),
     }
     image["trust"] = {
         "epoch": np.concatenate(
@@ -112,7 +112,7 @@ def fusion_of(image: Image, lateness_s: float) -> Fusion:
     records = {
         name: _restore_records(image[name]["bytes"], kind) for name, kind in _RECORDS.items()
     }
-    size, vehicles, hour, epoch = image["used"]["more"].tolist()
+    size, vehicles, forgotten_at, epoch = image["used"]["more"].tolist()
     state = State(
         live=Rows(
             _restore_beliefs(image["belief"]["bins"]), records["cells"], records["reporters"]
@@ -129,7 +129,7 @@ def fusion_of(image: Image, lateness_s: float) -> Fusion:
         pairs=records["pairs"],
         used=image["used"]["count"].copy(),
     )
-    fusion.store = Store.of(state, records["peers"], records["names"], size, vehicles, hour)
+    fusion.store = Store.of(state, records["peers"], records["names"], size, vehicles, forgotten_at)
     ends = np.cumsum(image["trusts"]["vehicles"])[:-1]
     weights = np.split(image["trust"]["weight"], ends)
     heeded = np.split(image["trust"]["heeded"].astype(np.bool_), ends)

@@ -28,7 +28,7 @@ from fleet_service.fusion.belief import (
     unpack_belief,
 )
 from fleet_service.fusion.shared import UNKNOWN_SHAPE, fade_weights, note_value
-from fleet_service.fusion.store.pairs import returning_bit
+from fleet_service.fusion.store.pairs import oldest_remembered, returning_bit
 from fleet_service.fusion.store.records import (
     AGED,
     FINE,
@@ -54,14 +54,12 @@ P = 0
 PADDED = 1
 LIKELIHOOD = 2
 SCRATCH: Final = mugrid.BINS + 2 * REACH
-_HOUR: Final = 3600
 # Mean of "at least EXCITED_SHARE" against the uniform prior. A bound of so much grip used is a
 # source of grip: only dry road gives it. On the best roads values lie at the grid's end and are
 # bounds.
 _GRIP_MEAN: Final = 0.5 * (EXCITED_SHARE + mugrid.UPPER)
 _GRIP_BIN: Final = int(np.searchsorted(mugrid.CENTRES, SLIPPERY_MU))  # first that is no ice
 _NEITHER: Final = 0.5  # P(slippery) that is neither ice nor grip
-_FORGOTTEN: Final = int(c.FORGOTTEN_S)
 _WITNESS_SLOPE: Final = UNKNOWN_SHAPE.alarm
 
 
@@ -123,7 +121,7 @@ def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
     kind = int(entries[entry].kind)
     pair = entries[entry].pair
     now = entries[entry].time // NS
-    least = now - now % _HOUR - _FORGOTTEN
+    least = oldest_remembered(now, kind)
     time = 0
     mean = np.float32(0.0)
     std = np.float32(0.0)
@@ -140,8 +138,8 @@ def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
     else:
         seen = (
             seen
-            or pairs[pair].time[BOUND] >= max(least, 1)
-            or pairs[pair].time[VALUE] >= max(least, 1)
+            or pairs[pair].time[BOUND] >= max(oldest_remembered(now, BOUND), 1)
+            or pairs[pair].time[VALUE] >= max(oldest_remembered(now, VALUE), 1)
         )
         time = int(pairs[pair].time[kind])
         mean = _from_parts(pairs[pair].mean[kind])

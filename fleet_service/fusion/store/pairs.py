@@ -4,9 +4,12 @@ linked list, because a late one may still come between them. One record sums up 
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
-from fleet_service.fusion.belief import VALUE
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.belief import BOUND, VALUE
 from fleet_service.fusion.store.records import NONE, PAIRS, State
 from fleet_service.fusion.store.table import AHEAD, pair_place
 from schemas.numeric import IntArray
@@ -14,6 +17,8 @@ from schemas.runtime.jit import compiled, prefetch, refcount_free_inlined
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
 
+_VALUES_S: Final = int(c.FORGOTTEN_S)
+_BOUNDS_S: Final = int(c.VOTE_RENEWAL_S)
 _FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its multiples lie far apart
 
 
@@ -90,28 +95,40 @@ def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 
 
 @refcount_free_inlined
-def _must_stay(pairs: RecordArray, place: int, least: int) -> bool:
-    """Return True if the record of a vehicle and cell must stay: the vehicle reported there at
-    `least` [s] or later, or has observations there that are younger than the checkpoint (the time
-    before which observations are final).
+def oldest_remembered(now: int, kind: int) -> int:
+    """Return the time [s] of the oldest report of a kind (BOUND or VALUE) that is still remembered
+    at `now` [s]. Older reports have no effect, whether or not their record is already deleted.
+    """
+    return int(now - now % c.FORGOTTEN_EVERY_S - (_VALUES_S if kind == VALUE else _BOUNDS_S))
+
+
+@refcount_free_inlined
+def _must_stay(pairs: RecordArray, place: int, now: int) -> bool:
+    """Return True if the record of a vehicle and cell must stay: the vehicle has reported there so
+    lately that the report is remembered at `now` [s], or has observations there that are younger
+    than the checkpoint (the time before which observations are final).
     """
     pair = pairs[place]
-    return bool(pair.last != NONE or pair.time[0] >= least or pair.time[1] >= least)
+    return bool(
+        pair.last != NONE
+        or pair.time[BOUND] >= oldest_remembered(now, BOUND)
+        or pair.time[VALUE] >= oldest_remembered(now, VALUE)
+    )
 
 
 @compiled
-def count_staying(pairs: RecordArray, least: int) -> int:
+def count_staying(pairs: RecordArray, now: int) -> int:
     """Return the number of records of a vehicle in a cell that must stay in memory, see
     `_must_stay`.
     """
     count = 0
     for place in range(len(pairs)):
-        count += pairs[place].slot != NONE and _must_stay(pairs, place, least)
+        count += pairs[place].slot != NONE and _must_stay(pairs, place, now)
     return count
 
 
 @compiled
-def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: int) -> IntArray:
+def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, now: int) -> IntArray:
     """Move the records of a vehicle in a cell that must stay (see `_must_stay`) to another table.
     Return the row numbers of the other pairs in the old table, one array.
     """
@@ -125,7 +142,7 @@ def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: 
         for place in range(begin, end):
             if old[place].slot == NONE:
                 continue
-            if not _must_stay(old, place, least):
+            if not _must_stay(old, place, now):
                 dropped[count] = place
                 count += 1
                 continue

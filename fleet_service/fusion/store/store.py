@@ -60,7 +60,7 @@ class Store:
         peers: record of each vehicle with its comparisons with other vehicles.
         names: record of each vehicle with its permanent number; the first `vehicles` are in use.
         size, vehicles: number of slots (cells and sectors) and of vehicles in use.
-        hour: hour [s] in which old records of vehicles in cells were last deleted.
+        forgotten_at: time [s] for which old records of vehicles in cells were last deleted.
     """
 
     def __init__(self) -> None:
@@ -79,11 +79,16 @@ class Store:
         self.size = self.vehicles = 0
         self._slots: IntArray = np.full(LEAST, NONE, np.int64)
         self._known: IntArray = np.full(LEAST, NONE, np.int64)
-        self.hour = 0  # whose pairs were dropped last
+        self.forgotten_at = 0
 
     @staticmethod
     def of(
-        state: State, peers: RecordArray, names: RecordArray, size: int, vehicles: int, hour: int
+        state: State,
+        peers: RecordArray,
+        names: RecordArray,
+        size: int,
+        vehicles: int,
+        forgotten_at: int,
     ) -> Store:
         """Return the store (complete state) of a fusion that contains the given arrays and
         counts.
@@ -94,7 +99,7 @@ class Store:
         store.names = names
         store.size = size
         store.vehicles = vehicles
-        store.hour = hour
+        store.forgotten_at = forgotten_at
         store._slots = table_of(state.live.cells, size, size)
         store._known = table_of(names, vehicles, vehicles)
         return store
@@ -217,15 +222,15 @@ class Store:
         self.state = old._replace(windows=windows, base=base, free_windows=free)
 
     def forget(self, checkpoint_s: int) -> None:
-        """Delete old data, once per hour of the checkpoint time: records of a vehicle in a cell
-        older than FORGOTTEN_S (`votes.discount_vote`), and lists of a cell's recent reporters older
-        than an hour (`trust.compare_reports`, `Fusion.sources`).
+        """Delete old data, once per quarter of an hour of the checkpoint time: records of a vehicle
+        in a cell that are not remembered (`pairs.oldest_remembered`), and lists of a cell's recent
+        reporters older than an hour (`trust.compare_reports`, `Fusion.sources`).
         """
-        hour = checkpoint_s - checkpoint_s % _HOUR
-        if hour != self.hour:
-            self.hour = hour
-            self._rebuild_pairs(hour - int(c.FORGOTTEN_S), 0)
-            self._rebuild_reporters(hour - _HOUR - _AHEAD)
+        now = checkpoint_s - checkpoint_s % c.FORGOTTEN_EVERY_S
+        if now != self.forgotten_at:
+            self.forgotten_at = now
+            self._rebuild_pairs(now, 0)
+            self._rebuild_reporters(now - _HOUR - _AHEAD)
 
     def untouched(self, before: int) -> BoolArray:
         """Return a mask of slots (cells and sectors), (size,): True if the last visit of a vehicle
@@ -258,15 +263,15 @@ class Store:
         self._rebuild_pairs(0, 0)
         return place
 
-    def _rebuild_pairs(self, least: int, most: int) -> None:
-        """Delete the pair records (one per vehicle and cell) whose last report was before `least`
-        [s], and make room for `most` pair records.
+    def _rebuild_pairs(self, now: int, most: int) -> None:
+        """Delete the pair records (one per vehicle and cell) that are not remembered at `now` [s],
+        and make room for `most` pair records.
         """
         state = self.state
         old = state.pairs
-        count = count_staying(old, least)
+        count = count_staying(old, now)
         new = _no_pairs(places_for(max(count, most), PAIRS_MOST))
-        dropped = move_pairs(state.entries, old, new, least)
+        dropped = move_pairs(state.entries, old, new, now)
         mark_returned(state, old["slot"][dropped], self.names["key"][old["vehicle"][dropped]])
         state.used[PAIRS] = count
         self.state = state._replace(pairs=new)

@@ -183,11 +183,11 @@ def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
 
 
 def places_for(entries: int, most: float) -> int:
-    """Return the length of a hash table (number of places) that has room for 35 % more than
-    `entries` when at most a share `most` of the places is in use. Records of vehicles in cells live
-    three hours, so 35 % is their growth in about one more hour.
+    """Return the length of a hash table (number of places) that has room for 25 % more than
+    `entries` when at most a share `most` of the places is in use. Most records of vehicles in cells
+    live an hour, and old ones are deleted each quarter of an hour, in which 25 % are added.
     """
-    return max(LEAST, int(1.35 * entries / most))
+    return max(LEAST, int(1.25 * entries / most))
 
 
 def is_full(entries: int, places: int, most: float) -> bool:

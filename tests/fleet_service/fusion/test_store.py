@@ -11,6 +11,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.fusion.store.records import GRIP, ICE, NONE, PAIRS, REPORTERS_USED, VEHICLE
 from fleet_service.fusion.store.table import PAIRS_MOST, fill_table, rows_of
 from schemas import mugrid
+from schemas.numeric import FloatArray
 from tests.fleet_service.examples import CELL, SECOND, START, at_least, belief, observations, value
 
 LATENESS_S = 120.0
@@ -101,3 +102,43 @@ def test_old_cells_back_at_the_prior_are_dropped_without_other_effect() -> None:
             belief(fusion, cell), belief(whole, cell), atol=1e-3
         )  # 16 bits a bin at rest
     assert fusion.live.vehicles[: fusion.size].max() < 40
+
+
+def count_pairs_after(evidence: FloatArray, hours: float) -> tuple[int, int]:
+    """Return the number of remembered pairs (vehicle and cell) `hours` after the only visit of a
+    vehicle, while another vehicle drives elsewhere; and the number of vehicles of the cell when the
+    first vehicle has returned.
+    """
+    fusion = Fusion(LATENESS_S)
+    fusion.update(observations([0.0], [1], evidence, CELL))
+    times = np.arange(60.0, hours * HOUR, 60.0)
+    for time in times.tolist():
+        fusion.update(observations([time], [2], at_least([0.3]), CELL + 1))
+    pairs = fusion.store.state.pairs
+    found = int((pairs["slot"] == fusion.slots_of(np.array([CELL]), np.array([0]))[0]).sum())
+    fusion.update(observations([hours * HOUR], [1], evidence, CELL))
+    return found, int(fusion.live.vehicles[0])
+
+
+@pytest.mark.parametrize(
+    ("evidence", "kept_h", "gone_h"),
+    [(at_least([0.5]), 1.0, 1.4), (value([0.5]), 3.0, 3.4)],
+    ids=["bound", "value"],
+)
+def test_bounds_are_remembered_for_an_hour_and_values_for_three(
+    evidence: FloatArray, kept_h: float, gone_h: float
+) -> None:
+    assert count_pairs_after(evidence, kept_h) == (1, 1)
+    assert count_pairs_after(evidence, gone_h) == (0, 1), "forgotten, and not counted twice"
+
+
+def test_a_vehicle_that_repeats_its_bound_within_the_hour_adds_little() -> None:
+    once, often, others = (Fusion(LATENESS_S) for _ in range(3))
+    once.update(observations([0.0], [1], at_least([0.6]), CELL))
+    for k in range(6):
+        often.update(observations([60.0 * k], [1], at_least([0.6]), CELL))
+        others.update(observations([60.0 * k], [k], at_least([0.6]), CELL))
+    now = START + int(HOUR * 1e9)
+    low = [belief(fusion, now=now)[mugrid.CENTRES < 0.5].sum() for fusion in (once, often, others)]
+    assert low[2] < low[1] <= low[0]
+    assert low[0] - low[1] < 0.25 * (low[0] - low[2])
