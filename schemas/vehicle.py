@@ -192,9 +192,8 @@ def load_vehicle(path: Path | str) -> Vehicle:
     try:
         vehicle = Vehicle.model_validate_json(Path(path).read_bytes())
     except OSError as error:
-        raise InputError(
-            "vehicle", f"cannot read {path} ({error.strerror})", "name a vehicle file"
-        ) from error
+        fix = f"name a vehicle file; of a simulated drive, simulate --vehicle-out {path} writes it"
+        raise InputError("vehicle", f"cannot read {path} ({error.strerror})", fix) from error
     except ValidationError as error:
         raise explain(error, f"vehicle file {path}") from error
     wheelbase = vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle

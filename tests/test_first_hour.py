@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 import zenoh
 from matplotlib.figure import Figure
 
 import edge_agent
 from deploy.router import open_router
+from edge_agent.cli import main as edge_agent_main
 from edge_agent.lab.simulation import PRESETS
-from fleet_service.analytics import plots
+from fleet_service.analytics import plots, synthetic
+from fleet_service.archive.maintenance.compaction import compact
+from fleet_service.cli import main as fleet_service_main
 from schemas import keys, wire
 from schemas.config import AgentConfig, ZenohSettings, load
 from schemas.runtime.zenoh_session import open_session
+from tests.edge_agent.inputs.formats import BLF, NMEA, VEHICLE
 from tests.fleet_service.conftest import running
 from tests.structure import ROOT
 from tests.usability.wrong_logs import find_unnoticed
@@ -91,3 +100,97 @@ def test_a_person_s_report_by_hand_as_the_page_has_it_is_acknowledged(tmp_path: 
     assert vehicle == "anna"
     assert stream.durable
     assert not stream.rejected
+
+
+def test_replay_without_a_vehicle_file_says_how_to_get_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "drive.parquet"
+    assert edge_agent_main(["simulate", "slalom", "--duration", "2", "--out", str(log)]) == 0
+    words = ["replay", str(log), "--out", str(tmp_path / "e.parquet")]
+    assert edge_agent_main(words) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("error: vehicle: cannot read ")
+    assert f"--vehicle-out {tmp_path / 'drive.json'}" in said
+    again = ["simulate", "slalom", "--duration", "2", "--out", str(log), *said.split()[-4:-2]]
+    assert edge_agent_main(again) == 0
+    assert edge_agent_main(words) in (0, 3)
+
+
+def test_real_minute_with_steering_in_degrees_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "minute.parquet"
+    files = [str(BLF), str(NMEA), "--profile", "toyota", "--vehicle", str(VEHICLE)]
+    assert edge_agent_main(["import", *files, "--out", str(log)]) == 0
+    table = pq.read_table(log)
+    for name in ("delta_fl", "delta_fr"):
+        at = table.schema.get_field_index(name)
+        degrees = pc.multiply(table[name], 180.0 / np.pi).cast(table.schema.field(name).type)
+        table = table.set_column(at, table.schema.field(name), degrees)
+    pq.write_table(table, log)
+    capsys.readouterr()
+    assert edge_agent_main(["check", str(log), "--vehicle", str(VEHICLE)]) == 1
+    assert re.search(r"^FAULT +delta +deg ", capsys.readouterr().out, re.MULTILINE)
+
+
+def test_times_in_csv_answers_are_iso_8601(tmp_path: Path) -> None:
+    archive = tmp_path / "archive"
+    synthetic.write_archive(archive, synthetic.SyntheticFleet(6000, 1, 20, 4, 30, 1), 2000)
+    compact(archive)
+    for question, columns in {"spells": ("onset",), "grip": ("day",)}.items():
+        out = tmp_path / f"{question}.csv"
+        assert (
+            fleet_service_main(
+                [
+                    "analyze",
+                    question,
+                    "--archive",
+                    str(archive),
+                    "--to",
+                    "2026-01-28",
+                    "--out",
+                    str(out),
+                ]
+            )
+            == 0
+        )
+        head, *rows = (line.split(",") for line in out.read_text().splitlines())
+        assert rows
+        names = [name.strip('"') for name in head]
+        for name in columns:
+            assert re.match(r'"?2026-01-27', rows[0][names.index(name)])
+        assert {"latitude", "longitude"} <= set(names)
+
+
+def test_example_without_its_arguments_prints_its_usage(tmp_path: Path) -> None:
+    command = [sys.executable, str(ROOT / "deploy" / "examples" / "be_warned.py")]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "Traceback" not in done.stderr
+    assert "be_warned.py ENDPOINT LATITUDE LONGITUDE" in done.stderr + done.stdout
+
+
+@pytest.mark.parametrize(
+    ("main", "line"),
+    [
+        (edge_agent_main, "simulate slalom --mu 0,5 --out x.parquet"),
+        (fleet_service_main, "page --port 80a"),
+        (fleet_service_main, "analyze grip"),
+    ],
+)
+def test_argument_errors_are_one_line(
+    main: Callable[[list[str]], int], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(line.split())
+    assert left.value.code == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith("error: ")
+
+
+def test_title_of_the_first_estimate_has_the_speed_of_its_curve() -> None:
+    truth, _ = edge_agent.simulate_manoeuvre("double-lane-change", mu=0.5, seed=1)
+    text = (ROOT / "deploy" / "examples" / "first_estimate.py").read_text()
+    title = re.search(r"double lane change at (\d+) m/s", text)
+    assert title is not None
+    assert round(float(truth["true_vx"][0].as_py())) == int(title[1])

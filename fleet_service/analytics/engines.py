@@ -66,7 +66,8 @@ class QueryEngine:
             self.connection.raw_sql(
                 "SET parquet_metadata_cache = true"
             )  # footers once, for questions about few rows
-            self.connection.raw_sql(f"SET enable_progress_bar = {str(self.progress).lower()}")
+            if self.progress:  # in a notebook even "false" would need ipywidgets
+                self.connection.raw_sql("SET enable_progress_bar = true")
 
     def files(self, table: str) -> list[Path]:
         """Return the archive files of a table that may contain rows of the selected part. A

@@ -18,7 +18,7 @@ import venv
 from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 
@@ -42,7 +42,7 @@ from tests.fleet_service.conftest import running
 from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import page_of
 from tests.structure import ROOT
-from tests.usability import mistakes, waiting
+from tests.usability import listed_bugs, mistakes, waiting
 from tests.usability.known_ice import KnownIce, find_hidden
 from tests.usability.wrong_logs import WRONG, find_unnoticed
 from tests.waiting import until
@@ -59,10 +59,27 @@ class House:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._readme: dict[str, Any] | None = None
         self.archive = folder / "archive"
         synthetic.write_archive(self.archive, WORLD, 2000)
         compact(self.archive)
         mistakes.prepare_files(folder)
+
+    def follow_readme(self) -> dict[str, Any]:
+        """Run the commands of the README and of the tutorials once, in a network namespace of their
+        own. Return the failed commands and the judged maps; empty if the run itself failed.
+        """
+        if self._readme is None:
+            folder = self.folder / "readme"
+            folder.mkdir()
+            line = f"ip link set lo up && exec {sys.executable} -m tests.usability.readme {folder}"
+            command = ["unshare", "-n", "bash", "-c", line]
+            done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+            if done.returncode:
+                self.print_measured("readme", done.stderr[-400:])
+            self._readme = {} if done.returncode else json.loads(done.stdout.splitlines()[-1])
+            self.print_measured("readme", self._readme)
+        return self._readme
 
     def print_measured(self, what: str, found: object) -> None:
         """Print the measurements behind a figure."""
@@ -73,17 +90,16 @@ def readme_commands_failed(house: House) -> float:
     """Return the number of commands of the tutorials that fail, run in a separate network
     namespace.
     """
-    folder = house.folder / "readme"
-    folder.mkdir()
-    line = f"ip link set lo up && exec {sys.executable} -m tests.usability.readme {folder}"
-    command = ["unshare", "-n", "bash", "-c", line]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
-    if done.returncode:
-        house.print_measured("readme", done.stderr[-400:])
-        return float("nan")
-    failed: list[str] = json.loads(done.stdout.splitlines()[-1])
-    house.print_measured("readme", failed)
-    return float(len(failed))
+    found = house.follow_readme()
+    return float(len(found["failed"])) if found else float("nan")
+
+
+def readme_order(house: House) -> float:
+    """Return the number of maps, out of five, that a browser shows populated when a reader follows
+    the README and the tutorials from top to bottom.
+    """
+    found = house.follow_readme()
+    return float(sum(not reason for reason in found["maps"].values())) if found else float("nan")
 
 
 def pages_with_errors(house: House) -> float:
@@ -287,6 +303,13 @@ def silent_reasons(house: House) -> float:
     return float(passed[1]) if passed else float("nan")
 
 
+def bugs_of_the_list(house: House) -> float:
+    """Return the number of bugs found by new users that came back or have no test."""
+    found = listed_bugs.find_open()
+    house.print_measured("bugs", f"{len(listed_bugs.TESTS)} listed, open: {found}")
+    return float(len(found))
+
+
 def install_to_first_map_s(house: House) -> float:
     """Return the time [s] from an empty environment and a wheel to a map in a browser."""
     wheel = build_wheel(house)
@@ -358,6 +381,7 @@ def first_drive_alerts(house: House) -> float:
 
 PARTS: Final[dict[str, tuple[Callable[[House], float], str, float, str]]] = {
     "readme_commands_failed": (readme_commands_failed, "", 0, "less"),
+    "readme_order": (readme_order, "populated maps of 5", 5, "more"),
     "pages_with_errors": (pages_with_errors, "", 0, "less"),
     "bound_painted": (bound_painted, "outputs", 0, "less"),
     "known_ice_hidden": (known_ice_hidden, "cells with P(slippery) > 0.5", 0, "less"),
@@ -370,6 +394,7 @@ PARTS: Final[dict[str, tuple[Callable[[House], float], str, float, str]]] = {
     "install_mb": (install_mb, "MB", 600, "less"),
     "install_packages": (install_packages, "", 45, "less"),
     "silent_reasons": (silent_reasons, "planted causes", 8, "more"),
+    "bugs_of_the_list": (bugs_of_the_list, f"of {len(listed_bugs.TESTS)}", 0, "less"),
     "options_undocumented": (options_undocumented, "", 0, "less"),
     "figures_stale": (figures_stale, "", 0, "less"),
     "first_drive_commands": (first_drive_commands, "", 5, "less"),

@@ -1,5 +1,5 @@
-"""Run the commands of the tutorials as written and in order, in a separate network namespace and an
-empty folder.
+"""Run the commands of the README and of the tutorials as written and in order, in a separate
+network namespace and an empty folder, and look at the maps that they leave in a browser.
 
 Commands that keep running (router, service, agent, watch, page) are started and must still run at
 the end. `pip install` is not run.
@@ -7,16 +7,20 @@ the end. `pip install` is not run.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from tests.browser import open_page
 from tests.structure import ROOT
+from tests.waiting import until
 
 PAGES: Final = tuple(
     ROOT / "deploy" / "docs" / name
@@ -41,6 +45,19 @@ LEFT_OUT: Final = ("pip install",)
 READY: Final = {"fleet-service run": "ready: "}  # what a person waits for before the next line
 SETTLE_S: Final = 2.0  # until what says nothing is up
 LONGEST_S: Final = 300.0
+
+
+README: Final = ROOT / "README.md"
+DEMO: Final = "make demo ARGS=--stay"  # of the README; `make` only installs and calls `gripmap`
+LIVE_PAGE: Final = "http://127.0.0.1:8080/"
+# the maps that a reader looks at after the last command of a page
+MAPS: Final[dict[str, dict[str, str]]] = {
+    "first-map.md": {"page after the first map": LIVE_PAGE},
+    "first-drive.md": {"page after the first drive": LIVE_PAGE},
+    "first-analysis.md": {"page at the end": LIVE_PAGE, "map of the analysis": "try/grip.html"},
+}
+LEAST_CELLS: Final = 100
+LEAST_PX: Final = 200  # extent of what is drawn on the first picture, in one direction
 
 
 def list_blocks(text: str) -> list[tuple[str, str]]:
@@ -71,8 +88,10 @@ def list_commands(text: str) -> list[str]:
     return [one for one in found if not one.startswith(LEFT_OUT)]
 
 
-def run_all(folder: Path) -> list[str]:
-    """Run all commands. Return those that failed, with the last line that they printed."""
+def run_all(folder: Path) -> tuple[list[str], dict[str, str]]:
+    """Run all commands. Return those that failed, with the last line that they printed, and for
+    each map the reason why it does not count as populated (empty if it does).
+    """
     for name in ("deploy", "tests/data"):
         shutil.copytree(
             ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "*.py")
@@ -80,9 +99,14 @@ def run_all(folder: Path) -> list[str]:
     bin_folder = Path(sys.executable).parent
     staying: list[tuple[str, subprocess.Popen[bytes]]] = []
     failed: list[str] = []
+    maps: dict[str, str] = {}
     try:
-        for number, command in enumerate(list_commands(read_pages())):
+        for number, (command, looks) in enumerate(_list_steps()):
             log = folder / f"{number}.log"
+            for name, place in looks.items():
+                maps[name] = look_at_map(place if place == LIVE_PAGE else folder / place)
+            if command is None:
+                continue
             if command.startswith(LASTING):
                 if "certs/" in command:  # the second router wants the port of the first
                     for words, process in staying:
@@ -108,7 +132,72 @@ def run_all(folder: Path) -> list[str]:
     finally:
         for words, process in staying:
             _end_process(words, process, failed)
-    return failed
+    return failed, maps
+
+
+def _list_steps() -> Iterator[tuple[str | None, dict[str, str]]]:
+    """Yield each command, or None and the maps to look at after the commands of a page."""
+    for page in PAGES:
+        for command in list_commands(page.read_text(encoding="utf-8")):
+            yield command, {}
+        yield None, MAPS.get(page.name, {})
+
+
+def look_at_map(place: str | Path) -> str:
+    """Open a map in a browser, and return why it is not populated; empty if it is.
+
+    A populated map shows at least LEAST_CELLS cells over LEAST_PX at once, without a click, an
+    error or a card that covers it.
+    """
+    with open_page(place) as seen:
+        if isinstance(place, str):
+            seen.page.wait_for_selector("body[data-ready]", state="attached")
+        with contextlib.suppress(TimeoutError):
+            until(lambda: seen.drawn_count >= LEAST_CELLS)
+        extent = seen.page.evaluate(_EXTENT)
+        if seen.drawn_count < LEAST_CELLS:
+            return f"{seen.drawn_count} cells are drawn"
+        if max(extent) < LEAST_PX:
+            return f"all that is drawn covers {extent} px"
+        if isinstance(place, str) and seen.page.locator("#card").is_visible():
+            return seen.page.locator("#card").inner_text()
+        return "; ".join(seen.errors)
+
+
+# Width and height of the part of the map that has colours of classes or hatching.
+_EXTENT: Final = """() => {
+  const map = document.querySelector("canvas"), ratio = map.width / map.clientWidth;
+  const { data } = map.getContext("2d").getImageData(0, 0, map.width, map.height);
+  const ground = data.slice(0, 4).join();
+  let left = map.width, right = 0, top = map.height, bottom = 0;
+  for (let k = 0; k < data.length; k += 4) {
+    if (data.slice(k, k + 4).join() === ground) continue;
+    const x = k / 4 % map.width, y = Math.floor(k / 4 / map.width);
+    left = Math.min(left, x); right = Math.max(right, x);
+    top = Math.min(top, y); bottom = Math.max(bottom, y);
+  }
+  return [Math.max(0, right - left) / ratio, Math.max(0, bottom - top) / ratio];
+}"""
+
+
+def look_at_demo(folder: Path) -> str:
+    """Run the README's demo, and return why its page is not populated at the end, or nothing."""
+    assert DEMO in README.read_text(encoding="utf-8"), "the README names the demo otherwise"
+    log = folder / "demo.log"
+    command = [str(Path(sys.executable).parent / "gripmap"), "demo", "--stay"]
+    with log.open("wb") as out:
+        demo = subprocess.Popen(command, cwd=folder, stdout=out, stderr=out)
+    failed: list[str] = []
+    try:
+        deadline = time.monotonic() + 2 * LONGEST_S
+        while "runs until Ctrl-C" not in (said := log.read_text(errors="replace")):
+            if demo.poll() is not None or time.monotonic() > deadline:
+                return f"the demo did not get so far: {_last_line(log)}"
+            time.sleep(0.5)
+        address = re.search(r"Live map: (\S+)", said)
+        return look_at_map(address[1]) if address else "the demo names no address"
+    finally:
+        _end_process("gripmap demo", demo, failed)
 
 
 def _run_to_end(line: list[str], folder: Path, log: Path, environment: dict[str, str]) -> int | str:
@@ -159,10 +248,13 @@ def _last_line(log: Path) -> str:
 
 
 def main() -> int:
-    """Run all commands in a folder, and print the failed ones as JSON. The process must have its
-    own network namespace.
+    """Run all commands in a folder, and print the failed ones and the judged maps as JSON. The
+    process must have its own network namespace.
     """
-    print(json.dumps(run_all(Path(sys.argv[1]))))
+    folder = Path(sys.argv[1])
+    demo = look_at_demo(folder)
+    failed, maps = run_all(folder)
+    print(json.dumps({"failed": failed, "maps": {"page of the demo": demo} | maps}))
     return 0
 
 

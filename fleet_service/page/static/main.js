@@ -26,7 +26,7 @@ import { alertWords, bySeverity } from "./words.js";
 
 const TABS = ["now", "legend", "cell", "alerts", "route", "health", "share"];
 const LOOK_MS = 120, CLOCK_MS = 500, HEALTH_MS = 3000, LIST_MS = 15000, ROADS_MS = 1500, SAID_MS = 10000, NEAR_PX = 12;
-const FAR = 1e-3;  // of the world: some 40 km
+const DOT = .1, DOT_ZOOM = 16, FAR = 1e-3;  // of the world: some 40 km
 const WORLD = [-180, -85, 180, 85];
 
 class App {
@@ -42,8 +42,7 @@ class App {
     this.timeline = new Timeline(byId("timeline"), this);
     this.moreRoads = 0;
     this.now.changed = () => this.draw();
-    this.frame = 0;
-    this.looking = 0;
+    this.frame = this.looking = 0;
     this.started = this.asked = this.missed = false;
   }
 
@@ -138,15 +137,18 @@ class App {
 
   // The whole map, and what comes to it, until somebody looks elsewhere.
   async all() {
-    const fit = () => { const extent = this.cells.extent; if (extent) { this.view.fit(extent); this.view.gone = false; } };
-    fit();
-    await this.look();
-    if (!this.view.gone) fit();  // to the cells, where only their tiles were known before
+    for (let zoom = null, k = 0; k < 4 && zoom !== this.view.zoom; k++) {  // again to the cells, where only their tiles or squares were known before
+      zoom = this.view.zoom;
+      if (this.cells.extent) { this.view.fit(this.cells.extent); this.view.gone = false; }
+      await this.look();
+      if (this.view.gone) return;
+    }
   }
 
   follow() {
     const { view, past } = this, box = view.box, extent = view.gone || past ? null : this.now.extent;
-    if (extent && (extent.west < box.west || extent.east > box.east || extent.north < box.north || extent.south > box.south)) this.all();
+    const dot = extent && view.zoom < DOT_ZOOM && Math.max((extent.east - extent.west) / view.width, (extent.south - extent.north) / view.height) * view.scale < DOT;  // the first cells, on a map of the world
+    if (dot || extent && (extent.west < box.west || extent.east > box.east || extent.north < box.north || extent.south > box.south)) this.begin();
   }
 
   resize() {

@@ -82,6 +82,25 @@ def test_what_was_not_measured_has_no_colour_of_the_scale(tmp_path: Path) -> Non
 
 
 @pytest.mark.campaign
+def test_cells_of_two_continents_open_as_one_area_and_a_list(tmp_path: Path) -> None:
+    far = int(grid.cell_of(np.array([37.77]), np.array([-122.42]))[0])
+    number = np.concatenate([CELL + np.arange(40), [far, far + 1]])
+    boxes = np.stack(grid.bounds(number), axis=1).tolist()
+    rows = [["0.3"]] * len(number)
+    path = tmp_path / "page.html"
+    drawn = DrawnCells(boxes, [0] * len(number), {"map": [0.3] * len(number)}, ["mu"], rows)
+    path.write_text(render("two", drawn, GRIP_SCALE))
+    with open_page(path) as found:
+        assert found.drawn_count == 40
+        assert (
+            found.page.locator("#area option").all_inner_texts()[1].startswith("37.77°, -122.42°")
+        )
+        found.page.locator("#area").select_option(index=1)
+        assert found.drawn_count == 2
+        found.page.get_by_role("button", name="all").click()
+        assert found.drawn_count == 42
+
+
 def test_pointing_tapping_and_the_keyboard_read_a_cell(tmp_path: Path) -> None:
     path = tmp_path / "page.html"
     path.write_text(render("one", cells([0.2]), GRIP_SCALE))

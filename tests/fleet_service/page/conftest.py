@@ -40,8 +40,8 @@ def page_of(connection: ZenohSettings, **changed: object) -> Iterator[str]:
     thread = threading.Thread(target=run, args=(settings, stop, lines.append))
     thread.start()
     try:
-        until(lambda: lines)
-        yield lines[0].removeprefix("page: ")
+        until(lambda: lines and lines[-1].startswith("page: "))
+        yield lines[-1].removeprefix("page: ")
     finally:
         stop.set()
         thread.join(10.0)

@@ -76,6 +76,20 @@ def test_mbtiles_rows_count_from_the_south_and_requests_from_the_north(tmp_path:
     )
 
 
+@pytest.mark.campaign
+def test_attribution_of_a_base_map_is_on_the_page(router: ZenohSettings, tmp_path: Path) -> None:
+    path = town(tmp_path / "town.mbtiles")
+    with closing(sqlite3.connect(path)) as table, table:
+        table.execute("insert into metadata values ('attribution', '© its makers')")
+    with (
+        page_of(router, base_map=base_map(str(path))) as address,
+        open_page(address) as seen,
+    ):
+        waits(seen, "document.getElementById('attribution').textContent")
+        assert seen.page.locator("#attribution").inner_text() == "© its makers"
+        assert seen.page.locator("#attribution").is_visible()
+
+
 def test_what_is_no_file_of_pictures_is_refused_with_its_fix(tmp_path: Path) -> None:
     (tmp_path / "text.mbtiles").write_text("no table")
     names = {

@@ -4,15 +4,26 @@ file, and screen reader.
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import re
+import time
+from pathlib import Path
 from typing import Final
 
+import numpy as np
 import pytest
+import zenoh
 
-from schemas import grid
-from tests.browser import Opened
+from schemas import grid, keys
+from schemas.config import ZenohSettings
+from schemas.tables import MAP_SCHEMA
+from schemas.wire import Kind
+from tests.browser import Opened, open_page
+from tests.fleet_service.conftest import running
+from tests.fleet_service.examples import batch, send
 from tests.fleet_service.page import scan, street
-from tests.fleet_service.page.conftest import Drive, RunningPage
+from tests.fleet_service.page.conftest import Drive, RunningPage, page_of
 from tests.fleet_service.page.test_page import (
     ICE,
     cell_of,
@@ -199,3 +210,95 @@ def _choose(seen: Opened, cell: int) -> None:
     seen.page.evaluate(
         "([tile, local]) => gripmap.choose(tile, local)", [cell >> 14, cell & 0x3FFF]
     )
+
+
+def test_map_of_two_continents_opens_on_one_of_them(
+    page: RunningPage, drive: Drive, session: zenoh.Session
+) -> None:
+    """The cells must be seen at once, and a list must lead to the other area. A view of the whole
+    world would show two dots.
+    """
+    drive("ice", "dry")
+    cell = grid.cell_of(np.array([37.77]), np.array([-122.42]))
+    region = int(grid.region_of(cell)[0])
+    far = batch(
+        "car-far",
+        1,
+        time.time_ns(),
+        [0.8],
+        latitude=np.array([37.77]),
+        longitude=np.array([-122.42]),
+        cell=cell,
+    )
+    far = dataclasses.replace(far, region=region)
+    assert page.service is not None
+    before = page.service.service.engine.counts[Kind.OBSERVATION]
+    send(session, far, keys.observation_key(region, "car-far"))
+    until(lambda: page.service and page.service.service.engine.counts[Kind.OBSERVATION] > before)
+    with open_map(page) as seen:
+        waits(seen, "document.querySelectorAll('#panel .area').length === 2")
+        assert seen.page.evaluate("gripmap.view.zoom") > 14
+        assert sum(kinds(seen)) == street.count_known("ice", "dry")
+        seen.page.locator("#panel .area").nth(1).click()
+        waits(seen, "Math.abs(gripmap.degreesOf(gripmap.view.x, gripmap.view.y)[0] + 122.42) < .1")
+
+
+def test_page_opened_on_an_empty_map_shows_the_first_cells_large(
+    page: RunningPage, drive: Drive
+) -> None:
+    with open_map(page) as seen:
+        waits(seen, "document.getElementById('card').dataset.state === 'empty'")
+        assert seen.page.evaluate("gripmap.view.zoom") < 5
+        drive("ice", "dry")
+        waits(seen, f"document.body.dataset.drawn === '{street.count_known('ice', 'dry')}'")
+        assert seen.page.evaluate("gripmap.view.zoom") > 14
+
+
+def test_page_exports_triangles_with_columns_of_the_service(
+    page: RunningPage, drive: Drive
+) -> None:
+    drive("ice")
+    with open_map(page) as seen:
+        near(seen, cell_of("ice"))
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
+        seen.page.locator("#tab-share").click()
+        with seen.page.expect_download() as waiting:
+            seen.page.locator("#geojson").click()
+        features = json.loads(Path(waiting.value.path()).read_text())["features"]
+    rings = [tuple(map(tuple, one["geometry"]["coordinates"][0])) for one in features]
+    assert all(len(ring) == 4 for ring in rings)
+    assert len(set(rings)) == len(features) == street.count_known("ice")
+    columns = set(features[0]["properties"])
+    assert {"cell", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis"} <= columns
+    assert columns - {field.name for field in MAP_SCHEMA} == {"heading", "zoom", "unknown_share"}
+
+
+def test_page_starts_before_the_archive_of_its_service(
+    router: ZenohSettings, tmp_path: Path
+) -> None:
+    archive = tmp_path / "archive"
+    with page_of(router, archive=archive) as address, open_page(address) as seen:
+        seen.page.wait_for_selector("body[data-ready]", state="attached")
+        assert not archive.exists()
+        with running(router, archive):
+            waits(seen, "document.getElementById('card').dataset.state === 'empty'")
+
+
+def test_unvisited_place_has_words_without_a_bar(page: RunningPage) -> None:
+    with open_map(page) as seen:
+        seen.page.evaluate("gripmap.choose(0, 0); gripmap.open('cell')")
+        waits(seen, "document.querySelector('#panel .nobody')")
+        ground = seen.page.evaluate(
+            "getComputedStyle(document.querySelector('#panel .nobody')).backgroundColor"
+        )
+        assert ground == "rgba(0, 0, 0, 0)"
+
+
+def test_whole_map_twice_is_the_same_view(page: RunningPage, drive: Drive) -> None:
+    drive()
+    with open_map(page) as seen:
+        seen.page.evaluate("for (let k = 0; k < 4; k++) gripmap.view.turn(.5)")
+        view = "[gripmap.view.zoom, gripmap.view.x, gripmap.view.y]"
+        both = f"async () => {{ await gripmap.all(); const one = {view}; "
+        views = seen.page.evaluate(f"{both} await gripmap.all(); return [one, {view}]; }}")
+        assert views[0] == pytest.approx(views[1], abs=1e-6)

@@ -56,6 +56,7 @@ def test_empty_map_says_that_no_vehicle_reported_and_what_to_do(page: RunningPag
         waits(
             seen, "document.getElementById('panel').innerText.includes('No vehicle has reported')"
         )
+        assert "No earlier map yet" in seen.page.locator("#timeline").inner_text()
         keep_picture(seen, "empty")
 
 

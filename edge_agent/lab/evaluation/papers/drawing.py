@@ -28,11 +28,11 @@ OTHERS: Final = [style.colour for style in ESTIMATORS.values() if style.colour !
 
 def draw_plot(plot: PaperPlot) -> Figure:
     """Return a plot of a reproduction as a matplotlib figure."""
-    from matplotlib.figure import Figure as Canvas
+    from edge_agent.lab.evaluation.papers.notebook_figure import NotebookFigure
 
     rows = -(-len(plot.panels) // plot.columns)
     width = WIDE_INCHES if plot.columns == 1 else PANEL_INCHES[0] * plot.columns
-    figure = Canvas(figsize=(width, PANEL_INCHES[1] * rows + 0.4), layout="constrained")
+    figure = NotebookFigure(figsize=(width, PANEL_INCHES[1] * rows + 0.4), layout="constrained")
     axes = figure.subplots(rows, plot.columns, squeeze=False)
     for axis, panel in zip(axes.flat, plot.panels, strict=False):
         if isinstance(panel, Heat):
