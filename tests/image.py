@@ -51,8 +51,8 @@ def parse_steps(text: str) -> list[tuple[str, str]]:
 
 
 class Image:
-    """State of the image after the steps that were run: its folders below `root`, working folder
-    and environment.
+    """State of a container image after the steps that were run: its folders below `root`, working
+    folder and environment.
     """
 
     def __init__(self, root: Path) -> None:
@@ -120,8 +120,8 @@ class Image:
 
 
 def time_start(image: Image) -> float:
-    """Start a service of the image, and return the time [s] until it is ready. It must not compile
-    anything.
+    """Start a service of the container image, and return the time [s] until it is ready. It must
+    not compile anything.
     """
     port = "127.0.0.1:0"
     with subprocess.Popen(
@@ -160,7 +160,7 @@ def time_start(image: Image) -> float:
 
 
 def main() -> int:
-    """Build the image, start its processes, and return the exit code."""
+    """Build the container image, start its processes, and return the exit code."""
     with tempfile.TemporaryDirectory() as folder:
         image = Image(Path(folder))
         (image.root / "home").mkdir()

@@ -141,7 +141,7 @@ def user_texts(package: str) -> Iterator[Docstring]:
 
 
 def is_participle(name: str) -> bool:
-    """Return True if a name is only a participle, such as `joined` or `kept`."""
+    """Return True if the name of a function is only a participle, such as `joined` or `kept`."""
     word = name.strip("_")
     regular = word.endswith("ed") and word.isalpha() and word not in NOT_PARTICIPLES
     return regular or word in PARTICIPLES

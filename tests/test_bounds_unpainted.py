@@ -42,8 +42,9 @@ END: Final = "2026-01-28"
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return an archive with measurements and lower bounds. As in files before version 1.2, its map
-    snapshot gives a cell that has only a lower bound a value of mu.
+    """Return an archive with measurements of friction and with lower bounds of friction. As in
+    files before version 1.2, its map snapshot gives a cell that has only a lower bound a value of
+    mu.
     """
     root = tmp_path_factory.mktemp("bounds") / "archive"
     synthetic.write_archive(root, WORLD, 2000)
@@ -72,8 +73,8 @@ def two_cells() -> pa.Table:
 def find_painted(
     rows: list[dict[str, Any]], known: Callable[[dict[str, Any]], bool], *names: str
 ) -> list[dict[str, Any]]:
-    """Return those of the rows that are not measured (`known` is False) but have a number in one of
-    the columns `names`. Fail if there are no measured or no unmeasured rows.
+    """Return those rows of an exported map that are not measured (`known` is False) but have a
+    number in one of the columns `names`. Fail if there are no measured or no unmeasured rows.
     """
     bounds = [row for row in rows if not known(row)]
     assert bounds

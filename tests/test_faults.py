@@ -92,8 +92,8 @@ def test_a_raising_campaign_ends_the_run_with_its_message(tmp_path: Path) -> Non
 
 @pytest.fixture
 def kept(tmp_path: Path) -> list[Batch]:
-    """Return three batches, and create an archive that contains the first batch twice, the second
-    once, and the third not at all.
+    """Return three batches, and create an archive that wrongly contains the first batch twice, the
+    second once, and the third not at all.
     """
     now = time.time_ns()
     batches = [batch("sim-001", seq, now - SECOND, [0.8, 0.7]) for seq in (1, 2, 3)]

@@ -208,7 +208,9 @@ def place_of(path: Path, line: int) -> str:
 
 
 def find_crossings(tree: ast.AST, package: str) -> list[tuple[int, str]]:
-    """Return line and name of the imports of project packages that `package` must not import."""
+    """Return line and name of the imports, in a module of `package`, of project packages that it
+    must not import.
+    """
     forbidden = set(PACKAGES) - MAY_IMPORT[package] - {package}
     return [(line, name) for line, name in list_imports(tree) if name.split(".")[0] in forbidden]
 

@@ -92,7 +92,9 @@ def write_stations(folder: Path) -> Path:
 
 
 def measure_archive(root: Path, rows: int) -> list[Figure]:
-    """Measure rows per second of compaction, and bytes per observation in the compacted archive."""
+    """Measure rows per second of compaction (sorting of new rows into files by cell), and bytes per
+    observation in the resulting archive.
+    """
     print_progress(f"writing {rows:,} observations")
     synthetic.write_archive(root, SyntheticFleet(rows, DAYS))
     inbox = size_of(segments.list_segments(root, Kind.OBSERVATION))
@@ -120,7 +122,7 @@ def _ask_question(name: str, root: Path, options: Options) -> pa.Table:
 
 
 def measure_questions(root: Path, readings: Path) -> list[Figure]:
-    """Measure the time of four questions on all rows [s], and that of the history of
+    """Measure the time of four questions on all rows [s], and that of a question about the past of
     one cell [ms].
     """
     found = []

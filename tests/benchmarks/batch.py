@@ -41,7 +41,9 @@ def measure_all(folder: Path) -> list[Figure]:
 
 
 def main() -> int:
-    """Measure the batch work. Return 1 if a figure misses its target, otherwise 0."""
+    """Measure the work on many files at once (Spark, Iceberg). Return 1 if a figure misses its
+    target, otherwise 0.
+    """
     FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         rows = measure_all(Path(folder))

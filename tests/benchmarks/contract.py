@@ -46,8 +46,8 @@ def contract() -> list[Figure]:
 
 
 def parquet_bytes() -> list[Figure]:
-    """Measure bytes per observation of an archive, as its service writes it and after
-    compaction.
+    """Measure bytes per observation of an archive, as its service writes it, and after its rows
+    were sorted by cell (compaction).
     """
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)

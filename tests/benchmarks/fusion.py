@@ -101,8 +101,8 @@ def split_batches(o: Observations) -> Iterator[Observations]:
 
 
 def per_observation_s(cells: int, per_s: int = 5_000) -> float:
-    """Return the processor time per observation [s] of a fusion with `cells` cells, the median over
-    ROUNDS simulated minutes.
+    """Return the processor time per observation [s] of a map computation (`Fusion`) with `cells`
+    cells, the median over ROUNDS simulated minutes.
     """
     fusion, rng = fill_fusion(cells, 1, 600.0)
     spent = []
@@ -170,8 +170,8 @@ def resident() -> None:
 
 
 def fusion() -> list[Figure]:
-    """Measure observations per second of the fusion alone into 10⁶ cells, the effect of more cells,
-    and memory.
+    """Measure observations per second of the map computation (fusion) alone into 10⁶ cells, the
+    effect of more cells, and memory.
     """
     few = per_observation_s(10_000)
     many = per_observation_s(CELLS)

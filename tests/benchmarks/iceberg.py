@@ -23,7 +23,7 @@ SEEDS: Final = (0, 10, 20, 30)
 
 
 def table_of(uri: str, kind: Kind) -> Table:
-    """Open the Iceberg table of a kind of rows as another program would."""
+    """Open the Iceberg table of observations or states as another program would."""
     from pyiceberg.catalog import load_catalog
 
     return load_catalog("gripmap", type="sql", uri=uri).load_table(
@@ -33,7 +33,7 @@ def table_of(uri: str, kind: Kind) -> Table:
 
 def rows_different(root: Path, uri: str) -> int:
     """Return the number of rows, compared in all columns, that occur more often in the archive's
-    compacted files than in the Iceberg tables, or less often.
+    compacted (sorted) files than in the Iceberg tables, or less often.
     """
     different = 0
     for kind in Kind:

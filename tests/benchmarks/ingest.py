@@ -93,7 +93,9 @@ def _decoding_s(sent: list[Message], decode: Callable[[list[Message]], object]) 
 
 
 def turn_of(sent: list[Message]) -> int:
-    """Return the number of these messages that the service ingests in one pass of its main loop."""
+    """Return the number of the messages `sent` that the service ingests in one pass of its main
+    loop.
+    """
     return min(STEP_BYTES // len(sent[0].payload), STEP_MESSAGES)
 
 

@@ -349,7 +349,7 @@ def colour_distance() -> float:
 
 
 def measure_all() -> list[Figure]:
-    """Measure the page, and return all figures in the order of the printed table."""
+    """Measure the live page, and return all figures in the order of the printed table."""
     with open_stage(SEED) as on:
         found = _time_part("drawn", lambda: measure_drawing(on))
         found["push_p95_ms"] = _time_part("pushed", lambda: pushed_ms(on))
@@ -385,7 +385,7 @@ def _time_part(what: str, measure: Callable[[], T]) -> T:
 
 
 def main() -> int:
-    """Measure the page and write the figures. Return 1 if a figure misses its target,
+    """Measure the live page and write the figures. Return 1 if a figure misses its target,
     otherwise 0.
     """
     began = time.time_ns()

@@ -35,8 +35,8 @@ QUERIES = 15
 
 
 def measure_past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
-    """Measure the time [ms] of a query with `at=` for a thousand cells, and the largest change of a
-    cell's probabilities caused by a restart.
+    """Measure the time [ms] of a query about a past map (`at=`) for a thousand cells, and the
+    largest change of a cell's probabilities caused by a restart.
     """
     synthetic.write_archive(root, WORLD)
     compact(root)

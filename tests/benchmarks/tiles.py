@@ -62,8 +62,8 @@ _ROWS = _ACROSS // ROW
 
 
 def make_visit(vehicle: int, turn: int) -> Batch:
-    """Return a batch with a visit of a vehicle to the middle of a tile. The vehicle reaches the
-    next of its tiles in each turn (period between two visits).
+    """Return a batch with an observation of a vehicle in the middle of a tile. The vehicle reaches
+    the next of its tiles in each turn (period between two visits).
     """
     first = grid.cell_of(LATITUDE, LONGITUDE, grid.REGION_ZOOM)
     x, y = (int(v) for v in grid.deinterleave(first))

@@ -159,7 +159,9 @@ class Cluster:
             assert fleet_service(["certs", *words]) == 0
 
     def _localize_addresses(self, name: str, text: str) -> str:
-        """Return a file's text with the addresses of pods replaced by those of this machine."""
+        """Return the text of a pod's configuration file with the addresses of pods replaced by
+        those of this machine.
+        """
         for pod in self.pods:
             for number, port in pod.ports.items():
                 text = text.replace(f"{pod.name}.routers:{number}", f"127.0.0.1:{port}")
@@ -182,8 +184,8 @@ class Cluster:
         return text.replace('"metrics_host": "0.0.0.0"', '"metrics_host": "127.0.0.1"')
 
     def _localize_paths(self, pod: Pod, container: Manifest, text: str) -> str:
-        """Return a text with the mount paths of a container replaced by paths below the pod's
-        folder.
+        """Return a configuration text with the mount paths of a container replaced by paths below
+        the pod's folder.
         """
         for mount in sorted(
             container.get("volumeMounts", []), key=lambda one: -len(one["mountPath"])

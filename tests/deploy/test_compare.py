@@ -164,8 +164,8 @@ def test_demo_page_opens_in_a_browser_with_both_maps_and_figures(tmp_path: Path)
 def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Two warned passes and one unwarned pass after the first alert must be counted. Earlier passes
-    must not count.
+    """Two passes over new ice of warned drivers and one of an unwarned driver after the first alert
+    must be counted. Earlier passes must not count.
     """
     driven = make_visits(
         ("sim-001", 1.0, 7, 0.9, 0.5),

@@ -45,8 +45,8 @@ START_S = 300.0  # the first start compiles the kernels, on a busy machine
 
 
 class Site:
-    """Site (test deployment): the folders of a deployment, moved below another root folder, and its
-    ports, replaced by free ones.
+    """Test deployment ("site"): the folders of a deployment, moved below another root folder, and
+    its ports, replaced by free ones.
     """
 
     def __init__(self, root: Path) -> None:

@@ -52,7 +52,9 @@ class MadeUp:
     jumps: NDArray[np.bool_] | None = None
 
     def part(self, rows: slice) -> MadeUp:
-        """Return the synthetic estimates of those samples that a slice selects."""
+        """Return the part of this synthetic output that belongs to the samples of the slice
+        `rows`.
+        """
         cut = {f.name: v[rows] for f in fields(self) if (v := getattr(self, f.name)) is not None}
         return replace(self, **cut)
 

@@ -13,7 +13,9 @@ from tests.faults.frame import run_and_exit, run_campaigns
 
 
 def main() -> int:
-    """Run the chosen campaigns. Return 0 if every figure meets its bar (target), otherwise 1."""
+    """Run the chosen fault campaigns (tests under failures). Return 0 if every figure meets its bar
+    (target), otherwise 1.
+    """
     names = [campaign.name for campaign in CAMPAIGNS]
     parser = argparse.ArgumentParser(
         prog="tests.faults", description="Fault campaigns; see tests/faults/README.md."

@@ -185,8 +185,8 @@ def _encode_past_query(root: Path) -> bytes:
 
 
 def _measure_process(what: str, root: Path, asked: bytes = b"") -> dict[str, float]:
-    """Run the operation `what` of the program `age_process` on an archive, and return the figures
-    that it prints.
+    """Run the operation `what` (such as a start) of the program `age_process` on an archive, and
+    return the figures that it prints.
     """
     command = [sys.executable, "-m", "tests.faults.age_process", what, str(root)]
     done = subprocess.run(command, input=asked, stdout=subprocess.PIPE, check=True)

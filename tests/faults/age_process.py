@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 
 
 def main() -> None:
-    """Run the chosen operation, and print its time [s] and peak memory [MB]."""
+    """Run the chosen operation of a service on an archive, and print its time [s] and peak memory
+    [MB].
+    """
     what = sys.argv[1]
     root = Path(sys.argv[2])
     began = time.perf_counter()

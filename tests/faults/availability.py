@@ -52,7 +52,7 @@ class Target(NamedTuple):
 
 def run(site: Site) -> list[Figure]:
     """Send twenty requests of another reader during each attack (in a quick run, six), and return
-    the figures.
+    figures of their answers.
     """
     asked = site.choose_amount(20, 6)
     served = {}

@@ -52,7 +52,9 @@ class Made:
     messages: int = 0
 
     def put(self, batch: StoredBatch) -> None:
-        """Receive a batch: put it into the queue, or drop it if the queue is full."""
+        """Receive a batch of reports: put it into the service's queue, or drop it if the queue is
+        full.
+        """
         self.sent += len(batch.payload)
         self.messages += 1
         if self.up and len(self.queue) < QUEUED * self.cars:

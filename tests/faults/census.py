@@ -103,7 +103,7 @@ def compare_with_archive(journals: Iterable[Path], archive: Path) -> Census:
 
 def _doubled_outside(archive: Path) -> int:
     """Return the number of rows that appear twice for a foreign program: one that reads all
-    compacted files directly and ignores the rules of the archive format.
+    compacted (sorted) files directly and ignores the rules of the archive format.
     """
     paths = list(layout.compacted_files(archive, Kind.OBSERVATION))
     whole = [pq.read_table(path, columns=ROW, partitioning=None) for path in paths]

@@ -42,7 +42,9 @@ CONFIG: Final = ServiceConfig(raw_days=31)
 
 
 class Case(NamedTuple):
-    """Size of a clock error, and whether it occurs at the start or while the service runs."""
+    """Case of a clock error: its size, and whether it occurs at the start or while the service
+    runs.
+    """
 
     jump: int
     at_start: bool
@@ -70,7 +72,9 @@ class Machine:
 
 @dataclass
 class Found:
-    """Numbers of failures by kind (refused batches, lost alerts …), summed over the cases."""
+    """Numbers of failures by kind (refused batches, lost alerts …), summed over the cases of wrong
+    clocks.
+    """
 
     sent: int = 0
     rejected: int = 0
@@ -82,8 +86,8 @@ class Found:
 
 
 def run(site: Site) -> list[Figure]:
-    """Run all cases: a year ahead, a year behind, and thirty years behind (as after an empty
-    battery), each while the service runs and at its start.
+    """Run a service with a wrong clock in all cases: a year ahead, a year behind, and thirty years
+    behind (as after an empty battery), each while the service runs and at its start.
     """
     cases = [
         Case(jump, at_start) for jump in (YEAR, -YEAR, -30 * YEAR) for at_start in (False, True)

@@ -170,8 +170,8 @@ def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
 
 
 def rows_of(root: Path) -> int:
-    """Return the number of observation rows in an archive, from its inbox and its compacted
-    files.
+    """Return the number of observation rows in an archive, from its new rows (inbox) and its
+    compacted (sorted) files.
     """
     return sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["row"]))
 

@@ -46,7 +46,7 @@ def run(
 
 
 def sync_and_report(copy: BucketReplica) -> int:
-    """Run one sync of the archive's bucket copy, and print a line at its end if it uploaded
+    """Synchronise the archive's copy in the bucket once, and print a line at its end if it uploaded
     anything. Return the number of changed objects.
     """
     _copying.at = False
@@ -57,8 +57,8 @@ def sync_and_report(copy: BucketReplica) -> int:
 
 
 def put_there(transfer: FileTransfer, name: str) -> bool:
-    """Upload one file to the bucket copy. At the first upload of a sync, print a line first, so
-    that a campaign can interrupt the sync.
+    """Upload one file to the bucket copy. At the first upload of a synchronisation, print a line
+    first, so that a campaign can interrupt it.
     """
     if getattr(_copying, "at", None) is False:
         _copying.at = True

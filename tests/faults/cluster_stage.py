@@ -291,7 +291,7 @@ class Machines:
         self._random = random_
 
     def start_standbys(self, standbys: int) -> None:
-        """Start services until `standbys` of them wait as standbys."""
+        """Start services until `standbys` of them wait to take over (as standbys)."""
         while len(self.waiting) < standbys:
             host = self._idle.pop(0)
             host.part.start()
@@ -327,7 +327,9 @@ class Machines:
         return sum(1 for _ in self._leases.glob("*.json"))
 
     def _await_takeover(self) -> None:
-        """Wait until one of the standbys is active, and record it as the active machine."""
+        """Wait until one of the standbys (waiting services) is active, and record it as the active
+        machine.
+        """
         until(self._find_ready, PATIENCE_S)
         taker = self._find_ready()
         assert taker is not None
@@ -427,8 +429,8 @@ def find_difference(one: dict[str, pa.Table], other: dict[str, pa.Table]) -> flo
 
 
 def drain_loads(parts: list[Part]) -> None:
-    """Stop new observations, and wait until all of them are acknowledged or no more
-    acknowledgements arrive.
+    """Stop the load generators' new observations, and wait until all of them are acknowledged or no
+    more acknowledgements arrive.
     """
     for part in parts:
         part.send_signal(signal.SIGUSR1)

@@ -89,15 +89,17 @@ class Reading:
 
 
 def read_compacted(root: Path) -> Iterable[pa.Table]:
-    """Return the rows that another program would read: only the compacted files, as listed at one
-    moment.
+    """Return the rows that another program would read: only the compacted (sorted) files, as listed
+    at one moment.
     """
     for path in list(layout.compacted_files(root, Kind.OBSERVATION)):
         yield pq.read_table(path, columns=["seq", "row"], partitioning=None)
 
 
 def is_complete(tables: Iterable[pa.Table], owed: int) -> bool:
-    """Return True if the tables contain every row of the batches 1 to `owed`, and no row twice."""
+    """Return True if the archive's tables contain every row of the batches 1 to `owed`, and no row
+    twice.
+    """
     rows = Counter(
         p for t in tables for p in zip(t["seq"].to_pylist(), t["row"].to_pylist(), strict=True)
     )
@@ -106,7 +108,9 @@ def is_complete(tables: Iterable[pa.Table], owed: int) -> bool:
 
 
 def run(site: Site) -> list[Figure]:
-    """Kill 50 compactions (in a quick run, five), and return the figures."""
+    """Kill a compaction of the archive (its sorting of new rows) 50 times (in a quick run, five
+    times), and return figures of lost and doubled rows.
+    """
     root = site.folder / "archive"
     random_ = random.Random(site.seed)
     part = Part(

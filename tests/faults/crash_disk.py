@@ -76,7 +76,9 @@ class CrashDisk:
         return self._numbers
 
     def _keep_content(self, path: Path) -> None:
-        """Record the durable content of a file that is about to be renamed, removed or replaced."""
+        """Record the content that is durable on the simulated disk of a file that is about to be
+        renamed, removed or replaced.
+        """
         if path.is_file():
             self._written[self._number[path.stat().st_ino]] = path.read_bytes()
 

@@ -64,7 +64,7 @@ class Lives(ABC, Generic[BatchType]):
 
     @abstractmethod
     def _run_life(self, root: Path, last: bool) -> None:
-        """Run one life of the archive on the disk `root`."""
+        """Run one life of the archive (from start to power loss) on the disk `root`."""
 
     @abstractmethod
     def _find_problems(self, root: Path, last: bool) -> list[str]:
@@ -73,4 +73,6 @@ class Lives(ABC, Generic[BatchType]):
         """
 
     def _pass_time(self) -> None:
-        """Change the archive between two lives, as the passing of time or an operator would."""
+        """Change the archive between two lives (runs of the program), as the passing of time or an
+        operator would.
+        """

@@ -58,7 +58,9 @@ NEARLY: Final = 0.01  # likewise, of a cell that was dropped for a week's rest a
 
 
 class Sent(NamedTuple):
-    """Batch as its vehicle stores it; `time` is the time of the batch's last row [ns]."""
+    """Batch of observations as its vehicle stores it until it is acknowledged; `time` is the time
+    of the batch's last row [ns].
+    """
 
     vehicle: str
     seq: int
@@ -289,7 +291,7 @@ class ServiceHistory(Lives[Sent]):
         return one.rows[0] // layout.DAY_NS <= self.retired or bool(marks & self.forgetting)
 
     def _came_back(self, root: Path, rows: Counter[int]) -> list[str]:
-        """Return one message per erased batch or key that is present again."""
+        """Return one message per batch or key that was erased and is nevertheless present."""
         found = [
             f"{one.vehicle} {one.seq} came back"
             for one in self.gone
@@ -344,7 +346,9 @@ def _compute_boot(vehicle: str) -> int:
 
 
 def _find_differences(begun: ServiceState, whole: ServiceState, now: int) -> list[str]:
-    """Return the differences between the beliefs of two states restored from one archive."""
+    """Return a description of the differences between the beliefs of two service states that were
+    restored from one archive.
+    """
     if not whole.fusion.size:
         return []
     slots = np.arange(whole.fusion.size)

@@ -107,8 +107,8 @@ def _refuse_writes(*names: str) -> Iterator[None]:
 
 
 def run(site: Site) -> list[Figure]:
-    """Fill the disk several times, at different stages of the background jobs, and return the
-    figures.
+    """Fill the disk several times, at different stages of the background jobs, and return figures
+    of losses and recovery.
     """
     false = 0
     stuck = 0

@@ -67,8 +67,8 @@ def hash_of(name: str) -> int:
 
 @dataclass
 class Honest:
-    """Honest vehicle that sends batches, repeats unsettled batches, and records the time until each
-    acknowledgement.
+    """Honest vehicle that sends batches, repeats batches that are not acknowledged, and records the
+    time until each acknowledgement.
     """
 
     session: zenoh.Session
@@ -119,8 +119,8 @@ class Honest:
 
 
 def run(site: Site) -> list[Figure]:
-    """Flood the service for half a minute (in a quick run, three seconds), and return the
-    figures.
+    """Flood the service for half a minute (in a quick run, three seconds), and return figures of
+    its effect on the other vehicles.
     """
     seconds = site.choose_amount(30, 3)
     fleet = make_enrolment(vehicles=[*HONEST, FLOODER])

@@ -49,7 +49,9 @@ class Site:
     say: Callable[[str], None]
 
     def choose_amount(self, full: int, quick: int) -> int:
-        """Return an amount for the campaign: `quick` in a quick run, otherwise `full`."""
+        """Return an amount (of time, messages, …) for the campaign: `quick` in a quick run,
+        otherwise `full`.
+        """
         return quick if self.quick else full
 
 
@@ -67,8 +69,8 @@ class Campaign(NamedTuple):
 def run_campaigns(
     campaigns: Sequence[Campaign], out: Path, title: str, quick: bool, seed: int
 ) -> list[Figure]:
-    """Run the campaigns with progress on stderr, write `out/figures.json` and `out/figures.md`, and
-    return all figures.
+    """Run the given fault campaigns with progress on stderr, write `out/figures.json` and
+    `out/figures.md`, and return all figures.
     """
     found: list[Figure] = []
     out.mkdir(parents=True, exist_ok=True)
@@ -80,7 +82,7 @@ def run_campaigns(
 
 
 def run_and_exit(run: Callable[[], int]) -> NoReturn:
-    """Run campaigns and end the process with their exit code. If a campaign raises, print the
+    """Run fault campaigns and end the process with their exit code. If a campaign raises, print the
     traceback and exit at once with RAISED.
 
     The process ends without interpreter teardown. Otherwise an open session would delay its end for

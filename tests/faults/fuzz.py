@@ -158,8 +158,8 @@ def _run_turn(site: Site, engine: Engine, messages: list[Message], now: int) -> 
 def _ask_query(
     site: Site, engine: Engine, asked: dict[str, str], now: int, past: bool
 ) -> tuple[int, int, int]:
-    """Answer a query. Return three counts (0 or 1): crashes, answers, and past maps rebuilt.
-    Without `past` no past map is rebuilt.
+    """Let the service answer a query. Return three counts (0 or 1): crashes, answers, and past maps
+    rebuilt. Without `past` no past map is rebuilt.
     """
     rebuilt = 0
     try:

@@ -36,7 +36,9 @@ PERIODS: Final[dict[str, object]] = {"compact_s": 5.0, "checkpoint_s": 4.0, "seg
 
 
 def run(site: Site) -> list[Figure]:
-    """Hand the region over twenty times, and return the figures."""
+    """Hand a region over to another service twenty times, and return figures of pauses and
+    losses.
+    """
     pauses = []
     lease_s = ServiceConfig().lease_s
     with ExitStack() as stack:

@@ -112,7 +112,9 @@ def run(site: Site) -> list[Figure]:
 
 
 def _make_attack(number: int, second: int, now: int, random_: np.random.Generator) -> Message:
-    """Return the next message of the insider; its six kinds of messages take turns."""
+    """Return the next message of the insider; its six kinds of messages follow each other in
+    turn.
+    """
     seq = number + 1
     what = number % 6
     if what == 0:  # places all over the region

@@ -179,8 +179,8 @@ def map_difference(archive: Path) -> float:
 def _run_round(
     there: Stage, agents: int, kills: int, random_: random.Random
 ) -> tuple[Census, Load]:
-    """Run one round. Return its census, and the load offered from the start of all processes until
-    the drain.
+    """Run one round of kills. Return the counts of batches and rows (census), and the load from the
+    start of all processes until the end.
     """
     for number in range(agents):
         there.make_load([f"sim-{number:03}"], RATE, seed=number).start()

@@ -58,8 +58,8 @@ def judge_without_comparison(seeds: Iterable[int]) -> Judged:
 
 
 def judge_without_expiry(seeds: Iterable[int]) -> Judged:
-    """Judge histories of a broken protocol: a holder acknowledges until it notices its
-    successor.
+    """Check simulated histories of a broken lease protocol: a holder acknowledges until it notices
+    its successor.
     """
     fresh = property(lambda lease: not lease.lost)
     with patch.object(Lease, "may_acknowledge", fresh):

@@ -87,7 +87,9 @@ class _EndError(BaseException):
 
 
 class _Process:
-    """State of a simulated service process: its clocks, and True if it is frozen or cut off."""
+    """State of a simulated service process: its clocks, whether it is frozen, and whether it is cut
+    off from the bucket.
+    """
 
     def __init__(self, name: str, random_: random.Random, lease_s: float) -> None:
         self.name = name
@@ -179,11 +181,11 @@ class VirtualTime:
     # what the module of the lease uses of `time`
 
     def monotonic(self) -> float:
-        """Return the elapsed-time clock of the running process [s]."""
+        """Return the reading [s] of the elapsed-time clock of the running simulated process."""
         return self.now * self.process.rate
 
     def time(self) -> float:
-        """Return the wall clock of the running process [s]."""
+        """Return the reading [s] of the wall clock of the running simulated process."""
         return self.process.wall + self.now
 
 
@@ -197,7 +199,7 @@ class VirtualStop:
         self._is_set = False
 
     def is_set(self) -> bool:
-        """Return True if the event has been set."""
+        """Return True if this event has been set."""
         return self._is_set
 
     def set(self) -> None:
@@ -205,13 +207,17 @@ class VirtualStop:
         self._is_set = True
 
     def wait(self, seconds: float) -> bool:
-        """Wait for `seconds` of the process's clock. Return True if the event is set."""
+        """Wait for `seconds` by the clock of the simulated process, or until the event is set.
+        Return True if it is set.
+        """
         self._world.sleep(seconds / self._world.process.rate)
         return self._is_set
 
 
 class VirtualBucket:
-    """Bucket in memory. Requests are slow or lost, and some lost requests take effect later."""
+    """Simulated bucket (object store) in memory. Requests are slow or lost, and some lost requests
+    take effect later.
+    """
 
     def __init__(self, world: VirtualTime, random_: random.Random) -> None:
         self.objects: dict[str, bytes] = {}
@@ -220,11 +226,11 @@ class VirtualBucket:
         self._network = _Process("network", random_, 1.0)
 
     def list_names(self, folder: str) -> list[str]:
-        """Return the names of the objects in a folder."""
+        """Return the names of the objects in a folder of the simulated bucket."""
         return list(self._request(lambda: [n for n in self.objects if n.startswith(f"{folder}/")]))
 
     def get(self, name: str) -> bytes | None:
-        """Return the content of an object, or None if it does not exist."""
+        """Return the content of an object in the simulated bucket, or None if it does not exist."""
         return cast("bytes | None", self._request(lambda: self.objects.get(name)))
 
     def put(self, name: str, content: bytes) -> None:
@@ -232,8 +238,8 @@ class VirtualBucket:
         self._request(lambda: self.objects.__setitem__(name, content))
 
     def create(self, name: str, content: bytes) -> bool:
-        """Create an object. Return False if one with other content exists; so a repeated request
-        succeeds.
+        """Create an object in the simulated bucket. Return False if one with other content exists;
+        so a repeated request succeeds.
         """
         return bool(self._request(lambda: self.objects.setdefault(name, content) == content))
 

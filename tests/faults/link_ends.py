@@ -31,7 +31,9 @@ HEAD: Final = struct.Struct("<Id")  # number of the message, time at which it wa
 
 
 def open_end(given: dict[str, Any]) -> zenoh.Session:
-    """Open the Zenoh session of this endpoint, with the certificate of the given name."""
+    """Open the Zenoh session of this endpoint of the link, with the certificate of the given
+    name.
+    """
     one = settings(given["connect"][0], Path(given["certificates"]))
     config = {key: value for key, value in one.config.items() if key != "connect/retry"}
     session = open_session(
@@ -42,8 +44,8 @@ def open_end(given: dict[str, Any]) -> zenoh.Session:
 
 
 def receive(given: dict[str, Any]) -> None:
-    """Subscribe until stdin is closed. Then print number, delay [s] and time of arrival [s] of each
-    message by key.
+    """Receive messages until stdin is closed. Then print number, delay [s] and time of arrival [s]
+    of each message by key.
     """
     arrived: dict[str, list[tuple[int, float, float]]] = {}
 

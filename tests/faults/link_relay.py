@@ -106,7 +106,7 @@ def open_device(namespace: str, device: str) -> int:
 
 
 def relay_packets(ends: tuple[int, int], terms: LinkTerms) -> None:
-    """Move packets between the two devices until stdin is closed."""
+    """Move packets between the network devices of both ends of the link until stdin is closed."""
     ways = {ends[0]: Direction(ends[1]), ends[1]: Direction(ends[0])}
     draw = random.Random(terms.seed)
     with selectors.DefaultSelector() as waiting:

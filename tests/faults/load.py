@@ -107,8 +107,8 @@ def make_visits(
 
 
 def offer_blocks(plan: Plan, publisher: Publisher, quiet: threading.Event) -> tuple[int, float]:
-    """Offer a block of observations every BLOCK_S until `quiet` is set. Return the number of blocks
-    that were late by a whole block, and the longest delay [s].
+    """Offer a block of observations to the publisher every BLOCK_S until `quiet` is set. Return the
+    number of blocks that were late by a whole block, and the longest delay [s].
     """
     rng = np.random.default_rng(plan.seed)
     per_block = plan.rate * BLOCK_S * len(plan.names)

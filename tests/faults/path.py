@@ -68,7 +68,7 @@ def _offset_position(north_m: Numbers, east_m: Numbers) -> tuple[FloatArray, Flo
 def _make_visits(
     name: str, seq: int, when: IntArray, place: tuple[FloatArray, FloatArray], mu: float
 ) -> list[Batch]:
-    """Return one batch per region of visits at the given times [ns] and places (latitude,
+    """Return one batch per region of observations at the given times [ns] and places (latitude,
     longitude).
     """
     cell = grid.cell_of(*place)
@@ -99,7 +99,7 @@ def _make_messages(batches: Sequence[Batch]) -> list[Message]:
 
 def _drive_teleports(site: Site, count: int) -> tuple[int, int]:
     """Let `count` cars drive honestly and each report one distant place too (a teleport). Return
-    the number of teleports that were fused, and the number of honest rows that were not fused.
+    the number of teleports that reached the map, and the number of honest rows that did not.
     """
     rng = np.random.default_rng(site.seed)
     start = time.time_ns() - 7200 * SECOND
@@ -143,7 +143,8 @@ def _drive_teleports(site: Site, count: int) -> tuple[int, int]:
 
 def _far_away(kind: str, name: str, start: int, rng: np.random.Generator) -> list[Batch]:
     """Return batches of the car `name` that report a place far from its path at about the time of
-    its true reports. `kind` is the way in which the false report is sent (see module).
+    its true reports. `kind` is the way in which the false report is sent, for example in a batch of
+    its own.
     """
     far = rng.uniform(FAR_M, 4e5) * np.exp(1j * rng.uniform(0, 2 * np.pi))
     second = {"before": -5, "between": 14.5}.get(kind, 31.0)

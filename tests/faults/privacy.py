@@ -116,8 +116,8 @@ def _visit(name: str, seq: int, when: int, trip: Trip, at: slice, mu: float) -> 
 
 
 class Town:
-    """Fleet service of a simulated town, the town's cars by day, and the tiles that a reader has
-    stored.
+    """Fleet service of a simulated town, the town's cars by day, and the map tiles that a reader
+    has stored.
     """
 
     def __init__(self, folder: Path, seed: int, public: int = PUBLIC) -> None:
@@ -153,7 +153,9 @@ class Town:
         return alerts
 
     def put(self, now: int) -> dict[int, tuple[pa.Table | None, pa.Table]]:
-        """Publish the changed tiles. Return for each tile its table before (or None) and after."""
+        """Let the service publish the changed tiles. Return for each tile its table before (or
+        None) and after.
+        """
         out = {}
         for tile, payload in changed_tiles(self.engine.queries, now):
             table = pa.ipc.open_stream(payload).read_all()

@@ -107,8 +107,8 @@ class Part:
         return self.wait(STOP_S)
 
     def limit_files(self, size: int) -> None:
-        """Limit each file of the process to `size` bytes, which acts like a full disk; -1 removes
-        the limit.
+        """Limit each file that the process writes to `size` bytes, which acts like a full disk; -1
+        removes the limit.
         """
         _, hard = resource.prlimit(self.pid, resource.RLIMIT_FSIZE)
         resource.prlimit(self.pid, resource.RLIMIT_FSIZE, (hard if size < 0 else size, hard))
@@ -188,7 +188,7 @@ class Stage:
                 self._await_news(patience_s)
 
     def _await_news(self, patience_s: float) -> None:
-        """Wait until a load generator has printed more lines, or all of them have ended. Raise
+        """Wait until a load generator has printed further lines, or all of them have ended. Raise
         TimeoutError after `patience_s` without news.
         """
         told = sum(journal.stat().st_size for journal in self.journals)

@@ -22,7 +22,7 @@ from schemas.runtime.zenoh_session import configuration
 
 
 def main() -> None:
-    """Run the session that the line on standard input describes."""
+    """Run the attacker's session that the line on standard input describes."""
     told = json.loads(sys.stdin.readline())
     heard: list[str] = []
     session = zenoh.open(

@@ -13,7 +13,9 @@ from tests.secured import open_network
 
 
 def run(site: Site) -> list[Figure]:
-    """Run every attack in one environment. The last attack revokes the attacker's certificate."""
+    """Run every attack on the system in one environment of router and service. The last attack
+    revokes the attacker's certificate.
+    """
     breaches = []
     with open_network(site.folder / "certificates") as running, open_ground(running) as found:
         for name, attempt in ATTEMPTS.items():

@@ -39,7 +39,7 @@ WHOLE_WAY: Final = 200
 
 def run(site: Site) -> list[Figure]:
     """Cut the newest segment at every byte, and change every fifth byte (in a quick run, some
-    hundred bytes); return the figures.
+    hundred bytes); return figures of lost rows.
     """
     logging.getLogger(load.__name__).setLevel(logging.ERROR)  # thousands of files are set aside
     batches, newest = _write_archive(site.folder)

@@ -30,8 +30,8 @@ from tests.fleet_service.archive.test_version import rewrite_file, with_columns
 
 
 def run(site: Site) -> list[Figure]:
-    """Read archives of an older and a newer format, before and after a compaction, with and without
-    a checkpoint (saved state). Return the figures.
+    """Read archives of an older and a newer format, before and after a compaction (sorting of new
+    rows), with and without a checkpoint (saved state). Return the figures.
     """
     old = site.folder / "old"
     new = site.folder / "new"

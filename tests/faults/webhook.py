@@ -129,7 +129,7 @@ def _read_request(client: socket.socket) -> tuple[bytes, bytes]:
 
 
 def make_stretch(number: int) -> StretchAlert:
-    """Return an alert of a road stretch whose id is `number`."""
+    """Return a made-up alert of a road stretch whose id is `number`."""
     return StretchAlert(
         id=f"id-{number}",
         state="raised",
@@ -173,7 +173,9 @@ def run_kind(folder: Path, kind: str) -> tuple[int, int]:
 
 
 def run(site: Site) -> list[Figure]:
-    """Send alerts to all kinds of receivers at once, for some seconds, and return the figures."""
+    """Send alerts by webhooks to all kinds of failing receivers at once, for some seconds, and
+    return the figures.
+    """
     with ThreadPoolExecutor(len(BREAKS)) as pool:
         found = dict(
             zip(BREAKS, pool.map(lambda kind: run_kind(site.folder, kind), BREAKS), strict=True)

@@ -42,7 +42,7 @@ class Running:
 
 @pytest.fixture(scope="session")
 def router() -> Iterator[ZenohSettings]:
-    """Yield the settings of a session to a router in this process."""
+    """Yield the settings with which a Zenoh session connects to a router in this process."""
     session, endpoints = open_router(listen="tcp/127.0.0.1:0")
     with session:
         yield ZenohSettings(connect=endpoints)

@@ -75,8 +75,8 @@ def observations(
 
 
 def posterior_evidence(mu: float, lower: float, upper: float, used: float) -> FloatArray:
-    """Return the log-likelihood (32,) that the service assumes for a report without a
-    likelihood.
+    """Return the log-likelihood (32,) of friction that the service assumes for a report with an
+    interval but without a likelihood.
     """
     names = ("mu", "mu_lower", "mu_upper", "mu_utilised")
     columns: dict[str, NDArray[Any]] = dict(
@@ -89,7 +89,9 @@ def posterior_evidence(mu: float, lower: float, upper: float, used: float) -> Fl
 
 
 def belief(fusion: Fusion, cell: int = CELL, sector: int = 0, now: int | None = None) -> FloatArray:
-    """Return the belief (32,) of one cell at the time of its last observation, or at `now`."""
+    """Return the belief (32 probabilities of μ) about one cell of a `Fusion` at the time of its
+    last observation, or at `now`.
+    """
     slot = fusion.slots_of(np.array([cell]), np.array([sector]))
     assert slot[0] >= 0, "nobody was there"
     return np.asarray(

@@ -292,8 +292,8 @@ def install_packages(house: House) -> float:
 
 
 def silent_reasons(house: House) -> float:
-    """Return the number of tested causes of an agent's silence (it publishes nothing) that the
-    agent names within five seconds.
+    """Return for how many tested causes an agent that publishes nothing names the cause within five
+    seconds.
     """
     path = "tests/edge_agent/app/test_publishing_reasons.py"
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "-k", "planted_cause", path]

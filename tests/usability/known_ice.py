@@ -133,7 +133,9 @@ def _key(row: dict[str, Any]) -> tuple[int, int]:
 
 
 def _hidden_rows(ice: KnownIce, rows: list[dict[str, Any]]) -> Places:
-    """Return the known slippery places that are missing in the rows, or have no μ there."""
+    """Return the known slippery places that are missing in the rows of an output, or have no μ
+    there.
+    """
     shown = {
         _key(row)
         for row in rows
@@ -343,7 +345,9 @@ _KINDS: Final = """async ([places, least]) => {
 
 
 def _hide_unvalued(table: pa.Table, unvalued: Places) -> pa.Table:
-    """Return a map in the form of older versions: the places `unvalued` are lower bounds."""
+    """Return a map in the form of older versions: the places `unvalued` have only a lower bound of
+    friction.
+    """
     rows = table.select(["cell", "sector"]).to_pylist()
     bound = pa.array([_key(row) in unvalued for row in rows])
     for name, other in (("basis", "bound"), ("mu", None)):

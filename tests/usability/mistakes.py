@@ -145,8 +145,8 @@ def prepare_files(folder: Path) -> None:
 
 
 def find_tracebacks(folder: Path, archive: Path) -> tuple[int, list[str]]:
-    """Return the number of mistakes, and the command lines answered with a traceback or with exit
-    code 0.
+    """Run mistaken command lines. Return their number, and those that were answered with a
+    traceback or with exit code 0.
     """
     bad = []
     lines: list[tuple[Callable[[list[str]], int], str]] = [

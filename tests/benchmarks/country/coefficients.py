@@ -31,7 +31,9 @@ TURN: Final = 512
 
 
 class Coefficients(NamedTuple):
-    """Memory cost of a service per vehicle, per cell, and per pair of cell and vehicle [bytes]."""
+    """Memory that a service needs per vehicle, per cell, and per pair of cell and vehicle
+    [bytes].
+    """
 
     vehicle_bytes: float
     cell_bytes: float

@@ -226,7 +226,9 @@ def _update_least(before: list[float], parts: Sequence[Part]) -> list[float]:
 
 
 def _last_line(sender: Part) -> dict[str, float]:
-    """Return the last complete line of the sender's output, parsed from JSON."""
+    """Return the last complete line of the output of the process that sends reports, parsed from
+    JSON.
+    """
     whole = [line for line in sender.read_lines() if line.endswith("}")]
     said: dict[str, float] = json.loads(whole[-1])
     return said

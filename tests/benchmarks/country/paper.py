@@ -22,7 +22,8 @@ NEW_PLACES: Final = 1.0
 
 
 def estimate_million(found: Mapping[str, float]) -> list[Figure]:
-    """Return estimated figures for a million vehicles that each report at the country's rate.
+    """Return estimated figures (memory, processor time) for a million vehicles that each report at
+    the country's rate.
 
     Args:
         found: measured figures of the country by name.

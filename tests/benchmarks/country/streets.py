@@ -75,7 +75,9 @@ def simulate_drives(sumo: Sumo, vehicles: int, seconds: int, seed: int) -> list[
 
 
 def _make_drive(rows: pd.DataFrame) -> Drive | None:
-    """Return the drive of one vehicle, or None if the vehicle jumped or did not move."""
+    """Return the drive of one vehicle from the rows of its positions, or None if the vehicle jumped
+    or did not move.
+    """
     x, y = HELSINKI.from_latlon(rows.vehicle_y.to_numpy(), rows.vehicle_x.to_numpy())
     step = np.hypot(np.diff(x), np.diff(y))
     moves = np.r_[True, step > 0.05]

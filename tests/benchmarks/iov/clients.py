@@ -11,7 +11,9 @@ from tests.deploy.clients import PLACES, build_client, missing_tool, run_client,
 
 
 def measure_clients(folder: Path, _quick: bool) -> list[Figure]:
-    """Build and run each client. Print the reason for each client that is left out or fails."""
+    """Build and run the map client in each programming language. Print the reason for each client
+    that is left out or fails.
+    """
     tested = 0
     failed = 0
     with TemporaryDirectory() as work, served_map(Path(work)) as endpoint:

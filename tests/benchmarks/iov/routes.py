@@ -118,7 +118,7 @@ def unpack_wheel(name: str, version: str, target: Path) -> None:
 
 
 class Valhalla:
-    """Valhalla's own programs, unpacked from the wheel into a folder."""
+    """Programs of the route planner Valhalla, unpacked from the wheel into a folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -162,8 +162,8 @@ class Valhalla:
         self._run("valhalla_build_tiles", "-c", str(self.config), str(pbf))
 
     def ask(self, action: str, request: dict[str, Any]) -> dict[str, Any]:
-        """Return Valhalla's answer to a routing request. An answer without a route has an
-        `error_code`.
+        """Return the answer of the route planner Valhalla to a routing request. An answer without a
+        route has an `error_code`.
         """
         done = self._call("valhalla_service", str(self.config), action, json.dumps(request))
         line = next((line for line in done.stdout.splitlines() if line.startswith("{")), None)

@@ -61,7 +61,7 @@ def cells(
 
 
 def make_local_map(parts: list[ReceivedCells]) -> LocalMap:
-    """Return a car's local map that contains these cells."""
+    """Return a car's local map that contains the given cells."""
     cache = LocalMap()
     for part in parts:
         for tile in np.unique(grid.tile_of(part.key // grid.SECTORS)).tolist():

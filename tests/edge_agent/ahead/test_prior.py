@@ -32,7 +32,9 @@ def sharp(mu: float, std: float = 0.06) -> FloatArray:
 
 
 def saying(mu: float, std: float = 0.08) -> FloatArray:
-    """Return a Gaussian log-likelihood of μ on the friction grid, (1, 32)."""
+    """Return a Gaussian log-likelihood of a measurement `mu` with standard deviation `std` on the
+    friction grid, (1, 32).
+    """
     log = -0.5 * ((mugrid.CENTRES - mu) / std) ** 2
     return np.asarray((log - log.max())[None])
 

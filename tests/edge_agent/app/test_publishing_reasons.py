@@ -70,7 +70,9 @@ CAUSES: dict[str, tuple[Block, State, list[str], str]] = {
 def told_within(
     source: Block, find: Callable[[SignalWatch], list[str]], seconds: float
 ) -> list[str]:
-    """Return the lines that the printer of reasons prints in `seconds` of simulated time."""
+    """Return the lines that the printer of reasons (why nothing is published) prints in `seconds`
+    of simulated time.
+    """
     clock = Clock()
     lines = list[str]()
     watch = SignalWatch(clock)

@@ -26,15 +26,17 @@ SHORT_S = 2.0
 
 @pytest.fixture(scope="module")
 def turn() -> tuple[GivenMotion, FloatArray]:
-    """Return the motion of a turn on snow, and the true friction of its wheels (T, 4)."""
+    """Return the true motion of a car in a turn on snow, and the true friction of its wheels (T,
+    4).
+    """
     spec = replace(MATCHED["003.turn"], duration_s=SHORT_S)
     batch = ideal(spec)
     return given_motion(batch, spec.vehicle), batch.mu_wheel[:, 0]
 
 
 def one_sample(speed: float) -> GivenMotion:
-    """Return the motion of one sample at `speed` [m/s], with slip at all wheels, as input of the
-    papers' filters.
+    """Return the true motion of a car at one sample at `speed` [m/s], with slip at all wheels, as
+    input of the papers' filters.
     """
     signals = np.zeros((1, len(CHANNELS)))
     signals[0, [S.AX, S.AY, S.YAW_RATE]] = 1.0, 2.0, 0.2

@@ -36,8 +36,8 @@ def drive(
 
 
 def seconds(*parts: tuple[float, float]) -> FloatArray:
-    """Return the values (T,) of a controller flag over time from pairs (duration [s], value): the
-    flag has each value for this duration.
+    """Return the values (T,) of a controller flag over time, computed from pairs (duration [s],
+    value): the flag has each value for this duration.
     """
     return np.concatenate([np.full(round(length * RATE), value) for length, value in parts])
 

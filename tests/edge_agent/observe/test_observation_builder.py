@@ -194,8 +194,8 @@ def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
 
 
 def observe_grip(observed: np.ndarray, east: np.ndarray) -> list[float]:
-    """Return the grip reported for each visit of a car that drives east along `east` (T, 1) [m] at
-    100 Hz and uses a grip of `observed` (T,).
+    """Return the grip reported for each visit (passage of a cell) of a car that drives east along
+    `east` (T, 1) [m] at 100 Hz and uses a grip of `observed` (T,).
     """
     flat = np.zeros_like(east)
     block = ground(east, flat, flat, rate_hz=100.0, fix_every=10)

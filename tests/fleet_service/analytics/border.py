@@ -28,7 +28,9 @@ NUMBERS: Final = ("mu", "mu_lower", "mu_upper", "p_slippery", "vehicles", "obser
 
 
 def fill(root: Path, world: SyntheticFleet) -> None:
-    """Write an archive with one day of observations, compact it, and compute its roll-ups."""
+    """Write an archive with one day of observations, sort its rows by cell (compaction), and
+    compute its hourly statistics (roll-ups).
+    """
     step = 360.0 / (1 << grid.CELL_ZOOM)
     shift = BORDER - synthetic.LONGITUDE - world.length // 2 * step
     writer = segments.Writer(root, "shard-0")

@@ -45,7 +45,9 @@ def find_visited(fusion: Fusion) -> IntArray:
 
 @pytest.fixture(scope="session")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a compacted archive with a snapshot of the map every twelve hours."""
+    """Return an archive with compacted (sorted) rows and a snapshot of the map every twelve
+    hours.
+    """
     root = tmp_path_factory.mktemp("analytics") / "archive"
     synthetic.write_archive(root, WORLD, 4000)
     compact(root)

@@ -61,8 +61,8 @@ def take(engine: Engine, sent: list[Batch]) -> None:
 
 
 def read_image(engine: Engine) -> dict[str, pa.Table]:
-    """Return the whole state of an engine that a service restores after a restart: map, trust in
-    vehicles, known batches and alerts.
+    """Return the whole state of an engine (service without network) that a service restores after a
+    restart: map, trust in vehicles, known batches and alerts.
     """
     return dict(engine._image().tables)
 

@@ -34,7 +34,7 @@ NEAR = f"{LONGITUDE - 0.1},{LATITUDE - 0.1},{LONGITUDE + 0.1},{LATITUDE + 0.1}"
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Return an archive with some compacted rows of one cell."""
+    """Return an archive with some rows of one cell in compacted (sorted) files."""
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for seq in range(1, 5):

@@ -16,8 +16,8 @@ from pyarrow import dataset
 
 
 class Seen(NamedTuple):
-    """Result of a tool that has read the observations of an archive: counts, mean of mu, and
-    zones.
+    """Result of a tool that has read the observations of an archive: counts, mean of mu, and zones
+    (map squares of zoom 7).
     """
 
     rows: int

@@ -41,8 +41,8 @@ class DiedError(BaseException):
 
 
 def public(root: Path, kind: Kind) -> list[tuple[int, int]]:
-    """Return (boot, seq) of the rows that a foreign program, which reads only the compacted files,
-    finds.
+    """Return (boot, seq) of the rows that a foreign program, which reads only the compacted
+    (sorted) files, finds.
     """
     paths = list((root / layout.TABLES[kind]).rglob("*.parquet"))
     found = [pq.read_table(path, columns=["boot", "seq"], partitioning=None) for path in paths]

@@ -30,7 +30,9 @@ _FLOAT = st.floats(width=32)
 @st.composite
 # protobuf messages are untyped
 def draw_message(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401
-    """Return a random message: records with some of the columns and arbitrary values."""
+    """Return a random message of a `kind` (observations or states): records with some of the
+    columns and arbitrary values.
+    """
     rows = draw(st.integers(1, 4))
     message = MESSAGES[kind](
         vehicle=draw(st.sampled_from(["sim-001", "", "a" * 200])),
@@ -52,8 +54,8 @@ def draw_message(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401
 
 
 def is_agreed(kind: Kind, payload: bytes) -> bool:
-    """Return True if the compiled decoder accepts the bytes. Fail if it then decodes anything else
-    than the protobuf library.
+    """Return True if the service's compiled decoder accepts the bytes of a message. Fail if it then
+    decodes anything else than the protobuf library.
     """
     data = np.frombuffer(payload, np.uint8)
     found = walk_fields(kind, data, np.array([len(payload)]))

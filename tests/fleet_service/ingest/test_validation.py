@@ -46,7 +46,7 @@ class Desk:
         self.intake = BatchIntake(SequenceTrackers(), Pseudonyms(folder), self.counts, self.acks)
 
     def take(self, *messages: Message) -> int:
-        """Process messages, and return the number of admitted rows."""
+        """Process messages as the service does, and return the number of admitted rows."""
         return sum(
             len(accepted.rows["row"]) for accepted in self.intake.accept(messages, CLOCK).values()
         )

@@ -31,8 +31,8 @@ from schemas import mugrid
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shrink the campaign to a few minutes and vehicles, so that it runs in seconds. The figures of
-    such a run are not meaningful.
+    """Shrink the evaluation of the map to a few minutes and vehicles, so that it runs in seconds.
+    The figures of such a run are not meaningful.
     """
     brief = tuple(fleet._replace(begin=0, minutes=6) for fleet in fleets.FLEETS)
     for module, name, value in (

@@ -60,7 +60,9 @@ def drive_parts(page: RunningPage, drive: Drive, *parts: str) -> None:
 
 
 def count(page: RunningPage) -> int:
-    """Return the number of features that the page offers, or 0 while it knows no service."""
+    """Return the number of features (map cells with heading) that the page offers, or 0 while it
+    knows no service.
+    """
     status, _, body = ask(page.address, ITEMS)
     assert status in (200, 503), body
     return int(json.loads(body)["numberReturned"]) if status == 200 else 0

@@ -58,7 +58,7 @@ def data(seen: Opened, name: str) -> str:
 
 
 def kinds(seen: Opened) -> list[int]:
-    """Return the number of drawn map records of each kind."""
+    """Return the number of map records (cells) of each kind that the page has drawn."""
     return [int(n) for n in data(seen, "kinds").split(",") if n] or [0] * 8
 
 
@@ -319,7 +319,9 @@ def test_slider_shows_a_past_cell_and_two_moments_side_by_side(
 
 
 def list_snapshots(archive: Path) -> list[int]:
-    """Return the times [s] of the map snapshots that the page offers."""
+    """Return the times [s since 1970] of those map snapshots of the archive that the page
+    offers.
+    """
     return sorted(
         snapshots.time_of(path) // 10**9 for path in archive.glob(f"{snapshots.TABLE}/*/*.parquet")
     )

@@ -27,7 +27,7 @@ _ICE_DRAWN: Final = f"document.body.dataset.kinds.split(',')[0] == {street.count
 
 
 def keep_picture(seen: Opened, name: str) -> Path:
-    """Store a picture of a state, and return its path."""
+    """Store a picture of the page in a state, and return its path."""
     FOLDER.mkdir(parents=True, exist_ok=True)
     path = FOLDER / f"{name}.png"
     seen.page.screenshot(path=path)
@@ -35,7 +35,9 @@ def keep_picture(seen: Opened, name: str) -> Path:
 
 
 def card(seen: Opened, state: str) -> str:
-    """Wait for the card of a state, and return its words."""
+    """Wait until the page shows the card of a state (such as "no service"), and return its
+    words.
+    """
     waits(seen, f"document.getElementById('card').dataset.state === '{state}'")
     assert seen.page.locator("#card").is_visible()
     return seen.page.locator("#card").inner_text()

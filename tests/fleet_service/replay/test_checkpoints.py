@@ -47,8 +47,8 @@ def message(one: Batch) -> Message:
 
 
 def keep(engine: Engine, root: Path) -> Path:
-    """Write a checkpoint as the service does: a background thread requests it, and the worker
-    thread makes it between two segments (files of new rows). Return its folder.
+    """Write a checkpoint (saved state) as the service does: a background thread requests it, and
+    the worker thread makes it between two segments (files of new rows). Return its folder.
     """
     taken: list[checkpoints.Taken | None] = []
     stop = threading.Event()
@@ -141,8 +141,8 @@ def read_state(engine: Engine) -> dict[str, NDArray[Any]]:
 def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
     tmp_path: Path, oldest_s: float
 ) -> None:
-    """A restart must not fuse a batch that is too old to be sent again, although a compaction
-    joined old and new rows in one file.
+    """A batch that is too old to be sent again must not affect the map after a restart, although a
+    compaction (sorting of rows) joined old and new rows in one file.
     """
     config = ServiceConfig(oldest_s=oldest_s)
     now = time.time_ns()

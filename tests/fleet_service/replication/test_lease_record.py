@@ -19,7 +19,9 @@ from schemas.errors import InputError
 
 
 class MemoryBucket:
-    """Bucket in memory, with an operation that creates an object only if there is none."""
+    """Simulated bucket (object store) in memory, with an operation that creates an object only if
+    there is none.
+    """
 
     def __init__(self) -> None:
         self.objects: dict[str, bytes] = {}

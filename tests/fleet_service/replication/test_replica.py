@@ -36,8 +36,8 @@ Make = Callable[[Path], BucketReplica]
 
 @pytest.fixture
 def make(bucket: BucketServer) -> Iterator[Make]:
-    """Yield a function that starts a bucket copy of an archive. At the end of the test all copies
-    are closed.
+    """Yield a function that starts a copy of an archive in a bucket (object store). At the end of
+    the test all copies are closed.
     """
     made: list[BucketReplica] = []
 

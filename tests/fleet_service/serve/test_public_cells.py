@@ -19,7 +19,9 @@ LATER_S = 2 * PERIOD_NS / SECOND
 
 
 class Map:
-    """Fusion of some cells, together with the public copy of these cells that readers see."""
+    """Beliefs about some cells (a `Fusion`), together with the public copy of these cells that
+    readers see.
+    """
 
     def __init__(self) -> None:
         self.fusion = Fusion(120.0)

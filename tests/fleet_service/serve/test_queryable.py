@@ -112,8 +112,8 @@ def nothing(
 def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(
     session: zenoh.Session, much: AnswerSize
 ) -> None:
-    """A light query must be answered while a heavy answer is still under way. Many tiles of one
-    cell each must count as heavy too.
+    """A query for little data must be answered while a query for much data is still being answered.
+    Many tiles of one cell each must count as heavy too.
     """
     key = keys.map_key(TILE)
     counts = Counter[str]()

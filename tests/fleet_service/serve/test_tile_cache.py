@@ -23,7 +23,9 @@ NOW = START + 60 * SECOND
 
 
 def visit(state: MapState, vehicle: int, cell: int = TILE << 14) -> None:
-    """Add one observation of a cell to the map, and mark the cell as changed as the engine does."""
+    """Add one observation of a cell to the map, and mark the cell as changed, as the service
+    does.
+    """
     state.mark_changed(
         state.fusion.update(observations([1.0], [vehicle], value([0.5]), cell)).slots
     )

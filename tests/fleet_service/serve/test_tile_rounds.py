@@ -12,8 +12,8 @@ COST_S = SHARE_S / 2.0  # that a tile takes
 
 
 class Made:
-    """Simulated surroundings of the rounds: tiles that change, a clock, and a list of the
-    publications with their times.
+    """Simulated surroundings of the publication rounds: tiles that change, a clock, and a list of
+    the publications with their times.
     """
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class Made:
         self.now += COST_S
 
     def turn(self, seconds: float = 0.0) -> int:
-        """Simulate one pass of the service's worker loop: other work for `seconds`, and then the
+        """Simulate one pass of the service's main loop: other work for `seconds`, and then the
         publication of tiles. Return the number of published tiles.
         """
         self.now += seconds

@@ -52,7 +52,7 @@ PLACE = (57.7, 11.97)
 
 
 def random_denm(draw: np.random.Generator) -> Denm:
-    """Return a random DENM with every field that the gateway can set."""
+    """Return a random DENM (hazard message) with every field that the gateway can set."""
     position = (float(draw.uniform(-80, 80)), float(draw.uniform(-179, 179)))
     near = [
         (position[0] + float(draw.normal(0, 1e-3)), position[1] + float(draw.normal(0, 1e-3)))
@@ -94,7 +94,9 @@ bytes_of_causes = strategies.integers(0, 255)
 
 @strategies.composite
 def any_denm(draw: strategies.DrawFn) -> Denm:
-    """Return a DENM with any content that its fields allow (Hypothesis strategy)."""
+    """Return a DENM (hazard message) with any content that its fields allow (Hypothesis
+    strategy).
+    """
     position = (draw(latitudes), draw(longitudes))
 
     def points() -> tuple[tuple[float, float], ...]:
@@ -359,7 +361,9 @@ def test_foreign_denm_alone_raise_no_alert(tmp_path: Path) -> None:
 
 
 def _yaws(denm: Denm) -> list[float]:
-    """Return the yaw angles [deg] of the reports that the gateway makes from a DENM, each once."""
+    """Return the yaw angles [deg] of the reports that the gateway makes from a DENM (hazard
+    message), each once.
+    """
     batches = [json.loads(body) for _, body in encode_reports(denm, "cits-se", 5, 1, START)]
     return sorted({round(math.degrees(yaw)) % 360 for batch in batches for yaw in batch["yaw"]})
 
