@@ -123,7 +123,7 @@ class LowerVertices:
 
     @staticmethod
     def bounds() -> tuple[FloatArray, FloatArray]:
-        """Return the lower and upper limits of the sets' free parameters, (16,) each."""
+        """Return the lower and upper limits of the fuzzy sets' free parameters, (16,) each."""
         return np.full(2 * FEET, 0.3), np.full(2 * FEET, 1.8)
 
 

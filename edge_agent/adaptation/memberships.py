@@ -146,7 +146,9 @@ class Memberships:
                 )
 
     def to_vector(self) -> FloatArray:
-        """Return the free parameters for an optimiser, (30,): all fields, one after the other."""
+        """Return the parameters of the fuzzy sets as a vector (30,) for an optimiser: all fields,
+        one after the other.
+        """
         return np.array([number for name in LENGTHS for number in getattr(self, name)])
 
     @classmethod

@@ -106,11 +106,13 @@ def update(
     measurement: Measurement,
     work: FloatArray,
 ) -> tuple[int, float, float]:
-    """Run the measurement update in place; rows whose innovation is NaN are skipped.
+    """Run the measurement update of a square-root filter in place; measurements whose innovation
+    (measured minus predicted) is NaN are skipped.
 
     Args:
-        mean: m, (n,), changed. sqrt_cov: L, (n, n), changed.
-        state_deviations: X, (n, points). measurement: Z, nu and r.
+        mean: state's mean (n,), changed. sqrt_cov: L, (n, n), root of its covariance, changed.
+        state_deviations: X, (n, points), of the sigma points from the mean. measurement: deviations
+            Z of the predicted readings, innovation nu, noise r.
         work: scratch memory (k + n, points + k) or larger.
 
     Returns:

@@ -114,7 +114,9 @@ class SharedState:
         self.adopt(state)
 
     def adopt(self, state: ServiceState) -> None:
-        """Replace the state and start with an empty tile cache."""
+        """Replace the service's state by a newly loaded one, and start with an empty cache of map
+        tiles.
+        """
         self.state = state
         self.tiles = TileCache(state.map, self.guard, self._public_vehicles, state.public)
 

@@ -1,4 +1,4 @@
-"""The complete evaluation: runs every part, and then writes figures, table and plots."""
+"""The complete evaluation of the map: runs every part, then writes figures, table and plots."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Benchmark of the fusion: processor time per observation on one thread. It includes updates of
-beliefs, commits (final storage of older observations) and the computation of trust in vehicles.
+"""Benchmark of the fusion (the map's computation from observations): processor time per observation
+on one thread. It includes updates of beliefs, commits (final storage of older observations) and the
+computation of trust in vehicles.
 """
 
 from __future__ import annotations

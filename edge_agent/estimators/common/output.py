@@ -2,7 +2,7 @@
 
 The papers' filters report friction as the median and the 5 % and 95 % quantiles of a Gaussian,
 clipped to the range of the friction grid. These filters cannot separate the evidence of one visit
-(the passage of one map cell) from their prior. Therefore their bank has no evidence, and the agent
+(the passage of one map cell) from their prior. Therefore they give no evidence, and the agent
 publishes friction with its interval.
 """
 

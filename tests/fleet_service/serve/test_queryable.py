@@ -147,8 +147,8 @@ COSTS = {2: MOST, 3: 2 * LIGHT, 4: LIGHT}  # by what is asked for; a question of
 
 
 class Half:
-    """Queryable for tests of scheduling: it answers a query with two tiles. A query of the most
-    expensive kind gets further replies until the event `go` is set.
+    """Zenoh queryable (handler of queries) for tests of scheduling: it answers a query with two
+    tiles. A query of the most expensive kind gets further replies until the event `go` is set.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
@@ -180,7 +180,9 @@ class Half:
 
 @pytest.fixture
 def half(session: zenoh.Session) -> Iterator[Half]:
-    """Yield a queryable of the class `Half` that a client's queries reach."""
+    """Yield a Zenoh queryable (handler of queries) that answers with two tiles, when a client's
+    queries reach it.
+    """
     made = Half(session)
     declared = session.declare_queryable(made.key, made.queryable, complete=True)
     querier = session.declare_querier(made.key)
