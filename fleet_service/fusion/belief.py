@@ -71,8 +71,9 @@ def bias_kernel() -> FloatArray:
 
 
 def _kernel_diagonals() -> Float32Array:
-    """Return the diagonals of the bias kernel B (see `bias_kernel`), (2·REACH + 1, 32). In this
-    form the numbers that one step of a convolution reads are contiguous in memory.
+    """Return the diagonals of the bias kernel B (how one vehicle reads each road, see
+    `bias_kernel`), (2·REACH + 1, 32). In this form the numbers that one step of a convolution reads
+    are contiguous in memory.
     """
     kernel = bias_kernel()
     taps = np.zeros((2 * REACH + 1, _BINS), np.float32)
@@ -88,8 +89,8 @@ _TAPS: Final = _kernel_diagonals()
 
 @compiled
 def quantiles(belief: FloatArray, levels: tuple[float, ...]) -> FloatArray:
-    """Return the quantiles [μ] of beliefs (k, 32) at the given levels, (levels, k). The results
-    equal those of `mugrid.quantiles` bit for bit and take a tenth of the time.
+    """Return the quantiles of the friction μ of beliefs (k, 32) at the given levels, (levels, k).
+    The results equal those of `mugrid.quantiles` bit for bit and take a tenth of the time.
     """
     out = np.empty((len(levels), len(belief)))
     for k in range(len(belief)):
@@ -161,7 +162,7 @@ def largest_bin(p: Bins) -> float:
 
 @refcount_free_inlined
 def unpack_belief(belief: PackedArray, row: int, p: Bins) -> None:
-    """Unpack the stored belief in a row (16-bit integers) and fill `p` (32) with its
+    """Unpack the stored belief in a row (16-bit integers) and fill `p` (32,) with its
     probabilities.
     """
     whole = np.uint32(0)
@@ -184,8 +185,8 @@ def pack_belief(p: Bins, belief: PackedArray, row: int) -> None:
 
 @refcount_free_inlined
 def mix_prior(p: Bins, change: float, prior: Float32Array) -> None:
-    """Mix the prior into a belief in place: p ← (1 - h)·p + h·prior, where h = `change` is the
-    probability that the road changed.
+    """Mix the prior into a belief `p` (32,) in place: p ← (1 - h)·p + h·prior, where h = `change`
+    is the probability that the road changed.
     """
     h = np.float32(change)
     for i in range(_BINS):
@@ -229,9 +230,9 @@ def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -
 
 @refcount_free_inlined
 def kind_of(evidence: ByteArray) -> int:
-    """Return the kind of a visit's likelihood (32,): VALUE if it falls by at least VALUE_DROP_STEPS
-    from its maximum to the highest friction, so that it limits μ from above; else BOUND, because it
-    is only a lower bound of μ.
+    """Return the kind of a visit's likelihood (32,): VALUE (a measurement) if it falls by at least
+    VALUE_DROP_STEPS from its maximum to the highest friction, so that it limits μ from above; else
+    BOUND, because it is only a lower bound of μ.
     """
     least = np.uint8(255)
     for i in range(_BINS):
@@ -270,8 +271,8 @@ def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> No
 
 @refcount_free_inlined
 def apply_vote(p: Bins, likelihood: Bins, strength: float) -> None:
-    """Multiply a belief `p` (32) in place by the likelihood L̃ (32) of one visit with strength s in
-    [0, 1]: p ← p·(s·L̃ + 1 - s). The result is not normalised.
+    """Multiply a belief `p` (32) in place by the likelihood L̃ (32) of one visit (passage of the
+    cell) with strength s in [0, 1]: p ← p·(s·L̃ + 1 - s). The result is not normalised.
     """
     s = np.float32(strength)
     rest = np.float32(1.0 - strength)
@@ -307,7 +308,7 @@ def mean_of(likelihood: Bins) -> float:
 @refcount_free_inlined
 def describe_likelihood(likelihood: Bins, mean: float) -> tuple[float, float]:
     """Return the standard deviation of μ around `mean` and P(slippery), both under a uniform prior,
-    for a likelihood whose mean over the bins is 1.
+    for a likelihood (32) of friction whose mean over the bins is 1.
     """
     second = 0.0
     slippery = 0.0

@@ -1,5 +1,5 @@
-"""Likelihood of the friction μ from one visit. The sender reports a log-likelihood, or a posterior
-with interval, or only the grip used. Vectorised, pure.
+"""Likelihood of the friction μ from one visit (passage of a cell). The sender reports a
+log-likelihood, or a posterior with interval, or only the grip used. Vectorised, pure.
 
 Legend
     ℓ    log-likelihood on the friction grid, maximum 0        (n, 32), nats
@@ -78,9 +78,9 @@ def bound_by_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
 
 @cache
 def _levelled_bounds() -> ByteArray:
-    """Return a table of log-likelihoods for visits that give only a lower bound, (m, 32), in steps
-    of 1/16 nat. Row k is for the grip used k·_USED_STEP, up to UTILISED_MOST. `level_above_used`
-    has been applied.
+    """Return a table of log-likelihoods for visits (passages of a cell) that give only a lower
+    bound of friction, (m, 32), in steps of 1/16 nat. Row k is for the grip used k·_USED_STEP, up to
+    UTILISED_MOST. The part above the grip used is already flat (`level_above_used`).
     """
     used = np.arange(0.0, c.UTILISED_MOST + 0.5 * _USED_STEP, _USED_STEP)
     return level_above_used(mugrid.encode_log_likelihood(at_least(used)), used)
@@ -125,8 +125,8 @@ def _level_rows(steps: ByteArray, used: FloatArray) -> None:
 
 
 def at_least(used: FloatArray) -> FloatArray:
-    """Return the log-likelihoods (n, 32) of lower bounds: ln Φ((μ - u) / σ_u), where u is the grip
-    used and σ_u its standard deviation. They are flat if u is NaN.
+    """Return the log-likelihoods (n, 32) of lower bounds of friction: ln Φ((μ - u) / σ_u), where u
+    is the grip used and σ_u its standard deviation. They are flat if u is NaN.
     """
     known_use = np.minimum(np.nan_to_num(used, nan=-np.inf), c.UTILISED_MOST)[:, None]
     std = np.hypot(c.UTILISED_STD, c.UTILISED_RELATIVE * np.maximum(known_use, 0.0))

@@ -30,7 +30,7 @@ Legend
     n      belief about the road of a neighbour from its own reports                       (32,)
     s      P(slippery) of n
     p₀     prior of an unmeasured road of the region                                      (32,)
-    K      shared kernel, see `shared`                                                    (32, 32)
+    K      shared kernel, maps measured friction to that of the road, see `shared`        (32, 32)
     d      distance in cells; 1 to the cell of the other direction
 """
 
@@ -204,7 +204,7 @@ def _stored_slippery(live: Rows, row: int) -> float:
 @refcount_free
 def _age_belief(live: Rows, weather: Weather, slot: int, now: int, scratch: Bins) -> int:
     """Age the belief about a slot (cell and sector) to `now` [ns] and write it to `scratch`. Return
-    the row number of its region's prior.
+    the row number of the prior that the weather of its region gives.
     """
     cells = live.cells
     p = scratch[P]

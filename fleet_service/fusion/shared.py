@@ -148,7 +148,8 @@ def base_kernel() -> FloatArray:
 def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
     """Return the kernel K, (32, 32): row i is the distribution of the vehicles' reading on a road
     of friction bin i. Its standard deviation is `below` (32,) [μ] for readings that are too low,
-    and `above` (32,) [μ] for readings that are too high.
+    and `above` (32,) [μ] for readings that are too high. K maps measured friction to that of the
+    road.
     """
     away = mugrid.CENTRES[None, :] - mugrid.CENTRES[:, None]
     kernel = np.exp(-0.5 * np.square(away / np.where(away < 0.0, below[:, None], above[:, None])))
@@ -156,9 +157,9 @@ def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
 
 
 def _kernel_table(slope: float) -> Float32Array:
-    """Return all kernels (distributions of the error that the reports of a cell share) for one
-    learned slope (see `shared_kernel`), (kernels, 32, 32); `kernel_of` gives the index. Each kernel
-    is transposed, so that the 32 bins of one belief are contiguous in memory.
+    """Return all kernels (maps from a belief about measured friction to one about the road) for one
+    learned slope (error per unit of unused grip), (kernels, 32, 32); `kernel_of` gives the index.
+    Each kernel is transposed, so that the 32 bins of one belief are contiguous in memory.
     """
     rows = [
         shared_kernel((row + 0.5) * USED_STEP, kinds, stated, slope).T
@@ -174,8 +175,8 @@ KERNELS: Final = tuple(_kernel_table(slope) for slope in SHAPES)
 
 
 def shape_class(slope: float) -> int:
-    """Return the index of the number in SHAPES (the slopes for which kernels are stored) that is
-    nearest to a given slope.
+    """Return the index of that slope in SHAPES which is nearest to `slope`; kernels are stored for
+    these slopes (error of a value per unit of unused grip).
     """
     away = [abs(shape - slope) for shape in SHAPES]
     return away.index(min(away))

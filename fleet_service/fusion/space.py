@@ -1,5 +1,5 @@
-"""Position error of a visit: it spreads the visit over the cells before and behind. Vectorised,
-pure.
+"""Position error of a visit (passage of a cell): it spreads the visit over the cells before and
+behind. Vectorised, pure.
 
 Legend
     σ      standard deviation of the position along the heading     (n,), m
@@ -32,8 +32,8 @@ _STEPS: Final = np.array([k for k in range(-c.SPREAD_CELLS, c.SPREAD_CELLS + 1) 
 def other_cells(
     cell: IntArray, latitude: FloatArray, yaw: FloatArray, position_std: FloatArray
 ) -> tuple[IntArray, Float32Array]:
-    """Return the other cells in which the vehicles of visits (n,) may have been, and the
-    probability of each; both arrays are (n, 2·SPREAD_CELLS).
+    """Return the other cells in which the vehicles of n visits (passages of a cell) may have been,
+    and the probability of each; both arrays are (n, 2·SPREAD_CELLS).
 
     An item is -1 with probability 0 in three cases: the probability is below SPREAD_LEAST, yaw or
     the standard deviation is unknown, or the other cell lies in another region, which another

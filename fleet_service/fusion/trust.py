@@ -161,16 +161,16 @@ def _note_shape(
 
 @refcount_free
 def _own_variance(mean: float, std: float) -> float:
-    """Return the relative variance of a reported value, without the part that the vehicle's
-    constant bias contributes.
+    """Return the relative variance of a reported friction value, without the part that the
+    vehicle's constant bias contributes.
     """
     return max((std / max(mean, mugrid.LOWER)) ** 2 - c.BIAS_RELATIVE**2, _LEAST_VARIANCE)
 
 
 @refcount_free
 def _pair_rank(vehicle: int, other: int) -> int:
-    """Return a fixed pseudo-random number of a pair of vehicles. It depends on the two vehicle
-    numbers and not on their order of arrival.
+    """Return a fixed pseudo-random number of two vehicles, by which pairs are ranked. It depends on
+    the two vehicle numbers and not on their order of arrival.
 
     A vehicle's table of other vehicles has only PEERS places. If two others compete for a place,
     the pair with the lower number keeps it. So a vehicle that was met rarely is as likely to be
@@ -208,8 +208,8 @@ def _record_meeting(
 def compute_vote_weights(
     peers: RecordArray, before: VoteWeights, epoch: int, *, enrolled: bool
 ) -> VoteWeights:
-    """Return the vote weights of the vehicles (V,) from `epoch` on, from their agreement with other
-    vehicles. `before` contains the earlier weights of these other vehicles.
+    """Return the vote weights (trust) of the vehicles (V,) from the minute `epoch` on, from their
+    agreement with other vehicles. `before` contains the earlier weights of these other vehicles.
 
     In an established service, a vehicle that has met few trusted vehicles is a newcomer with less
     weight. If only `enrolled` vehicles are fused, no vehicle can take a new name, so there are no
@@ -226,8 +226,8 @@ def compute_vote_weights(
 def _update_weights(
     peers: RecordArray, before: Float32Array, out: Float32Array, enrolled: bool
 ) -> bool:
-    """Fill `out` (V,) with the new weights of the vehicles, computed from the earlier weights
-    `before`. Return True if the service is established, so that newcomers get less weight.
+    """Fill `out` (V,) with the new weights (trust) of the vehicles, computed from the earlier
+    weights `before`. Return True if the service is established, so that newcomers get less weight.
     """
     known = np.empty(len(out), np.bool_)
     trusted = 0

@@ -200,9 +200,9 @@ def update(
     weather: Weather,
     scratch: Bins,
 ) -> None:
-    """Update the state of a cell, row `row`, with one entry (an observation), whose likelihood is
-    in `scratch`. `sources` is the row of the list of vehicles that recently reported ice or grip in
-    this cell.
+    """Update the state of a cell, row `row`, with the effect of one entry (an observation), whose
+    likelihood is in `scratch`. `sources` is the row of the list of vehicles that recently reported
+    ice or grip in this cell.
     """
     belief = rows.belief
     cells = rows.cells
@@ -385,8 +385,8 @@ def _untrusted_weight(
 
 @refcount_free
 def _note_source(reporters: RecordArray, row: int, side: int, vehicle: int, time: int) -> None:
-    """Record that a vehicle reported ice or grip (`side`) in a cell at a time. The record replaces
-    the vehicle's earlier one, or else the oldest one in the cell's list.
+    """Record that a vehicle reported ice or grip (`side`) in a cell at the time `time` [ns]. The
+    record replaces the vehicle's earlier one, or else the oldest one in the cell's list.
     """
     source = reporters[row].source
     source_time = reporters[row].source_time

@@ -90,8 +90,8 @@ class Weather(NamedTuple):
 
 
 def report_rates(reports: Reports) -> FloatArray:
-    """Return factors on the rates of drift and of change for each weather report, (n, 2); 1 where
-    the weather is unknown.
+    """Return, for each weather report, factors on the rates at which friction drifts and at which
+    roads change suddenly, (n, 2); 1 where the weather is unknown.
     """
     road = np.where(
         np.isnan(reports.road_temperature),
@@ -111,7 +111,9 @@ def report_rates(reports: Reports) -> FloatArray:
 
 
 def report_priors(reports: Reports) -> Float32Array:
-    """Return the prior of each weather report, (n, 32), mixed with a share of the uniform prior."""
+    """Return the belief about an unmeasured road that each weather report gives, (n, 32), mixed
+    with a share of the uniform prior.
+    """
     given = np.where(np.isnan(reports.prior), mugrid.PRIOR, reports.prior)
     given = given / given.sum(axis=1, keepdims=True)
     mixed: FloatArray = UNIFORM_SHARE * mugrid.PRIOR + (1.0 - UNIFORM_SHARE) * given
