@@ -97,7 +97,8 @@ def combined_dugoff(
     slip: tuple[float, float], stiffness: tuple[float, float], mu: float, load: float
 ) -> tuple[float, float]:
     """Return the forces (Fx, Fy) [N] of one wheel in its own frame, from its slip in both
-    directions, by similarity with the Dugoff curve. The arguments are as in `combined_magic`.
+    directions, by similarity with the Dugoff curve. slip (longitudinal, tangent of the slip angle)
+    [1], stiffness (longitudinal [N], lateral [N/rad]), mu [1], load [N].
 
     The curve of the normalised slip theta is theta up to one half, where the force is stiffness
     times slip, then 1 - 1/(4*theta). It has no falling branch.

@@ -58,10 +58,11 @@ def update_by_downdate(
     measurement: Measurement,
     work: FloatArray,
 ) -> tuple[int, float, float, bool]:
-    """Run the measurement update in place as in paper 003: the covariance factor is reduced by the
-    columns of the gain times the root of the innovation covariance, one after the other.
+    """Run the measurement update in place as in paper 003: the covariance factor is downdated (its
+    covariance is reduced) by one column per measurement.
 
-    Arguments as in `householder.update`. Return the same values, and True if a downdate was refused
+    The arguments are those of `householder.update`. Return number of measurements used,
+    log-likelihood [nat], squared innovation over its covariance, and True if a downdate was refused
     because the result would not be a covariance. In that case `householder.update`, which cannot
     fail, performs the step instead.
     """

@@ -88,8 +88,8 @@ class Queries:
     def measure_answer(
         self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None
     ) -> AnswerSize:
-        """Return an upper bound of an answer's size, as number of cells and number of tiles; errors
-        as for `answer`.
+        """Return an upper bound of an answer's size, as number of cells and number of tiles. `only`
+        is the only possible tile if the query's key names one.
         """
         return size_asked(self._shared.tiles, query, wanted, only)
 

@@ -178,7 +178,7 @@ class SegmentLog(Generic[Batch]):
         became durable. Each batch is returned once.
 
         Raises:
-            OSError: the same as for `end`.
+            OSError: the disk is full or broken; rows that are not durable wait for the next write.
         """
         durable = self.end()
         self._next.batches[:0] = durable  # they are reported with the rest, which may fail

@@ -83,7 +83,7 @@ class Fusion:
             full weight.
 
     Attributes:
-        enrolled: the argument of that name.
+        enrolled: True if only vehicles of an enrolment file are fused.
         store: cells, recent observations per cell, records per vehicle and cell, and vehicles.
         vote_weights: weights of the vehicles' votes, one record per epoch, the oldest first.
         reports: weather reports that a later update may still need.

@@ -37,8 +37,9 @@ class Evidence(NamedTuple):
 
 
 def as_reported(steps: NDArray[Any]) -> Evidence:
-    """Return two arrays: log-likelihoods (n, 32) in steps, shifted so that the smallest step is 0;
-    and mean, standard deviation and P(slippery) of each (n, 3), NaN for lower bounds.
+    """Return two arrays for n received log-likelihoods `steps` (n, 32): the same in steps below the
+    maximum, which is 0; and the mean, standard deviation and P(slippery) of each (n, 3), NaN for
+    one that is only a lower bound.
     """
     out = steps.astype(np.uint8)
     reported = np.full((len(steps), 3), np.nan, np.float32)

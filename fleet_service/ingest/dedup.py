@@ -155,8 +155,8 @@ class SequenceTrackers:
 
     def columns(self) -> tuple[dict[str, IntArray], IntArray]:
         """Return two items: all streams as columns (n,), and the accepted sequence numbers above
-        the watermarks (see module) of all streams in one array. The column `above` is the number of
-        items of this array that belong to each stream.
+        the watermarks (numbers up to which no batch is expected any more) of all streams in one
+        array. The column `above` is the number of items of this array that belong to each stream.
         """
         streams = list(self._streams.values())
         above = [sorted(stream.seen) for stream in streams]

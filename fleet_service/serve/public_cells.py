@@ -56,7 +56,7 @@ class PublicCells:
             start.
 
     Attributes:
-        visitors: the argument of that name.
+        visitors: recent vehicles per cell.
     """
 
     def __init__(

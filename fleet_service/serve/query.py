@@ -62,7 +62,8 @@ def size_asked(
     cache: TileCache, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None
 ) -> AnswerSize:
     """Return an upper bound of the size of a query's answer: that of all tiles that must be read.
-    Arguments and errors are the same as for `answer_query`.
+    `cache` contains the tiles, `wanted` returns True for tiles that match the query's key, and
+    `only` is the only such tile if there is one.
     """
     route = keys_along(query.route) if query.route else None
     tiles = [

@@ -92,9 +92,9 @@ def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt:
 
 @compiled
 def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int, dt: float) -> None:
-    """Advance by `dt` [s] the limit that ABS sets to the brake torque of wheel `i`: reduce, hold or
-    increase it, as the module describes. `x` is the vehicle's state, which is changed, `p` its
-    parameters, `u` the inputs and `w` the forces and slips of the wheels.
+    """Advance by `dt` [s] the limit that ABS sets to the brake torque of wheel `i`: reduce it while
+    the wheel slips too much, else hold or increase it. `x` is the vehicle's state, which is
+    changed, `p` its parameters, `u` the inputs and `w` the forces and slips of the wheels.
     """
     asked = u[Control.BRAKE, i] + x[Motion.HELD + i]
     limit = slip_limit(p, i)

@@ -257,8 +257,8 @@ def _lane_table(lane: FloatArray) -> FloatArray:
 def _plan_speeds(
     tables: list[FloatArray], limits: list[FloatArray], ways: list[list[int]], spacing: FloatArray
 ) -> None:
-    """Compute the speed profiles (v²/q, see module) of all lanes: backwards from their ends,
-    repeatedly until nothing changes.
+    """Compute the speed profiles of all lanes (v²/q: squared speed over the acceleration that the
+    driver accepts): backwards from their ends, repeatedly until nothing changes.
 
     At each point, a driver brakes at most with the part of the accepted acceleration that cornering
     leaves.

@@ -25,7 +25,8 @@ def optimise(
     progress: Progress | None = None,
 ) -> Result:
     """Search for the vector with the largest objective, with ants·iterations evaluations one after
-    the other. Arguments and result are the same as for the colonies.
+    the other. `ants` times `iterations` is the number of evaluations, as in the colonies; the
+    result is the best vector.
     """
     tally = SearchTally(problem)
     begin = tally.uniform(rng) if problem.start is None else np.asarray(problem.start, float)

@@ -16,8 +16,8 @@ def optimise(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> Result:
-    """Return the best of `ants`·`iterations` uniform draws. Arguments and result are the same as
-    for the ant colony.
+    """Return the best of `ants`·`iterations` vectors that are drawn uniformly from the possible
+    values; `progress` is called after each iteration.
     """
     graph = Graph.from_choices(problem.choices)
     ledger = Ledger(problem.objective, graph, problem.admissible)

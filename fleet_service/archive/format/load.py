@@ -138,15 +138,17 @@ def load_groups(
     take: Callable[[pa.Table], None],
     damaged: Damaged = skip_damaged,
 ) -> bool:
-    """Read a file like `load`, but pass the matching rows to `take`, one Parquet row group at a
-    time.
+    """Read a file of the archive, and pass its rows that match `where` to `take`, one Parquet row
+    group (part of the file) at a time.
 
     This saves memory: reading a complete file takes several times the memory of its rows. In a row
     group without a matching row, only the columns of `where` are read. The result is False if the
     file is damaged; the caller must then discard the rows passed to `take`.
 
     Raises:
-        the same errors as `load`.
+        FileNotFoundError: the file no longer exists.
+        InputError: the file has a newer major version.
+        OSError: the file cannot be read.
     """
     known = pa.schema([schema.field(name) for name in columns])
 
@@ -199,7 +201,9 @@ def read_content(path: Path, damaged: Damaged = skip_damaged) -> Content | None:
     damaged.
 
     Raises:
-        the same errors as `load`.
+        FileNotFoundError: the file no longer exists.
+        InputError: the file has a newer major version.
+        OSError: the file cannot be read.
     """
     return _read_verified(path, lambda file: file.read(), damaged)
 

@@ -103,7 +103,10 @@ class Listing:
     (sorted) files, which are read later.
 
     Args:
-        the same as for `read_tables` and `read_wanted`.
+        root: folder of the archive.
+        kind: observations or states.
+        wanted: selection of rows.
+        damaged: called with each damaged file.
     """
 
     def __init__(

@@ -176,12 +176,14 @@ def forget_vehicle(root: Path, vehicle: str, month: str) -> ErasureResult:
 
 @contextmanager
 def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]:
-    """Remove a vehicle's data from the files, as `forget_vehicle` does, while a service may write
-    new rows. Only rows that exist at the beginning are removed. This is a context manager, which
-    yields the result; no compaction can run until its block ends.
+    """Remove the rows of one vehicle in one month, and all derived data that could reveal them,
+    from the files, while a service may write new rows. Only rows that exist at the beginning are
+    removed. This is a context manager, which yields the result; no compaction can run until its
+    block ends.
 
     Raises:
-        the same errors as `forget_vehicle`, except for a running service.
+        InputError: the month's key does not exist.
+        OSError: a file cannot be read or written.
     """
     key_of(root, month)
     compact(root)
