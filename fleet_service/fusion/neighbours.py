@@ -79,6 +79,13 @@ def next_cell(cell: int, heading: int) -> int:
     return x | y
 
 
+@refcount_free_inlined
+def _write_message(message: FloatArray, weight: float, road: FloatArray, prior: FloatArray) -> None:
+    """Write the factors (32,) by which a neighbour with the belief `road` changes a belief."""
+    for i in range(_BINS):
+        message[i] = 1.0 - weight + weight * road[i] / prior[i]
+
+
 @compiled
 def road_beliefs(
     live: Rows,
@@ -115,11 +122,10 @@ def road_beliefs(
             most = 0.0
             there = cell
             for step in range(1, c.NEIGHBOURS + 1):
-                if (
-                    side == 2
-                ):  # the other direction: of the same cell, or of the one to the left or right
-                    if step > 3:
-                        break
+                if side == 2 and step > 3:
+                    break
+                # the other direction: of the same cell, or of the one to the left or right
+                if side == 2:
                     there = (
                         cell
                         if step == 1
@@ -133,9 +139,9 @@ def road_beliefs(
                 if row == NONE or live.cells[row].vehicles == 0:
                     continue
                 kept = _stored_slippery(live, row)
+                if kept < _ASKED and side < 2 and kept < c.NEIGHBOUR_GRIP:
+                    break
                 if kept < _ASKED:
-                    if side < 2 and kept < c.NEIGHBOUR_GRIP:
-                        break
                     continue
                 _age_belief(live, weather, row, now[k], scratch)
                 read_road(kernels, live.cells, row, scratch[P], road)
@@ -143,8 +149,7 @@ def road_beliefs(
                 weight = _KEPT[1 if side == 2 else step] * (slippery - unknown) / (1.0 - unknown)
                 if weight > most:
                     most = weight
-                    for i in range(_BINS):
-                        message[i] = 1.0 - weight + weight * road[i] / weather.prior[prior, i]
+                    _write_message(message, weight, road, weather.prior[prior])
             if most > 0.0:
                 informative = True
                 for i in range(_BINS):

@@ -5,7 +5,7 @@ much of a vote is new information, and updates the cell. Compiled.
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -190,20 +190,28 @@ def _novel_share(kind: int, mean: float, std: float, new_mean: float, new_std: f
     return min(max(share, 0.0), 1.0)
 
 
+class CellPlace(NamedTuple):
+    """Rows of one cell in `Rows`: of its state, and of the list of vehicles that recently reported
+    ice or grip in it.
+    """
+
+    row: int
+    sources: int
+
+
 @refcount_free
 def update(
     rows: Rows,
-    row: int,
-    sources: int,
+    place: CellPlace,
     entries: RecordArray,
     entry: int,
     weather: Weather,
     scratch: Bins,
 ) -> None:
-    """Update the state of a cell, row `row`, with the effect of one entry (an observation), whose
-    likelihood is in `scratch`. `sources` is the row of the list of vehicles that recently reported
-    ice or grip in this cell.
+    """Update the state of a cell with the effect of one entry (an observation), whose likelihood is
+    in `scratch`.
     """
+    row, sources = place
     belief = rows.belief
     cells = rows.cells
     time = entries[entry].time

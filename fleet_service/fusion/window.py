@@ -36,6 +36,7 @@ from fleet_service.fusion.store.table import AHEAD, first_place
 from fleet_service.fusion.trust import compare_reports, judge_flag
 from fleet_service.fusion.votes import (
     SCRATCH,
+    CellPlace,
     describe_vote,
     discount_vote,
     load_likelihood,
@@ -74,12 +75,14 @@ class Votes(NamedTuple):
     """Votes of a batch, arrays of shape (k,). A vote is the effect of one observation on one cell:
     row of the observation, slot (cell and sector), and P(the vehicle was in this cell).
 
-    Among the votes of one observation, the vote for its own cell comes first.
+    Among the votes of one observation, the vote for its own cell comes first. At most `most`
+    observations of a vehicle may wait in one cell.
     """
 
     row: IntArray
     slot: IntArray
     share: Float32Array
+    most: int
 
 
 class Marks(NamedTuple):
@@ -93,9 +96,7 @@ class Marks(NamedTuple):
     stale: Int32Array
 
 
-def absorb_votes(
-    state: State, weather: Weather, arrivals: Arrivals, votes: Votes, most: int
-) -> BoolArray:
+def absorb_votes(state: State, weather: Weather, arrivals: Arrivals, votes: Votes) -> BoolArray:
     """Add the votes of a batch (effects of its observations on cells) to the lateness windows
     (recent observations, sorted by time) of their cells, and update the beliefs.
 
@@ -107,7 +108,7 @@ def absorb_votes(
     k = len(votes.row)
     marks = Marks(np.zeros(n, np.bool_), np.zeros(n, np.bool_), np.empty(k, np.int32))
     scratch = np.zeros((3, SCRATCH), np.float32)
-    waiting = _absorb_votes(state, weather, arrivals, votes, most, marks, scratch)
+    waiting = _absorb_votes(state, weather, arrivals, votes, marks, scratch)
     _recompute_beliefs(state, weather, marks.stale[:waiting], scratch)
     return marks.left_out
 
@@ -118,7 +119,6 @@ def _absorb_votes(
     weather: Weather,
     arrivals: Arrivals,
     votes: Votes,
-    most: int,
     marks: Marks,
     scratch: Bins,
 ) -> int:
@@ -139,7 +139,7 @@ def _absorb_votes(
         if marks.left_out[row]:
             continue
         pair = pair_of(pairs, state.used, slot, arrivals.vehicle[row])
-        if not marks.seen[row] and pairs[pair].waiting >= most:
+        if not marks.seen[row] and pairs[pair].waiting >= votes.most:
             marks.left_out[row] = True
             continue
         marks.seen[row] = True
@@ -162,7 +162,8 @@ def _absorb_votes(
             waiting += 1
             continue
         discount_vote(entries, pairs, entry)
-        update(state.live, slot, cells[slot].reporters, entries, entry, weather, scratch)
+        place = CellPlace(slot, cells[slot].reporters)
+        update(state.live, place, entries, entry, weather, scratch)
     return waiting
 
 
@@ -275,16 +276,23 @@ def _recompute_beliefs(state: State, weather: Weather, stale: Int32Array, scratc
         while entry != NONE:
             discount_vote(entries, state.pairs, entry)
             load_likelihood(entries, entry, scratch)
-            update(live, slot, reporters, entries, entry, weather, scratch)
+            place = CellPlace(slot, reporters)
+            update(live, place, entries, entry, weather, scratch)
             entry = entries[entry].following
         windows[window].stale = 0
+
+
+class VehicleRecords(NamedTuple):
+    """Records of all vehicles: comparisons with other vehicles, and permanent numbers."""
+
+    peers: RecordArray
+    names: RecordArray
 
 
 def commit_windows(
     state: State,
     weather: Weather,
-    peers: RecordArray,
-    names: RecordArray,
+    vehicles: VehicleRecords,
     due_windows: IntArray,
     before: int,
 ) -> None:
@@ -292,9 +300,8 @@ def commit_windows(
     windows (k,), one after the other. Older observations are moved from the window into the base,
     the cell's final state.
     """
-    _commit_windows(
-        state, weather, peers, names, due_windows, before, np.zeros((3, SCRATCH), np.float32)
-    )
+    scratch = np.zeros((3, SCRATCH), np.float32)
+    _commit_windows(state, weather, vehicles, due_windows, before, scratch)
 
 
 @refcount_free_inlined
@@ -333,12 +340,12 @@ def _prefetch_due(state: State, due_windows: IntArray, begin: int, end: int) -> 
 def _commit_windows(
     state: State,
     weather: Weather,
-    peers: RecordArray,
-    names: RecordArray,
+    vehicles: VehicleRecords,
     due_windows: IntArray,
     before: int,
     scratch: Bins,
 ) -> None:
+    peers, names = vehicles
     live = state.live
     windows = state.windows
     entries = state.entries
@@ -352,7 +359,8 @@ def _commit_windows(
         while entry != NONE and entries[entry].time < before:
             if not whole:
                 load_likelihood(entries, entry, scratch)
-                update(state.base, window, window, entries, entry, weather, scratch)
+                place = CellPlace(window, window)
+                update(state.base, place, entries, entry, weather, scratch)
             if entries[entry].limited > 0:
                 judge_flag(live.reporters, live.cells[slot].reporters, peers, entries, entry)
             if entries[entry].kind == VALUE:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -113,6 +113,19 @@ class SequenceTracker:
 BatchId = tuple[SequenceTracker, int]  # and seq
 
 
+class ArchivedRows(NamedTuple):
+    """Columns (n,) of archived rows that identify their batches; `time` [ns] is the time of each
+    record.
+    """
+
+    vehicle: IntArray
+    boot: IntArray
+    region: IntArray
+    seq: IntArray
+    first_held: IntArray
+    time: IntArray
+
+
 class SequenceTrackers:
     """Accepted batches of all streams (vehicle, start, kind, region) of one service."""
 
@@ -205,16 +218,12 @@ class SequenceTrackers:
     def restore(
         self,
         kind: Kind,
-        vehicle: IntArray,
-        boot: IntArray,
-        region: IntArray,
-        seq: IntArray,
-        first_held: IntArray,
-        time: IntArray,
+        rows: ArchivedRows,
     ) -> None:
         """Record the batches of archived rows of one kind, (n,), as accepted; rows may be in any
-        order. `time` [ns] is the time of each record.
+        order.
         """
+        vehicle, boot, region, seq, first_held, time = rows
         if not len(seq):
             return
         group, first = group_rows(vehicle, boot, region)
@@ -230,9 +239,8 @@ class SequenceTrackers:
         for stream, least, last in zip(streams, held, newest, strict=True):
             stream.raise_to(least)
             stream.newest = max(stream.newest, last)
-        above = np.flatnonzero(
-            seq > np.array([stream.low for stream in streams])[group]
-        )  # few: senders hold little
+        # few: senders hold little
+        above = np.flatnonzero(seq > np.array([stream.low for stream in streams])[group])
         above = above[np.lexsort((seq[above], group[above]))]
         starts = np.flatnonzero(np.diff(group[above], prepend=-1))
         for start, stop in pairwise([*starts.tolist(), len(above)]):

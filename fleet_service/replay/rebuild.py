@@ -24,7 +24,7 @@ from fleet_service.archive.identity.pseudonyms import pseudonym_number
 from fleet_service.fusion import Fusion, Observations, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.fuse import RecordedResult
-from fleet_service.ingest.dedup import SequenceTrackers
+from fleet_service.ingest.dedup import ArchivedRows, SequenceTrackers
 from fleet_service.ingest.weather import archived_reports
 from schemas import grid
 from schemas.errors import InputError
@@ -101,9 +101,9 @@ def restore_streams(
                 table[name].to_numpy() for name in (*IDENTITY[1:], "first_held")
             )
             time = segments.to_nanoseconds(table[first])
-            streams.restore(
-                kind, pseudonym_numbers(table["vehicle"]), boot, region, seq, first_held, time
-            )
+            vehicle = pseudonym_numbers(table["vehicle"])
+            rows = ArchivedRows(vehicle, boot, region, seq, first_held, time)
+            streams.restore(kind, rows)
 
 
 def pseudonym_numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:

@@ -4,14 +4,18 @@ tables and pools that grow. Compiled code receives all arrays as one `State`.
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
-
 import numpy as np
-from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.store.cells import Cells, cells_of, no_beliefs, rows_of_lines
-from fleet_service.fusion.store.pairs import count_staying, mark_returned, move_pairs
+from fleet_service.fusion.store.growth import (
+    grow_entries,
+    grow_rows,
+    grow_windows,
+    no_pairs,
+    rebuild_pairs,
+    rebuild_reporters,
+)
 from fleet_service.fusion.store.records import (
     CELL,
     ENTRY,
@@ -19,7 +23,6 @@ from fleet_service.fusion.store.records import (
     FREE_WINDOWS,
     NOBODY,
     NONE,
-    PAIR,
     PAIRS,
     PEER,
     REPORTER,
@@ -27,7 +30,6 @@ from fleet_service.fusion.store.records import (
     SOURCE,
     VEHICLE,
     WINDOW,
-    Int32Array,
     Rows,
     State,
 )
@@ -37,7 +39,6 @@ from fleet_service.fusion.store.table import (
     ROWS_MOST,
     assign_rows,
     is_full,
-    places_for,
     rows_of,
     slots_for,
     table_of,
@@ -71,7 +72,7 @@ class Store:
             free_windows=_NOTHING,
             entries=np.zeros(0, ENTRY),
             free_entries=_NOTHING,
-            pairs=_no_pairs(LEAST),
+            pairs=no_pairs(LEAST),
             used=np.zeros(4, np.int64),
         )
         self.peers = no_peers(0)
@@ -154,7 +155,7 @@ class Store:
             live = self.state.live
             rows = max(most, 2 * len(self.state.live.cells))
             live = live._replace(
-                belief=_grow_rows(live.belief, rows), cells=_grow_rows(live.cells, rows)
+                belief=grow_rows(live.belief, rows), cells=grow_rows(live.cells, rows)
             )
             self.state = self.state._replace(live=live)
         slots[new], self.size = slots_for(self._slots, self.state.live, keys[new], self.size)
@@ -178,7 +179,7 @@ class Store:
             self._known = table_of(self.names, self.vehicles, most)
         if most > len(self.names):
             rows = max(most, 2 * len(self.names))
-            self.names = _grow_rows(self.names, rows)
+            self.names = grow_rows(self.names, rows)
             peers = no_peers(rows)
             peers[: len(self.peers)] = self.peers
             self.peers = peers
@@ -191,35 +192,18 @@ class Store:
         """
         used = self.state.used
         if used[FREE_ENTRIES] < rows:
-            self._more_entries(self.waiting + rows)
+            self.state = grow_entries(self.state, self.waiting + rows)
         if used[FREE_WINDOWS] < rows:
-            self._more_windows(len(self.state.free_windows) - int(used[FREE_WINDOWS]) + rows)
+            most = len(self.state.free_windows) - int(used[FREE_WINDOWS]) + rows
+            self.state = grow_windows(self.state, most)
         live = self.state.live
         if used[REPORTERS_USED] + rows > len(live.reporters):
             most = max(int(used[REPORTERS_USED]) + rows, 2 * len(live.reporters))
             self.state = self.state._replace(
-                live=live._replace(reporters=_grow_rows(live.reporters, most))
+                live=live._replace(reporters=grow_rows(live.reporters, most))
             )
         if is_full(int(used[PAIRS]) + rows, len(self.state.pairs), PAIRS_MOST):
-            self._rebuild_pairs(0, int(used[PAIRS]) + rows)
-
-    def _more_entries(self, most: int) -> None:
-        entries = _grow_rows(self.state.entries, max(2 * len(self.state.entries), most))
-        free = _free_rows(self.state.free_entries, self.state.used, FREE_ENTRIES, len(entries))
-        self.state = self.state._replace(entries=entries, free_entries=free)
-
-    def _more_windows(self, most: int) -> None:
-        old = self.state
-        rows = max(2 * len(self.state.windows), most)
-        windows = _grow_rows(old.windows, rows)
-        windows["slot"][len(old.windows) :] = NONE
-        base = Rows(
-            _grow_rows(old.base.belief, rows),
-            _grow_rows(old.base.cells, rows),
-            _grow_rows(old.base.reporters, rows),
-        )
-        free = _free_rows(old.free_windows, old.used, FREE_WINDOWS, rows)
-        self.state = old._replace(windows=windows, base=base, free_windows=free)
+            self.state = rebuild_pairs(self.state, self.names, 0, int(used[PAIRS]) + rows)
 
     def forget(self, checkpoint_s: int) -> None:
         """Delete old data, once per quarter of an hour of the checkpoint time: records of a vehicle
@@ -229,8 +213,8 @@ class Store:
         now = checkpoint_s - checkpoint_s % c.FORGOTTEN_EVERY_S
         if now != self.forgotten_at:
             self.forgotten_at = now
-            self._rebuild_pairs(now, 0)
-            self._rebuild_reporters(now - _HOUR - _AHEAD)
+            self.state = rebuild_pairs(self.state, self.names, now, 0)
+            self.state = rebuild_reporters(self.state, self.size, now - _HOUR - _AHEAD)
 
     def untouched(self, before: int) -> BoolArray:
         """Return a mask of slots (cells and sectors), (size,): True if the last visit of a vehicle
@@ -260,39 +244,8 @@ class Store:
             pointing[used] = place[pointing[used]]
         self.size = len(stay)
         self._slots = table_of(cells, self.size, self.size)
-        self._rebuild_pairs(0, 0)
+        self.state = rebuild_pairs(self.state, self.names, 0, 0)
         return place
-
-    def _rebuild_pairs(self, now: int, most: int) -> None:
-        """Delete the pair records (one per vehicle and cell) that are not remembered at `now` [s],
-        and make room for `most` pair records.
-        """
-        state = self.state
-        old = state.pairs
-        count = count_staying(old, now)
-        new = _no_pairs(places_for(max(count, most), PAIRS_MOST))
-        dropped = move_pairs(state.entries, old, new, now)
-        mark_returned(state, old["slot"][dropped], self.names["key"][old["vehicle"][dropped]])
-        state.used[PAIRS] = count
-        self.state = state._replace(pairs=new)
-
-    def _rebuild_reporters(self, least: int) -> None:
-        """Delete lists of recent reporters whose last report was before `least` [s]. Cells with
-        observations that are not yet final keep their lists.
-        """
-        live = self.state.live
-        cells = self.state.live.cells[: self.size]
-        slots = np.flatnonzero(cells["reporters"] != NONE)
-        row = cells["reporters"][slots]
-        old = live.reporters
-        last = np.maximum(
-            old["time"].max(axis=1, initial=0), old["source_time"].max(axis=(1, 2), initial=0)
-        )
-        stay = (last[row] >= least) | (cells["window"][slots] != NONE)
-        cells["reporters"][slots] = NONE
-        cells["reporters"][slots[stay]] = np.arange(stay.sum())
-        self.state.used[REPORTERS_USED] = stay.sum()
-        self.state = self.state._replace(live=live._replace(reporters=old[row[stay]]))
 
 
 @compiled
@@ -333,31 +286,3 @@ def distinct_values(values: IntArray) -> IntArray:
     return np.asarray(
         ordered[np.append(np.ones(len(ordered[:1]), bool), ordered[1:] != ordered[:-1])]
     )
-
-
-def _no_pairs(places: int) -> RecordArray:
-    pairs = rows_of_lines(places, PAIR)
-    pairs["slot"] = NONE
-    return pairs
-
-
-Array = TypeVar("Array", bound=NDArray[Any])
-
-
-def _grow_rows(old: Array, rows: int) -> Array:
-    new = rows_of_lines(rows, old.dtype, *old.shape[1:])
-    new[: len(old)] = old
-    return new  # type: ignore[return-value] # of the very type of `old`
-
-
-def _free_rows(old: Int32Array, used: IntArray, which: int, rows: int) -> Int32Array:
-    """Return the list of free rows of an array of records that has grown to `rows`: the earlier
-    free rows `old` and the new rows. The number of free rows is stored in `used[which]`.
-    """
-    count = int(used[which])
-    more = rows - len(old)
-    new = np.zeros(rows, np.int32)
-    new[:count] = old[:count]
-    new[count : count + more] = np.arange(len(old), rows)
-    used[which] = count + more
-    return new

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_service.ingest import dedup
-from fleet_service.ingest.dedup import SequenceTracker, SequenceTrackers
+from fleet_service.ingest.dedup import ArchivedRows, SequenceTracker, SequenceTrackers
 from schemas.wire import Kind
 
 KEY = (1, 5, Kind.STATE, 7)
@@ -67,7 +67,8 @@ def test_rows_of_an_archive_restore_the_streams_that_wrote_them(
     columns = np.array(rows, np.int64).reshape(-1, 3).T
     fixed = np.ones_like(columns[0])
     held = np.minimum(columns[1], columns[2])
-    after.restore(Kind.STATE, columns[0], 5 * fixed, 7 * fixed, columns[1], held, 100 + columns[1])
+    archived = ArchivedRows(columns[0], 5 * fixed, 7 * fixed, columns[1], held, 100 + columns[1])
+    after.restore(Kind.STATE, archived)
     for vehicle in {row[0] for row in rows}:
         one = before[vehicle, 5, Kind.STATE, 7]
         other = after[vehicle, 5, Kind.STATE, 7]

@@ -1,0 +1,162 @@
+"""Beliefs of all cells as the last update left them, and the queries that read them. The module is
+pure.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.belief import SLIPPERY_SHARE, unpack_belief
+from fleet_service.fusion.neighbours import road_beliefs
+from fleet_service.fusion.observations import SmallArray
+from fleet_service.fusion.shared import KERNELS, UNKNOWN_SHAPE, kernel_of, shape_class
+from fleet_service.fusion.store.cells import Cells
+from fleet_service.fusion.store.records import NOBODY, NONE, Rows
+from fleet_service.fusion.store.store import Store
+from fleet_service.fusion.vote_weights import VoteWeights
+from fleet_service.fusion.weather import Weather
+from schemas import grid
+from schemas.numeric import Float32Array, FloatArray, IntArray
+from schemas.runtime.jit import compiled
+from schemas.thresholds import NS
+
+# What each bin of a belief adds to P(slippery) of the road, and to all of it, by the fleet's shape:
+# (kernels, 2, 32).
+SLIPPERY_WEIGHTS: Final = tuple(
+    np.stack([k @ SLIPPERY_SHARE, k.sum(axis=2, dtype=float)], axis=1) for k in KERNELS
+)
+
+
+class BeliefMap:
+    """Beliefs of all cells, and the trust in the vehicles that reported them. `Fusion` updates
+    them. A slot is the storage of one cell and sector.
+
+    Attributes:
+        store: cells, recent observations per cell, records per vehicle and cell, and vehicles.
+        vote_weights: weights of the vehicles' votes, one record per epoch, the oldest first.
+    """
+
+    def __init__(self, store: Store, vote_weights: list[VoteWeights], weather: Weather) -> None:
+        self.store = store
+        self.vote_weights = vote_weights
+        self._weather = weather
+        self._shape = UNKNOWN_SHAPE
+
+    @property
+    def live(self) -> Cells:
+        """Current state of all cells (belief, counts, times) as columns; rows from `size` on are
+        unused.
+        """
+        return self.store.live
+
+    @property
+    def size(self) -> int:
+        """Number of slots in use; a slot is the storage of one cell and sector."""
+        return self.store.size
+
+    @property
+    def cell(self) -> IntArray:
+        """Cell number of every slot (stored cell and sector), (size,)."""
+        return self.live.key[: self.size] // grid.SECTORS
+
+    @property
+    def sector(self) -> SmallArray:
+        """Heading sector of every slot (stored cell and sector), (size,)."""
+        return (self.live.key[: self.size] % grid.SECTORS).astype(np.int8)
+
+    def beliefs(self, slots: IntArray, now: int, rows: Rows | None = None) -> FloatArray:
+        """Return the belief about the road (32 probabilities of μ) for each slot (cell and sector),
+        (k, 32), predicted to `now` [ns]. It includes the evidence of slippery neighbouring cells.
+        If `rows` is given, read this copy of the state instead of the live one.
+        """
+        kernels = KERNELS[shape_class(self._shape.reader)]
+        return self._read(kernels, slots, np.full(len(slots), now), rows)
+
+    def beliefs_at_last_report(self, slots: IntArray) -> FloatArray:
+        """Return the belief about the road (32 probabilities of μ) for each slot (cell and sector),
+        (k, 32), at the time of the slot's last observation.
+        """
+        return self._read(KERNELS[shape_class(self._shape.reader)], slots, self.live.time[slots])
+
+    def slippery(self, slots: IntArray) -> FloatArray:
+        """Return P(slippery) for each slot (cell and sector), (k,), at its last observation, from
+        reports of this cell alone (without neighbours).
+        """
+        return _slippery_probability(
+            self.store.state.live, SLIPPERY_WEIGHTS[shape_class(self._shape.reader)], slots
+        )
+
+    def beliefs_for_alerts(self, slots: IntArray) -> FloatArray:
+        """Return the same array (k, 32) as `beliefs_at_last_report`, but with a more cautious
+        tyre-shape slope, as alerts require.
+
+        The slope says how far a report may be too low if the vehicle used little grip. Alerts use
+        the upper end of the slope's range; see `shared`.
+        """
+        return self._read(KERNELS[shape_class(self._shape.alarm)], slots, self.live.time[slots])
+
+    def _read(
+        self, kernels: Float32Array, slots: IntArray, now: IntArray, rows: Rows | None = None
+    ) -> FloatArray:
+        rows = self.store.state.live if rows is None else rows
+        return road_beliefs(rows, self.store.table, self._weather, kernels, slots, now)
+
+    def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
+        """Return the slot (row number) (n,) of each pair of cell and sector; -1 if no vehicle has
+        reported the pair.
+        """
+        return self.store.slots_of(cell * grid.SECTORS + sector)
+
+    def trust(self, vehicle: int) -> float:
+        """Return the weight that the next report of a vehicle will have in the map's beliefs about
+        friction; it depends on the vehicle's agreement with others, and 0 means no trust.
+        """
+        return float(self.vote_weights[-1].weights(self._index(vehicle))[0])
+
+    def _index(self, vehicle: int) -> IntArray:
+        index = self.store.known(np.array([vehicle]))
+        return np.where(index < 0, self.store.vehicles, index)
+
+    def sources(self, slots: IntArray, side: int, since: IntArray | int) -> IntArray:
+        """Return the report times [ns] of the vehicles that corroborate ice or grip in each slot
+        (cell and sector), (k, SOURCES), newest first.
+
+        Only vehicles count that are still trusted and reported `side` (GRIP or ICE) after `since`
+        [ns]. At most SOURCES vehicles per slot are stored; time 0 means no vehicle.
+        """
+        _, when = self.find_sources(slots, side, since)
+        return -np.sort(-when, axis=1)
+
+    def find_sources(
+        self, slots: IntArray, side: int, since: IntArray | int
+    ) -> tuple[IntArray, IntArray]:
+        """Return the vehicles that corroborate `side` (GRIP or ICE) in the slots (cells and
+        sectors), as two arrays (k, SOURCES): index of the vehicle, and time of its report [ns]. The
+        time is 0 if the vehicle does not count (see `sources`).
+        """
+        row = self.live.reporters[slots]
+        reporters = self.store.state.live.reporters
+        who = np.where(row[:, None] == NONE, NOBODY, reporters["source"][row, side])
+        when = reporters["source_time"][row, side].astype(np.int64) * NS
+        trusted = self.vote_weights[-1].weights(np.maximum(who, 0)) >= c.SOURCE_TRUST
+        counted = (who != NOBODY) & trusted & (when > np.reshape(since, (-1, 1)))
+        return who, np.where(counted, when, 0)
+
+
+@compiled
+def _slippery_probability(live: Rows, weights: FloatArray, slots: IntArray) -> FloatArray:
+    p = np.empty(live.belief.shape[1])
+    out = np.empty(len(slots))
+    for k in range(len(slots)):
+        unpack_belief(live.belief, slots[k], p)
+        weight = weights[kernel_of(live.cells, slots[k])]
+        slippery = 0.0
+        whole = 0.0
+        for i in range(len(p)):
+            slippery += weight[0, i] * p[i]
+            whole += weight[1, i] * p[i]
+        out[k] = slippery / whole
+    return out
