@@ -15,6 +15,7 @@ import functools
 import http.server
 import json
 import math
+import re
 import struct
 import subprocess
 import sys
@@ -44,6 +45,7 @@ from tests.benchmarks.page_stage import CELLS, Stage, open_stage, pin_to_core, s
 from tests.browser import Opened
 from tests.colour_vision import SIGHTS, colour_difference, to_lab
 from tests.fleet_service.page import scan
+from tests.fleet_service.page.contrast import worst_contrasts
 from tests.waiting import until
 
 T = TypeVar("T")
@@ -348,6 +350,18 @@ def colour_distance() -> float:
     )
 
 
+def count_states() -> float:
+    """Return the number of the page's states that pass their tests; each leaves a picture in
+    `.page/states`.
+    """
+    path = "tests/fleet_service/page/test_states.py"
+    command = [sys.executable, "-m", "pytest", "-q", "--tb=no", path]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    print(f"  {done.stdout[-200:].strip()}", file=sys.stderr)
+    passed = re.search(r"(\d+) passed", done.stdout)
+    return float(passed[1]) if passed and not done.returncode else 0.0
+
+
 def measure_all() -> list[Figure]:
     """Measure the live page, and return all figures in the order of the printed table."""
     with open_stage(SEED) as on:
@@ -356,7 +370,9 @@ def measure_all() -> list[Figure]:
         found["bytes_per_cell"] = bytes_per_cell(on)
         found["axe_serious"] = _time_part("scanned", lambda: count_findings(on))
         found["watchers"] = _time_part("watched", lambda: count_watchers(on))
+    found["states"] = _time_part("states", count_states)
     found["colour_distance"] = colour_distance()
+    found["contrast_text"], found["contrast_classes"] = worst_contrasts()
     rows: list[tuple[str, str, float | None, Any]] = [
         ("first_picture_s", f"s, {CELLS} cells, the middle of {ROUNDS}", 0.5, "less"),
         ("maplibre_first_picture_s", "s", None, "less"),
@@ -369,6 +385,9 @@ def measure_all() -> list[Figure]:
         ("foreign_requests", "requests", 0, "less"),
         ("console_errors", "errors", 0, "less"),
         ("axe_serious", "findings", 0, "less"),
+        ("states", "states with tests and pictures", 10, "more"),
+        ("contrast_text", "to 1, the least (WCAG AA)", 4.5, "more"),
+        ("contrast_classes", "to 1, the least (WCAG AA)", 3.0, "more"),
         ("colour_distance", "CIEDE2000, the least", 10.0, "more"),
     ]
     own = [

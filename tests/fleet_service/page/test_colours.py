@@ -5,7 +5,6 @@ and none of them looks like a promise of grip.
 from __future__ import annotations
 
 import colorsys
-import re
 from itertools import combinations, pairwise
 
 import pytest
@@ -23,7 +22,7 @@ from schemas.runtime.palette import (
 )
 from tests.colour_vision import SIGHTS, colour_difference, to_lab
 from tests.fleet_service.page.cell_colours import colour_of
-from tests.structure import ROOT
+from tests.fleet_service.page.contrast import THEMES, class_contrasts, text_contrasts
 
 LEAST = 10.0
 STEP = 5.0  # of lightness between two classes that follow each other in danger
@@ -93,29 +92,10 @@ def test_what_is_slippery_at_its_upper_end_keeps_its_colour() -> None:
 
 
 @pytest.mark.parametrize("sight", SIGHTS)
-@pytest.mark.parametrize("theme", [":root", '[data-theme="dark"]'])
+@pytest.mark.parametrize("theme", THEMES)
 def test_text_and_map_classes_have_the_contrast_of_wcag_aa(sight: str, theme: str) -> None:
     """Text must have a contrast of 4.5 : 1 (WCAG 1.4.3). Fill or edge of a map class must have 3 :
     1 against the background (1.4.11).
     """
-    static = ROOT / "fleet_service" / "page" / "static"
-    style = (static / "style.css").read_text()
-    block = style[style.index(theme) :].partition("}")[0]
-    named = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", block))
-    texts = [(text, behind) for text in ("ink", "soft", "blue") for behind in ("paper", "sunk")]
-    for text, behind in (*texts, ("alert", "paper")):
-        assert contrast(named[text], named[behind], sight) >= 4.5, (text, behind)
-    edged = re.search(r"EDGED = \[([\d, ]+)\]", (static / "ribbons.js").read_text())
-    assert edged is not None
-    with_edge = {int(kind) for kind in edged[1].split(", ")}
-    classes = ("ice", "snow", "wet", "dry", "rather", "rather-not", "little")
-    for kind, name in enumerate(classes):
-        colours = (named[name], *((named["bound"],) if kind in with_edge else ()))
-        assert max(contrast(one, named["ground"], sight) for one in colours) >= 3.0, name
-
-
-def contrast(first: str, second: str, sight: str) -> float:
-    """Return the contrast ratio of two colours (WCAG 2.2), computed from CIE lightness."""
-    light = [float(to_lab(colour, sight)[0]) for colour in (first, second)]
-    low, high = sorted(((v + 16) / 116) ** 3 if v > 8 else v / 903.3 for v in light)
-    return (high + 0.05) / (low + 0.05)
+    assert min(text_contrasts(theme, sight).values()) >= 4.5
+    assert min(class_contrasts(theme, sight).values()) >= 3.0
