@@ -65,8 +65,8 @@ def held_readings(name: str, series: Series, t: FloatArray, *, lasting: bool) ->
 
 
 def lasting_signals(profile: Profile) -> set[str]:
-    """Return the full names of the signals of `lasting` channels, which are sent only when they
-    change.
+    """Return the full names of the signals of a profile's `lasting` channels, which are sent only
+    when they change.
     """
     return {
         name

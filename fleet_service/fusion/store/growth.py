@@ -28,15 +28,15 @@ from schemas.runtime.records import RecordArray
 
 
 def grow_entries(state: State, most: int) -> State:
-    """Return the state with space for at least `most` entries (observations that wait)."""
+    """Return the fusion's state with space for at least `most` entries (observations that wait)."""
     entries = grow_rows(state.entries, max(2 * len(state.entries), most))
     free = _free_rows(state.free_entries, state.used, FREE_ENTRIES, len(entries))
     return state._replace(entries=entries, free_entries=free)
 
 
 def grow_windows(state: State, most: int) -> State:
-    """Return the state with space for at least `most` lateness windows (recent observations of one
-    cell each).
+    """Return the fusion's state with space for at least `most` lateness windows (recent
+    observations of one cell each).
     """
     rows = max(2 * len(state.windows), most)
     windows = grow_rows(state.windows, rows)
@@ -51,8 +51,9 @@ def grow_windows(state: State, most: int) -> State:
 
 
 def rebuild_pairs(state: State, names: RecordArray, now: int, most: int) -> State:
-    """Return the state without the pair records (one per vehicle and cell) that are not remembered
-    at `now` [s], and with room for `most` pair records. `names` are the records of the vehicles.
+    """Return the fusion's state without the pair records (one per vehicle and cell) that are too
+    old at `now` [s], and with room for `most` pair records. `names` are the records of the
+    vehicles.
     """
     old = state.pairs
     count = count_staying(old, now)
@@ -64,9 +65,9 @@ def rebuild_pairs(state: State, names: RecordArray, now: int, most: int) -> Stat
 
 
 def rebuild_reporters(state: State, size: int, least: int) -> State:
-    """Return the state without the lists of recent reporters whose last report was before `least`
-    [s]. Cells with observations that are not yet final keep their lists. `size` is the number of
-    slots (cells and sectors) in use.
+    """Return the fusion's state without the lists of recent reporters whose last report was before
+    `least` [s]. Cells with observations that are not yet final keep their lists. `size` is the
+    number of slots (cells and sectors) in use.
     """
     live = state.live
     cells = live.cells[:size]

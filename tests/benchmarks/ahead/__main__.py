@@ -22,7 +22,7 @@ ENTRY_TOWNS: Final = 4  # of the map as a prior, where the estimator itself driv
 
 
 def measure_ahead(seeds: range, quick: bool) -> list[Figure]:
-    """Return the figures of all parts; each seed draws a town."""
+    """Return the figures of the warnings and of the map as a prior; each seed draws a town."""
     rows: list[Callable[[], list[Figure]]] = [
         lambda: cost.cost_figures(FIGURES, 2e3 if quick else 20e3),
         lambda: latency.latency_figures(
@@ -44,7 +44,9 @@ def measure_ahead(seeds: range, quick: bool) -> list[Figure]:
 
 
 def main() -> int:
-    """Measure and write the figures. Return 0 if every figure meets its target, otherwise 1."""
+    """Measure the warnings in the car and the map as a prior, and write the figures. Return 0 if
+    every figure meets its target, otherwise 1.
+    """
     parser = argparse.ArgumentParser(prog="tests.benchmarks.ahead", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path(".evaluation/ahead"))
     parser.add_argument("--seeds", type=int, default=SEEDS, help="number of towns")
