@@ -293,8 +293,8 @@ class Routes:
         )
 
     async def situations(self, _: Request) -> Response:
-        """Return the slippery stretches as a DATEX II publication: a message for road authorities with
-        the complete current state (snapshot pull).
+        """Return the slippery stretches as a DATEX II publication: a message for road authorities
+        with the complete current state (snapshot pull).
         """
         if self._of.datex is None:
             return PlainTextResponse("this page publishes no situations; see --datex\n", 404)

@@ -53,7 +53,8 @@ DOUBTED = 0.05  # of distrust_noise, at the brink of it
 
 class NodeUpdate(NamedTuple):
     """Result of the measurement update of one node (friction hypothesis): its log-likelihood, the
-    number of measurement rows (scalar measurements) used, and related numbers.
+    number of measurement rows (scalar measurements) used, and the terms from which the weights of
+    all nodes and the penalties are computed.
     """
 
     log_likelihood: float  # with the inflated R and the price of sliding [nat]

@@ -262,10 +262,11 @@ def share_by_sides(mean: float, most: float, most_other: float) -> float:
 
 @compiled
 def _slip_at_force(curve: TyreCurve, mu: float, force: float, other: float) -> float:
-    """Return the slip [1] at which a tyre of friction `mu` has the force over load `force` [1] in
-    one direction, while its force over load at right angles is `other` [1].
+    """Return the slip at which a tyre of friction `mu` has the force over load `force` [1] in one
+    direction, while its force over load at right angles is `other` [1].
 
-    The slip is expressed as linear force over load [1]; it is infinite at or beyond the peak.
+    The slip is given as the force over load [1] that a linear tyre would have at it; it is infinite
+    at or beyond the peak of the curve.
     """
     size = math.sqrt(force * force + other * other)
     if math.isnan(size) or size < TINY:
