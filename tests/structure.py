@@ -409,7 +409,7 @@ FIGURES: Final = (
     Figure(
         "arrows inside friction_mixture/",
         22,
-        130,
+        21,
         lambda root: room_arrows(root, "edge_agent/estimators/friction_mixture"),
     ),
     Figure("import circles", 0, 0, import_circles),

@@ -25,9 +25,9 @@ from edge_agent.estimators import (
 )
 from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
-from edge_agent.estimators.friction_mixture.calibrated import means_of, spreads_of
-from edge_agent.estimators.friction_mixture.design import design_of
-from edge_agent.estimators.friction_mixture.tyre_curve import Curve, check_curve
+from edge_agent.estimators.friction_mixture.state.calibrated import means_of, spreads_of
+from edge_agent.estimators.friction_mixture.state.design import design_of
+from edge_agent.estimators.friction_mixture.state.tyre_curve import Curve, check_curve
 from schemas.errors import InputError
 from schemas.vehicle import Vehicle
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from edge_agent.dynamics.parameters import Parameter, parameter_row
-from edge_agent.estimators.friction_mixture.calibrated import means_of, spreads_of
-from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
-from edge_agent.estimators.friction_mixture.design import nominal_states
+from edge_agent.estimators.friction_mixture.state.calibrated import means_of, spreads_of
+from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
+from edge_agent.estimators.friction_mixture.state.design import nominal_states
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.thresholds import GRAVITY
 from schemas.vehicle import Calibration

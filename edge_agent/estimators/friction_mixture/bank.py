@@ -8,17 +8,21 @@ from edge_agent.estimators.bank import EstimatorBank, Part
 from edge_agent.estimators.common.arrays import clear_vector, copy_vector
 from edge_agent.estimators.common.output import write_motion, write_quality, write_unknown
 from edge_agent.estimators.estimates import FOUR_FRICTIONS, Column
-from edge_agent.estimators.friction_mixture.beliefs import report_beliefs
-from edge_agent.estimators.friction_mixture.constants import NODES, NodeState
-from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.friction_grid import quantile, visit_evidence
-from edge_agent.estimators.friction_mixture.grip_guard import reported_upper
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles, new_filters
-from edge_agent.estimators.friction_mixture.reported_interval import LOWER_END, UPPER_END
-from edge_agent.estimators.friction_mixture.split_sides import BOTH, project_weights
+from edge_agent.estimators.friction_mixture.block.grip_guard import reported_upper
+from edge_agent.estimators.friction_mixture.report.beliefs import report_beliefs
+from edge_agent.estimators.friction_mixture.report.reported_interval import LOWER_END, UPPER_END
+from edge_agent.estimators.friction_mixture.report.visit_parts import begin_part, end_part
+from edge_agent.estimators.friction_mixture.state.constants import NODES, NodeState
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.friction_grid import quantile, visit_evidence
+from edge_agent.estimators.friction_mixture.state.memory import (
+    MixtureMemory,
+    Quantiles,
+    new_filters,
+)
+from edge_agent.estimators.friction_mixture.state.split_sides import BOTH, project_weights
+from edge_agent.estimators.friction_mixture.state.workspace import MixtureContext, Scratch
 from edge_agent.estimators.friction_mixture.step import mean_velocity, step
-from edge_agent.estimators.friction_mixture.visit_parts import begin_part, end_part
-from edge_agent.estimators.friction_mixture.workspace import MixtureContext, Scratch
 from schemas.mugrid import CENTRES
 from schemas.numeric import BoolArray, FloatArray
 from schemas.runtime.jit import compiled, nogil

@@ -12,23 +12,27 @@ from edge_agent.estimators.common.arrays import clear_vector, copy_vector, put_s
 from edge_agent.estimators.common.excitation import begin_excitation
 from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD
 from edge_agent.estimators.common.readings import read_plausible, rolling_speed
-from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, NodeState
-from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.drive_split import FIRST_ODDS
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory
-from edge_agent.estimators.friction_mixture.reported_interval import find_interval
-from edge_agent.estimators.friction_mixture.rolling_motion import STANDING_STD
-from edge_agent.estimators.friction_mixture.wheel_readings import refuse_jumps
-from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
+from edge_agent.estimators.friction_mixture.block.drive_split import FIRST_ODDS
+from edge_agent.estimators.friction_mixture.block.wheel_readings import refuse_jumps
+from edge_agent.estimators.friction_mixture.node.rolling_motion import STANDING_STD
+from edge_agent.estimators.friction_mixture.report.reported_interval import find_interval
+from edge_agent.estimators.friction_mixture.state.constants import NODES, NodeState
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.gap import (
+    SLOWEST_M_S,
+    UNKNOWN_YAW_VAR,
+    YAW_STD,
+    put_split_to_sleep,
+    restart_motion,
+)
+from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, Scratch
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
 # [m/s] wheels that turn slower at the first sample are those of a car at rest
 REST_M_S = 0.1
-YAW_STD = 0.002  # [rad/s] white noise of a gyroscope sample
-UNKNOWN_YAW_VAR = 1.0  # [rad^2/s^2] without a gyroscope
-GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
 # along, over load, below which wheels that roll alike are taken for rolling freely
 FREE_FORCE = 0.05
 ALIKE = 0.03  # relative difference of their speeds
@@ -39,8 +43,6 @@ LOST_SPREAD_M_S = 5.0
 FAR_M_S = 0.7
 FAR_SHARE = 0.04
 FAR_SPREADS = 2.0
-# below this speed of vehicle and wheels slip has no meaning, and nothing is concluded
-SLOWEST_M_S = 1.5
 
 
 @compiled
@@ -108,71 +110,6 @@ def forget_vehicle(memory: MixtureMemory) -> None:
             covariance[i, j] = covariance[j, i] = 0.0
         covariance[i, i] = nominal.std[i] ** 2
     clear_vector(memory.penalty)
-
-
-@compiled
-def put_split_to_sleep(memory: MixtureMemory) -> None:
-    """Deactivate the nodes of split roads (different friction left and right), and normalise the
-    weights of the other nodes."""
-    if not memory.split:
-        return
-    memory.split = False
-    for weight in (memory.weight, memory.visit_weight):
-        total = 0.0
-        for j in range(NODES):
-            total += weight[j]
-        for j in range(ALL_NODES):
-            weight[j] = weight[j] / total if j < NODES else 0.0
-
-
-@compiled
-def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
-    """Restart the velocity of all nodes (filters of one friction hypothesis each): v_x is `speed`
-    [m/s] and v_y zero.
-
-    If `speed` is NaN, all nodes keep the mixture's v_x with standard deviation `spread` [m/s].
-    """
-    if not math.isnan(speed):
-        memory.overall_mean[NodeState.VX], spread = speed, FIRST_V_STD
-    memory.overall_mean[NodeState.VY] = 0.0
-    covariance = memory.overall_covariance
-    for i in range(covariance.shape[0]):
-        for axis in range(2):
-            covariance[i, axis] = covariance[axis, i] = 0.0
-    covariance[NodeState.VX, NodeState.VX], covariance[NodeState.VY, NodeState.VY] = (
-        spread**2,
-        FIRST_V_STD**2,
-    )
-    for j in range(ALL_NODES):
-        copy_vector(memory.mean[j], memory.overall_mean)
-        put_square(memory.covariance[j], covariance)
-
-
-@compiled
-def bridge_gap(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
-    """Continue the filter after a gap of dt [s] without samples; return the health flag RESET.
-
-    The friction estimate moves towards the prior according to the metres driven during the gap, and
-    the motion estimate restarts.
-    """
-    last = memory.last
-    now = memory.last.now
-    prior = design.prior
-    hazard = 1.0 - math.exp(-abs(memory.overall_mean[NodeState.VX]) * dt * design.constants.hazard)
-    put_split_to_sleep(memory)
-    for j in range(NODES):
-        memory.weight[j] += hazard * (prior[j] - memory.weight[j])
-        memory.visit_weight[j] += hazard * (prior[j] - memory.visit_weight[j])
-    restart_motion(
-        memory, rolling_speed(memory.row, now), min(GAP_ACCELERATION * dt, UNKNOWN_V_STD)
-    )
-    rate = now[S.YAW_RATE]
-    if not math.isnan(rate):
-        last.yaw_rate = rate
-        last.yaw_rate_var = YAW_STD**2
-    for wheel in range(4):
-        last.omega[wheel] = now[S.OMEGA + wheel]
-    return flags.RESET
 
 
 @compiled

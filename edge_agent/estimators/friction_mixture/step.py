@@ -15,38 +15,50 @@ from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.excitation import note_excitation
 from edge_agent.estimators.common.motion import SLIDING_THETA
-from edge_agent.estimators.friction_mixture.block_features import (
+from edge_agent.estimators.friction_mixture.block.block_features import (
     SLOWEST_COMPARED_M_S,
     block_features,
 )
-from edge_agent.estimators.friction_mixture.constants import NODES, NodeState
-from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.drive_split import learn_drive
-from edge_agent.estimators.friction_mixture.grip_guard import lower_while_sliding
-from edge_agent.estimators.friction_mixture.ice_patch import grow_patches
-from edge_agent.estimators.friction_mixture.intake import begin_block, take_sample
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles, VelocityGain
-from edge_agent.estimators.friction_mixture.mixing import (
+from edge_agent.estimators.friction_mixture.block.drive_split import learn_drive
+from edge_agent.estimators.friction_mixture.block.grip_guard import lower_while_sliding
+from edge_agent.estimators.friction_mixture.block.intake import begin_block, take_sample
+from edge_agent.estimators.friction_mixture.block.used_grip import used_grip
+from edge_agent.estimators.friction_mixture.block.wheel_slip import update_slip
+from edge_agent.estimators.friction_mixture.mixture.ice_patch import grow_patches
+from edge_agent.estimators.friction_mixture.mixture.mixing import (
     active_nodes,
     apply_road_change,
     match_moments,
     wake_or_sleep,
 )
-from edge_agent.estimators.friction_mixture.node_filter import predict_node
-from edge_agent.estimators.friction_mixture.reported_interval import find_interval
-from edge_agent.estimators.friction_mixture.residuals import gained_velocity
-from edge_agent.estimators.friction_mixture.restart import reset_to_wheel_speed, start_vehicle
-from edge_agent.estimators.friction_mixture.rolling_motion import watch_wheels
-from edge_agent.estimators.friction_mixture.split_sides import BOTH, LEFT, RIGHT, project_weights
-from edge_agent.estimators.friction_mixture.trust import (
+from edge_agent.estimators.friction_mixture.mixture.trust import (
     LEAST_VARIANCE,
     nominal_agreement,
     update_consistency,
 )
-from edge_agent.estimators.friction_mixture.used_grip import used_grip
-from edge_agent.estimators.friction_mixture.weighing import apply_measurement, update_novelty
-from edge_agent.estimators.friction_mixture.wheel_slip import update_slip
-from edge_agent.estimators.friction_mixture.workspace import Scratch
+from edge_agent.estimators.friction_mixture.mixture.weighing import (
+    apply_measurement,
+    update_novelty,
+)
+from edge_agent.estimators.friction_mixture.node.node_filter import predict_node
+from edge_agent.estimators.friction_mixture.node.residuals import gained_velocity
+from edge_agent.estimators.friction_mixture.node.rolling_motion import watch_wheels
+from edge_agent.estimators.friction_mixture.report.reported_interval import find_interval
+from edge_agent.estimators.friction_mixture.restart import reset_to_wheel_speed, start_vehicle
+from edge_agent.estimators.friction_mixture.state.constants import NODES, NodeState
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.memory import (
+    MixtureMemory,
+    Quantiles,
+    VelocityGain,
+)
+from edge_agent.estimators.friction_mixture.state.split_sides import (
+    BOTH,
+    LEFT,
+    RIGHT,
+    project_weights,
+)
+from edge_agent.estimators.friction_mixture.state.workspace import Scratch
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 

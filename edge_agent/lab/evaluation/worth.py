@@ -28,7 +28,7 @@ from edge_agent.adaptation.rule_base import plain_rules
 from edge_agent.app.tuned_memberships import search_results, shipped_memberships
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
-from edge_agent.estimators.friction_mixture.design import MixtureDesign, design_of
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, design_of
 from edge_agent.lab.evaluation.batch import DriveSet, join_drives
 from edge_agent.lab.evaluation.real_world import interval_score, town
 from edge_agent.lab.simulation import PRESETS, DriveSetup, simulate_manoeuvre

@@ -7,10 +7,10 @@ from __future__ import annotations
 import numpy as np
 
 from edge_agent.dynamics.parameters import Parameter
-from edge_agent.estimators.friction_mixture.calibrated import LEARNED, spreads_of
-from edge_agent.estimators.friction_mixture.constants import STATES, Constants, NodeState
-from edge_agent.estimators.friction_mixture.design import nominal_states
-from edge_agent.estimators.friction_mixture.memory import new_filters
+from edge_agent.estimators.friction_mixture.state.calibrated import LEARNED, spreads_of
+from edge_agent.estimators.friction_mixture.state.constants import STATES, Constants, NodeState
+from edge_agent.estimators.friction_mixture.state.design import nominal_states
+from edge_agent.estimators.friction_mixture.state.memory import new_filters
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.vehicle import Calibration
 

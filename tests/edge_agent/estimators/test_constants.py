@@ -14,8 +14,8 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators.estimates import Estimates
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
-from edge_agent.estimators.friction_mixture.constants import NODES, Constants, NodeState
-from edge_agent.estimators.friction_mixture.design import design_of
+from edge_agent.estimators.friction_mixture.state.constants import NODES, Constants, NodeState
+from edge_agent.estimators.friction_mixture.state.design import design_of
 from edge_agent.lab.simulation import DriveSetup, simulate_manoeuvre
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S

@@ -11,17 +11,23 @@ import numpy as np
 import pytest
 
 from edge_agent.dynamics.tyres import magic_formula
-from edge_agent.estimators.friction_mixture.constants import ACTIVE, NODES, ROWS, STATES, Constants
-from edge_agent.estimators.friction_mixture.friction_grid import node_table
-from edge_agent.estimators.friction_mixture.node_filter import slip_noise_correction, take_rows
-from edge_agent.estimators.friction_mixture.split_sides import project_weights, side_table
-from edge_agent.estimators.friction_mixture.tyre_curve import (
+from edge_agent.estimators.friction_mixture.node.node_filter import slip_noise_correction, take_rows
+from edge_agent.estimators.friction_mixture.state.constants import (
+    ACTIVE,
+    NODES,
+    ROWS,
+    STATES,
+    Constants,
+)
+from edge_agent.estimators.friction_mixture.state.friction_grid import node_table
+from edge_agent.estimators.friction_mixture.state.split_sides import project_weights, side_table
+from edge_agent.estimators.friction_mixture.state.tyre_curve import (
     curve_tables,
     magic_formulas,
     ratio_at,
     theta_at,
 )
-from edge_agent.estimators.friction_mixture.workspace import NodeWorkspace
+from edge_agent.estimators.friction_mixture.state.workspace import NodeWorkspace
 from schemas.runtime.records import records
 
 SEEDS = (0, 1, 2)

@@ -11,8 +11,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from edge_agent.estimators.friction_mixture.constants import NODES, Constants
-from edge_agent.estimators.friction_mixture.friction_grid import (
+from edge_agent.estimators.friction_mixture.state.constants import NODES, Constants
+from edge_agent.estimators.friction_mixture.state.friction_grid import (
     RoadChange,
     change_road,
     multiply_likelihood,

@@ -11,10 +11,10 @@ import pytest
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.dynamics.parameters import Parameter, parameter_table
-from edge_agent.estimators.friction_mixture.design import MixtureDesign, design_of
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory
-from edge_agent.estimators.friction_mixture.weighing import saturation, update_novelty
-from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, MixtureContext
+from edge_agent.estimators.friction_mixture.mixture.weighing import saturation, update_novelty
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, design_of
+from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, MixtureContext
 from schemas.runtime.records import put_record, records
 from tests.edge_agent.estimators.drives import drive
 

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.estimators.friction_mixture.constants import PATCH_NODES
-from edge_agent.estimators.friction_mixture.design import design_of
-from edge_agent.estimators.friction_mixture.friction_grid import probability_below, quantile
-from edge_agent.estimators.friction_mixture.grip_guard import lower_while_sliding
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory
-from edge_agent.estimators.friction_mixture.reported_interval import (
+from edge_agent.estimators.friction_mixture.block.grip_guard import lower_while_sliding
+from edge_agent.estimators.friction_mixture.report.reported_interval import (
     DRAWN_IN,
     LEARNED_END,
     LOWER_END,
     UPPER_END,
     find_interval,
 )
-from edge_agent.estimators.friction_mixture.workspace import MixtureContext
+from edge_agent.estimators.friction_mixture.state.constants import PATCH_NODES
+from edge_agent.estimators.friction_mixture.state.design import design_of
+from edge_agent.estimators.friction_mixture.state.friction_grid import probability_below, quantile
+from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.state.workspace import MixtureContext
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import nogil
 from schemas.runtime.records import Records, put_record, records

@@ -13,16 +13,16 @@ import pytest
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
-from edge_agent.estimators.friction_mixture.constants import Constants
-from edge_agent.estimators.friction_mixture.design import design_of
-from edge_agent.estimators.friction_mixture.memory import Trust
-from edge_agent.estimators.friction_mixture.trust import (
+from edge_agent.estimators.friction_mixture.block.block_features import strained_noise
+from edge_agent.estimators.friction_mixture.mixture.trust import (
     FACTOR,
     axles_ratio,
     belief_strain,
-    strained_noise,
     used_evidence_share,
 )
+from edge_agent.estimators.friction_mixture.state.constants import Constants
+from edge_agent.estimators.friction_mixture.state.design import design_of
+from edge_agent.estimators.friction_mixture.state.memory import Trust
 from schemas.numeric import BoolArray, FloatArray
 from schemas.runtime.records import records
 from schemas.signals import Health, S

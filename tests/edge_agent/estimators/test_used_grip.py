@@ -9,7 +9,7 @@ import pytest
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
-from edge_agent.estimators.friction_mixture.used_grip import MOST_USED
+from edge_agent.estimators.friction_mixture.block.used_grip import MOST_USED
 from edge_agent.lab.simulation import DriveSetup, simulate_manoeuvre
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S

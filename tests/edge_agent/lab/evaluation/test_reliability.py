@@ -11,7 +11,7 @@ import pytest
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
-from edge_agent.estimators.friction_mixture.reported_interval import (
+from edge_agent.estimators.friction_mixture.report.reported_interval import (
     LEARNED_END,
     LOWER_END,
     NEARER,

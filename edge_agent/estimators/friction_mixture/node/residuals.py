@@ -24,15 +24,15 @@ import math
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position
 from edge_agent.dynamics.tyres import TINY
-from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
-from edge_agent.estimators.friction_mixture.memory import VelocityGain
-from edge_agent.estimators.friction_mixture.tyre_curve import (
+from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
+from edge_agent.estimators.friction_mixture.state.memory import VelocityGain
+from edge_agent.estimators.friction_mixture.state.tyre_curve import (
     TyreCurve,
     interpolate_table,
     ratio_at,
     theta_at,
 )
-from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, NodeWorkspace
+from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, NodeWorkspace
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 

@@ -20,13 +20,22 @@ import math
 import numpy as np
 
 from edge_agent.estimators.common.arrays import clear_rows, clear_vector, copy_vector, put_square
-from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, Constants, NodeState
-from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.friction_grid import SMALLEST, RoadChange, change_road
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory
-from edge_agent.estimators.friction_mixture.restart import put_split_to_sleep
-from edge_agent.estimators.friction_mixture.trust import used_evidence_share
-from edge_agent.estimators.friction_mixture.workspace import Scratch
+from edge_agent.estimators.friction_mixture.mixture.trust import used_evidence_share
+from edge_agent.estimators.friction_mixture.state.constants import (
+    ALL_NODES,
+    NODES,
+    Constants,
+    NodeState,
+)
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.friction_grid import (
+    SMALLEST,
+    RoadChange,
+    change_road,
+)
+from edge_agent.estimators.friction_mixture.state.gap import put_split_to_sleep
+from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.state.workspace import Scratch
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 

@@ -16,18 +16,21 @@ from edge_agent.adaptation.rule_base import evidence_share
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import SLOWEST_M_S as SLOWEST_SLIP_M_S
 from edge_agent.dynamics.tyres import TINY
-from edge_agent.estimators.friction_mixture.constants import NodeState
-from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.friction_grid import multiply_likelihood
-from edge_agent.estimators.friction_mixture.grip_guard import guard_penalty
-from edge_agent.estimators.friction_mixture.ice_patch import shrink_patches
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory
-from edge_agent.estimators.friction_mixture.mixing import active_nodes, reset_diverged
-from edge_agent.estimators.friction_mixture.node_filter import update_node
-from edge_agent.estimators.friction_mixture.restart import SLOWEST_M_S
-from edge_agent.estimators.friction_mixture.rolling_motion import take_rolling
-from edge_agent.estimators.friction_mixture.trust import slippery_probability, used_evidence_share
-from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
+from edge_agent.estimators.friction_mixture.block.grip_guard import guard_penalty
+from edge_agent.estimators.friction_mixture.mixture.ice_patch import shrink_patches
+from edge_agent.estimators.friction_mixture.mixture.mixing import active_nodes, reset_diverged
+from edge_agent.estimators.friction_mixture.mixture.trust import (
+    slippery_probability,
+    used_evidence_share,
+)
+from edge_agent.estimators.friction_mixture.node.node_filter import update_node
+from edge_agent.estimators.friction_mixture.node.rolling_motion import take_rolling
+from edge_agent.estimators.friction_mixture.state.constants import NodeState
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.friction_grid import multiply_likelihood
+from edge_agent.estimators.friction_mixture.state.gap import SLOWEST_M_S
+from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, Scratch
 from edge_agent.filters.cholesky import factorize
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled

@@ -12,9 +12,9 @@ from __future__ import annotations
 import math
 
 from edge_agent.dynamics.parameters import Parameter
-from edge_agent.estimators.friction_mixture.constants import Constants
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory
-from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
+from edge_agent.estimators.friction_mixture.state.constants import Constants
+from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY

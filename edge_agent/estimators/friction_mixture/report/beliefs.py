@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from edge_agent.estimators.common.arrays import clear_vector
-from edge_agent.estimators.friction_mixture.constants import NODES
-from edge_agent.estimators.friction_mixture.friction_grid import visit_evidence
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory
-from edge_agent.estimators.friction_mixture.split_sides import BOTH, project_weights
-from edge_agent.estimators.friction_mixture.workspace import MixtureContext
+from edge_agent.estimators.friction_mixture.state.constants import NODES
+from edge_agent.estimators.friction_mixture.state.friction_grid import visit_evidence
+from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.state.split_sides import BOTH, project_weights
+from edge_agent.estimators.friction_mixture.state.workspace import MixtureContext
 from schemas.mugrid import CENTRES
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.estimators.friction_mixture.constants import Constants
-from edge_agent.estimators.friction_mixture.memory import GripInUse, Quantiles
+from edge_agent.estimators.friction_mixture.state.constants import Constants
+from edge_agent.estimators.friction_mixture.state.memory import GripInUse, Quantiles
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY

@@ -19,10 +19,10 @@ from __future__ import annotations
 import math
 
 from edge_agent.estimators.common.arrays import copy_vector
-from edge_agent.estimators.friction_mixture.constants import NODES
-from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.friction_grid import visit_evidence
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.state.constants import NODES
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.friction_grid import visit_evidence
+from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from schemas.mugrid import CENTRES
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled

@@ -8,7 +8,7 @@ import math
 
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators import flags
-from edge_agent.estimators.friction_mixture.memory import LastInputs
+from edge_agent.estimators.friction_mixture.state.memory import LastInputs
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S

@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.estimators.friction_mixture.constants import PATCH_NODES
-from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.state.constants import PATCH_NODES
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 

@@ -28,10 +28,15 @@ import math
 
 from edge_agent.adaptation.rule_base import forgetting_rate
 from edge_agent.estimators import flags
-from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, Constants, NodeState
-from edge_agent.estimators.friction_mixture.design import MixtureDesign, Nominal
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Trust
-from edge_agent.estimators.friction_mixture.node_filter import belief_cost
+from edge_agent.estimators.friction_mixture.node.node_filter import belief_cost
+from edge_agent.estimators.friction_mixture.state.constants import (
+    ALL_NODES,
+    NODES,
+    Constants,
+    NodeState,
+)
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, Nominal
+from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory, Trust
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import SLIPPERY_MU
@@ -145,14 +150,6 @@ def degrees_of_freedom(covariance: FloatArray, nominal: Nominal) -> float:
     for i in range(NodeState.LN_KX, covariance.shape[0]):
         total += max(1.0 - covariance[i, i] / nominal.std[i] ** 2, 0.0)
     return total
-
-
-@compiled
-def strained_noise(trust: Trust, constants: Constants) -> float:
-    """Return the factor on R (measurement noise) of the axles that follows from the strain
-    (deviation of the states from their prior)."""
-    factor = (trust.strain / constants.strain_usual) ** constants.strain_power
-    return float(min(max(factor, constants.strain_least), constants.strain_most))
 
 
 @compiled

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.estimators.friction_mixture.constants import STATES, NodeState
+from edge_agent.estimators.friction_mixture.state.constants import STATES, NodeState
 from schemas.numeric import FloatArray
 from schemas.signals import WHEELS
 from schemas.thresholds import GRAVITY

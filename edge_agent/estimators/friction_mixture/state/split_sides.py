@@ -14,7 +14,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, SPLIT_NODES
+from edge_agent.estimators.friction_mixture.state.constants import ALL_NODES, NODES, SPLIT_NODES
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled

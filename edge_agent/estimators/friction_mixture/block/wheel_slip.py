@@ -12,10 +12,10 @@ from __future__ import annotations
 import math
 
 from edge_agent.dynamics.parameters import Parameter
-from edge_agent.estimators.friction_mixture.block_features import at_centre
-from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory
-from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
+from edge_agent.estimators.friction_mixture.block.block_features import at_centre
+from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
+from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures
 from schemas.runtime.jit import compiled
 
 SLOWEST_M_S = 2.5  # below this speed the resolution of wheel speeds looks like slip

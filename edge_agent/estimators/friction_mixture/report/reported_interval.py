@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.estimators.friction_mixture.constants import PATCH_NODES
-from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.friction_grid import probability_below, quantile
-from edge_agent.estimators.friction_mixture.memory import Quantiles
+from edge_agent.estimators.friction_mixture.state.constants import PATCH_NODES
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.friction_grid import probability_below, quantile
+from edge_agent.estimators.friction_mixture.state.memory import Quantiles
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import SLIPPERY_MU

@@ -14,12 +14,12 @@ from __future__ import annotations
 import math
 
 from edge_agent.dynamics.parameters import Parameter
-from edge_agent.estimators.friction_mixture.block_features import ROUNDING, at_centre, mean_or
-from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
-from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory
-from edge_agent.estimators.friction_mixture.residuals import gained_velocity
-from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
+from edge_agent.estimators.friction_mixture.block.block_features import ROUNDING, at_centre, mean_or
+from edge_agent.estimators.friction_mixture.node.residuals import gained_velocity
+from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, Scratch
 from edge_agent.filters.sequential import apply_projection, potter_factors
 from schemas.runtime.jit import compiled
 from schemas.signals import S

@@ -20,16 +20,15 @@ from edge_agent.dynamics.parameters import Parameter, body_of
 from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position
 from edge_agent.dynamics.wheel import force_from_torque
 from edge_agent.estimators import flags
-from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
-from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.drive_split import (
+from edge_agent.estimators.friction_mixture.block.drive_split import (
     BRAKES_FRONT,
     ENGINE_BRAKE,
     front_share,
 )
-from edge_agent.estimators.friction_mixture.memory import BlockSums, MixtureMemory
-from edge_agent.estimators.friction_mixture.trust import strained_noise
-from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
+from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.memory import BlockSums, MixtureMemory, Trust
+from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
@@ -43,6 +42,14 @@ STEEPEST = 0.3  # least cosine of steering
 # standard deviations of wheel-speed noise that a difference between the sides must exceed,
 CERTAIN = 4.0
 LIKELY = 2.0  # and of what is unknown of the radii
+
+
+@compiled
+def strained_noise(trust: Trust, constants: Constants) -> float:
+    """Return the factor on R (measurement noise) of the axles that follows from the strain
+    (deviation of the states from their prior)."""
+    factor = (trust.strain / constants.strain_usual) ** constants.strain_power
+    return float(min(max(factor, constants.strain_least), constants.strain_most))
 
 
 @compiled

@@ -21,7 +21,15 @@ import math
 from typing import NamedTuple
 
 from edge_agent.dynamics.slip import SLOWEST_M_S
-from edge_agent.estimators.friction_mixture.constants import (
+from edge_agent.estimators.friction_mixture.node.residuals import (
+    correct_forces,
+    find_residuals,
+    find_shape_force,
+    find_slips,
+    gained_velocity,
+    slope_along,
+)
+from edge_agent.estimators.friction_mixture.state.constants import (
     ACTIVE,
     CURVED,
     ROWS,
@@ -30,18 +38,14 @@ from edge_agent.estimators.friction_mixture.constants import (
     Constants,
     NodeState,
 )
-from edge_agent.estimators.friction_mixture.design import MixtureDesign, Nominal
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Trust
-from edge_agent.estimators.friction_mixture.residuals import (
-    correct_forces,
-    find_residuals,
-    find_shape_force,
-    find_slips,
-    gained_velocity,
-    slope_along,
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, Nominal
+from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory, Trust
+from edge_agent.estimators.friction_mixture.state.tyre_curve import TyreCurve
+from edge_agent.estimators.friction_mixture.state.workspace import (
+    BlockFeatures,
+    NodeWorkspace,
+    Scratch,
 )
-from edge_agent.estimators.friction_mixture.tyre_curve import TyreCurve
-from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, NodeWorkspace, Scratch
 from edge_agent.filters.cholesky import covariance_of_factor
 from edge_agent.filters.sequential import apply_projection, potter_factors
 from schemas.numeric import FloatArray

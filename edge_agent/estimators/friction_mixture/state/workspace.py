@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from edge_agent.estimators.friction_mixture.constants import (
+from edge_agent.estimators.friction_mixture.state.constants import (
     ACTIVE,
     ALL_NODES,
     CURVED,
@@ -14,8 +14,8 @@ from edge_agent.estimators.friction_mixture.constants import (
     ROWS,
     STATES,
 )
-from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.memory import PlanarVector, VelocityGain
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.memory import PlanarVector, VelocityGain
 from schemas.numeric import FloatArray
 
 

@@ -20,12 +20,16 @@ from edge_agent.estimators.common.readings import (
     position_time,
     read_plausible,
 )
-from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
-from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.grip_guard import note_grip
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory, PlanarVector, VelocityGain
-from edge_agent.estimators.friction_mixture.restart import UNKNOWN_YAW_VAR, YAW_STD, bridge_gap
-from edge_agent.estimators.friction_mixture.wheel_readings import note_step, refuse_jumps
+from edge_agent.estimators.friction_mixture.block.grip_guard import note_grip
+from edge_agent.estimators.friction_mixture.block.wheel_readings import note_step, refuse_jumps
+from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.gap import UNKNOWN_YAW_VAR, YAW_STD, bridge_gap
+from edge_agent.estimators.friction_mixture.state.memory import (
+    MixtureMemory,
+    PlanarVector,
+    VelocityGain,
+)
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S

@@ -11,10 +11,15 @@ import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.adaptation.rule_base import RuleBase, rule_base
-from edge_agent.estimators.friction_mixture.constants import NODES, STATES, Constants, NodeState
-from edge_agent.estimators.friction_mixture.friction_grid import node_table
-from edge_agent.estimators.friction_mixture.split_sides import Sides, side_table
-from edge_agent.estimators.friction_mixture.tyre_curve import (
+from edge_agent.estimators.friction_mixture.state.constants import (
+    NODES,
+    STATES,
+    Constants,
+    NodeState,
+)
+from edge_agent.estimators.friction_mixture.state.friction_grid import node_table
+from edge_agent.estimators.friction_mixture.state.split_sides import Sides, side_table
+from edge_agent.estimators.friction_mixture.state.tyre_curve import (
     Curve,
     TyreCurve,
     curve_tables,

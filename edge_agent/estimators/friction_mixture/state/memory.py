@@ -9,8 +9,13 @@ import numpy as np
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators.common.excitation import Excitation
 from edge_agent.estimators.common.readings import INPUTS
-from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, PATCH_NODES, STATES
-from edge_agent.estimators.friction_mixture.design import Nominal
+from edge_agent.estimators.friction_mixture.state.constants import (
+    ALL_NODES,
+    NODES,
+    PATCH_NODES,
+    STATES,
+)
+from edge_agent.estimators.friction_mixture.state.design import Nominal
 from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.records import RecordArray, records
 

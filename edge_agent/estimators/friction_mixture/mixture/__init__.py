@@ -1,0 +1,1 @@
+"""Weights of the nodes: evidence, trust, change of the road and ice patches."""

@@ -1,0 +1,1 @@
+"""Filter of one node (friction hypothesis): prediction, residuals and update."""
