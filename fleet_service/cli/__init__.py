@@ -1,5 +1,6 @@
 """`fleet-service`: the command line program. Its commands are run, query, watch, page, router,
-hand-over, compact, retention, forget, export, roads, analyze, rebuild, certs, evaluate, completion.
+size, hand-over, compact, retention, forget, export, roads, analyze, rebuild, certs, evaluate,
+completion.
 
 Bad input is reported as one line on stderr, "error: field: problem; fix", with exit code 2. Modules
 are imported only when a command needs them, so that help is fast.
@@ -56,6 +57,12 @@ COMMANDS: Final = (
         "deploy.router",
         "run a Zenoh router until a signal; the same as `gripmap router`",
         "fleet-service router --listen tcp/127.0.0.1:7447",
+    ),
+    Command(
+        "size",
+        "fleet_service.cli.size",
+        "estimate cores, memory, disk and network for a fleet",
+        "fleet-service size --vehicles 1e6 --road-km 200000",
     ),
     Command(
         "hand-over",

@@ -26,6 +26,7 @@ from tests.benchmarks.measure import SEED
 from tests.benchmarks.public import public
 from tests.benchmarks.service import service
 from tests.benchmarks.shards import shards
+from tests.benchmarks.sizing import sizing
 from tests.benchmarks.state import state
 from tests.benchmarks.step import bank, step
 from tests.benchmarks.tiles import tiles
@@ -45,6 +46,7 @@ _ALL = (
     public,
     shards,
     state,
+    sizing,
     cluster,
 )
 PARTS: dict[str, Callable[[], list[Figure]]] = {part.__name__: part for part in _ALL}

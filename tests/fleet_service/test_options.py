@@ -141,6 +141,7 @@ SHOWN_BELOW: Final = {
         *("--catalog", "--namespace", "--at"),
         *("--exclude-ice", "--last", "--roads"),  # test_refused_files.py
     },
+    "size": {"--vehicles", "--road-km", "--latitude", "--rate", "--json"},  # app/test_sizing.py
     "roads": {"extract", "--out", "--id", "--name"},  # analytics/roads/test_join.py
     "analyze": {"--roads", "--level", "--within", "--last"},  # analytics/roads/test_contract.py
     "query": {
@@ -205,6 +206,7 @@ GIVEN_IN: Final[dict[str, tuple[str, ...]]] = {
     "certs": ("enrolment/test_certificates",),
     "run": (),
     "export": ("client/test_datex", "archive/test_iceberg", "test_refused_files"),
+    "size": ("app/test_sizing",),
     "roads": ("analytics/roads/test_join",),
     "analyze": ("analytics/roads/test_contract", "test_refused_files"),
     "router": ("test_refused_files",),

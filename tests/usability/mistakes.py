@@ -82,6 +82,7 @@ FLEET: Final = (
     "page --base-map {d}/none.mbtiles",
     "page --host no.such.host.invalid --port 0",
     "roads {d}/none.osm.pbf --out {d}/r.parquet",
+    "size --vehicles 0 --road-km 1",
     "roads {d}/text.csv --out {d}/r.parquet",
     "roads {d}/none.gpkg --out {d}/r.xlsx",
     "rebuild --archive {d} --out {d}/r",

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from fleet_service.fusion.constants import FORGOTTEN_EVERY_S, FORGOTTEN_S, VOTE_RENEWAL_S
+from fleet_service.app.sizing import COSTS, remembered_pairs
 from schemas.runtime.figures import Figure
 from tests.benchmarks.country.replayed import ROWS
 
@@ -16,9 +16,6 @@ VEHICLES: Final = 1_000_000
 FACTOR: Final = 10  # times the country that was measured: its vehicles, stream and cells
 USED: Final = 0.6  # of a core at the most, so that a service catches up after an outage
 DAY_S: Final = 86_400.0
-VALUES: Final = 0.15  # share of the visits that give a value: .14 to .17 on four whole ways
-# of the visits, those where their vehicle was not in the last hours: nobody turns round
-NEW_PLACES: Final = 1.0
 
 
 def estimate_million(found: Mapping[str, float]) -> list[Figure]:
@@ -31,8 +28,7 @@ def estimate_million(found: Mapping[str, float]) -> list[Figure]:
     rate = FACTOR * found["country.rate"]
     cells = FACTOR * found["country.cells"]
     cores = rate * found["country.service_us"] * 1e-6
-    remembered_s = VALUES * FORGOTTEN_S + (1.0 - VALUES) * VOTE_RENEWAL_S + FORGOTTEN_EVERY_S / 2
-    pairs = rate * NEW_PLACES * remembered_s
+    pairs = remembered_pairs(rate, COSTS.values)
     per_day = rate * DAY_S * found["country.archive_bytes"] / 1e9
     return [
         Figure("country.million.per_s", rate, f"observations/s of {VEHICLES} vehicles"),

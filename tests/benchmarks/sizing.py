@@ -1,0 +1,126 @@
+"""Check of `fleet-service size`: memory of an engine with 10⁴ and 10⁵ vehicles, compared with the
+calculator's estimate. Each engine runs in a separate process.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_service.app.engine import Engine
+from fleet_service.app.sizing import MemoryContent, split_memory
+from fleet_service.fusion.store.records import PAIRS
+from fleet_service.ingest.inbox import Message
+from schemas import grid, keys, mugrid, wire
+from schemas.config import ServiceConfig
+from schemas.runtime.figures import Figure
+from schemas.thresholds import NS as SECOND
+from schemas.wire import Batch, Kind
+
+VEHICLES: Final = {10_000: 8, 100_000: 3}  # and messages of each
+ROWS: Final = 10  # observations of a message
+AREAS: Final = 10  # regions in which the vehicles drive
+LANES: Final = 1500  # roads of a region
+REGION_BITS: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM)
+TURN: Final = 512
+BAR: Final = 0.2
+
+
+def sizing() -> list[Figure]:
+    """Measure the relative error of the calculated memory at 10⁴ and 10⁵ vehicles."""
+    out = []
+    for vehicles, messages in VEHICLES.items():
+        command = [sys.executable, "-m", "tests.benchmarks.sizing", str(vehicles), str(messages)]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+        found = json.loads(done.stdout.splitlines()[-1])
+        measured = found.pop("bytes")
+        estimated = sum(split_memory(MemoryContent(**found)).values())
+        said = f"{measured / 1e6:.0f} MB measured, {estimated / 1e6:.0f} MB estimated; {found}"
+        error = abs(estimated / measured - 1.0)
+        out.append(Figure(f"scale.calculator_error.v{vehicles}", error, said, BAR))
+    return out
+
+
+def main(vehicles: int, messages: int) -> None:
+    """Ingest a number of messages of each vehicle. Print the content of the engine's memory, and
+    the memory that it takes [bytes], as one line of JSON.
+    """
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        closing(Engine(ServiceConfig(), Path(folder))) as engine,
+    ):
+        begin = time.time_ns() - messages * ROWS * SECOND
+        engine.intake.ingest([make_message(0, 0, AREAS, begin)], begin + ROWS * SECOND)
+        engine.settlement.flush()
+        before = _read_resident_bytes()
+        for number in range(messages):
+            end = begin + (number + 1) * ROWS * SECOND
+            for first in range(0, vehicles, TURN):
+                some = range(first, min(first + TURN, vehicles))
+                sent = [make_message(vehicle, number, vehicle % AREAS, end) for vehicle in some]
+                engine.intake.ingest(sent, end)
+            engine.settlement.flush()
+        assert engine.counts["implausible_moves"] == 0, engine.counts
+        store = engine.state.fusion.store
+        content = MemoryContent(
+            vehicles=store.vehicles,
+            cells=store.size,
+            pairs=int(store.state.used[PAIRS]),
+            waiting=store.waiting,
+        )
+        print(json.dumps(content._asdict() | {"bytes": _read_resident_bytes() - before}))
+
+
+def make_message(vehicle: int, number: int, area: int, end: int) -> Message:
+    """Return message `number` of a vehicle that drives straight east, one cell per second, in one
+    of the areas; its last visit ends at `end` [ns]. One visit in seven gives a value of friction.
+    """
+    lane, group = vehicle // AREAS % LANES, vehicle // AREAS // LANES
+    x, y = grid.deinterleave(grid.region_of(grid.cell_of(57.7, 11.97)) << REGION_BITS)
+    cell = grid.interleave(
+        x + (area << REGION_BITS // 2) + ROWS * (number + group) + np.arange(ROWS),
+        np.full(ROWS, y + lane),
+    )
+    latitude, longitude = grid.centre(cell)
+    leave = end - SECOND * np.arange(ROWS)[::-1]
+    is_value = (vehicle + number + np.arange(ROWS)) % 7 == 0
+    value = -0.5 * np.square((mugrid.CENTRES - 0.7) / 0.08)
+    bound = np.where(mugrid.CENTRES < 0.2, -6.0, 0.0)
+    columns: dict[str, NDArray[Any]] = {
+        "enter_time": leave - SECOND,
+        "leave_time": leave,
+        "cell": cell,
+        "sector": np.zeros(ROWS, np.int8),
+        "latitude": latitude,
+        "longitude": longitude,
+        "position_std": np.ones(ROWS, np.float32),
+        "yaw": np.zeros(ROWS, np.float32),
+        "speed": np.full(ROWS, 10.0, np.float32),
+        "mu_utilised": np.where(is_value, 0.6, 0.2).astype(np.float32),
+        "log_likelihood": mugrid.encode_log_likelihood(np.where(is_value[:, None], value, bound)),
+    }
+    region = int(grid.region_of(cell[0]))
+    name = f"sim-{area}-{vehicle}"
+    batch = Batch(Kind.OBSERVATION, name, 1, region, number + 1, number + 1, columns)
+    key = keys.observation_key(region, name)
+    return Message(batch.kind, key, wire.encode(batch), wire.ENCODING[batch.kind])
+
+
+def _read_resident_bytes() -> int:
+    gc.collect()
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) * 1024
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]))
