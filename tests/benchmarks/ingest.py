@@ -35,6 +35,8 @@ from tests.faults.load import make_visits
 
 VEHICLES: Final = 1000
 CELLS_ACROSS: Final = 200
+STEP_NS: Final = 200_000_000  # between two cells of 10 m
+REGION_BITS: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM)
 FLUSH: Final = 20_000  # messages between two segments
 COUNTS: Final = {10: 16_384, 1: 65_536}  # messages of a round, by records in each
 MESSAGE: Final = wire.MESSAGES[Kind.OBSERVATION]
@@ -117,21 +119,35 @@ def _decode_messages(sent: list[Message]) -> list[NDArray[Any]]:
 def make_messages(
     count: int, records: int, now: int, vehicles: int = VEHICLES, begin: int = 0, east: int = 0
 ) -> list[Message]:
-    """Return `count` messages with `records` visits that ended at `now` [ns], in one region or in a
-    region `east` regions further east.
+    """Return `count` messages with `records` visits, the last of which end at `now` [ns], in one
+    region or in a region `east` regions further east.
 
     The first `begin` messages were made before: vehicles and sequence numbers continue after them.
+    Each vehicle drives to and fro on a straight road, so that the service accepts its path.
     """
     rng = np.random.default_rng([SEED, begin])
-    columns = make_visits(rng, np.zeros(2 * count * records, np.int64), now, CELLS_ACROSS).columns
-    columns["longitude"] = columns["longitude"] + east * 360.0 / (1 << grid.REGION_ZOOM)
-    columns["cell"] = grid.cell_of(columns["latitude"], columns["longitude"])
-    home = grid.region_of(columns["cell"])
-    region = int(np.bincount(home - home.min()).argmax() + home.min())
-    mine = np.resize(np.flatnonzero(home == region), count * records)
+    columns = make_visits(rng, np.zeros(count * records, np.int64), now, CELLS_ACROSS).columns
+    message, vehicle = (
+        np.repeat(part, records) for part in divmod(begin + np.arange(count), vehicles)
+    )
+    later = (int(message[-1]) - message) * records + np.tile(np.arange(records)[::-1], count)
+    leave = now - STEP_NS * later
+    along = (leave // STEP_NS + 7 * vehicle) % (2 * CELLS_ACROSS)
+    x, y = grid.deinterleave(grid.region_of(grid.cell_of(57.7, 11.97)) << REGION_BITS)
+    cell = grid.interleave(
+        x
+        + (east << REGION_BITS // 2)
+        + np.where(along < CELLS_ACROSS, along, 2 * CELLS_ACROSS - 1 - along),
+        y + vehicle % CELLS_ACROSS,
+    )
+    columns["cell"] = cell
+    columns["latitude"], columns["longitude"] = grid.centre(cell)
+    columns["leave_time"] = leave
+    columns["enter_time"] = leave - STEP_NS
+    region = int(grid.region_of(cell[0]))
     out = []
     for number in range(count):
-        part = mine[number * records : (number + 1) * records]
+        part = slice(number * records, (number + 1) * records)
         seq, place = divmod(begin + number, vehicles)
         taken = {name: column[part] for name, column in columns.items()}
         batch = Batch(
