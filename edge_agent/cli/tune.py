@@ -1,8 +1,9 @@
 """`edge-agent tune`: search for the best memberships (fuzzy sets) by ant colony optimisation and by
 random search with equal budget; write the best result.
 
-With --study: run paper 004's own filter with correct and wrong R, several searches each; write
-figures, a table and a plot.
+With --study: tune the published filter on which the default estimator is based (paper 004: Xiong et
+al., 2019; see deploy/docs/reference/bibliography.md). Run several searches each with a correct and
+with a wrong measurement noise R; write figures, a table and a plot.
 """
 
 from __future__ import annotations
@@ -229,8 +230,8 @@ def _search_worth(score: Score, objective: str) -> float:
 
 
 def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
-    """Run the study of paper 004's filter, a comparison of searches for fuzzy sets, and write its
-    results into a folder; return 0.
+    """Run the study: compare searches for the fuzzy sets of the filter of paper 004 (Xiong et al.,
+    2019), and write the results into a folder; return 0.
     """
     from edge_agent.lab.tuning import study_report
 

@@ -47,19 +47,21 @@ REASONS: Final = {
 
 
 class FlagRecord:
-    """State of one controller flag of one vehicle, as a record."""
+    """Memory about one controller flag (ABS, ESC or traction control) of one vehicle, from which
+    the conditions above are decided. It is updated with each sample in which the flag is known.
+    """
 
-    time: float  # of its last sample [s]
-    off: float  # for how long it was off without a break [s]
-    active: float  # for how long it was on, with forgetting [s]
-    known: float  # for how long it was known, with forgetting [s]
-    standing: float  # for how long it was on while the vehicle stood [s]
-    was_off: bool  # for OFF_S without a break, once
-    doubt: int  # why it is doubted: NEVER_OFF and others; 0 while it was never on
+    time: float  # time of the flag's last known sample [s]
+    off: float  # for how long it has been off without a break [s]
+    active: float  # for how long it was on, with exponential forgetting (MEMORY_S) [s]
+    known: float  # for how long it was known, with the same forgetting [s]
+    standing: float  # for how long it was on while the vehicle stood, since it was last off [s]
+    was_off: bool  # True once it was off for OFF_S without a break
+    doubt: int  # sum of the reasons why it is implausible, such as NEVER_OFF; 0 if plausible
 
 
 def new_flag_records(vehicles: int) -> RecordArray:
-    """Return new records (N, len(FLAGS)) for vehicles whose flags have not been read."""
+    """Return the memory, (N, len(FLAGS)) records, for N vehicles whose flags have not been read."""
     made = records(FlagRecord, vehicles, len(FLAGS))
     made["time"] = np.nan
     return made
@@ -112,7 +114,7 @@ def doubted_flags(record: RecordArray) -> list[tuple[int, str, str]]:
 def _check_flags(
     flags: Records[FlagRecord], t: FloatArray, standing: FloatArray, context: FloatArray
 ) -> None:
-    """Update the records of the controller flags sample by sample, and set implausible flags in the
+    """Update the memory of all controller flags sample by sample, and set implausible flags in the
     context to NaN; this is the compiled part of `trusted_context`.
     """
     for k in range(t.shape[0]):
@@ -135,7 +137,15 @@ def _check_flags(
 
 @compiled
 def _count_sample(record: FlagRecord, dt: float, on: bool, stands: bool) -> None:
-    """Update the record of a flag with one more known sample, `dt` [s] after the previous one."""
+    """Update the memory of one controller flag with a new sample, and decide whether the flag is
+    implausible (`record.doubt`).
+
+    Args:
+        record: memory of the flag.
+        dt: time since the flag's previous known sample [s].
+        on: True if the flag is on in this sample.
+        stands: True if the vehicle stands in this sample.
+    """
     keep = np.exp(-dt / MEMORY_S)
     record.known = record.known * keep + dt
     record.active = record.active * keep + (dt if on else 0.0)

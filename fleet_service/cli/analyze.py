@@ -176,8 +176,11 @@ def _within_seconds(text: str | None) -> float | None:
 
 
 def _checked_question(arguments: argparse.Namespace) -> Question:
-    """Check the command's options as far as this is possible before any computation; return the
-    question.
+    """Check the command's options as far as this is possible before any computation. Return the
+    question (predefined analysis) that the user named.
+
+    Raises:
+        InputError: the question is unknown, or an option does not apply to it or is out of range.
     """
     question = question_of(arguments.question)
     if arguments.out is not None:

@@ -209,11 +209,15 @@ def compute_vote_weights(
     peers: RecordArray, before: VoteWeights, epoch: int, *, enrolled: bool
 ) -> VoteWeights:
     """Return the vote weights (trust) of the vehicles (V,) from the minute `epoch` on, from their
-    agreement with other vehicles. `before` contains the earlier weights of these other vehicles.
+    agreement with other vehicles. `before` contains the previous weights.
 
-    In an established service, a vehicle that has met few trusted vehicles is a newcomer with less
-    weight. If only `enrolled` vehicles are fused, no vehicle can take a new name, so there are no
-    newcomers.
+    A vehicle is known once it has been compared with enough others (ESTABLISHED_PEERS, counted by
+    their weights). A service is established once ESTABLISHED_VEHICLES vehicles are known and
+    trusted. In an established service, a vehicle that is not known is a newcomer: its weight is at
+    most NEWCOMER, so that an attacker gains nothing by reporting under a new name.
+
+    `enrolled` is True if the service accepts only vehicles on the operator's list. Then nobody can
+    invent a name, and no vehicle is treated as a newcomer.
     """
     weight = np.empty(len(before.weight), np.float32)
     established = _update_weights(peers, before.weight, weight, enrolled)
@@ -226,8 +230,9 @@ def compute_vote_weights(
 def _update_weights(
     peers: RecordArray, before: Float32Array, out: Float32Array, enrolled: bool
 ) -> bool:
-    """Fill `out` (V,) with the new weights (trust) of the vehicles, computed from the earlier
-    weights `before`. Return True if the service is established, so that newcomers get less weight.
+    """Fill `out` (V,) with the new weights (trust) of the vehicles, computed from the previous
+    weights `before`. Return True if newcomers got less weight: the service is established and
+    accepts also vehicles that are not enrolled, see `compute_vote_weights`.
     """
     known = np.empty(len(out), np.bool_)
     trusted = 0
@@ -288,7 +293,9 @@ def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:
 
 
 def initial_trust(established: bool) -> float:
-    """Return the weight of a vehicle that has not been compared with others yet."""
+    """Return the weight of a vehicle that has not been compared with others yet; it is at most
+    NEWCOMER if the service is `established`, see `compute_vote_weights`.
+    """
     weight = _scale_trust(c.TRUST_PRIOR)
     return min(weight, c.NEWCOMER) if established else weight
 

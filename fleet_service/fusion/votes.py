@@ -310,9 +310,9 @@ def is_ice_source(entries: RecordArray, entry: int) -> bool:
     """Return True if a visit supports an alert: by its value, or by the intervention of a slip
     controller that no value of the visit contradicts.
 
-    An intervention while little grip is used corroborates the reports of other vehicles. It never
-    enters the belief, because the intervention and the likelihood of the same visit come from one
-    slip.
+    An intervention while little grip is used corroborates the reports of other vehicles. The
+    intervention itself never changes the belief: the controller and the visit's likelihood observe
+    the same sliding wheel, so this evidence would count twice.
     """
     slippery = entries[entry].slippery
     if slippery >= c.SOURCE_SHARE and ice_evidence(entries, entry) >= c.WITNESS_NATS:

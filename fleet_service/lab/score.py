@@ -222,14 +222,20 @@ def calibration(scores: Sequence[Scores]) -> FloatArray:
 
 
 def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
-    """Return scores of P(slippery) over all answers: `brier`, `log`, `ece`, `missed` and
-    `grip_raised`.
+    """Return scores of the map's P(slippery) against the true friction, over all answers; for each
+    of them smaller is better.
 
-    `ece` is the expected calibration error over BINS bins, weighted by answers (Naeini et al.,
-    2015). `missed` is the share of truly slippery cells with a P(slippery) below MISSED.
-    `grip_raised` is the share of cells with grip (μ > SURE_GRIP) with a P(slippery) above RAISED.
-    The error of the worst bin is not used. All cells of one simulated drive share the same snow, so
-    even a calibrated map would meet a limit on it in only a third of the evaluations.
+    brier        mean of (P(slippery) - truth)², where the truth is 1 for slippery road, else 0
+    log          mean of -ln P, where P is the map's probability of the true case [nat]
+    ece          expected calibration error: answers are sorted into BINS bins by their P(slippery);
+                 mean over all answers of |mean P(slippery) - share of slippery road| in their bin
+                 (Naeini et al., 2015)
+    missed       share of the truly slippery answers with a P(slippery) below MISSED
+    grip_raised  share of the answers about roads with grip (μ > SURE_GRIP) with a P(slippery)
+                 above RAISED
+
+    The error of the worst bin is no score. All cells of one simulated drive share the same snow, so
+    even a calibrated map would keep a limit on this error in only a third of the evaluations.
     """
     given = np.concatenate([s.slippery for s in scores])
     truth = np.concatenate([s.truth for s in scores])
@@ -246,15 +252,15 @@ def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
 
 
 def false_grip(s: Scores) -> float:
-    """Return the share of the map's answers whose 90 % interval lies above the true friction, so
-    that the road is more slippery than the map states.
+    """Return the share of false grip: answers of the map whose whole 90 % interval lies above the
+    true friction, so that the road is more slippery than the map states.
     """
     return _mean_or_nan(s.rank < ALPHA / 2.0)
 
 
 def false_ice(s: Scores) -> float:
-    """Return the share of the map's answers whose 90 % interval lies below the true friction, so
-    that the road has more grip than the map states.
+    """Return the share of false ice: answers of the map whose whole 90 % interval lies below the
+    true friction, so that the road has more grip than the map states.
     """
     return _mean_or_nan(s.rank > 1.0 - ALPHA / 2.0)
 

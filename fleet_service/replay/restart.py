@@ -51,8 +51,11 @@ class Restart(NamedTuple):
 
 
 def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()) -> Restart:
-    """Return the initial state from the newest usable checkpoint (saved state) of an archive.
-    `extra_tables` names additional tables that the service stored with those of `image_of`.
+    """Return the initial state from the newest usable checkpoint (saved state) of an archive; an
+    empty state if there is none.
+
+    A checkpoint contains the tables that `image_of` makes. The service may have added further
+    tables; `extra_tables` are the names of those to read.
     """
     refused = 0
     for path in checkpoints.list_checkpoints(root):
@@ -85,8 +88,8 @@ def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()
 def image_of(
     fusion: Fusion, standing: list[Alert], streams: SequenceTrackers
 ) -> dict[str, pa.Table]:
-    """Return the tables of a checkpoint (saved state), from which `load_restart` restores the
-    state.
+    """Return the tables of a checkpoint (saved state) by name: the tables of the fusion, the active
+    alerts, and the record of accepted batches. `load_restart` restores the state from them.
     """
     columns, above = streams.columns()
     return tables_of(fusion) | {

@@ -2,8 +2,9 @@
 router that returns, and a flood.
 
 Router and service run in one network namespace, cars in others. `link_relay.py` simulates the links
-between them. The same traffic runs over QUIC and over TLS for comparison. Creating namespaces and
-TUN devices needs root.
+between them. An endpoint is a process with one Zenoh session to the router, which plays a car, a
+reader or the service (`link_ends.py`). The same traffic runs over QUIC and over TLS for comparison.
+Creating namespaces and TUN devices needs root.
 """
 
 from __future__ import annotations
@@ -145,8 +146,15 @@ class Namespaces:
     def start_end(
         self, role: str, namespace: str, name: str, protocols: Sequence[str], **given: object
     ) -> subprocess.Popen[str]:
-        """Start one endpoint of the campaign (see `link_ends.py`) with a role and a certificate
-        name.
+        """Start an endpoint: a process that connects to the router over the transports
+        `protocols`.
+
+        Args:
+            role: task of the process, see `link_ends.py`: "receive", "send", "open" or "watch".
+            namespace: network namespace in which the process runs.
+            name: name in the certificate with which it connects.
+            protocols: transports that it tries: "quic", "tls".
+            given: options of the role; `ports` are those of the routers.
         """
         inside = "127.0.0.1" if namespace == self.road else ROUTER_ADDRESS
         ports = given.pop("ports", PORTS[:1])
@@ -193,8 +201,8 @@ def read_line(process: subprocess.Popen[str]) -> str:
 
 
 def finish_end(process: subprocess.Popen[str]) -> dict[str, Any]:
-    """Close the stdin of an endpoint's process (see `link_ends.py`), which ends it, and return the
-    result that it then prints.
+    """Close the stdin of an endpoint's process, which ends it, and return the result that it then
+    prints.
     """
     assert process.stdin is not None
     process.stdin.close()
@@ -283,7 +291,7 @@ def delay_alerts(site: Site, protocol: str, seconds: float) -> dict[str, float]:
 
 
 def block_udp(site: Site) -> float:
-    """Return the time [s] until a session is open where UDP is blocked."""
+    """Return the time [s] until a car's session is open over TLS when the link blocks UDP."""
     with open_namespaces(site.folder / "udp") as there:
         for letter in "ab":
             there.start_router(letter)
@@ -296,8 +304,8 @@ def block_udp(site: Site) -> float:
 
 
 def return_with_tls(site: Site, outages_s: Sequence[float]) -> float:
-    """Return the longest time [s] that a car takes to find a router that came back with
-    TLS only.
+    """Return the longest time [s] until a car is connected again, after a router that served QUIC
+    and TLS was off for each of `outages_s` [s] and then came back with TLS only.
     """
     longest = 0.0
     with open_namespaces(site.folder / "back") as there:
@@ -320,8 +328,9 @@ def return_with_tls(site: Site, outages_s: Sequence[float]) -> float:
 
 
 def measure_flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, float]:
-    """Return two figures: the p99 delay of honest messages with a flooding car, divided by that
-    without, and the rate of messages of the flooding car that passed the router [1/s].
+    """Let one car send as many messages as it can. Return the p99 delay of the other cars' messages
+    during this flood divided by that before it, and the rate at which messages of the flooding car
+    passed the router [1/s]. `capped` is True if the router limits message rates.
     """
     with open_namespaces(site.folder / f"flood-{capped}") as there:
         there.start_router(capped=capped)

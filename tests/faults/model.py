@@ -1,5 +1,9 @@
-"""Campaign on the model of acknowledgement, lease, hand-over and erasure: all states are checked,
-also with each rule switched off.
+"""Campaign that checks the model of acknowledgement, lease, takeover, hand-over and erasure
+(`protocol_model.py`) exhaustively: the model checker visits every reachable state.
+
+The whole protocol must break no invariant. Then one rule at a time is switched off (the protocols
+in BROKEN), for example the fence, or the limit of half a lease for acknowledgements. Each of these
+protocols must break an invariant, which shows that the checker can find errors.
 """
 
 from __future__ import annotations
@@ -11,8 +15,9 @@ from tests.faults.protocol_model import BROKEN, Rules, explore_states
 
 
 def run(site: Site) -> list[Figure]:
-    """Check all states of the model of acknowledgement and takeover with equal and different lease
-    times, and that the model finds each broken protocol; return the figures.
+    """Check all states of the whole protocol, with equal and with different lease times of the two
+    services, and of each protocol in BROKEN. Return the figures: violations of the whole protocol,
+    broken protocols without a violation (both must be 0), and the number of states checked.
     """
     checked = [
         explore_states(Rules(), most_turn=site.choose_amount(2, 1)),

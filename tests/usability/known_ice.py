@@ -1,7 +1,10 @@
-"""Measurement of how many known slippery cells an output of the map draws as unknown.
+"""Measurement of how many known slippery places each output of the map hides, that is, shows as
+unknown.
 
-A cell and heading with P(μ < 0.4) above 0.5 is known to be slippery. An output draws it as unknown
-if it gives it no value of μ, hatches it, or gives it the hollow or grey class of the page.
+A place is a cell and a heading. It is known to be slippery if P(μ < 0.4) is above 0.5. An output of
+the map is a form in which a user sees it: an answer to a query, an exported file, a picture, or a
+live page. The output hides a place if it leaves the place out, gives it no value of μ, hatches it,
+or draws it in the page's hollow or grey class.
 """
 
 from __future__ import annotations
@@ -107,7 +110,9 @@ def _find_slippery(fusion: Fusion, slots: Any) -> tuple[Places, Places]:  # noqa
 
 
 def find_hidden(ice: KnownIce) -> dict[str, Places]:
-    """Return for each output of the map the known slippery places that it draws as unknown."""
+    """Return, by name of the output, the known slippery places that this output of the map hides
+    (shows as unknown). A correct output has an empty set.
+    """
     return {
         **{f"answer, {form}": _hidden_rows(ice, _answered_rows(ice, form)) for form in Format},
         **{
@@ -133,8 +138,8 @@ def _key(row: dict[str, Any]) -> tuple[int, int]:
 
 
 def _hidden_rows(ice: KnownIce, rows: list[dict[str, Any]]) -> Places:
-    """Return the known slippery places that are missing in the rows of an output, or have no μ
-    there.
+    """Return the known slippery places that the rows of an output hide: they have no row, no μ, or
+    the basis `bound`.
     """
     shown = {
         _key(row)

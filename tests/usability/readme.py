@@ -89,8 +89,9 @@ def list_commands(text: str) -> list[str]:
 
 
 def run_all(folder: Path) -> tuple[list[str], dict[str, str]]:
-    """Run all commands. Return those that failed, with the last line that they printed, and for
-    each map the reason why it does not count as populated (empty if it does).
+    """Run all commands of PAGES in a folder. Return those that failed, with the last line that they
+    printed, and for each map in MAPS the reason why it does not count as populated (empty if it
+    does).
     """
     for name in ("deploy", "tests/data"):
         shutil.copytree(
@@ -144,10 +145,11 @@ def _list_steps() -> Iterator[tuple[str | None, dict[str, str]]]:
 
 
 def look_at_map(place: str | Path) -> str:
-    """Open a map in a browser, and return why it is not populated; empty if it is.
+    """Open a map in a browser, and return the reason why it does not count as populated; empty if
+    it does.
 
-    A populated map shows at least LEAST_CELLS cells over LEAST_PX at once, without a click, an
-    error or a card that covers it.
+    A populated map shows at least LEAST_CELLS cells, drawn over at least LEAST_PX pixels. The user
+    need not click for it, no error occurs, and no card covers it.
     """
     with open_page(place) as seen:
         if isinstance(place, str):
@@ -181,7 +183,9 @@ _EXTENT: Final = """() => {
 
 
 def look_at_demo(folder: Path) -> str:
-    """Run the README's demo, and return why its page is not populated at the end, or nothing."""
+    """Run the README's demo, and return the reason why the map on its page does not count as
+    populated (empty if it does).
+    """
     assert DEMO in README.read_text(encoding="utf-8"), "the README names the demo otherwise"
     log = folder / "demo.log"
     command = [str(Path(sys.executable).parent / "gripmap"), "demo", "--stay"]
@@ -248,8 +252,10 @@ def _last_line(log: Path) -> str:
 
 
 def main() -> int:
-    """Run all commands in a folder, and print the failed ones and the judged maps as JSON. The
-    process must have its own network namespace.
+    """Run the demo of the README and the commands of PAGES in the folder that the command line
+    names. Print as JSON the commands that failed, and for each map that they leave the reason why
+    it does not count as populated (empty if it does). The process must have its own network
+    namespace.
     """
     folder = Path(sys.argv[1])
     demo = look_at_demo(folder)

@@ -1,16 +1,23 @@
 """Search for quantities with a wrong unit, sign or clock: the smallest set of faults that explains
-all identities (quantities that are equal by physics).
+all identities. An identity is a pair of expressions that are equal by physics, for example the
+measured a_y and the product v·r (speed and yaw rate); see `identities`.
 
-Every quantity may be free of faults or have one of a few faults. Each fault is a factor on the
-recorded value and costs FAULT_COST / 2 in log probability, because faulty columns are rare (Occam).
-An identity relates the quantities by
+The gain of an identity is the slope of its left side over its right side in the recorded drive
+(`Fit.gain`). Without faults it is near the identity's centre, which is about 1 and includes known
+effects such as body roll. Every quantity may be free of faults or have one of a few faults. A fault
+multiplies the recorded value by a factor, for example 57.3 for deg instead of rad. So
 
-    ln |gain| = ln centre + Σ ± ln factor of its quantities + error
+    ln |gain| = ln centre + Σ power · ln |factor| + error      over the quantities of the identity
     sign(gain) = Π sign(factor)
 
-Every set of at most two faulty quantities is tried. A quantity is settled if each explanation that
-gives it another fault costs at least SETTLED more than the best explanation. Clocks are treated in
-the same way: the lag of an identity is the difference between the lags of two devices.
+where the power is 1 for a quantity on the left side and -1 on the right side. Each fault costs
+FAULT_COST, twice its negative log probability, because faulty columns are rare (Occam's razor). An
+explanation is a set of faults; its cost is the sum of its faults' costs and of the squared
+normalised errors. Every set of at most two faulty quantities is tried. A quantity is settled if
+each explanation that gives it another fault costs at least SETTLED more than the best explanation.
+
+Clocks are treated in the same way: the lag of an identity is the difference between the lags of two
+devices.
 """
 
 from __future__ import annotations
@@ -34,7 +41,7 @@ WRONG_SIGN: Final = 60.0  # cost of a sign that nothing explains, at full correl
 
 
 class Mistake(NamedTuple):
-    """A fault of a quantity: its name, and the ratio of the recorded to the true value."""
+    """A fault of a quantity: its name, and the factor by which it multiplies the true value."""
 
     name: str
     factor: float
@@ -42,7 +49,7 @@ class Mistake(NamedTuple):
 
 class Member(NamedTuple):
     """A quantity in an identity (two sides that are equal by physics), and the power, 1 or -1, with
-    which a wrong factor of this quantity changes the ratio of the sides (gain).
+    which the factor of its fault enters the gain (slope of the left side over the right side).
     """
 
     quantity: str
@@ -50,9 +57,12 @@ class Member(NamedTuple):
 
 
 class Law(NamedTuple):
-    """Properties of an identity (equation between two sides) on a car without faults: expected gain
-    (ratio of the sides), standard deviation of the gain's logarithm between cars, and its
-    quantities.
+    """Properties of an identity (equation between two sides) for cars without faults.
+
+    Attributes:
+        centre: expected gain (slope of the left side over the right side).
+        spread: standard deviation of ln(gain) between cars.
+        members: quantities on both sides.
     """
 
     centre: float
@@ -144,8 +154,9 @@ JOINT: Final = (
 class Verdict:
     """Result of the search for faults (wrong units and signs) of measured quantities.
 
-    `faults` has the fault of each quantity, None if there is none. `margins` has, for each
-    quantity, the extra cost of the best explanation that gives this quantity another fault.
+    `faults` has the fault of each quantity in the best explanation, None if there is none.
+    `margins` has, for each quantity, by how much the best explanation that gives this quantity
+    another fault (or none) costs more.
     """
 
     faults: dict[str, Mistake | None]
@@ -159,8 +170,8 @@ class Verdict:
 
 
 def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
-    """Return the smallest set of faults (wrong units and signs) that explains the fitted identities
-    (pairs of quantities that are equal by physics).
+    """Return the cheapest set of faults (wrong units and signs) that explains the gains of the
+    fitted identities `found` (pairs of expressions that are equal by physics).
     """
     choices = faults_of(vehicle, found["ground"])
     known = {name: fit for name, fit in found.items() if fit.is_known}
@@ -224,11 +235,12 @@ def _misfit_of(name: str, fit: Fit, guess: Mapping[str, Mistake]) -> float:
 
 
 def late_clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
-    """Return the smallest set of late devices that explains the lags, as device → (delay of its
-    clock [s], margin).
+    """Return the one late device that best explains the lags of the identities, as device → (delay
+    of its clock [s], margin). The margin is by how much the best other explanation (another device,
+    or none) costs more.
 
-    The result is empty if no device is late. The margin is the extra cost of the next best
-    explanation.
+    The result is empty if the delay is below LATE_S, or if the explanation without a late device
+    costs less.
     """
     known = {
         name: fit

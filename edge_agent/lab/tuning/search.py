@@ -2,8 +2,9 @@
 result and its history.
 
 A search looks for the best vector, with one value per vertex (variable). Each vertex has its own
-short list of possible values, its positions. A search does not depend on filters: the objective is
-any function of the vector, and larger is better.
+short list of possible values, its positions. A path selects one position per vertex: it is an array
+of V indices, and the positions with these indices form a vector. A search does not depend on
+filters: the objective is any function of the vector, and larger is better.
 """
 
 from collections.abc import Callable, Sequence
@@ -105,15 +106,15 @@ class Graph:
         return cls(positions, np.isfinite(positions))
 
     def vector(self, path: IntArray) -> FloatArray:
-        """Return the vector of values (V,) for a path (V,), which has, per vertex (variable), the
-        index of its position (possible value)."""
+        """Return the vector of values (V,) that a path (V,) selects."""
         return self.positions[np.arange(len(path)), path]
 
 
 @dataclass
 class Ledger:
-    """Record of all evaluated paths (one index of a value per variable): no path is evaluated
-    twice, and the best one is stored."""
+    """Record of all evaluated paths with their objectives, of the best path, and of the iterations.
+    The objective of a path is computed only once.
+    """
 
     objective: Objective
     graph: Graph
@@ -124,8 +125,8 @@ class Ledger:
     history: list[Iteration] = field(default_factory=list)
 
     def draw(self, sample: Callable[[], IntArray]) -> IntArray:
-        """Return a path (V,), one index of a value per variable, that `sample` draws and the
-        problem admits, if possible one that was not evaluated before.
+        """Return a path (V,) that `sample` draws at random and whose vector is admissible. Draw up
+        to REDRAWS times to find a path that was not evaluated before.
 
         Raises:
             InputError: no drawn path is admissible.
@@ -144,8 +145,8 @@ class Ledger:
         return fallback
 
     def evaluate(self, path: IntArray) -> float:
-        """Return the objective at a path (one index of a value per variable); it is computed only
-        once per path. A value that is not finite counts as the worst.
+        """Return the objective of a path (V,), from the record if it was evaluated before. An
+        objective that is not finite counts as -infinity, the worst.
         """
         key = path.tobytes()
         if key not in self.values:

@@ -1,5 +1,9 @@
 """Changes of the memory of a fusion's state: larger arrays of records, and deletion of old records.
 Each function returns the new state.
+
+An entry is one observation in one cell. It waits in the cell's lateness window until it is older
+than the checkpoint (latest time minus the allowed delay). Until then it is not final, because an
+earlier observation may still arrive.
 """
 
 from __future__ import annotations
@@ -28,15 +32,17 @@ from schemas.runtime.records import RecordArray
 
 
 def grow_entries(state: State, most: int) -> State:
-    """Return the fusion's state with space for at least `most` entries (observations that wait)."""
+    """Return the fusion's state with space for at least `most` entries (observations that are not
+    yet final): twice the present space, or `most` if this is more.
+    """
     entries = grow_rows(state.entries, max(2 * len(state.entries), most))
     free = _free_rows(state.free_entries, state.used, FREE_ENTRIES, len(entries))
     return state._replace(entries=entries, free_entries=free)
 
 
 def grow_windows(state: State, most: int) -> State:
-    """Return the fusion's state with space for at least `most` lateness windows (recent
-    observations of one cell each).
+    """Return the fusion's state with space for at least `most` lateness windows (lists of the
+    recent observations of one cell): twice the present space, or `most` if this is more.
     """
     rows = max(2 * len(state.windows), most)
     windows = grow_rows(state.windows, rows)

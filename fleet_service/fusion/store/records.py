@@ -4,6 +4,18 @@ are adjacent in memory. Compiled functions see a row as an object.
 The state consists of record arrays instead of columns for two reasons. A visit to a cell that was
 not used recently costs two memory accesses instead of one per column. Compiled functions receive a
 few arrays of records instead of dozens of columns, which makes calls cheap.
+
+Terms
+    slot          storage of one visited cell and heading sector, by number
+    observation   report of one vehicle about one visit
+    vote          effect of an observation on the belief of one cell
+    value, bound  observation that measures the friction; one that only gives a lower bound of it
+    checkpoint    latest time minus the allowed delay; observations before it are final
+    window        list of the observations of a slot after the checkpoint, in order of time
+    pair          one vehicle in one slot
+
+Records store some numbers as small integers. "In units of 1/FINE" means that the stored integer is
+the number times FINE, rounded. The same holds for USED, SHARED and others.
 """
 
 from __future__ import annotations
@@ -57,10 +69,11 @@ class CellRecord:
         vehicles: number of distinct vehicles.
         values: number of observations with a friction value; a repeated one of the same vehicle
             counts as a fraction.
-        window: row of the slot's window, or NONE.
-        reporters: row of its recent reporters, or NONE if no vehicle recently gave a value or
-            corroborated an alert.
-        aged: time before `time` by which the belief must still be aged, in units of 1/AGED s.
+        window: row of the slot's window in `State.windows`, or NONE.
+        reporters: row of its recent reporters in `Rows.reporters`, or NONE if no vehicle recently
+            gave a value or corroborated an alert.
+        aged: length of the time before `time` for which the belief has not been aged yet, in units
+            of 1/AGED s; the belief is aged in portions of FORGET_S.
         used: weighted mean grip used by the vehicles that gave values, in units of 1/USED.
         shared: weighted mean of the relative error that these values have in common (standard
             deviation), in units of 1/SHARED.
@@ -86,35 +99,47 @@ class CellRecord:
 
 
 class EntryRecord:
-    """Entry of the lateness window (the recent observations of a cell, in order of time): one
-    observation in one cell. A commit moves an entry that has become older than the checkpoint
-    (latest time minus the allowed delay) into the final state; the fields that it reads are in the
-    first of the entry's two cache lines.
+    """Entry of a lateness window: one observation in one slot. When an entry has become older than
+    the checkpoint, a commit applies it to the final state. The fields that a commit reads are in
+    the first of the entry's two cache lines.
+
+    The strength with which an entry changes the belief is weight · power · share.
 
     Attributes:
-        previous, following: neighbouring entries of the slot's window, in order of time.
-        before, after: neighbouring entries of the same vehicle in this window.
-        pair: row of the pair of slot and vehicle.
-        vehicle: index of the vehicle.
+        previous, following: rows of the neighbouring entries in the slot's window, in order of
+            time; NONE at an end.
+        before, after: rows of the neighbouring entries of the same vehicle in this window; NONE at
+            an end.
+        pair: row of the pair (this slot and vehicle) in the table of pairs.
+        vehicle: index of the vehicle in this service.
         kind: BOUND or VALUE.
-        fresh: True if the vehicle has not reported in this cell recently.
-        last_mean, last_std, spent: summary of the vehicle's reports in this cell, this entry
-            included; in units of 1/FINE.
+        fresh: 1 if no earlier report of the vehicle in this cell is remembered, else 0.
+        last_mean, last_std: mean and standard deviation that stand for all reports of this kind
+            that the vehicle made in this cell up to this entry, in units of 1/FINE. The vehicle's
+            next report is compared with them.
+        spent: votes that the vehicle has used up in this cell up to this entry, in units of
+            1/FINE; a report with `power` 1 uses up one vote. The number decreases with time, and a
+            vehicle has at most VOTES.
         time: end of the visit [ns].
-        weight: trust in the vehicle.
-        share: P(the vehicle was in this cell).
-        power: share of the vote that is new information.
-        mean, std, slippery: mean, standard deviation and P(slippery) of the vote.
-        number, boot, sequence: the vehicle's number, its start, the row in its stream; they order
-            entries of equal times.
-        evidence: likelihood in steps, see `likelihoods.make_evidence`.
-        used, shared: grip used, and the error that its value shares with others, in units of 1/USED
-            and 1/SHARED.
-        manoeuvre: kind of manoeuvre, see `shared`.
-        late: True if the observation came after the checkpoint; it is then compared with no other
-            vehicle.
-        limited: CLAIMED if a slip controller reports a slippery road, HEEDED if in addition the
-            vehicle's controllers have a good record, else 0.
+        weight: trust in the vehicle, see `vote_weights`; about 0 to 1.
+        share: P(the vehicle was in this cell), 0 to 1; below 1 if its position is inaccurate.
+        power: share, 0 to 1, of the observation that is new information after the vehicle's earlier
+            reports in this cell, see `votes.discount_vote`.
+        mean, std, slippery: mean and standard deviation of μ, and P(slippery), according to this
+            observation alone.
+        number, boot, sequence: permanent number of the vehicle, random number of its start, and
+            number of the row in its stream; they order entries of equal times.
+        evidence: log-likelihood of the visit on the friction grid, see
+            `likelihoods.make_evidence`.
+        used: grip used in the visit, in units of 1/USED.
+        shared: relative error that the value has in common with values of other vehicles, see
+            `shared.shared_parts`; in units of 1/SHARED.
+        manoeuvre: kind of manoeuvre, see `shared.manoeuvre_of`.
+        late: 1 if the observation arrived after the checkpoint had passed its time; it is then
+            compared with no other vehicle.
+        limited: CLAIMED if a slip controller (ABS, ESC, traction control) intervened below the
+            slippery limit; HEEDED if in addition the vehicle's earlier interventions agreed with
+            other vehicles; else 0.
     """
 
     previous: np.int32
@@ -147,12 +172,12 @@ class EntryRecord:
 
 
 class WindowRecord:
-    """The lateness window of a slot (cell and sector): its recent observations, which are not yet
-    final.
+    """The lateness window of a slot: its recent observations, which are not yet final, as a linked
+    list of entries.
 
     Attributes:
         slot: the slot; NONE if the window is not in use.
-        head, tail: first and last entry (observation) in the list.
+        head, tail: rows of the first and the last entry.
         stale: 1 if the current belief of the slot must be computed again.
         first: time of the first entry [ns].
         values: number of entries that are values (not only lower bounds).
@@ -167,19 +192,18 @@ class WindowRecord:
 
 
 class PairRecord:
-    """Summary of the older reports of one vehicle in one slot (cell and sector), called a pair: the
-    reports that are older than the checkpoint (latest time minus the allowed delay) and therefore
-    final. A record is half a cache line long, so that no record crosses the border of a line.
+    """Summary of the reports of one vehicle in one slot (a pair) that are older than the checkpoint
+    and therefore final. A record is half a cache line long, so that no record crosses the border of
+    a line.
 
     Attributes:
-        slot, vehicle: the pair; a free place of the table has slot NONE.
-        last: newest of the pair's observations that are still in the lateness window, or NONE.
-        waiting: number of the pair's observations in the window.
-        std: standard deviation of the last value, in units of 1/FINE.
-        time: time [s] of the last lower bound and of the last value; 0 for none.
-        mean, spent: mean friction, and the part of the vehicle's allowed votes (effects on the
-            belief) that is used up, at the last lower bound and at the last value; in units of
-            1/FINE.
+        slot, vehicle: slot and index of the vehicle; a free place of the table has slot NONE.
+        last: row of the newest of the pair's entries in the window, or NONE.
+        waiting: number of the pair's entries in the window.
+        std: `last_std` (see `EntryRecord`) of the last value, in units of 1/FINE.
+        time: times [s] of the last bound and of the last value; 0 for none.
+        mean, spent: `last_mean` and `spent` (see `EntryRecord`) of the last bound and of the last
+            value, in units of 1/FINE.
     """
 
     slot: np.int32

@@ -8,6 +8,10 @@ wait for memory.
 The first place for a key is proportional to its hash. Therefore a table may have any length. A
 longer table contains its rows in the same order, so that it can be filled from one end to the
 other.
+
+A slot is the storage of one cell and heading sector. A pair is one slot and one vehicle; a pair
+record sums up the vehicle's reports there. Pair records are stored in the places of their hash
+table themselves, so that no row number is needed.
 """
 
 from __future__ import annotations
@@ -110,8 +114,8 @@ def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
 
 @compiled
 def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int) -> tuple[IntArray, int]:
-    """Return the slot of each key (cell and sector), (n,), and the number of slots in use
-    afterwards. An unknown key gets the next free slot; the table must have room for it.
+    """Return the slot of each of the keys `wanted` (n,), cell · 4 + sector, and the number of slots
+    in use afterwards. An unknown key gets the next free slot; the table must have room for it.
     """
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
@@ -153,17 +157,17 @@ def fill_table(table: IntArray, rows: RecordArray, used: int) -> None:
 
 @refcount_free_inlined
 def first_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
-    """Return the place (index) of the hash table `pairs` at which the search for a slot (cell and
-    sector) and a vehicle begins.
+    """Return the place (index) of the hash table `pairs` at which the search for a pair (slot and
+    vehicle) begins.
     """
     return _first_place(_hash_key((np.int64(slot) << np.int64(32)) | np.int64(vehicle)), len(pairs))
 
 
 @refcount_free_inlined
 def pair_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
-    """Return the place (index) of a slot (cell and sector) and a vehicle in a hash table that
-    contains the pair records themselves. If both together are unknown, return the free place (slot
-    NONE) where it belongs.
+    """Return the place (index) of the record of a pair (slot and vehicle) in the hash table
+    `pairs`. If there is no such record, return the free place where it belongs; its field `slot` is
+    NONE.
     """
     place = first_place(pairs, slot, vehicle)
     while pairs[place].slot != NONE and (

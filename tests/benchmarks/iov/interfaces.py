@@ -45,11 +45,12 @@ KUKSA: Final = (
 
 
 def measure_foreign(_folder: Path, quick: bool) -> list[Figure]:
-    """Let one foreign publisher report ice in three situations: alone, where enrolled vehicles
-    measure grip, and where one enrolled vehicle measures ice too.
+    """Let one foreign publisher (another party's service, which sends DENM warnings) report ice in
+    three situations: alone, where enrolled vehicles measure grip, and where one enrolled vehicle
+    measures ice too. Return the numbers of alerts and of accepted reports as figures.
 
-    The last case is the control, because a publisher that is never believed would also raise no
-    false alert.
+    In the first two situations no alert may be raised. In the third one the alert must be raised.
+    This is the control, because a publisher that is never believed would also raise no false alert.
     """
     draw = np.random.default_rng(4204)
     places = draw.normal((57.7, 11.97), 0.02, (20 if quick else 200, 2)).tolist()
@@ -129,8 +130,11 @@ def _own_report(
 
 
 def measure_kuksa(folder: Path, quick: bool) -> list[Figure]:
-    """Write signals to a gRPC server made from the published modules of kuksa.val.v2, and return
-    the figures.
+    """Let `KuksaProvider` write signals to a stub of the Kuksa databroker, and return one figure:
+    the share of the values that the stub received correctly (`kuksa.written`).
+
+    The stub is a local gRPC server for the published interface kuksa.val.v2. Its generated modules
+    come from the package kuksa-client. No real broker runs.
     """
     draw = np.random.default_rng(4205)
     wheel = folder / "kuksa"
@@ -167,8 +171,9 @@ def _number(point: Any) -> float | None:  # noqa: ANN401 modules of the wheel ha
 
 @contextmanager
 def _broker() -> Iterator[tuple[int, dict[str, Any]]]:
-    """Serve kuksa.val.v2 with types of VSS. Yield the port, and the received data
-    points by path.
+    """Run the stub of a Kuksa databroker: a gRPC server that implements only `PublishValue` of
+    kuksa.val.v2 and rejects unknown paths and wrong types, as VSS defines them. Yield its port, and
+    the data points that it has received, by path.
     """
     import grpc
     from kuksa.val.v2 import val_pb2, val_pb2_grpc  # type: ignore[import-not-found]
@@ -198,8 +203,8 @@ def _broker() -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def measure_mcap(folder: Path, quick: bool) -> list[Figure]:
-    """Read a drive's estimates with the three readers of the official MCAP library, and return the
-    figures.
+    """Write a drive's estimates as an MCAP file, read it with the three readers of the official
+    MCAP library, and return the figures.
     """
     from mcap.reader import NonSeekingReader, SeekingReader
     from mcap.records import Message as Record

@@ -1,4 +1,6 @@
-"""The recorded minute in tests/data, and its CAN frames."""
+"""Paths of the test recording (one minute of a Toyota RAV4: CAN log, GNSS log and vehicle file in
+tests/data), its CAN frames, and the functions that write the frames in other log formats.
+"""
 
 from __future__ import annotations
 

@@ -105,7 +105,10 @@ class RollingMotion:
 
 
 class WheelSlip:
-    """Record of signs of sliding wheels that are derived from the wheel speeds alone."""
+    """Record of the evidence that a wheel slides (from the wheel speeds alone, see
+    `block/wheel_slip.py`), and that an axle slides on a slippery road (from its slip and the
+    friction estimate, see `mixture/weighing.py`). A membership is a fuzzy truth value, 0 to 1.
+    """
 
     held: float  # membership of the last second in "a wheel slides" [1]
     begins: float  # what this block adds to it [1]
