@@ -260,12 +260,18 @@ def install_demo(house: House) -> Path:
     """
     place = house.folder / "demo-venv"
     if not place.exists():
-        wheel = build_wheel(house)
-        venv.create(place, with_pip=True)
-        pip = [str(place / "bin" / "python"), "-m", "pip", "install", "--quiet", "--constraint"]
-        command = [*pip, str(ROOT / "constraints.txt"), f"{wheel}[demo,page]"]
-        subprocess.run(command, check=True, capture_output=True)
+        install_wheel(build_wheel(house), "demo,page", place)
     return place
+
+
+def install_wheel(wheel: Path, extras: str, place: Path) -> None:
+    """Create the environment `place` with the wheel, its extras and pip, without packages from
+    outside.
+    """
+    venv.create(place, with_pip=True)
+    pip = [str(place / "bin" / "python"), "-I", "-m", "pip", "install", "--quiet", "--constraint"]
+    command = [*pip, str(ROOT / "constraints.txt"), f"{wheel}[{extras}]"]
+    subprocess.run(command, check=True, capture_output=True)
 
 
 def install_mb(house: House) -> float:
@@ -315,23 +321,11 @@ def install_to_first_map_s(house: House) -> float:
     wheel = build_wheel(house)
     began = time.monotonic()
     place = house.folder / "venv"
-    venv.create(place, with_pip=True)
-    pip = [str(place / "bin" / "python"), "-m", "pip", "install", "--quiet", "--constraint"]
-    subprocess.run(
-        [*pip, str(ROOT / "constraints.txt"), f"{wheel}[analytics]"],
-        check=True,
-        capture_output=True,
-    )
+    install_wheel(wheel, "analytics", place)
     out = house.folder / "first.html"
-    command = [
-        str(place / "bin" / "fleet-service"),
-        "analyze",
-        "grip",
-        "--archive",
-        str(house.archive),
-        *DAY,
-    ]
-    subprocess.run([*command, "--out", str(out)], check=True, capture_output=True, cwd=house.folder)
+    program = [str(place / "bin" / "python"), "-I", str(place / "bin" / "fleet-service")]
+    words = ["analyze", "grip", "--archive", str(house.archive), *DAY, "--out", str(out)]
+    subprocess.run([*program, *words], check=True, capture_output=True, cwd=house.folder)
     with open_page(out) as found:
         assert found.drawn_count > 0
     return time.monotonic() - began
