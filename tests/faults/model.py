@@ -1,5 +1,6 @@
 """Campaign that checks the model of acknowledgement, lease, takeover, hand-over and erasure
-(`protocol_model.py`) exhaustively: the model checker visits every reachable state.
+(`protocol_model.py`) exhaustively: the model checker visits every reachable state within a bound on
+the numbers of leases and renewals.
 
 The whole protocol must break no invariant. Then one rule at a time is switched off (the protocols
 in BROKEN), for example the fence, or the limit of half a lease for acknowledgements. Each of these
