@@ -192,9 +192,9 @@ def alert_delays_ms(session: zenoh.Session) -> list[float]:
     out = []
     for k in range(ALERTS):
         at = np.array([60 + APART * (k % 15)]), np.array([1 + APART * (k // 15)])
-        put_batch(session, make_batch("ice-0", k + 1, *at, True))
+        put_batch(session, make_batch(f"ice-{k}-first", 1, *at, True))
         time.sleep(0.05)
-        second = make_batch("ice-1", k + 1, *at, True)
+        second = make_batch(f"ice-{k}-second", 1, *at, True)
         cell = int(second.columns["cell"][0])
         began = time.perf_counter()
         put_batch(session, second)
@@ -273,8 +273,13 @@ def service() -> list[Figure]:
         client = open_session(ZenohSettings(connect=[endpoint]))
         assert client is not None
         stack.enter_context(client)
-        put_batch(client, make_batch("first", 1, np.zeros(1, int), np.zeros(1, int), False))
-        poll_until(lambda: len(fetch_reply(client, f"{keys.ROOT}/map/**")))
+        first = make_batch("first", 1, np.zeros(1, int), np.zeros(1, int), False)
+
+        def serves_a_cell() -> bool:
+            put_batch(client, first)
+            return len(fetch_reply(client, f"{keys.ROOT}/map/**")) > 0
+
+        poll_until(serves_a_cell)
         idle = ack_delays_s(client, "acked-1", (0.5, 1.5), IDLE_ACKS)
         stack.enter_context(
             run_process("-c", f"from tests.benchmarks.service import load; load({endpoint!r})")
