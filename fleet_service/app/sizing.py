@@ -10,8 +10,6 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-import numpy as np
-
 from fleet_service.fusion.constants import FORGOTTEN_EVERY_S, FORGOTTEN_S, VOTE_RENEWAL_S
 from schemas import grid
 from schemas.thresholds import EARTH_RADIUS_M
@@ -154,7 +152,7 @@ def cells_of_roads(road_km: float, latitude: float) -> float:
     """Return the number of cells (with sector, both directions) of roads of a total length
     [km] at a latitude [deg].
     """
-    edge_m = _CELL_M * float(np.cos(np.radians(latitude)))
+    edge_m = _CELL_M * math.cos(math.radians(latitude))
     return _DIRECTIONS * _DIAGONAL * 1e3 * road_km / edge_m
 
 

@@ -116,6 +116,14 @@ def _decode_messages(sent: list[Message]) -> list[NDArray[Any]]:
     return out
 
 
+def corner_of_region(east: int) -> tuple[int, int]:
+    """Return column and row of the north-west cell of a region, `east` regions east of the one with
+    Gothenburg.
+    """
+    x, y = grid.deinterleave(grid.region_of(grid.cell_of(57.7, 11.97)) << REGION_BITS)
+    return int(x) + (east << REGION_BITS // 2), int(y)
+
+
 def make_messages(
     count: int, records: int, now: int, vehicles: int = VEHICLES, begin: int = 0, east: int = 0
 ) -> list[Message]:
@@ -133,11 +141,9 @@ def make_messages(
     later = (int(message[-1]) - message) * records + np.tile(np.arange(records)[::-1], count)
     leave = now - STEP_NS * later
     along = (leave // STEP_NS + 7 * vehicle) % (2 * CELLS_ACROSS)
-    x, y = grid.deinterleave(grid.region_of(grid.cell_of(57.7, 11.97)) << REGION_BITS)
+    x, y = corner_of_region(east)
     cell = grid.interleave(
-        x
-        + (east << REGION_BITS // 2)
-        + np.where(along < CELLS_ACROSS, along, 2 * CELLS_ACROSS - 1 - along),
+        x + np.where(along < CELLS_ACROSS, along, 2 * CELLS_ACROSS - 1 - along),
         y + vehicle % CELLS_ACROSS,
     )
     columns["cell"] = cell

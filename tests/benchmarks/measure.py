@@ -1,10 +1,12 @@
-"""Functions that measure durations: medians of rounds after a warm-up."""
+"""Functions that measure durations (medians of rounds after a warm-up) and memory."""
 
 from __future__ import annotations
 
+import gc
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 ROUNDS = 5
 SEED = 0
@@ -35,3 +37,10 @@ def time_in_turn(
             work()
             times.append(time.perf_counter() - began)
     return statistics.median(spent[0]), statistics.median(spent[1])
+
+
+def read_resident_bytes() -> int:
+    """Return the resident memory of this process [bytes], after a garbage collection."""
+    gc.collect()
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) * 1024

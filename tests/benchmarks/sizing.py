@@ -4,7 +4,6 @@ calculator's estimate. Each engine runs in a separate process.
 
 from __future__ import annotations
 
-import gc
 import json
 import subprocess
 import sys
@@ -26,12 +25,13 @@ from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.thresholds import NS as SECOND
 from schemas.wire import Batch, Kind
+from tests.benchmarks.ingest import corner_of_region
+from tests.benchmarks.measure import read_resident_bytes
 
 VEHICLES: Final = {10_000: 8, 100_000: 3}  # and messages of each
 ROWS: Final = 10  # observations of a message
 AREAS: Final = 10  # regions in which the vehicles drive
 LANES: Final = 1500  # roads of a region
-REGION_BITS: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM)
 TURN: Final = 512
 BAR: Final = 0.2
 
@@ -62,7 +62,7 @@ def main(vehicles: int, messages: int) -> None:
         begin = time.time_ns() - messages * ROWS * SECOND
         engine.intake.ingest([make_message(0, 0, AREAS, begin)], begin + ROWS * SECOND)
         engine.settlement.flush()
-        before = _read_resident_bytes()
+        before = read_resident_bytes()
         for number in range(messages):
             end = begin + (number + 1) * ROWS * SECOND
             for first in range(0, vehicles, TURN):
@@ -78,17 +78,17 @@ def main(vehicles: int, messages: int) -> None:
             pairs=int(store.state.used[PAIRS]),
             waiting=store.waiting,
         )
-        print(json.dumps(content._asdict() | {"bytes": _read_resident_bytes() - before}))
+        print(json.dumps(content._asdict() | {"bytes": read_resident_bytes() - before}))
 
 
 def make_message(vehicle: int, number: int, area: int, end: int) -> Message:
     """Return message `number` of a vehicle that drives straight east, one cell per second, in one
     of the areas; its last visit ends at `end` [ns]. One visit in seven gives a value of friction.
     """
-    lane, group = vehicle // AREAS % LANES, vehicle // AREAS // LANES
-    x, y = grid.deinterleave(grid.region_of(grid.cell_of(57.7, 11.97)) << REGION_BITS)
+    group, lane = divmod(vehicle // AREAS, LANES)
+    x, y = corner_of_region(area)
     cell = grid.interleave(
-        x + (area << REGION_BITS // 2) + ROWS * (number + group) + np.arange(ROWS),
+        x + ROWS * (number + group) + np.arange(ROWS),
         np.full(ROWS, y + lane),
     )
     latitude, longitude = grid.centre(cell)
@@ -114,12 +114,6 @@ def make_message(vehicle: int, number: int, area: int, end: int) -> Message:
     batch = Batch(Kind.OBSERVATION, name, 1, region, number + 1, number + 1, columns)
     key = keys.observation_key(region, name)
     return Message(batch.kind, key, wire.encode(batch), wire.ENCODING[batch.kind])
-
-
-def _read_resident_bytes() -> int:
-    gc.collect()
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) * 1024
 
 
 if __name__ == "__main__":

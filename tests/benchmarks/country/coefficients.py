@@ -7,7 +7,6 @@ quantity. Therefore the window of late observations has the same size in all run
 
 from __future__ import annotations
 
-import gc
 import subprocess
 import sys
 import tempfile
@@ -22,6 +21,7 @@ from fleet_service.ingest.inbox import Message
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
 from tests.benchmarks.ingest import make_messages
+from tests.benchmarks.measure import read_resident_bytes
 
 MANY: Final = 40_000  # messages of each part
 ROWS: Final = 10
@@ -62,12 +62,6 @@ def _measure_growth(kind: str) -> tuple[float, float, float]:
     return float(grown), float(cells), float(pair)
 
 
-def _read_resident_memory() -> int:
-    gc.collect()
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) * 1024
-
-
 def _make_stream(kind: str) -> list[Message]:
     now = time.time_ns()
     if kind == "cells":
@@ -89,7 +83,7 @@ def main(kind: str) -> None:
         warm = make_messages(FEW, ROWS, time.time_ns(), FEW, 0, REGIONS)
         engine.intake.ingest(warm, time.time_ns())
         engine.settlement.flush()
-        before = _read_resident_memory()
+        before = read_resident_bytes()
         for at in range(0, len(sent), TURN):
             engine.intake.ingest(sent[at : at + TURN], time.time_ns())
             if at % (16 * TURN) == 0:
@@ -98,7 +92,7 @@ def main(kind: str) -> None:
         assert engine.counts[Kind.OBSERVATION] == (MANY + FEW) * ROWS, engine.counts
         state = engine.state.fusion.store.state
         print(
-            _read_resident_memory() - before,
+            read_resident_bytes() - before,
             engine.state.fusion.size,
             state.pairs.nbytes / state.used[PAIRS],
         )
