@@ -1,8 +1,9 @@
 """Sizing of a deployment: processor cores, memory, disk and network for a fleet. The estimate uses
 measured costs per vehicle, cell, pair of vehicle and cell, and observation.
 
-The costs come from `make country-bench` (100 000 vehicles for ten minutes on two cores) and are
-checked against engines with 10⁴ and 10⁵ vehicles by `make bench ONLY=sizing`.
+The costs of processor, network and disk come from `make country-bench` (100 000 vehicles for ten
+minutes on two cores). The costs of memory are fitted to engines with 10⁴ to 10⁵ vehicles, of which
+`make bench ONLY=sizing` measures two again.
 """
 
 from __future__ import annotations
