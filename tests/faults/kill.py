@@ -147,10 +147,12 @@ def old_days(archive: Path) -> list[Path]:
 
 def _find_finished_jobs(archive: Path) -> frozenset[str]:
     """Return the names of the background jobs that have left results, which shows that they ran
-    during the kills.
+    during the kills. The old rows were compacted before.
     """
-    found = {"checkpoints": "checkpoints/*-*", "compaction": "observations/*/*/*.parquet"}
-    return frozenset(name for name, pattern in found.items() if any(archive.glob(pattern)))
+    old = old_days(archive)
+    compacted = (file.parents[1] not in old for file in archive.glob("observations/*/*/*.parquet"))
+    found = {"checkpoints": any(archive.glob("checkpoints/*-*")), "compaction": any(compacted)}
+    return frozenset(name for name, done in found.items() if done)
 
 
 def map_difference(archive: Path) -> float:
@@ -181,6 +183,8 @@ def _run_round(
 ) -> tuple[Census, Load]:
     """Run one round of kills. Return the counts of batches and rows (census), and the load from the
     start of all processes until the end.
+
+    The kills go on, up to three times as many, until compaction and checkpoints have left results.
     """
     for number in range(agents):
         there.make_load([f"sim-{number:03}"], RATE, seed=number).start()
@@ -192,7 +196,7 @@ def _run_round(
     began = time.time()
     old = len(old_days(there.archive))
     assert old
-    while killed < kills:
+    while killed < kills or (killed < 3 * kills and len(_find_finished_jobs(there.archive)) < 2):
         if killed % RETIRED_EVERY == 1 and not retention.is_alive:
             retention.start()
         time.sleep(random_.uniform(*PAUSE_S))
