@@ -47,16 +47,21 @@ def test_a_lost_router_is_noticed_and_logged_at_once(caplog: pytest.LogCaptureFi
         of_router = {metric.name: metric.values for metric in router_metrics(router)}
         assert of_router["router_sessions"] == {"client": 1.0, "router": 0.0, "peer": 0.0}
         assert of_router["router_links"]["tcp"] == 1.0
+        until(lambda: len(_link_messages(caplog)) >= 3)  # logged after the state has changed
         watch.close()
     router.close()
     assert changes[-2:] == [False, True]
-    said = [record.getMessage() for record in caplog.records if record.name.endswith("link_watch")]
     address = endpoints[0].partition("/")[2]
-    assert said == [
+    assert _link_messages(caplog) == [
         f"anna is connected to the router at {address} over tcp",
         f"anna lost the router at {address} (tcp)",
         f"anna is connected to the router at {address} over tcp",
     ]
+
+
+def _link_messages(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """Return the messages that the link watch has logged."""
+    return [record.getMessage() for record in caplog.records if record.name.endswith("link_watch")]
 
 
 def test_session_prefers_quic_and_takes_tls_where_udp_is_closed(tmp_path: Path) -> None:
