@@ -413,7 +413,7 @@ FIGURES: Final = (
         lambda root: room_arrows(root, "edge_agent/estimators/friction_mixture"),
     ),
     Figure("import circles", 0, 0, import_circles),
-    Figure("methods of the largest class", 15, 21, methods_of_largest_class),
+    Figure("methods of the largest class", 15, 15, methods_of_largest_class),
     Figure("most parameters", 6, 6, most_parameters),
     Figure("functions with more than 6 parameters", 0, 0, functions_with_many_parameters),
     Figure("packed assignments per 1,000 lines", 2, 2, packed_assignments, per_1000=True),

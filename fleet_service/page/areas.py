@@ -32,7 +32,7 @@ def found_in(world: MapMirror, named: Sequence[tuple[str, float, float]]) -> lis
     tile = np.asarray(grid.tile_of(cell))
     tiles, of_tile = np.unique(tile, return_inverse=True)
     label = link_cells(tiles)[of_tile]
-    standing = world.standing()
+    standing = world.alerts.as_json()
     found: list[dict[str, Any]] = []
     for number in range(int(label.max(initial=-1)) + 1):
         own = cell[label == number]

@@ -1,24 +1,23 @@
-"""Local copy ("mirror") of the live map: tiles as records of cells, and alerts by stretch of road.
-This module does not use the network.
+"""Local copy ("mirror") of the live map: tiles as records of cells. This module does not use the
+network.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.client.stretches import StretchAlert, Stretches
 from fleet_service.page import records
+from fleet_service.page.alert_mirror import AlertMirror
 from fleet_service.page.recent import RecentMoments
 from fleet_service.page.records import Records, TileBlock
 from schemas import grid
 from schemas.numeric import IntArray
-from schemas.wire import Alert
 
 _EMPTY: Final = np.zeros(0, records.RECORD)
 
@@ -46,17 +45,15 @@ class _Before(NamedTuple):
 
 
 class MapMirror:
-    """Local copy of the live map: all received tiles and alerts; thread-safe."""
+    """Local copy of the live map: all received tiles, and the alerts as `alerts`; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._tiles: dict[int, MirroredTile] = {}
         self._before: dict[int, _Before] = {}  # of the tiles that changed since `changes` was asked
-        self._stretches = Stretches()
         self.recent = RecentMoments()
-        self._alerts_changed = False
-        self.alerts_heard = 0  # counts what was said of alerts
-        self.heard = 0.0  # when any service said anything [s since 1970]
+        self._heard = 0.0
+        self.alerts = AlertMirror()
 
     def take_tile(self, tile: int, table: pa.Table, now: float) -> None:
         """Replace the content of a tile of the local copy with a received table of its cells; `now`
@@ -64,7 +61,7 @@ class MapMirror:
         """
         cells = records.of_table(table)
         with self._lock:
-            self.heard = now
+            self._heard = now
             held = self._tiles.setdefault(tile, MirroredTile())
             held.heard = now
             if np.array_equal(held.cells, cells):
@@ -74,23 +71,10 @@ class MapMirror:
             held.version = held.version + 1
             held.made = {}
 
-    def take_alert(self, alert: Alert, now: float) -> None:
-        """Record that the alert of a cell was raised, repeated or cleared."""
-        with self._lock:
-            self.heard = now
-            self.alerts_heard += 1
-            self._stretches.apply_alert(alert)
-
-    def take_standing(
-        self, standing: Iterable[Alert], served: Callable[[int], bool], now: float
-    ) -> None:
-        """Replace the active alerts with the given ones. `served` is a function that returns True
-        if a service answers for a cell; alerts of cells without a service are kept.
-        """
-        with self._lock:
-            self.heard = now
-            self.alerts_heard += 1
-            self._stretches.replace_alerts(standing, lambda alert: served(alert.cell))
+    @property
+    def heard(self) -> float:
+        """Return when any service sent anything [s since 1970]; 0 if none has."""
+        return max(self._heard, self.alerts.heard)
 
     def remember(self, now: float) -> None:
         """Store the present map, so that the time slider of the page can show it later."""
@@ -126,29 +110,6 @@ class MapMirror:
                 )
                 found.append(block)
             return found
-
-    def alerts_changed(self) -> bool:
-        """Return True if the stretches of road with an alert have changed since the last call."""
-        with self._lock:
-            found = bool(self._stretches.take_changes()) or self._alerts_changed
-            self._alerts_changed = False
-            return found
-
-    def stretches(self) -> list[StretchAlert]:
-        """Return the stretches of road with an active alert, according to everything received until
-        now.
-        """
-        with self._lock:
-            self._alerts_changed |= bool(self._stretches.take_changes())
-            return self._stretches.standing
-
-    def standing(self) -> list[dict[str, Any]]:
-        """Return the stretches of road with an active alert in a form for JSON, newest first."""
-        with self._lock:
-            return [
-                one.to_json_values()
-                for one in sorted(self._stretches.standing, key=lambda one: -one.since)
-            ]
 
     def tiles(self) -> list[int]:
         """Return the numbers of all tiles in the local copy that have cells."""

@@ -1,5 +1,5 @@
 """Zenoh client of the page, with the rights of a reader. It receives tiles and alerts, queries
-those that it has missed, and tracks for which regions a service answers.
+those that it has missed.
 
 It publishes nothing. If the access list hides liveliness tokens, it works without them.
 """
@@ -18,8 +18,9 @@ import zenoh
 
 from fleet_service.client import map_client
 from fleet_service.client.watching import standing_alerts
-from fleet_service.page.map_mirror import MapMirror, box_of
-from schemas import grid, keys, regions, tables, wire
+from fleet_service.page.map_mirror import MapMirror
+from fleet_service.page.served_regions import ServedRegions
+from schemas import grid, keys, tables, wire
 from schemas.config import ZenohSettings
 from schemas.errors import InputError, WireError
 from schemas.runtime import presence, zenoh_session
@@ -32,7 +33,6 @@ AGAIN_S: Final = 5.0  # between two questions to a service of which nothing is k
 REFRESH_S: Final = 60.0
 # tiles in a round: 40 a second, 2 400 in the minute; more are renewed more rarely
 REFRESHED: Final = 20
-REGIONS: Final = 256  # that are watched for a service
 
 
 class Reader:
@@ -47,13 +47,9 @@ class Reader:
         self._connection = connection
         self._world = world
         self._session: zenoh.Session | None = None
-        self._queriers: dict[int, Any] = {}
-        self._away_since: dict[int, float] = {}
+        self._regions = ServedRegions()
         self._names: dict[str, set[str]] = {"alive": set(), "shard": set()}
         self._anything: Any = None
-        self._fallen: dict[
-            str, float
-        ] = {}  # regions whose service said that it serves them, and went: since when
         self._served = False
         self._stood = 0.0
         self._tried = -AGAIN_S
@@ -80,7 +76,7 @@ class Reader:
                 elif served and time.monotonic() >= self._stood + REFRESH_S:
                     self._ask_standing(session)
                 self._served = served
-                self._note_fallen(services)
+                self._regions.note_fallen(services, time.time())
                 self._refresh(session)
                 if served:
                     self._world.remember(time.time())
@@ -100,40 +96,15 @@ class Reader:
 
     def is_heard(self, latitude: float, longitude: float) -> bool:
         """Return True if a service answers for a place [deg]."""
-        return self._answers(int(grid.region_of(int(grid.cell_of(latitude, longitude)))))
+        return self._regions.is_answered(
+            int(grid.region_of(int(grid.cell_of(latitude, longitude))))
+        )
 
     def regions(self) -> list[dict[str, Any]]:
         """Return the regions with cells: their box, whether a service answers for them, and, if
         not, since when.
         """
-        return [
-            {
-                "region": grid.quadkey(region, grid.REGION_ZOOM),
-                "box": box_of(region, grid.REGION_ZOOM),
-                "served": region not in self._away_since,
-                "since": self._away_since.get(region),
-            }
-            for region in list(self._queriers)
-        ] + [
-            {"region": region, "box": _box_of_expression(region), "served": False, "since": since}
-            for region, since in self._fallen.copy().items()
-        ]
-
-    def _note_fallen(self, services: presence.PresenceTracker) -> None:
-        """Record regions that no service announces any more and of which the page knows no cells.
-        Regions with known cells need no record, because queries about these cells show if a service
-        answers.
-        """
-        here = {token.region for token in services.active}
-        known = [keys.chunks(region, grid.REGION_ZOOM) for region in self._queriers]
-        fallen = {
-            token.region
-            for token in services.lost_tokens
-            if token.region.startswith(tuple("0123"))
-            and not any(regions.covers(one, token.region) for one in here)
-            and not any(regions.overlap(one, token.region) for one in known)
-        }
-        self._fallen = {region: self._fallen.get(region, time.time()) for region in fallen}
+        return self._regions.as_json()
 
     def names(self, kind: str) -> list[str]:
         """Return the names that have a Zenoh liveliness token (sign of a connected process) of the
@@ -163,7 +134,7 @@ class Reader:
 
     def _alert(self, sample: zenoh.Sample) -> None:
         with _refusals_logged(sample):
-            self._world.take_alert(wire.decode_alert(sample.payload.to_bytes()), time.time())
+            self._world.alerts.take_alert(wire.decode_alert(sample.payload.to_bytes()), time.time())
 
     def _token(self, sample: zenoh.Sample) -> None:
         with _refusals_logged(sample):
@@ -185,23 +156,13 @@ class Reader:
     def _ask_standing(self, session: zenoh.Session) -> None:
         self._stood = time.monotonic()
         standing = standing_alerts(session)
-        self._world.take_standing(
-            standing, lambda cell: self._answers(int(grid.region_of(cell))), time.time()
+        self._world.alerts.take_standing(
+            standing, lambda cell: self._regions.is_answered(int(grid.region_of(cell))), time.time()
         )
 
     def _refresh(self, session: zenoh.Session) -> None:
-        for region in {
-            int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM)) for tile in self._world.tiles()
-        }:
-            if region not in self._queriers and len(self._queriers) < REGIONS:
-                expression = f"{keys.ROOT}/map/{keys.chunks(region, grid.REGION_ZOOM)}/*"
-                self._queriers[region] = session.declare_querier(expression)
-        for region, querier in self._queriers.items():
-            if querier.matching_status.matching:
-                self._away_since.pop(region, None)
-            else:
-                self._away_since.setdefault(region, time.time())
         now = time.time()
+        self._regions.watch(session, self._world.tiles(), now)
         for tile in self._world.oldest(now - REFRESH_S, REFRESHED):
             found = False
             try:
@@ -212,16 +173,12 @@ class Reader:
                 log.warning("a tile could not be read: %s", error)
             if found:
                 continue
-            if self._answers(int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM))):
+            if self._regions.is_answered(int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM))):
                 self._world.take_tile(
                     tile, tables.MAP_SCHEMA.empty_table(), now
                 )  # fewer vehicles than are shown
             else:
                 self._world.touch(tile, now)
-
-    def _answers(self, region: int) -> bool:
-        querier = self._queriers.get(region)
-        return querier is not None and bool(querier.matching_status.matching)
 
     def _sees_services(self) -> bool:
         """Return True if a service answers for any place. A service's token shows this; if tokens
@@ -231,7 +188,7 @@ class Reader:
         of the whole world is found by any tile, and a service of a region by a region already
         known. Before any region is known, only a reply to a query shows a service.
         """
-        if self._names["shard"] or any(self._answers(region) for region in self._queriers):
+        if self._names["shard"] or self._regions.is_any_answered:
             return True
         session = self._session
         if session is None or not self.is_connected:
@@ -246,14 +203,6 @@ class Reader:
         with contextlib.suppress(InputError):
             return any(True for _ in map_client.query_replies(session, map_client.EVERYWHERE, {}))
         return False
-
-
-def _box_of_expression(region: str) -> list[float]:
-    """Return west, south, east, north [deg] of the square that the leading digits of a region
-    expression name.
-    """
-    digits = region.partition("*")[0].replace("/", "")
-    return box_of(grid.from_quadkey(digits), len(digits))
 
 
 @contextlib.contextmanager

@@ -28,6 +28,7 @@ from fleet_service.page.map_mirror import MapMirror
 from fleet_service.page.moments import Moments
 from fleet_service.page.reader import Reader
 from fleet_service.page.roads import RoadMap
+from fleet_service.page.sources import Sources
 from fleet_service.page.watchers import MOST, Watchers
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
@@ -76,7 +77,7 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
     Raises:
         InputError: the port is in use.
     """
-    listening = _open_socket(settings.host, settings.port)
+    listening = open_socket(settings.host, settings.port)
     world = MapMirror()
     reader = Reader(settings.connection, world)
 
@@ -85,7 +86,7 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
         return {"router": reader.is_connected, "served": reader.is_served, "away": away}
 
     watchers = Watchers(world, reader_state, settings.most)
-    sources = web.Sources(
+    sources = Sources(
         world,
         reader,
         Moments(settings.archive, world.recent),
@@ -128,12 +129,12 @@ def update_publication(
     """
     seen = -1
     while not stop.wait(GATHER_S):
-        if not reader.is_served or (world.alerts_heard == seen and not file.is_due):
+        if not reader.is_served or (world.alerts.heard_count == seen and not file.is_due):
             # where no service speaks nothing ends, and the publication's time says how old it is
             continue
-        seen = world.alerts_heard
+        seen = world.alerts.heard_count
         try:
-            file.keep_up(world.stretches(), reader.is_heard)
+            file.keep_up(world.alerts.stretches(), reader.is_heard)
         except InputError as error:  # it is served all the same
             log.warning("%s", error)
 
@@ -179,9 +180,17 @@ class _Server(uvicorn.Server):
         yield
 
 
-def _open_socket(host: str, port: int) -> socket.socket:
+def open_socket(host: str, port: int) -> socket.socket:
+    """Return a TCP socket that is bound to an address, for the web server.
+
+    The event loop sets TCP_NODELAY only where the socket names its protocol. Otherwise the body of
+    an answer waits until the browser acknowledges the head: 40 ms on a connection in use.
+
+    Raises:
+        InputError: the address or port cannot be used.
+    """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    found = socket.socket(family, socket.SOCK_STREAM)
+    found = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         found.bind((host, port))

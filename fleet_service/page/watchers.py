@@ -83,7 +83,7 @@ class Watchers:
             self._make_place(client)
         watcher = _OpenPage(view, asyncio.Queue(WAITING), client)
         self._watchers[watcher.queue] = watcher
-        watcher.queue.put_nowait(_encode_event("alerts", self._world.standing()))
+        watcher.queue.put_nowait(_encode_event("alerts", self._world.alerts.as_json()))
         watcher.queue.put_nowait(_encode_event("beat", self._beat()))
         return self._events(watcher)
 
@@ -110,8 +110,8 @@ class Watchers:
             await asyncio.sleep(FLUSH_S)
             if changes := self._world.changes():
                 self.push(changes)
-            if self._world.alerts_changed():
-                self._tell(_encode_event("alerts", self._world.standing()))
+            if self._world.alerts.take_change():
+                self._tell(_encode_event("alerts", self._world.alerts.as_json()))
             if time.monotonic() - beaten >= BEAT_S:
                 beaten = time.monotonic()
                 self._tell(_encode_event("beat", self._beat()))

@@ -16,6 +16,7 @@ import uvicorn
 from fleet_service.page import connections
 from fleet_service.page.connections import BoundedProtocol, RareMessages, report_loop_error
 from fleet_service.page.map_mirror import MapMirror
+from fleet_service.page.server import open_socket
 from fleet_service.page.turns import (
     MOST_WAITING,
     RUNNING,
@@ -192,6 +193,27 @@ def test_connection_that_does_not_end_its_second_request_is_closed(
         return head
 
     assert asyncio.run(send_both()).startswith(b"HTTP/1.1 204")
+
+
+def test_web_server_sends_each_part_of_an_answer_at_once() -> None:
+    """TCP_NODELAY must be set, else each answer waits up to 40 ms for an acknowledgement."""
+
+    async def accept() -> int:
+        accepted: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+
+        def note_option(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            connection = writer.get_extra_info("socket")
+            accepted.set_result(connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+            writer.close()
+
+        with open_socket("127.0.0.1", 0) as listening:
+            server = await asyncio.start_server(note_option, sock=listening)
+            async with server:
+                _, writer = await asyncio.open_connection(*listening.getsockname())
+                writer.close()
+                return await accepted
+
+    assert asyncio.run(accept()) == 1
 
 
 def test_repeated_messages_are_logged_once_in_a_while(
