@@ -161,6 +161,7 @@ PURE_SCHEMAS = {
     "mugrid",
     "numeric",
     "runtime.jit",
+    "runtime.lanes",
     "runtime.records",
     "signals",
     "stopping",

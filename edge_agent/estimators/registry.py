@@ -1,7 +1,7 @@
 """The estimators by name, and `create`, which makes a bank of them.
 
 `aco-fckf`, `fckf` and `ckf` are one filter: a Rao-Blackwellised mixture over friction with
-square-root cubature filters as its nodes. They differ in the fuzzy adaptation of the measurement
+cubature filters as its nodes. They differ in the fuzzy adaptation of the measurement
 noise: tuned by ant colony optimisation, untuned, or none. The filter is based on paper 004 and
 departs from it in these points: kinematic prediction; wheel speed as a measurement; force from
 torque; residuals by total least squares; friction as a mixture instead of a state; stiffness, leaks

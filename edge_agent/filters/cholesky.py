@@ -1,9 +1,9 @@
-"""Cholesky factor of a covariance, and covariance of a square root.
+"""Cholesky factor of a covariance.
 
-Legend: P covariance, L its lower-triangular factor with P = L*L' (Cholesky), both (n, n); q
-variances (n,). A pivot (squared diagonal element of L) is the variance of a state given the states
-before it, so it is at least the variance of the state's own noise. If rounding makes it smaller,
-the noise variance replaces it.
+Legend: P covariance, L its lower-triangular factor with P = L*L' (Cholesky), both (n, n). A pivot
+(squared diagonal element of L) is the variance of a state given the states before it, so it is at
+least the variance of the state's own noise. If rounding makes it smaller, the noise variance
+replaces it.
 """
 
 from __future__ import annotations
@@ -34,35 +34,6 @@ def factorize_column(a: FloatArray, j: int, least: float) -> None:
             total -= a[i, k] * a[j, k]
         a[i, j] = total * per
         a[j, i] = 0.0
-
-
-@compiled
-def factorize(covariance: FloatArray, sqrt_cov: FloatArray, least: float) -> None:
-    """Compute sqrt_cov (n, n), the lower-triangular factor of covariance (n, n). Only the lower
-    half of the covariance is read.
-    """
-    n = covariance.shape[0]
-    for i in range(n):
-        for j in range(i + 1):
-            sqrt_cov[i, j] = covariance[i, j]
-    for j in range(n):
-        factorize_column(sqrt_cov, j, least)
-
-
-@compiled
-def covariance_of_factor(
-    sqrt_cov: FloatArray, variances: FloatArray, covariance: FloatArray
-) -> None:
-    """Compute the covariance (n, n) from any square root `sqrt_cov` (n, n) of a covariance, and add
-    the `variances` (n,) of independent noise to its diagonal.
-    """
-    n = sqrt_cov.shape[0]
-    for i in range(n):
-        for j in range(i + 1):
-            total = variances[i] if i == j else 0.0
-            for k in range(n):
-                total += sqrt_cov[i, k] * sqrt_cov[j, k]
-            covariance[i, j] = covariance[j, i] = total
 
 
 @compiled

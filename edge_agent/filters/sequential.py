@@ -1,15 +1,10 @@
-"""Measurement updates of a square-root filter with one scalar measurement after the other.
+"""Measurement update of a square-root filter with a scalar measurement of one state.
 
 Legend
     m, L     state's mean (n,), and square root of its covariance, P = L*L' (n, n)
-    f        deviation of the measurement in the axes of L's columns (n,); h = L*f is its covariance
-             with x
-    r, a     variance of the noise, and of the innovation, a = f'*f + r
-    nu       innovation, measured minus predicted
+    a        variance of the innovation (measurement minus prediction)
 
-No variance is ever subtracted from another, so variances cannot become negative. Rows with
-independent noise may be applied in any order. An update changes L, and with it the deviations f of
-the rows that remain; `apply_projection` updates these deviations.
+No variance is ever subtracted from another, so variances cannot become negative.
 """
 
 from __future__ import annotations
@@ -18,38 +13,6 @@ import math
 
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import inlined
-
-
-@inlined
-def potter_factors(f: FloatArray, noise: float) -> tuple[float, float]:
-    """Return (a, g) for a scalar measurement with noise variance `noise` > 0, of which f (k,) is
-    the measurement row times the covariance root L. a is the variance of the innovation nu
-    (measurement minus prediction), g the factor of the covariance update. The update is then m <- m
-    + L*f*nu/a and L <- L*(I - g*f*f') (Potter 1963).
-    """
-    a = noise
-    for c in range(f.shape[0]):
-        a += f[c] ** 2
-    share = 1.0 / a
-    return a, share / (1.0 + math.sqrt(noise * share))
-
-
-@inlined
-def apply_projection(
-    mean: FloatArray, root: FloatArray, f: FloatArray, step: float, gain: float
-) -> None:
-    """Apply the update of one scalar measurement to the mean and to the covariance root L (n, k or
-    more): mean (n,) += L*f*step and L <- L*(I - gain*f*f'), with f (k,), the measurement row times
-    L. Columns of L beyond k are unchanged.
-    """
-    for i in range(mean.shape[0]):
-        along = 0.0
-        for c in range(f.shape[0]):
-            along += root[i, c] * f[c]
-        mean[i] += along * step
-        along *= gain
-        for c in range(f.shape[0]):
-            root[i, c] -= along * f[c]
 
 
 @inlined

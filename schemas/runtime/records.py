@@ -7,14 +7,21 @@ the type and `records` the array. Compiled code sees a row as an object with the
 A tuple of arrays would be slower: each array in it costs 0.1 to 0.3 µs per call, and a record array
 costs as much as one array. The data of one vehicle are contiguous, and sizes are constants, so
 short loops are unrolled.
+
+Annotated[LaneArray, size, ...] adds a last axis of LANES numbers, which compiled code reads as one
+vector (`lanes.py`). Such fields begin at a cache line, because a vector that crosses two lines is
+read twice.
 """
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from typing import (
     Annotated,
     Any,
+    Final,
+    NewType,
     Protocol,
     TypeAlias,
     TypeVar,
@@ -29,6 +36,9 @@ from numpy.typing import NDArray
 from schemas.numeric import FloatArray, IntArray
 
 RecordArray: TypeAlias = NDArray[np.void]
+LaneArray = NewType("LaneArray", FloatArray)
+LANES: Final = 8  # numbers in a vector: 512 bits; other processors take two or four registers
+LINE: Final = 8 * LANES  # bytes of a vector, and of a cache line
 R_co = TypeVar("R_co", covariant=True)
 
 
@@ -70,22 +80,62 @@ def record_type(kind: type) -> np.dtype[np.void]:
     """Return the structured NumPy type whose fields are the annotations of `kind`; fields of base
     classes come first.
     """
-    fields = []
+    names = []
+    formats: list[Any] = []
+    offsets = []
+    end = 0
     for name, hint in get_type_hints(kind, include_extras=True).items():
         held, *sizes = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-        fields.append(
-            (
-                name,
-                KINDS[held] if held in KINDS else record_type(held),
-                tuple(int(size) for size in sizes),
-            )
-        )
-    return np.dtype(fields, align=True)
+        shape = tuple(int(size) for size in sizes)
+        form = np.dtype((_number_type(held), (*shape, LANES) if held is LaneArray else shape))
+        offsets.append(_round_up(end, _alignment(held)))
+        names.append(name)
+        formats.append(form)
+        end = offsets[-1] + form.itemsize
+    return np.dtype(
+        {
+            "names": names,
+            "formats": formats,
+            "offsets": offsets,
+            "itemsize": _round_up(end, _alignment(kind)),
+        },
+        align=True,
+    )
+
+
+def _number_type(held: Any) -> Any:  # noqa: ANN401 the annotation of a field
+    if held is LaneArray:
+        return np.dtype("f8")
+    return np.dtype(KINDS[held]) if held in KINDS else record_type(held)
+
+
+@cache
+def _alignment(held: Any) -> int:  # noqa: ANN401 the annotation of a field
+    """Return the number of bytes at a multiple of which a field must begin."""
+    if held is LaneArray:
+        return LINE
+    if held in KINDS:
+        return int(np.dtype(KINDS[held]).alignment)
+    hints = get_type_hints(held, include_extras=True).values()
+    parts = (get_args(hint)[0] if get_origin(hint) is Annotated else hint for hint in hints)
+    return max((_alignment(part) for part in parts), default=1)
+
+
+def _round_up(value: int, step: int) -> int:
+    return -(-value // step) * step
 
 
 def records(kind: type, *shape: int) -> RecordArray:
-    """Return an array of records of the class `kind`, all zero."""
-    return np.zeros(shape, record_type(kind))
+    """Return an array of records of the class `kind`, all zero; it begins at a cache line if the
+    records contain lanes.
+    """
+    form = record_type(kind)
+    if _alignment(kind) < LINE:
+        return np.zeros(shape, form)
+    size = math.prod(shape) * form.itemsize
+    room = np.zeros(size + LINE, np.uint8)
+    begin = -room.ctypes.data % LINE
+    return room[begin : begin + size].view(form).reshape(shape)
 
 
 def put_record(row: np.void, value: tuple[Any, ...]) -> None:

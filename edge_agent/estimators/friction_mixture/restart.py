@@ -8,7 +8,7 @@ import math
 
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators import flags
-from edge_agent.estimators.common.arrays import clear_vector, copy_vector, put_square
+from edge_agent.estimators.common.arrays import clear_vector
 from edge_agent.estimators.common.excitation import begin_excitation
 from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD
 from edge_agent.estimators.common.readings import read_plausible, rolling_speed
@@ -24,6 +24,7 @@ from edge_agent.estimators.friction_mixture.state.gap import (
     YAW_STD,
     put_split_to_sleep,
     restart_motion,
+    spread_moments,
 )
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, Scratch
@@ -79,8 +80,7 @@ def start_vehicle(
     covariance[NodeState.VY, NodeState.VY] = first**2
     for j in range(NODES):
         memory.weight[j] = memory.visit_weight[j] = design.prior[j]
-        copy_vector(memory.mean[j], memory.overall_mean)
-        put_square(memory.covariance[j], covariance)
+    spread_moments(memory)
     for friction in (memory.friction, memory.friction_left, memory.friction_right):
         find_interval(design, design.prior, memory.patch, scratch.blended, 0.0, friction)
     for kind in range(3):

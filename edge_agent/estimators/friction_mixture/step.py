@@ -1,10 +1,10 @@
 """Processing of one sample of one vehicle: add the sample to the sums of the block (the samples
 within 0.05 s) and, at the end of the block, run one step of the friction mixture (all hypotheses).
 
-Order at the end of a block: road change and mixing; measurement update of every node at the state
-of the block's beginning; update of the node weights with evidence that counts more at larger tyre
-forces; adaptation of R; prediction to the block's end. Within a block, the same exact kinematics
-advance the velocity.
+Order at the end of a block: road change; then one pass over the nodes, a group at a time: mixing,
+measurement update at the state of the block's beginning, prediction to the block's end; update of
+the node weights with evidence that counts more at larger tyre forces; adaptation of R; moments of
+the mixture. Within a block, the same exact kinematics advance the velocity.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from edge_agent.estimators.friction_mixture.block.used_grip import used_grip
 from edge_agent.estimators.friction_mixture.block.wheel_slip import update_slip
 from edge_agent.estimators.friction_mixture.mixture.ice_patch import grow_patches
 from edge_agent.estimators.friction_mixture.mixture.mixing import (
-    active_nodes,
     apply_road_change,
     match_moments,
+    share_weights,
     wake_or_sleep,
 )
 from edge_agent.estimators.friction_mixture.mixture.trust import (
@@ -37,10 +37,10 @@ from edge_agent.estimators.friction_mixture.mixture.trust import (
     update_consistency,
 )
 from edge_agent.estimators.friction_mixture.mixture.weighing import (
-    apply_measurement,
+    update_all,
     update_novelty,
+    weigh_nodes,
 )
-from edge_agent.estimators.friction_mixture.node.node_filter import predict_node
 from edge_agent.estimators.friction_mixture.node.residuals import gained_velocity
 from edge_agent.estimators.friction_mixture.node.rolling_motion import watch_wheels
 from edge_agent.estimators.friction_mixture.report.reported_interval import find_interval
@@ -95,8 +95,11 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     wake_or_sleep(memory, design, scratch)
     apply_road_change(memory, design, scratch, features.speed * features.duration)
     grow_patches(memory, design, features.speed * features.duration)
-    apply_measurement(memory, design, scratch)
-    predict(memory, design, scratch)
+    prepare_prediction(memory, design, scratch)
+    update_all(memory, design, scratch)
+    weigh_nodes(memory, design, scratch)
+    share_weights(memory, scratch)
+    match_moments(memory, scratch)
     memory.health = health | reset_to_wheel_speed(memory, design, features)
     ratio = scratch.actual_sum[1] / max(scratch.stated_sum, LEAST_VARIANCE)
     update_consistency(memory, design, features.duration, ratio, memory.health)
@@ -108,9 +111,9 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
 
 
 @compiled
-def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Predict the states of all nodes (friction hypotheses) to the end of the block (0.05 s), and
-    update mean and covariance of the mixture.
+def prepare_prediction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+    """Compute the process variances of the states over the block (0.05 s), and the factors by which
+    vehicle and sensor states return to their prior.
     """
     block = memory.block
     constants = design.constants
@@ -137,18 +140,6 @@ def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
             pace += memory.trust.hurry
         keep[i] = math.exp(-duration * pace)
         process[i] = nominal.std[i] ** 2 * (1.0 - keep[i] ** 2)
-    cos = math.cos(block.angle)
-    sin = math.sin(block.angle)
-    count = active_nodes(memory)
-    for j in range(count):
-        predict_node(memory, scratch, j, cos, sin)
-    match_moments(
-        memory.mean,
-        memory.covariance,
-        memory.weight[:count],
-        memory.overall_mean,
-        memory.overall_covariance,
-    )
 
 
 @compiled
@@ -221,7 +212,12 @@ def turned_velocity(
     and has gained the velocity `gain`.
     """
     x = memory.overall_mean
-    gained_x, gained_y = gained_velocity(gain, x)
+    gained_x, gained_y = gained_velocity(
+        gain,
+        x[NodeState.LEAK_Y],
+        x[NodeState.BIAS_X] + x[NodeState.SLOPE],
+        x[NodeState.BIAS_Y] + x[NodeState.BANK],
+    )
     return (
         cos * x[NodeState.VX] + sin * x[NodeState.VY] + gained_x,
         cos * x[NodeState.VY] - sin * x[NodeState.VX] + gained_y,

@@ -14,7 +14,13 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators.estimates import Estimates
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
-from edge_agent.estimators.friction_mixture.state.constants import NODES, Constants, NodeState
+from edge_agent.estimators.friction_mixture.state.constants import (
+    NODES,
+    PLACES,
+    STATES,
+    Constants,
+    NodeState,
+)
 from edge_agent.estimators.friction_mixture.state.design import design_of
 from edge_agent.lab.simulation import DriveSetup, simulate_manoeuvre
 from schemas.numeric import FloatArray
@@ -298,9 +304,8 @@ def inside(filters: np.ndarray) -> dict[str, float]:
     chain = weight[:, :NODES]
     halves = weight[split][:, NODES:].sum(axis=1)
     best = chain.argmax(axis=1)
-    apart = np.abs(
-        filters["mean"][:, :NODES, :2] - filters["mean"][np.arange(len(best)), best][:, None, :2]
-    )
+    velocity = filters["mean"].swapaxes(2, 3).reshape(len(best), PLACES, STATES)[..., :2]
+    apart = np.abs(velocity[:, :NODES] - velocity[np.arange(len(best)), best][:, None])
     overall = filters["overall_mean"]
     std = np.sqrt(np.diag(filters["overall_covariance"][-1]))
     mean = overall[-1]

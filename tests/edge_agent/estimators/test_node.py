@@ -1,5 +1,5 @@
-"""Tests that compare parts of a node (filter of one friction hypothesis) with textbook formulas:
-sequential update and tyre curve.
+"""Tests that compare parts of a group of nodes (filters of one friction hypothesis each) with
+textbook formulas: update, prediction, mixing and tyre curve.
 """
 
 from __future__ import annotations
@@ -11,15 +11,24 @@ import numpy as np
 import pytest
 
 from edge_agent.dynamics.tyres import magic_formula
-from edge_agent.estimators.friction_mixture.node.node_filter import slip_noise_correction, take_rows
+from edge_agent.estimators.friction_mixture.node.covariance import (
+    factorize_first,
+    mix_states,
+    predict_covariance,
+)
+from edge_agent.estimators.friction_mixture.node.linearization import slip_noise_correction
+from edge_agent.estimators.friction_mixture.node.node_filter import find_covariances, take_rows
 from edge_agent.estimators.friction_mixture.state.constants import (
     ACTIVE,
+    CURVED,
     NODES,
     ROWS,
     STATES,
     Constants,
+    NodeState,
 )
 from edge_agent.estimators.friction_mixture.state.friction_grid import node_table
+from edge_agent.estimators.friction_mixture.state.memory import VelocityGain
 from edge_agent.estimators.friction_mixture.state.split_sides import project_weights, side_table
 from edge_agent.estimators.friction_mixture.state.tyre_curve import (
     curve_tables,
@@ -27,43 +36,148 @@ from edge_agent.estimators.friction_mixture.state.tyre_curve import (
     ratio_at,
     theta_at,
 )
-from edge_agent.estimators.friction_mixture.state.workspace import NodeWorkspace
-from schemas.runtime.records import records
+from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, NodeWorkspace
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import nogil
+from schemas.runtime.lanes import lanes_at, put_lanes
+from schemas.runtime.records import LANES, records
 
 SEEDS = (0, 1, 2)
 
 
-def covariance(seed: int) -> np.ndarray:
-    factor = np.random.default_rng(seed).normal(size=(STATES, STATES))
-    return np.asarray(factor @ factor.T + 0.1 * np.eye(STATES))
+def covariances(seed: int) -> FloatArray:
+    """Return LANES random covariances, side by side (STATES, STATES, LANES)."""
+    factor = np.random.default_rng(seed).normal(size=(LANES, STATES, STATES))
+    return np.ascontiguousarray(
+        np.moveaxis(factor @ factor.swapaxes(1, 2) + 0.1 * np.eye(STATES), 0, -1)
+    )
+
+
+def whole(covariance: FloatArray, lane: int) -> FloatArray:
+    """Return the covariance of one lane, of which only the lower half is stored."""
+    lower = np.tril(covariance[..., lane])
+    return np.asarray(lower + np.tril(lower, -1).T)
 
 
 @pytest.mark.parametrize("missing", [(), (1,), (0, 4)])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_rows_taken_in_one_by_one_are_the_textbook_s_update(
-    seed: int, missing: tuple[int, ...]
-) -> None:
+def test_rows_taken_one_by_one_are_the_textbook_update(seed: int, missing: tuple[int, ...]) -> None:
     rng = np.random.default_rng(seed)
-    before = np.linalg.cholesky(covariance(seed))
-    mean = rng.normal(size=STATES)
+    before = covariances(seed)
+    mean = rng.normal(size=(STATES, LANES))
+    h = rng.normal(size=(ROWS, STATES, LANES))
+    h[list(missing)] = 0.0
+    v = rng.normal(size=(ROWS, LANES))
+    noise = rng.uniform(0.1, 1.0, (ROWS, LANES))
     node = records(NodeWorkspace, 1)[0]
-    # deviations that only the first ACTIVE axes of the factor see: rows = H*x with H = A*L^-1
-    node["deviation"] = rng.normal(size=(ROWS, ACTIVE))
-    node["residual"], node["inflated"] = rng.normal(size=ROWS), rng.uniform(0.1, 1.0, ROWS)
-    a, v, r = (
-        np.delete(node[name], missing, axis=0) for name in ("deviation", "residual", "inflated")
-    )
-    node["residual"][list(missing)] = np.nan
-    spread = a @ a.T + np.diag(r)
-    cross = before[:, :ACTIVE] @ a.T
-    expected = mean + cross @ np.linalg.solve(spread, v)
-    left = before @ before.T - cross @ np.linalg.solve(spread, cross.T)
-    root = before.copy()
-    loss, used = take_rows(mean, root, node, 0.0)
-    assert used == ROWS - len(missing)
-    assert mean == pytest.approx(expected, abs=1e-9)
-    assert root @ root.T == pytest.approx(left, abs=1e-9)
-    assert loss == pytest.approx(0.5 * v @ np.linalg.solve(spread, v), abs=1e-9)
+    features = records(BlockFeatures, 1)[0]
+    for row in missing:
+        features["rolling" if row < 4 else "side"][row % 4] = np.nan
+    node["residual"] = v
+    node["cross"] = np.einsum("ijl,rjl->irl", before, h)
+    node["spread"] = np.einsum("ril,iql->rql", h, node["cross"])
+    for row in range(ROWS):
+        node["spread"][row, row] += noise[row]
+    after = before.copy()
+    found = mean.copy()
+    take_all_rows(features, found, after, node)
+    seen = np.delete(np.arange(ROWS), missing)
+    for lane in range(LANES):
+        own = h[seen, :, lane]
+        cross = before[..., lane] @ own.T
+        spread = own @ cross + np.diag(noise[seen, lane])
+        expected = mean[:, lane] + cross @ np.linalg.solve(spread, v[seen, lane])
+        left = before[..., lane] - cross @ np.linalg.solve(spread, cross.T)
+        assert found[:, lane] == pytest.approx(expected, abs=1e-9)
+        assert whole(after, lane) == pytest.approx(left, abs=1e-9)
+        loss = 0.5 * v[seen, lane] @ np.linalg.solve(spread, v[seen, lane])
+        assert node["gain"][0, lane] == pytest.approx(loss, abs=1e-9)
+
+
+@nogil
+def take_all_rows(
+    features: BlockFeatures, mean: FloatArray, covariance: FloatArray, node: NodeWorkspace
+) -> None:
+    """Apply all rows, and write the loss of each node over node.gain."""
+    put_lanes(node.gain, 0, take_rows(features, mean, covariance, node, 0.0))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_covariances_with_rows_are_those_of_the_whole_factor(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    covariance = covariances(seed)
+    node = records(NodeWorkspace, 1)[0]
+    node["curved"] = rng.normal(size=(ROWS, CURVED, LANES))
+    node["derivative"] = rng.normal(size=(ACTIVE, ROWS, LANES))
+    node["derivative"][:CURVED] = np.nan
+    factorize_first(covariance, node["root"])
+    find_covariances(covariance, node)
+    for lane in range(LANES):
+        root = np.linalg.cholesky(covariance[..., lane])
+        deviation = node["derivative"][CURVED:, :, lane].T @ root[CURVED:ACTIVE]
+        deviation[:, :CURVED] += node["curved"][..., lane]
+        assert node["root"][..., lane] == pytest.approx(root[:, :CURVED], abs=1e-12)
+        assert node["cross"][..., lane] == pytest.approx(root @ deviation.T, abs=1e-9)
+        spread = np.tril(deviation @ deviation.T)
+        assert np.tril(node["spread"][..., lane]) == pytest.approx(spread, abs=1e-9)
+
+
+def test_a_pivot_lost_by_rounding_is_raised_to_its_limit() -> None:
+    root = np.zeros((STATES, CURVED, LANES))
+    factorize_first(np.zeros((STATES, STATES, LANES)), root)
+    assert root[0, 0] == pytest.approx(1e-9)
+
+
+def test_prediction_is_the_textbook_one() -> None:
+    rng = np.random.default_rng(0)
+    before = covariances(0)
+    after = before.copy()
+    gain = records(VelocityGain, 1)[0]
+    gain["leak_y"]["x"], gain["leak_y"]["y"] = 0.3, -0.7
+    gain["unit"]["x"], gain["unit"]["y"] = 0.05, 0.002
+    keep = rng.uniform(0.5, 1.0, STATES)
+    noise = rng.uniform(0.0, 0.1, STATES)
+    angle = 0.2
+    turn = (np.cos(angle), np.sin(angle))
+    predict_covariance(after, np.zeros((2, STATES, LANES)), gain, turn, keep, noise)
+    f = np.diag(keep)
+    f[:2] = 0.0
+    f[0, :2], f[1, :2] = (turn[0], turn[1]), (-turn[1], turn[0])
+    f[:2, NodeState.LEAK_Y] = -0.3, 0.7
+    f[:2, [NodeState.BIAS_X, NodeState.SLOPE]] = [[-0.05], [-0.002]]
+    f[:2, [NodeState.BIAS_Y, NodeState.BANK]] = [[0.002], [-0.05]]
+    for lane in range(LANES):
+        expected = f @ before[..., lane] @ f.T + np.diag(noise)
+        assert whole(after, lane) == pytest.approx(expected, abs=1e-12)
+
+
+def test_mixing_matches_the_moments_of_both_distributions() -> None:
+    rng = np.random.default_rng(0)
+    own = covariances(0)
+    overall = covariances(1)[..., 0]
+    mean = rng.normal(size=(STATES, LANES))
+    overall_mean = rng.normal(size=STATES)
+    z = np.linspace(0.0, 1.0, LANES)
+    mixed = own.copy()
+    mixed_mean = mean.copy()
+    mix_all(mixed_mean, mixed, z, overall_mean, overall)
+    for lane, share in enumerate(z):
+        apart = overall_mean - mean[:, lane]
+        expected = (1.0 - share) * own[..., lane] + share * overall
+        expected = expected + share * (1.0 - share) * np.outer(apart, apart)
+        assert whole(mixed, lane) == pytest.approx(expected, abs=1e-12)
+        assert mixed_mean[:, lane] == pytest.approx(mean[:, lane] + share * apart, abs=1e-12)
+
+
+@nogil
+def mix_all(
+    mean: FloatArray,
+    covariance: FloatArray,
+    z: FloatArray,
+    overall_mean: FloatArray,
+    overall_covariance: FloatArray,
+) -> None:
+    mix_states(mean, covariance, lanes_at(z, 0), overall_mean, overall_covariance)
 
 
 def test_the_tables_are_the_magic_formula_and_its_inverse() -> None:
@@ -71,7 +185,9 @@ def test_the_tables_are_the_magic_formula_and_its_inverse() -> None:
     e = Constants().curve_e
     curve = curve_tables(partial(magic_formulas, c=c, e=e))
     for theta in (0.01, 0.3, 1.0, 1.7, 4.0, 30.0, 900.0):
-        assert ratio_at(curve, theta) * theta == pytest.approx(magic_formula(theta, c, e), abs=5e-4)
+        assert ratio_at(curve, theta, theta / (1.0 + theta)) * theta == pytest.approx(
+            magic_formula(theta, c, e), abs=5e-4
+        )
     for force in (0.05, 0.5, 0.9, 0.99):
         assert magic_formula(theta_at(curve, force), c, e) == pytest.approx(force, abs=1e-4)
     assert np.isinf(theta_at(curve, 1.0))
@@ -79,7 +195,9 @@ def test_the_tables_are_the_magic_formula_and_its_inverse() -> None:
 
 def test_slip_beyond_the_table_gives_the_sliding_force() -> None:
     curve = curve_tables(partial(magic_formulas, c=1.45, e=-0.1))
-    assert ratio_at(curve, 1e4) * 1e4 == pytest.approx(magic_formula(1e4, 1.45, -0.1), abs=2e-3)
+    assert ratio_at(curve, 1e4, 1e4 / (1.0 + 1e4)) * 1e4 == pytest.approx(
+        magic_formula(1e4, 1.45, -0.1), abs=2e-3
+    )
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.3, 1.0])

@@ -71,6 +71,7 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
     for wheel in range(4):
         features.steer_cos[wheel] = math.cos(last.delta[wheel])
         features.steer_sin[wheel] = math.sin(last.delta[wheel])
+        _turn_wheel(row, features, wheel)
         features.rolling[wheel] = row[Parameter.RADIUS] * mean_or(block, S.OMEGA + wheel, math.nan)
         change = (last.omega[wheel] - block.start_omega[wheel]) / features.duration
         features.spin[wheel] = 0.0 if math.isnan(change) else change
@@ -84,6 +85,20 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
     _compute_information(constants, features)
     features.asymmetry = unexplained_slip_difference(memory, constants, features)
     return health
+
+
+@compiled
+def _turn_wheel(row: FloatArray, features: BlockFeatures, wheel: int) -> None:
+    """Compute the velocity of a wheel's centre that comes from the yaw rate, in the wheel's axes
+    [m/s].
+    """
+    x, y = wheel_position(row, wheel)
+    ahead = -y * features.yaw_rate
+    left = x * features.yaw_rate
+    cos = features.steer_cos[wheel]
+    sin = features.steer_sin[wheel]
+    features.turn_along[wheel] = cos * ahead + sin * left
+    features.turn_across[wheel] = cos * left - sin * ahead
 
 
 @compiled

@@ -19,13 +19,15 @@ import math
 
 import numpy as np
 
-from edge_agent.estimators.common.arrays import clear_rows, clear_vector, copy_vector, put_square
+from edge_agent.estimators.common.arrays import copy_vector
 from edge_agent.estimators.friction_mixture.mixture.trust import used_evidence_share
+from edge_agent.estimators.friction_mixture.node.covariance import mix_states
 from edge_agent.estimators.friction_mixture.state.constants import (
     ALL_NODES,
     NODES,
+    PLACES,
+    STATES,
     Constants,
-    NodeState,
 )
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.state.friction_grid import (
@@ -38,6 +40,8 @@ from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import Scratch
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
+from schemas.runtime.lanes import lanes_at, largest_lane, put_lanes, select, sum_lanes
+from schemas.runtime.records import LANES
 
 LEAST_MIXING = 1e-3  # a smaller share of foreign mass changes no digit that is read
 LEAST_WEIGHT = 1e-9  # nor does a node of less
@@ -80,8 +84,18 @@ def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
         for j in range(NODES, ALL_NODES):
             weight[j] = visit[j] = design.sides.prior[j]
             memory.penalty[j] = 0.0
-            copy_vector(memory.mean[j], memory.overall_mean)
-            put_square(memory.covariance[j], memory.overall_covariance)
+            _put_moments(memory, j)
+
+
+@compiled
+def _put_moments(memory: MixtureMemory, node: int) -> None:
+    """Set mean and covariance of a node to those of the whole mixture."""
+    group = node // LANES
+    lane = node % LANES
+    for i in range(STATES):
+        memory.mean[group, i, lane] = memory.overall_mean[i]
+        for j in range(i + 1):
+            memory.covariance[group, i, j, lane] = memory.overall_covariance[i, j]
 
 
 @compiled
@@ -89,8 +103,8 @@ def apply_road_change(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, metres: float
 ) -> None:
     """Account for a possible change of the road within `metres`: move probability between nodes
-    (friction hypotheses). The state of a node is mixed with the states of the nodes from which its
-    probability comes.
+    (friction hypotheses), and compute scratch.mixing, the share of each node's state that
+    `mix_nodes` then mixes with the states of the nodes from which its probability comes.
     """
     count = active_nodes(memory)
     constants = design.constants
@@ -110,88 +124,99 @@ def apply_road_change(
     change_road(visit, prior, NODES, change, predicted)
     copy_vector(visit, predicted)
     change_road(weight, prior, NODES, change, predicted)
-    for j in range(count):
-        zeta = min(hazard * prior[j] / predicted[j], 1.0)
-        memory.penalty[j] *= 1.0 - zeta
-        mix_node(
-            memory.mean[j],
-            memory.covariance[j],
+    copy_vector(weight, predicted)
+    for j in range(PLACES):
+        # a node that sleeps keeps the state of the mixture, so that it stays finite
+        scratch.mixing[j] = min(hazard * prior[j] / predicted[j], 1.0) if j < count else 1.0
+        memory.penalty[j] *= 1.0 - scratch.mixing[j]
+    share_weights(memory, scratch)
+
+
+@compiled
+def share_weights(memory: MixtureMemory, scratch: Scratch) -> None:
+    """Write the weights of the active nodes to scratch.share, and 0 for the others."""
+    count = active_nodes(memory)
+    for j in range(PLACES):
+        scratch.share[j] = memory.weight[j] if j < count else 0.0
+
+
+@compiled
+def mix_nodes(memory: MixtureMemory, scratch: Scratch, group: int) -> None:
+    """Mix the states of a group of nodes (friction hypotheses) with that of the whole mixture in
+    the shares scratch.mixing.
+    """
+    zeta = lanes_at(scratch.mixing, group)
+    zeta = select(zeta < LEAST_MIXING, 0.0, zeta)
+    if largest_lane(zeta) > 0.0:
+        mix_states(
+            memory.mean[group],
+            memory.covariance[group],
             zeta,
             memory.overall_mean,
             memory.overall_covariance,
         )
-    copy_vector(weight, predicted)
 
 
 @compiled
-def mix_node(
-    mean: FloatArray,
-    covariance: FloatArray,
-    zeta: float,
-    overall_mean: FloatArray,
-    overall_covariance: FloatArray,
-) -> None:
-    """Mix the state of one node (friction hypothesis) with that of the whole mixture: mean (n,) and
-    covariance (n, n) are changed in place."""
-    if zeta < LEAST_MIXING:
-        return
-    n = mean.shape[0]
-    for i in range(n):
-        apart = zeta * (1.0 - zeta) * (overall_mean[i] - mean[i])
-        for j in range(i + 1):
-            foreign = zeta * (overall_covariance[i, j] - covariance[i, j])
-            covariance[i, j] += foreign + apart * (overall_mean[j] - mean[j])
-            covariance[j, i] = covariance[i, j]
-    for i in range(n):
-        mean[i] += zeta * (overall_mean[i] - mean[i])
-
-
-@compiled
-def match_moments(
-    mean: FloatArray,
-    covariance: FloatArray,
-    weight: FloatArray,
-    overall_mean: FloatArray,
-    overall_covariance: FloatArray,
-) -> None:
-    """Compute mean (n,) and covariance (n, n) of the mixture of the first K nodes (filters of one
-    friction hypothesis each) with weights (K,).
+def match_moments(memory: MixtureMemory, scratch: Scratch) -> None:
+    """Compute mean (n,) and covariance (n, n) of the mixture of the active nodes (filters of one
+    friction hypothesis each) with weights scratch.share.
     """
-    count = weight.shape[0]
-    n = mean.shape[1]
-    clear_vector(overall_mean)
-    clear_rows(overall_covariance)
-    for k in range(count):
-        for i in range(n):
-            overall_mean[i] += weight[k] * mean[k, i]
-    for k in range(count):
-        if weight[k] < LEAST_WEIGHT:
-            continue
-        for i in range(n):
-            apart = mean[k, i] - overall_mean[i]
-            for j in range(i + 1):
-                overall_covariance[i, j] += weight[k] * (
-                    covariance[k, i, j] + apart * (mean[k, j] - overall_mean[j])
-                )
-    for i in range(n):
-        for j in range(i):
-            overall_covariance[j, i] = overall_covariance[i, j]
+    groups = (active_nodes(memory) + LANES - 1) // LANES
+    apart = scratch.apart
+    for i in range(STATES):
+        total = 0.0
+        for group in range(groups):
+            share = lanes_at(scratch.share, group)
+            total += share * lanes_at(memory.mean, (group, i))
+        memory.overall_mean[i] = sum_lanes(total)
+        for group in range(groups):
+            own = lanes_at(memory.mean, (group, i))
+            put_lanes(apart, (group, i), own - memory.overall_mean[i])
+    for i in range(STATES):
+        for j in range(i + 1):
+            total = 0.0
+            for group in range(groups):
+                share = lanes_at(scratch.share, group)
+                share = select(share < LEAST_WEIGHT, 0.0, share)
+                product = lanes_at(apart, (group, i)) * lanes_at(apart, (group, j))
+                total += share * (lanes_at(memory.covariance, (group, i, j)) + product)
+            found = sum_lanes(total)
+            memory.overall_covariance[i, j] = found
+            memory.overall_covariance[j, i] = found
 
 
 @compiled
 def reset_diverged(
-    mean: FloatArray, root: FloatArray, weight: FloatArray, constants: Constants
+    memory: MixtureMemory, scratch: Scratch, weight: FloatArray, constants: Constants
 ) -> None:
     """Reset diverged nodes (filters of one friction hypothesis): each gets the state of the most
-    probable node, and a weight of almost zero.
+    probable node, and a weight of almost zero. A node has diverged if its velocity after the
+    measurements, scratch.updated, is far from that of the most probable node.
     """
     best = int(np.argmax(weight))
+    velocity = scratch.updated
+    group = best // LANES
+    lane = best % LANES
     for j in range(weight.shape[0]):
+        own = velocity[j // LANES]
         astray = max(
-            abs(mean[j, NodeState.VX] - mean[best, NodeState.VX]) / constants.diverged_x,
-            abs(mean[j, NodeState.VY] - mean[best, NodeState.VY]) / constants.diverged_y,
+            abs(own[0, j % LANES] - velocity[group, 0, lane]) / constants.diverged_x,
+            abs(own[1, j % LANES] - velocity[group, 1, lane]) / constants.diverged_y,
         )
         if astray > 1.0:
-            copy_vector(mean[j], mean[best])
-            put_square(root[j], root[best])
+            _copy_node(memory, j, best)
             weight[j] = SMALLEST
+
+
+@compiled
+def _copy_node(memory: MixtureMemory, target: int, source: int) -> None:
+    """Set mean and covariance of one node to those of another."""
+    mean = memory.mean
+    covariance = memory.covariance
+    group = target // LANES
+    lane = target % LANES
+    for i in range(STATES):
+        mean[group, i, lane] = mean[source // LANES, i, source % LANES]
+        for j in range(i + 1):
+            covariance[group, i, j, lane] = covariance[source // LANES, i, j, source % LANES]

@@ -28,7 +28,6 @@ import math
 
 from edge_agent.adaptation.rule_base import forgetting_rate
 from edge_agent.estimators import flags
-from edge_agent.estimators.friction_mixture.node.node_filter import belief_cost
 from edge_agent.estimators.friction_mixture.state.constants import (
     ALL_NODES,
     NODES,
@@ -70,7 +69,7 @@ def update_consistency(
     constants = design.constants
     # by what any car may be: a calibration makes the belief of this one narrower, and contradicts
     # nothing
-    cost = belief_cost(memory.overall_mean, design.nominal)
+    cost = mixture_cost(memory.overall_mean, design.nominal)
     trust.strain = belief_strain(
         cost, degrees_of_freedom(memory.overall_covariance, design.nominal), constants.strain_prior
     )
@@ -124,6 +123,17 @@ def slippery_probability(memory: MixtureMemory, design: MixtureDesign) -> float:
     for j in range(ALL_NODES if memory.split else NODES):
         if 0.5 * (design.sides.mu[j, 0] + design.sides.mu[j, 1]) < SLIPPERY_MU:
             total += memory.weight[j]
+    return total
+
+
+@compiled
+def mixture_cost(mean: FloatArray, nominal: Nominal) -> float:
+    """Return half the sum of the squared deviations of the mixture's vehicle and sensor states,
+    `mean` (n,), from their prior, in standard deviations [nat].
+    """
+    total = 0.0
+    for i in range(NodeState.LN_KX, mean.shape[0]):
+        total += 0.5 * ((mean[i] - nominal.mean[i]) / nominal.std[i]) ** 2
     return total
 
 

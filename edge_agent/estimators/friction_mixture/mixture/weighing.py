@@ -18,82 +18,102 @@ from edge_agent.dynamics.slip import SLOWEST_M_S as SLOWEST_SLIP_M_S
 from edge_agent.dynamics.tyres import TINY
 from edge_agent.estimators.friction_mixture.block.grip_guard import guard_penalty
 from edge_agent.estimators.friction_mixture.mixture.ice_patch import shrink_patches
-from edge_agent.estimators.friction_mixture.mixture.mixing import active_nodes, reset_diverged
+from edge_agent.estimators.friction_mixture.mixture.mixing import (
+    active_nodes,
+    mix_nodes,
+    reset_diverged,
+)
 from edge_agent.estimators.friction_mixture.mixture.trust import (
     slippery_probability,
     used_evidence_share,
 )
-from edge_agent.estimators.friction_mixture.node.node_filter import update_node
+from edge_agent.estimators.friction_mixture.node.node_filter import predict_nodes, update_nodes
+from edge_agent.estimators.friction_mixture.node.residuals import is_measured
 from edge_agent.estimators.friction_mixture.node.rolling_motion import take_rolling
-from edge_agent.estimators.friction_mixture.state.constants import NodeState
+from edge_agent.estimators.friction_mixture.state.constants import ROWS, NodeState
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.state.friction_grid import multiply_likelihood
 from edge_agent.estimators.friction_mixture.state.gap import SLOWEST_M_S
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, Scratch
-from edge_agent.filters.cholesky import factorize
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
+from schemas.runtime.lanes import (
+    exp_lanes,
+    lanes_at,
+    largest_lane,
+    put_lanes,
+    select,
+    sum_lanes,
+)
+from schemas.runtime.records import LANES
 from schemas.signals import S
 
-LEAST_VARIANCE = 1e-18  # of a state given the states before it
 LEAST_DEMAND = 1e-3  # [1] below it no evidence is left
 
 
 @compiled
-def apply_measurement(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Apply the measurements of the block (0.05 s): update all nodes (friction hypotheses),
-    recompute their weights, and adapt the measurement noise R.
+def weigh_nodes(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+    """Recompute the weights of all nodes (friction hypotheses) from the likelihoods of the block
+    (0.05 s), and adapt the measurement noise R.
     """
-    update_all(memory, design, scratch)
     temper_evidence(memory, design, scratch)
-    weight = memory.weight[: active_nodes(memory)]
-    reset_diverged(memory.mean, scratch.root, weight, design.constants)
+    count = active_nodes(memory)
+    weight = memory.weight[:count]
+    reset_diverged(memory, scratch, weight, design.constants)
     shrink_patches(memory.patch, weight, scratch.log_likelihood)
     multiply_likelihood(weight, scratch.log_likelihood)
-    multiply_likelihood(memory.visit_weight[: active_nodes(memory)], scratch.log_likelihood)
+    multiply_likelihood(memory.visit_weight[:count], scratch.log_likelihood)
     adapt_noise(memory, design, scratch)
 
 
 @compiled
 def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Update every active node (filter of one friction hypothesis); store the NIS (squared
-    innovation over its variance) and the predictive log-likelihood of the mixture.
+    """Advance all groups of active nodes (filters of one friction hypothesis each) by one block
+    (0.05 s): mix their states after a road change, apply the measurements, and predict to the
+    block's end. Store the NIS (squared innovation over its variance) and the predictive
+    log-likelihood of the mixture.
     """
-    inflation = max(design.constants.correlation_time / scratch.features.duration, 1.0)
-    count = active_nodes(memory)
-    for group in range(2):
-        scratch.actual_sum[group] = scratch.theoretical_sum[group] = 0.0
-    scratch.stated_sum = 0.0
-    surplus = 1.0 - 1.0 / scratch.features.axle_scale
-    top = -math.inf
-    nis = 0.0
-    rows = 0
     features = scratch.features
+    inflation = max(design.constants.correlation_time / features.duration, 1.0)
     steady = design.constants.steady_share
     features.novelty = steady + (1.0 - steady) * features.new
-    for j in range(count):
-        factorize(memory.covariance[j], scratch.root[j], LEAST_VARIANCE)
-        found = update_node(memory, design, scratch, j, inflation)
-        scratch.log_likelihood[j] = found.log_likelihood - take_rolling(memory, design, scratch, j)
-        scratch.moved[j] = found.moved
-        scratch.joint[j] = found.plain + math.log(memory.weight[j])
-        top = max(top, scratch.joint[j])
-        rows = found.rows
-        nis += memory.weight[j] * found.square
-        for r in range(6):
-            if not math.isnan(scratch.innovation[j, r]):
-                group = 0 if r < 4 else 1
-                scratch.actual_sum[group] += memory.weight[j] * scratch.innovation[j, r] ** 2
-                scratch.theoretical_sum[group] += memory.weight[j] * scratch.theoretical[j, r]
-                if group == 1:
-                    without = scratch.theoretical[j, r] - surplus * scratch.node.noise[r]
-                    scratch.stated_sum += memory.weight[j] * without
+    for kind in range(2):
+        scratch.actual_sum[kind] = scratch.theoretical_sum[kind] = 0.0
+    scratch.stated_sum = scratch.square_sum = 0.0
+    turn = (math.cos(memory.block.angle), math.sin(memory.block.angle))
+    groups = (active_nodes(memory) + LANES - 1) // LANES
+    for group in range(groups):
+        mix_nodes(memory, scratch, group)
+        found = update_nodes(memory, design, scratch, group, inflation)
+        cost = take_rolling(memory, design, scratch, group)
+        put_lanes(scratch.log_likelihood, group, found.log_likelihood - cost)
+        put_lanes(scratch.moved, group, found.moved)
+        put_lanes(scratch.plain, group, found.plain)
+        for axis in range(2):
+            velocity = lanes_at(memory.mean, (group, axis))
+            put_lanes(scratch.updated, (group, axis), velocity)
+        predict_nodes(memory, scratch, group, turn)
+    rows = 0
+    for r in range(ROWS):
+        rows += 1 if is_measured(features, r) else 0
+    memory.log_likelihood = mixture_likelihood(scratch, groups) if rows > 0 else 0.0
+    memory.nis = scratch.square_sum / rows if rows > 0 else 0.0
+
+
+@compiled
+def mixture_likelihood(scratch: Scratch, groups: int) -> float:
+    """Return the log-likelihood [nat] of the block's measurements by the whole mixture."""
+    top = -math.inf
+    for group in range(groups):
+        awake = lanes_at(scratch.share, group) > 0.0
+        plain = select(awake, lanes_at(scratch.plain, group), -math.inf)
+        top = max(top, largest_lane(plain))
     total = 0.0
-    for j in range(count):
-        total += math.exp(scratch.joint[j] - top)
-    memory.log_likelihood = top + math.log(total) if rows > 0 else 0.0
-    memory.nis = nis / rows if rows > 0 else 0.0
+    for group in range(groups):
+        likelihood = exp_lanes(lanes_at(scratch.plain, group) - top)
+        total += sum_lanes(lanes_at(scratch.share, group) * likelihood)
+    return top + math.log(total)
 
 
 @compiled

@@ -1,18 +1,20 @@
-"""Filter of one node: a cubature Kalman filter of the vehicle, given the friction under its left
-and right wheels.
+"""Filters of a group of nodes side by side: each is a cubature Kalman filter of the vehicle, given
+the friction under its left and right wheels.
 
 Legend
-    m, L        mean (n,) and square root of the covariance, L*L' = P          (n, n)
-    A           measurement deviations in the axes of L's columns              (6, ACTIVE)
-    f, a        row of A that is applied, and its variance f'f + r^2
+    m, P        mean (n,) and covariance (n, n)
+    B           measurement deviations of the cubature points, in the axes of the first CURVED
+                columns of the factor of P                             (6, CURVED)
     D           derivative of the rows by a state that they depend on linearly
+    h           covariance of the states with a row                     (n,)
+    S           covariance of the rows without noise                    (6, 6)
 
 The measurement rows are nonlinear only in velocity and stiffness. Therefore the third-degree
 cubature rule is applied in these four dimensions. The rows are linear in the other states: leak
 (gravity that a tilted accelerometer measures), steering error, shape of the tyre curve and gain of
-torque. These enter exactly, by the derivative D (a Rao-Blackwellised rule). Rows are applied one
-after the other (Potter 1963): L <- L*(I - g*f*f'), with g such that no covariance is ever
-subtracted.
+torque. These enter exactly, by the derivative D (a Rao-Blackwellised rule). With L the first
+columns of the factor, h = L*B' + P*D' and S = B*(B + D*L)' + D*h. Rows are applied one after the
+other, so that the noise of each may differ from node to node.
 """
 
 from __future__ import annotations
@@ -20,292 +22,224 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from edge_agent.dynamics.slip import SLOWEST_M_S
+from edge_agent.estimators.friction_mixture.node.covariance import (
+    factorize_first,
+    predict_covariance,
+    symmetric_at,
+)
+from edge_agent.estimators.friction_mixture.node.linearization import linearize_nodes
 from edge_agent.estimators.friction_mixture.node.residuals import (
-    correct_forces,
+    find_ratios,
     find_residuals,
-    find_shape_force,
     find_slips,
-    gained_velocity,
-    slope_along,
+    gained_by,
+    is_measured,
 )
 from edge_agent.estimators.friction_mixture.state.constants import (
     ACTIVE,
     CURVED,
     ROWS,
     STATES,
-    STRAIGHT,
     Constants,
     NodeState,
 )
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, Nominal
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory, Trust
-from edge_agent.estimators.friction_mixture.state.tyre_curve import TyreCurve
 from edge_agent.estimators.friction_mixture.state.workspace import (
     BlockFeatures,
     NodeWorkspace,
     Scratch,
 )
-from edge_agent.filters.cholesky import covariance_of_factor
-from edge_agent.filters.sequential import apply_projection, potter_factors
 from schemas.numeric import FloatArray
-from schemas.runtime.jit import compiled
+from schemas.runtime.jit import compiled, inlined
+from schemas.runtime.lanes import lanes_at, log_lanes, put_lanes, sum_lanes
 
 REAR_ROWS = (2, 3, 5)
 DOUBTED = 0.05  # of distrust_noise, at the brink of it
 
 
 class NodeUpdate(NamedTuple):
-    """Result of the measurement update of one node (friction hypothesis): its log-likelihood, the
-    number of measurement rows (scalar measurements) used, and the terms from which the weights of
-    all nodes and the penalties are computed.
+    """Result of the measurement update of a group of nodes (friction hypotheses), per node: its
+    log-likelihood, and the terms from which the weights of all nodes and the penalties are
+    computed.
     """
 
     log_likelihood: float  # with the inflated R and the price of sliding [nat]
     moved: float  # change of `belief_cost` [nat]
     plain: float  # log-likelihood with the plain R, rows taken as independent [nat]
-    square: float  # normalised innovation squared with the plain R
-    rows: int
 
 
 @compiled
-def update_node(
-    memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int, inflation: float
+def update_nodes(
+    memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, group: int, inflation: float
 ) -> NodeUpdate:
-    """Run the cubature update of node j (friction hypothesis) with the measurement noise R times
-    `inflation`. The update changes the node's mean and scratch.root[j].
+    """Run the cubature update of a group of nodes (friction hypotheses) with the measurement noise
+    R times `inflation`. The update changes mean and covariance of the nodes.
+
+    The function also adds the innovations (measurement minus prediction), weighted by the nodes'
+    probabilities, to the sums from which R is adapted.
+    """
+    features = scratch.features
+    node = scratch.node
+    mean = memory.mean[group]
+    covariance = memory.covariance[group]
+    put_friction(design, features, node, group)
+    gained_x, gained_y = gained_by(features.gain, mean)
+    put_lanes(node.gained_x, 0, gained_x)
+    put_lanes(node.gained_y, 0, gained_y)
+    price = linearize_nodes(memory.row, design, mean, features, node)
+    factorize_first(covariance, node.root)
+    spread_points(memory.row, design, mean, features, node)
+    find_covariances(covariance, node)
+    plain = weigh_rows(memory, design, scratch, lanes_at(scratch.share, group), inflation)
+    before = belief_cost(mean, memory.nominal)
+    loss = take_rows(features, mean, covariance, node, design.constants.axle_penalty)
+    keep_within(mean, design.constants, memory.nominal)
+    moved = belief_cost(mean, memory.nominal) - before
+    price *= design.constants.sliding_penalty / inflation
+    return NodeUpdate(-loss - price, moved, plain)
+
+
+@compiled
+def put_friction(
+    design: MixtureDesign, features: BlockFeatures, node: NodeWorkspace, group: int
+) -> None:
+    """Write the friction of the nodes under wheels and axles, and its inverse."""
+    for side in range(2):
+        mu = lanes_at(design.sides.lanes, (group, side))
+        put_lanes(node.mu, side, mu)
+        put_lanes(node.per_mu, side, 1.0 / mu)
+    for axle in range(2):
+        mu = features.load_share[2 * axle] * lanes_at(node.mu, 0)
+        mu += features.load_share[2 * axle + 1] * lanes_at(node.mu, 1)
+        put_lanes(node.axle_mu, axle, mu)
+        put_lanes(node.per_axle_mu, axle, 1.0 / mu)
+
+
+@compiled
+def weigh_rows(
+    memory: MixtureMemory,
+    design: MixtureDesign,
+    scratch: Scratch,
+    share: float,
+    inflation: float,
+) -> float:
+    """Compute innovation, variance and inflated noise of each row, and add them to the sums of the
+    block, weighted by the nodes' probabilities `share`. Return the log-likelihood with the plain R.
 
     The noise of the axles' rows is increased further if these rows contradict the model, and while
     the inputs are steady. With steady inputs, errors of the tyre curve and of offsets repeat from
     block to block; if they were treated as noise, the filter would average them into stiffness and
     shape.
-
-    The function also stores each innovation (measurement minus prediction), and its expected
-    variance without `inflation`.
     """
     constants = design.constants
-    nominal = memory.nominal
     features = scratch.features
     node = scratch.node
-    mean = memory.mean[j]
-    root = scratch.root[j]
-    innovation = scratch.innovation[j]
-    theoretical = scratch.theoretical[j]
-    node.gained.x, node.gained.y = gained_velocity(features.gain, mean)
-    price = linearize_node(memory, design, scratch, j)
-    spread_points(memory, design, scratch, j)
     across = inflation * doubted_noise(memory.trust, constants) / features.novelty
     unlike = rear_noise(memory, constants)
-    plain = square = 0.0
+    surplus = 1.0 - 1.0 / features.axle_scale
+    squares = 0.0 * share
+    product = 1.0 + squares
     for r in range(ROWS):
-        innovation[r] = -node.residual[r]
-        noise = node.noise[r]
-        variance = node.nonlinearity[r]
-        for column in range(ACTIVE):
-            variance += node.deviation[r, column] ** 2
-        theoretical[r] = variance + noise
-        excess = node.residual[r] ** 2 / constants.huber**2 - variance
+        if not is_measured(features, r):
+            continue
+        residual = lanes_at(node.residual, r)
+        noise = lanes_at(node.noise, r)
+        curvature = lanes_at(node.nonlinearity, r)
+        variance = lanes_at(node.spread, (r, r)) + curvature
+        total = variance + noise
+        excess = residual * residual * (1.0 / constants.huber**2) - variance
         factor = inflation if r < 4 else across
         if r in REAR_ROWS:
             factor *= unlike
-        node.inflated[r] = max(noise * factor, excess) + node.nonlinearity[r] + node.abrupt[r]
-        if not math.isnan(node.residual[r]):
-            ratio = node.residual[r] ** 2 / theoretical[r]
-            square += ratio
-            plain -= 0.5 * (ratio + math.log(2.0 * math.pi * theoretical[r]))
-    for r in range(ROWS):
-        node.residual[r] = innovation[r]
-    before = belief_cost(mean, nominal)
-    loss, used = take_rows(mean, root, node, constants.axle_penalty)
-    keep_within(mean, constants, nominal)
-    moved = belief_cost(mean, nominal) - before
-    return NodeUpdate(
-        -loss - constants.sliding_penalty / inflation * price, moved, plain, square, used
-    )
+        inflated = max(noise * factor, excess) + curvature + lanes_at(node.abrupt, r)
+        put_lanes(node.residual, r, -residual)
+        spread = lanes_at(node.spread, (r, r)) + inflated
+        put_lanes(node.spread, (r, r), spread)
+        squares += residual * residual / total
+        product *= 2.0 * math.pi * total
+        kind = 0 if r < 4 else 1
+        scratch.actual_sum[kind] += sum_lanes(share * residual * residual)
+        scratch.theoretical_sum[kind] += sum_lanes(share * total)
+        if kind == 1:
+            scratch.stated_sum += sum_lanes(share * (total - surplus * noise))
+    scratch.square_sum += sum_lanes(share * squares)
+    return -0.5 * (squares + log_lanes(product))
 
 
 @compiled
-def linearize_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
-    """For node j (friction hypothesis) at its mean state, compute node.force (tyre forces over
-    load) and node.derivative (of the measurement rows by the linear states). Return the penalty
-    [nat] for sliding wheels.
-
-    The leak (gravity in a_y when the body rolls) and the offset of a_y change the same forces.
-    Therefore the derivative by the one is computed from the derivative by the other.
-    """
-    constants = design.constants
-    curve = design.curve
-    side_mu = design.sides.mu[j]
-    row = memory.row
-    mean = memory.mean[j]
-    features = scratch.features
-    node = scratch.node
-    price = 0.0
-    all_torques = True
-    for wheel in range(4):
-        all_torques = all_torques and features.force_unit[wheel] == 0.0
-    for i in range(STATES):
-        node.point[i] = mean[i]
-    for state in range(STRAIGHT, CURVED - 1, -1):  # at the mean, then with each moved, STEER last
-        if state == NodeState.LEAK_Y or (state == NodeState.BIAS_X and all_torques):
-            continue
-        step = 0.0 if state == STRAIGHT else 0.5 * design.nominal.std[state]
-        if state < STRAIGHT:
-            node.point[state] += step
-        if state == STRAIGHT or state == NodeState.STEER:
-            find_slips(row, constants, mean, features, node)
-        if state == STRAIGHT:
-            find_shape_force(curve, side_mu, features, node)
-            price = weigh_slopes(curve, side_mu, features, constants.sliding_slope, node)
-        correct_forces(row, curve, side_mu, features, node)
-        out = node.residual[:] if state == STRAIGHT else node.derivative[state]
-        find_residuals(curve, side_mu, features, node, out)
-        if state < STRAIGHT:
-            node.point[state] -= step
-            for r in range(ROWS):
-                out[r] = (out[r] - node.residual[r]) / step
-    _by_wheel_speeds(memory, design, scratch, j)
-    derivative = node.derivative
-    for r in range(ROWS):
-        axle = r // 2 if r < 4 else r - 4
-        across = -features.side_leak[axle] / features.side_unit[axle]
-        derivative[NodeState.LEAK_Y, r] = (
-            0.0 if math.isnan(across) else derivative[NodeState.BIAS_Y, r] * across
-        )
-        by_angle = derivative[NodeState.STEER, r]
-        derivative[NodeState.LAG_STEER, r] = by_angle * features.steer_rate
-        derivative[NodeState.STEER_GAIN, r] = by_angle * features.steering
-        derivative[NodeState.COMPLIANCE, r] = (
-            0.0 if math.isnan(features.side[0]) else -by_angle * features.side[0]
-        )
-        if all_torques:  # an offset of a_x is then no force
-            derivative[NodeState.BIAS_X, r] = 0.0
-    return price
-
-
-@compiled
-def _by_wheel_speeds(
-    memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int
+def spread_points(
+    row: FloatArray,
+    design: MixtureDesign,
+    mean: FloatArray,
+    features: BlockFeatures,
+    node: NodeWorkspace,
 ) -> None:
-    """Compute the derivatives of the measurement rows by the four wheel radii, and by the time lag
-    of the wheel speed signals.
+    """Compute the predicted measurements at the cubature points (sample states) of a group of nodes
+    (friction hypotheses).
 
-    Each wheel's measurement row depends on the speed of this wheel. One evaluation with all four
-    radii changed gives all derivatives, because the radii hardly change the rows of the axles.
-    node.force, the force over load, must already be computed at the mean.
+    Fill node.curved (B), node.residual with the predicted rows, and node.nonlinearity with the
+    variance caused by nonlinearity. node.root holds the first columns of the covariances' factors.
     """
-    row = memory.row
-    mean = memory.mean[j]
-    side_mu = design.sides.mu[j]
-    features = scratch.features
-    node = scratch.node
-    step = design.nominal.std[NodeState.RADIUS]
-    for wheel in range(4):
-        node.point[NodeState.RADIUS + wheel] = mean[NodeState.RADIUS + wheel] + step
-    find_slips(row, design.constants, mean, features, node)
-    correct_forces(row, design.curve, side_mu, features, node)
-    by_lag = node.derivative[NodeState.LAG_WHEEL]
-    find_residuals(design.curve, side_mu, features, node, by_lag)
-    for wheel in range(4):
-        node.point[NodeState.RADIUS + wheel] = mean[NodeState.RADIUS + wheel]
-        by_radius = node.derivative[NodeState.RADIUS + wheel]
-        for r in range(ROWS):
-            by_radius[r] = 0.0
-        by_radius[wheel] = (by_lag[wheel] - node.residual[wheel]) / step
-        by_lag[wheel] = (
-            by_radius[wheel] * features.change / max(abs(features.rolling[wheel]), SLOWEST_M_S)
-        )
-    by_lag[4] = by_lag[5] = 0.0
-
-
-@compiled
-def weigh_slopes(
-    curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, flat: float, node: NodeWorkspace
-) -> float:
-    """Compute node.noise, the noise variances of the six measurement rows at the slips node.slip;
-    return the penalty [nat] for sliding wheels.
-
-    The penalty applies to wheels on the flat part of the curve: a sliding wheel may have any slip,
-    so its probability density is low.
-    """
-    slip = node.slip
-    price = 0.0
-    for axle in range(2):
-        across = 0.0
-        for wheel in range(2 * axle, 2 * axle + 2):
-            mu = side_mu[wheel % 2]
-            g_x = slip.along[wheel]
-            g_y = slip.across[wheel]
-            along = slope_along(curve, g_x, g_y, mu)
-            across += features.load_share[wheel] * slope_along(curve, g_y, g_x, mu)
-            node.noise[wheel] = (
-                features.noise_std[wheel] ** 2
-                - slip_noise_correction(along) * features.slip_noise[wheel]
-            )
-            node.abrupt[wheel] = (0.5 - slip_noise_correction(along)) * features.abrupt_noise[wheel]
-            if not math.isnan(features.rolling[wheel]):
-                price -= min(math.log(along / flat), 0.0)
-        side = 4 + axle
-        node.noise[side] = (
-            features.noise_std[side] ** 2
-            - slip_noise_correction(across) * features.slip_noise[side]
-        )
-        node.abrupt[side] = 0.0
-    return price
-
-
-@compiled
-def slip_noise_correction(slope: float) -> float:
-    """Return one half minus the share of the slip noise variance that enters a residual, for a
-    given slope of the tyre curve.
-
-    A residual is the distance normal to the curve. On a line of slope k, the share k^2/(1 + k^2) of
-    the slip noise enters it (errors in variables); at slope 1 this is one half, which
-    features.noise_std already contains. A constant share would be too large on the flat part of the
-    curve, where hardly any slip noise enters. It would favour nodes (friction hypotheses) by which
-    the wheels slide.
-    """
-    return 0.5 - slope * slope / (1.0 + slope * slope)
-
-
-@compiled
-def spread_points(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> None:
-    """Compute the predicted measurements at the cubature points (sample states) of node j, a
-    friction hypothesis.
-
-    Fill node.deviation (A), node.residual with the predicted rows, and node.nonlinearity with the
-    variance caused by nonlinearity. scratch.root[j] is lower triangular.
-    """
-    row = memory.row
-    mean = memory.mean[j]
-    root = scratch.root[j]
-    side_mu = design.sides.mu[j]
-    features = scratch.features
-    node = scratch.node
     scale = math.sqrt(CURVED)
-    for r in range(ROWS):
-        node.residual[r] = node.nonlinearity[r] = 0.0
+    slip = node.moved_slip
     for column in range(CURVED):
         for sign in range(2):
             signed = scale if sign == 0 else -scale
-            out = node.ahead[:] if sign == 0 else node.behind[:]
+            out = node.ahead if sign == 0 else node.behind
             for i in range(CURVED):
-                node.point[i] = mean[i] + signed * root[i, column]
-            find_slips(row, design.constants, mean, features, node)
-            find_residuals(design.curve, side_mu, features, node, out)
+                moved = lanes_at(mean, i) + signed * lanes_at(node.root, (i, column))
+                put_lanes(node.point, i, moved)
+            find_slips(row, design.constants, mean, features, node, slip)
+            find_ratios(design.curve, features, node, slip)
+            find_residuals(features, slip, node.forces, out)
         for r in range(ROWS):
-            node.deviation[r, column] = 0.5 * (node.ahead[r] - node.behind[r]) / scale
-            node.middle[column, r] = 0.5 * (node.ahead[r] + node.behind[r])
-            node.residual[r] += node.middle[column, r] / CURVED
+            ahead = lanes_at(node.ahead, r)
+            behind = lanes_at(node.behind, r)
+            put_lanes(node.curved, (r, column), (0.5 / scale) * (ahead - behind))
+            put_lanes(node.middle, (column, r), 0.5 * (ahead + behind))
+    for r in range(ROWS):
+        centre = 0.0
+        for column in range(CURVED):
+            centre += lanes_at(node.middle, (column, r)) * (1.0 / CURVED)
+        nonlinearity = 0.0
+        for column in range(CURVED):
+            apart = lanes_at(node.middle, (column, r)) - centre
+            nonlinearity += apart * apart * (1.0 / CURVED)
+        put_lanes(node.residual, r, centre)
+        put_lanes(node.nonlinearity, r, nonlinearity)
+
+
+@compiled
+def find_covariances(covariance: FloatArray, node: NodeWorkspace) -> None:
+    """Compute node.cross, the covariance of the states with each row (h), and node.spread, that of
+    the rows with each other (S).
+    """
+    for i in range(STATES):
+        for r in range(ROWS):
+            total = 0.0
+            for column in range(CURVED):
+                total += lanes_at(node.root, (i, column)) * lanes_at(node.curved, (r, column))
+            for state in range(CURVED, ACTIVE):
+                by_state = lanes_at(node.derivative, (state, r))
+                total += symmetric_at(covariance, i, state) * by_state
+            put_lanes(node.cross, (i, r), total)
     for r in range(ROWS):
         for column in range(CURVED):
-            node.nonlinearity[r] += (node.middle[column, r] - node.residual[r]) ** 2 / CURVED
-        for column in range(CURVED, ACTIVE):
-            node.deviation[r, column] = 0.0
-        for state in range(CURVED, ACTIVE):
-            by_state = node.derivative[state, r]
-            for column in range(state + 1):
-                node.deviation[r, column] += by_state * root[state, column]
+            total = lanes_at(node.curved, (r, column))
+            for state in range(CURVED, ACTIVE):
+                by_state = lanes_at(node.derivative, (state, r))
+                total += by_state * lanes_at(node.root, (state, column))
+            put_lanes(node.whole, (r, column), total)
+    for r in range(ROWS):
+        for q in range(r + 1):
+            total = 0.0
+            for column in range(CURVED):
+                total += lanes_at(node.curved, (r, column)) * lanes_at(node.whole, (q, column))
+            for state in range(CURVED, ACTIVE):
+                by_state = lanes_at(node.derivative, (state, r))
+                total += by_state * lanes_at(node.cross, (state, q))
+            put_lanes(node.spread, (r, q), total)
 
 
 @compiled
@@ -332,48 +266,85 @@ def rear_noise(memory: MixtureMemory, constants: Constants) -> float:
 
 @compiled
 def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
-    """Return the penalty [nat] for deviations of a node's vehicle and sensor states from their
-    prior (a node is the filter of one friction hypothesis): half the sum of the squared deviations
-    in standard deviations. `mean` has shape (n,).
+    """Return the penalty [nat] of each node (filter of one friction hypothesis) for deviations of
+    its vehicle and sensor states from their prior: half the sum of the squared deviations in
+    standard deviations. `mean` has shape (n, LANES).
     """
     total = 0.0
     for i in range(NodeState.LN_KX, mean.shape[0]):
-        total += 0.5 * ((mean[i] - nominal.mean[i]) / nominal.std[i]) ** 2
-    return total
+        apart = (lanes_at(mean, i) - nominal.mean[i]) * (1.0 / nominal.std[i])
+        total += apart * apart
+    return 0.5 * total
 
 
 @compiled
 def take_rows(
-    mean: FloatArray, root: FloatArray, node: NodeWorkspace, axle_penalty: float
-) -> tuple[float, int]:
-    """Update a node (friction hypothesis) with the innovations node.residual (6,), one measurement
-    row after the other.
+    features: BlockFeatures,
+    mean: FloatArray,
+    covariance: FloatArray,
+    node: NodeWorkspace,
+    axle_penalty: float,
+) -> float:
+    """Update a group of nodes (friction hypotheses) with the innovations node.residual, one
+    measurement row after the other. node.spread is S with the noise on its diagonal.
 
-    Return (negative log-likelihood [nat] without constants, number of rows applied). The former is
-    half of the normalised squared innovations, plus half of `axle_penalty`·ln(innovation variance)
-    for each row of the axles.
+    Return the negative log-likelihood [nat] without constants: half of the normalised squared
+    innovations, plus half of `axle_penalty`·ln(innovation variance) for each row of the axles.
     """
-    loss = 0.0
-    used = 0
+    squares = 0.0 * lanes_at(node.residual, 0)
+    product = 1.0 + squares
     for r in range(ROWS):
-        if math.isnan(node.residual[r]):
+        if not is_measured(features, r):
+            put_lanes(node.gain, r, 0.0)
             continue
-        used += 1
-        variance, gain = potter_factors(node.deviation[r], node.inflated[r])
-        step = node.residual[r] * (1.0 / variance)
-        loss += 0.5 * node.residual[r] * step
+        variance = lanes_at(node.spread, (r, r))
+        per = 1.0 / variance
+        innovation = lanes_at(node.residual, r)
+        step = innovation * per
+        squares += innovation * step
         if r >= 4:
-            loss += 0.5 * axle_penalty * math.log(variance)
-        apply_projection(mean, root, node.deviation[r], step, gain)
-        apply_projection(
-            node.residual[r + 1 :], node.deviation[r + 1 :], node.deviation[r], -step, gain
-        )
-    return loss, used
+            product *= variance
+        put_lanes(node.gain, r, per)
+        for i in range(STATES):
+            put_lanes(mean, i, lanes_at(mean, i) + lanes_at(node.cross, (i, r)) * step)
+        _condition_rows(node, r, per)
+    _subtract_rows(covariance, node)
+    return 0.5 * (squares + axle_penalty * log_lanes(product))
+
+
+@inlined
+def _condition_rows(node: NodeWorkspace, r: int, per: float) -> None:
+    """Condition the rows after r on row r, whose variance is 1/per: their innovations, covariances
+    with each other, and covariances with the states.
+    """
+    for q in range(r + 1, ROWS):
+        share = lanes_at(node.spread, (q, r)) * per
+        innovation = lanes_at(node.residual, q) - share * lanes_at(node.residual, r)
+        put_lanes(node.residual, q, innovation)
+        for p in range(r + 1, q + 1):
+            left = lanes_at(node.spread, (q, p)) - share * lanes_at(node.spread, (p, r))
+            put_lanes(node.spread, (q, p), left)
+        for i in range(STATES):
+            left = lanes_at(node.cross, (i, q)) - share * lanes_at(node.cross, (i, r))
+            put_lanes(node.cross, (i, q), left)
+
+
+@inlined
+def _subtract_rows(covariance: FloatArray, node: NodeWorkspace) -> None:
+    """Subtract from the covariances what all rows explain: h*h'*gain of each."""
+    for i in range(STATES):
+        for r in range(ROWS):
+            put_lanes(node.scaled, r, lanes_at(node.cross, (i, r)) * lanes_at(node.gain, r))
+        for j in range(i + 1):
+            left = lanes_at(covariance, (i, j))
+            for r in range(ROWS):
+                left -= lanes_at(node.scaled, r) * lanes_at(node.cross, (j, r))
+            put_lanes(covariance, (i, j), left)
 
 
 @compiled
 def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> None:
-    """Limit the vehicle and sensor states in `mean` (n,) to their possible range.
+    """Limit the vehicle and sensor states in `mean` (n, LANES) to their possible range.
 
     Only the ratios of the wheel radii are observable. A common error of all radii scales the speed,
     and no sensor here measures that scale. Therefore the mean of the radius errors is set to zero.
@@ -381,49 +352,39 @@ def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> Non
     far = constants.farthest
     common = 0.0
     for wheel in range(4):
-        common += 0.25 * mean[NodeState.RADIUS + wheel]
+        common += 0.25 * lanes_at(mean, NodeState.RADIUS + wheel)
     for wheel in range(4):
-        mean[NodeState.RADIUS + wheel] -= common
+        i = NodeState.RADIUS + wheel
+        put_lanes(mean, i, lanes_at(mean, i) - common)
     for i in range(NodeState.LN_KX, mean.shape[0]):
         middle = nominal.mean[i]
         reach = far * nominal.std[i]
-        mean[i] = min(max(mean[i], middle - reach), middle + reach)
+        put_lanes(mean, i, min(max(lanes_at(mean, i), middle - reach), middle + reach))
 
 
 @compiled
-def predict_node(
-    memory: MixtureMemory, scratch: Scratch, j: int, turn_cos: float, turn_sin: float
+def predict_nodes(
+    memory: MixtureMemory, scratch: Scratch, group: int, turn: tuple[float, float]
 ) -> None:
-    """Predict the state of node j (friction hypothesis) to the end of the block (0.05 s): rotate
-    the velocity by the yaw angle (given by its cosine and sine), add the velocity gained by
+    """Predict the states of a group of nodes (friction hypotheses) to the end of the block (0.05
+    s): rotate the velocity by the yaw angle (cosine and sine `turn`), add the velocity gained by
     acceleration, and add the process variances scratch.process.
 
-    The prediction is affine, so cubature is exact: the covariance P becomes F*P*F' + diag(noise),
-    where F is the matrix of the prediction. Vehicle and sensor states return to their prior by the
-    factors scratch.keep. The function multiplies the covariance root scratch.root[j] by F.
+    The prediction is affine, so cubature is exact. Vehicle and sensor states return to their prior
+    by the factors scratch.keep.
     """
     nominal = memory.nominal
     keep = scratch.keep
-    noise = scratch.process
+    mean = memory.mean[group]
+    cos, sin = turn
+    vx = lanes_at(mean, NodeState.VX)
+    vy = lanes_at(mean, NodeState.VY)
+    gained_x, gained_y = gained_by(memory.block.gain, mean)
+    put_lanes(mean, NodeState.VX, cos * vx + sin * vy + gained_x)
+    put_lanes(mean, NodeState.VY, cos * vy - sin * vx + gained_y)
+    for i in range(NodeState.LN_KX, STATES):
+        apart = lanes_at(mean, i) - nominal.mean[i]
+        put_lanes(mean, i, nominal.mean[i] + keep[i] * apart)
+    covariance = memory.covariance[group]
     gain = memory.block.gain
-    mean = memory.mean[j]
-    root = scratch.root[j]
-    covariance = memory.covariance[j]
-    n = mean.shape[0]
-    for k in range(n):
-        column = root[:, k]
-        vx = column[NodeState.VX]
-        vy = column[NodeState.VY]
-        gained_x, gained_y = gained_velocity(gain, column)
-        column[NodeState.VX] = turn_cos * vx + turn_sin * vy + (gained_x - gain.measured.x)
-        column[NodeState.VY] = turn_cos * vy - turn_sin * vx + (gained_y - gain.measured.y)
-        for i in range(NodeState.LN_KX, n):
-            column[i] *= keep[i]
-    vx = mean[NodeState.VX]
-    vy = mean[NodeState.VY]
-    gained_x, gained_y = gained_velocity(gain, mean)
-    mean[NodeState.VX] = turn_cos * vx + turn_sin * vy + gained_x
-    mean[NodeState.VY] = turn_cos * vy - turn_sin * vx + gained_y
-    for i in range(NodeState.LN_KX, n):
-        mean[i] = nominal.mean[i] + keep[i] * (mean[i] - nominal.mean[i])
-    covariance_of_factor(root, noise, covariance)
+    predict_covariance(covariance, scratch.node.turned, gain, turn, keep, scratch.process)

@@ -15,6 +15,8 @@ linear range e weights slip and force equally. On the flat part and beyond the p
 counts, so the row of a sliding wheel measures its friction (errata, what made the difference, 1).
 An axle has one mean slip; its wheels share the lateral force in proportion to load. The states of a
 node (gravity leaking into a_y, gain of torque, shape of the tyre) correct the measured force.
+
+All functions work on a group of nodes side by side (`schemas.runtime.lanes`).
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ import math
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position
 from edge_agent.dynamics.tyres import TINY
-from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
+from edge_agent.estimators.friction_mixture.state.constants import ROWS, Constants, NodeState
 from edge_agent.estimators.friction_mixture.state.memory import VelocityGain
 from edge_agent.estimators.friction_mixture.state.tyre_curve import (
     TyreCurve,
@@ -32,39 +34,50 @@ from edge_agent.estimators.friction_mixture.state.tyre_curve import (
     ratio_at,
     theta_at,
 )
-from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, NodeWorkspace
+from edge_agent.estimators.friction_mixture.state.workspace import (
+    BlockFeatures,
+    NodeForces,
+    NodeSlip,
+    NodeWorkspace,
+)
 from schemas.numeric import FloatArray
-from schemas.runtime.jit import compiled
+from schemas.runtime.jit import compiled, inlined
+from schemas.runtime.lanes import exp_lanes, lanes_at, put_lanes, select
 
 # of its friction, that the slippery side gives before the other side takes the rest
 SPLIT_LIMIT = 0.9
 FLATTEST = 0.03  # a sliding wheel's slip is not quite arbitrary: its inertia holds it for a block
 
 
-@compiled
+@inlined
+def is_measured(features: BlockFeatures, r: int) -> bool:
+    """Return True if all readings of measurement row r (four wheels, two axles) are known."""
+    reading = features.rolling[r] if r < 4 else features.side[r - 4]
+    return not math.isnan(reading)
+
+
+@inlined
 def curve_distance(along: float, across: float) -> float:
     """Return the signed distance [1] of a measured point (slip, force) from the tyre curve: `along`
     is its distance along the slip axis, `across` its distance along the force axis.
 
     If `along` is infinite (the force exceeds the peak), return `across`.
     """
-    if math.isinf(along):
-        return across
     size = math.sqrt(along * along + across * across)
-    return 0.0 if size < TINY else across * abs(along) / size
+    distance = select(size < TINY, 0.0, across * abs(along) / size)
+    return select(abs(along) == math.inf, across, distance)
 
 
-@compiled
-def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
-    """Return the velocity (forward, left) [m/s] gained in the block (0.05 s), corrected by the
-    states in x (n,): leak (gravity that tilted accelerometers measure), sensor offsets, and the
-    road's slope and bank (lateral slope).
+@inlined
+def gained_velocity(
+    gain: VelocityGain, leak_y: float, bias_x: float, bias_y: float
+) -> tuple[float, float]:
+    """Return the velocity (forward, left) [m/s] gained in the block (0.05 s), corrected by leak
+    (gravity that tilted accelerometers measure) and offsets of the sensors, to which the road's
+    slope and bank (lateral slope) belong [m/s^2].
 
     An offset of a_y has the same effect as an offset of a_x, rotated by 90 degrees.
     """
-    leak_y = x[NodeState.LEAK_Y]
-    bias_x = x[NodeState.BIAS_X] + x[NodeState.SLOPE]
-    bias_y = x[NodeState.BIAS_Y] + x[NodeState.BANK]
     measured = gain.measured
     unit = gain.unit
     return (
@@ -73,23 +86,37 @@ def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
     )
 
 
-@compiled
-def slope_along(curve: TyreCurve, g_x: float, g_y: float, mu: float) -> float:
-    """Return the derivative [1] of the tyre's longitudinal force by that of a linear tyre with the
-    same slip.
-
-    It is 1 at small slip, 0 on the flat part of the curve, and limited to at least FLATTEST.
+@inlined
+def gained_by(gain: VelocityGain, mean: FloatArray) -> tuple[float, float]:
+    """Return the velocity (forward, left) [m/s] that each node of a group gained in the block
+    (0.05 s) by its states `mean` (n, LANES).
     """
-    square = g_x * g_x + g_y * g_y
-    if square < TINY:
-        return 1.0
-    theta = math.sqrt(square) / mu
-    u = theta / (1.0 + theta)
-    return max(
-        (interpolate_table(curve.slope, u) * g_x * g_x + ratio_at(curve, theta) * g_y * g_y)
-        / square,
-        FLATTEST,
+    return gained_velocity(
+        gain,
+        lanes_at(mean, NodeState.LEAK_Y),
+        lanes_at(mean, NodeState.BIAS_X) + lanes_at(mean, NodeState.SLOPE),
+        lanes_at(mean, NodeState.BIAS_Y) + lanes_at(mean, NodeState.BANK),
     )
+
+
+@compiled
+def find_readings(features: BlockFeatures, node: NodeWorkspace) -> None:
+    """Compute node.rolling and node.steering: the speeds of the wheels and the offset of the
+    steering as the states node.point correct them.
+
+    The offset of the steering includes the compliance of the front axle: steering column and
+    bushings of production cars yield up to 35 mrad per g of lateral acceleration.
+    """
+    x = node.point
+    late = lanes_at(x, NodeState.LAG_WHEEL) * features.change
+    for wheel in range(4):
+        radius = 1.0 + lanes_at(x, NodeState.RADIUS + wheel)
+        put_lanes(node.rolling, wheel, features.rolling[wheel] * radius + late)
+    steering = lanes_at(x, NodeState.STEER)
+    steering += lanes_at(x, NodeState.LAG_STEER) * features.steer_rate
+    steering += lanes_at(x, NodeState.STEER_GAIN) * features.steering
+    steering -= lanes_at(x, NodeState.COMPLIANCE) * features.side[0]
+    put_lanes(node.steering, 0, steering)
 
 
 @compiled
@@ -99,126 +126,113 @@ def find_slips(
     mean: FloatArray,
     features: BlockFeatures,
     node: NodeWorkspace,
+    slip: NodeSlip,
 ) -> None:
-    """Compute node.slip, the slips of wheels and axles, at node.point: a state of this node
-    (friction hypothesis) at the beginning of the block (0.05 s).
+    """Compute the slips of the wheels at node.point: velocity and stiffness of each node of a group
+    at the beginning of the block (0.05 s).
 
-    `mean` (n,) is the node's mean. Where the force is too small to distinguish stiffness from slip
-    noise, the logarithm of stiffness in node.point is moved towards that of `mean`.
+    `mean` (n, LANES) are the nodes' means. Where the force is too small to distinguish stiffness
+    from slip noise, the logarithm of stiffness in node.point is moved towards that of `mean`.
     """
     x = node.point
-    slip = node.slip
-    vx = features.cos * x[NodeState.VX] + features.sin * x[NodeState.VY] + node.gained.x
-    vy = features.cos * x[NodeState.VY] - features.sin * x[NodeState.VX] + node.gained.y
-    mean_kx = mean[NodeState.LN_KX]
-    mean_ky = mean[NodeState.LN_KY]
+    ahead = lanes_at(x, NodeState.VX)
+    left = lanes_at(x, NodeState.VY)
+    vx = features.cos * ahead + features.sin * left + lanes_at(node.gained_x, 0)
+    vy = features.cos * left - features.sin * ahead + lanes_at(node.gained_y, 0)
+    mean_kx = lanes_at(mean, NodeState.LN_KX)
+    mean_ky = lanes_at(mean, NodeState.LN_KY)
     for axle in range(2):
-        blind = math.isnan(
-            features.side[axle]
-        )  # slip across is then guesswork, and must not bend the force along
-        offset = steering_offset(x, features) if axle == 0 and not blind else 0.0
-        ln_kx = mean_kx + features.informs_x[axle] * (x[NodeState.LN_KX] - mean_kx)
-        ln_ky = mean_ky + features.informs_y[axle] * (x[NodeState.LN_KY] - mean_ky)
-        slope_x = row[Parameter.SLOPE_X] * math.exp(ln_kx)
-        slope_y = row[Parameter.SLOPE_Y] * math.exp(ln_ky)
-        slip.scale_x[axle] = math.exp(-constants.stiffness_power_x * ln_kx)
-        slip.scale_y[axle] = math.exp(-constants.stiffness_power_y * ln_ky)
+        # slip across is guesswork without side force, and must not bend the force along
+        blind = math.isnan(features.side[axle])
+        ln_kx = mean_kx + features.informs_x[axle] * (lanes_at(x, NodeState.LN_KX) - mean_kx)
+        ln_ky = mean_ky + features.informs_y[axle] * (lanes_at(x, NodeState.LN_KY) - mean_ky)
+        slope_x = row[Parameter.SLOPE_X] * exp_lanes(ln_kx)
+        slope_y = row[Parameter.SLOPE_Y] * exp_lanes(ln_ky)
+        put_lanes(slip.scale_x, axle, exp_lanes(-constants.stiffness_power_x * ln_kx))
+        put_lanes(slip.scale_y, axle, exp_lanes(-constants.stiffness_power_y * ln_ky))
         for wheel in range(2 * axle, 2 * axle + 2):
-            px, py = wheel_position(row, wheel)
-            ahead = vx - py * features.yaw_rate
-            left = vy + px * features.yaw_rate
             cos = features.steer_cos[wheel]
             sin = features.steer_sin[wheel]
-            along = cos * ahead + sin * left
-            across = cos * left - sin * ahead
-            speed = max(abs(along), SLOWEST_M_S)
-            rolling = features.rolling[wheel] * (1.0 + x[NodeState.RADIUS + wheel])
-            rolling += x[NodeState.LAG_WHEEL] * features.change
-            known = not math.isnan(rolling)
-            slip.along[wheel] = (
-                slope_x * (rolling - along) / speed if known else features.force[wheel]
-            )
-            slip.across[wheel] = 0.0 if blind else slope_y * (offset - across / speed)
+            along = cos * vx + sin * vy + features.turn_along[wheel]
+            across = cos * vy - sin * vx + features.turn_across[wheel]
+            per_speed = 1.0 / max(abs(along), SLOWEST_M_S)
+            if is_measured(features, wheel):
+                faster = lanes_at(node.rolling, wheel) - along
+                put_lanes(slip.along, wheel, slope_x * faster * per_speed)
+            else:
+                put_lanes(slip.along, wheel, features.force[wheel])
+            if blind:
+                put_lanes(slip.across, wheel, 0.0)
+            else:
+                offset = lanes_at(node.steering, 0) if axle == 0 else 0.0
+                put_lanes(slip.across, wheel, slope_y * (offset - across * per_speed))
 
 
 @compiled
-def steering_offset(x: FloatArray, features: BlockFeatures) -> float:
-    """Return the true minus the measured steering angle of the front wheels [rad], positive to the
-    left, for state x (n,).
-
-    The difference includes the compliance of the front axle: steering column and bushings of
-    production cars yield up to 35 mrad per g of lateral acceleration.
-    """
-    lagged = x[NodeState.STEER] + x[NodeState.LAG_STEER] * features.steer_rate
-    return float(
-        lagged
-        + x[NodeState.STEER_GAIN] * features.steering
-        - x[NodeState.COMPLIANCE] * features.side[0]
-    )
-
-
-@compiled
-def find_shape_force(
-    curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace
+def find_ratios(
+    curve: TyreCurve, features: BlockFeatures, node: NodeWorkspace, slip: NodeSlip
 ) -> None:
+    """Compute the forces that the tyre curve gives at the slips `slip`: of the wheels relative to
+    those of linear tyres, and of the axles.
+    """
+    for axle in range(2):
+        model = 0.0
+        mean = 0.0
+        for wheel in range(2 * axle, 2 * axle + 2):
+            g_x = lanes_at(slip.along, wheel)
+            g_y = lanes_at(slip.across, wheel)
+            size = math.sqrt(g_x * g_x + g_y * g_y)
+            theta = size * lanes_at(node.per_mu, wheel % 2)
+            place = theta / (1.0 + theta)
+            ratio = ratio_at(curve, theta, place)
+            put_lanes(slip.size, wheel, size)
+            put_lanes(slip.place, wheel, place)
+            put_lanes(slip.ratio, wheel, ratio)
+            across = features.load_share[wheel] * g_y
+            model += ratio * across
+            mean += across
+        put_lanes(slip.axle_force, axle, model)
+        put_lanes(slip.axle_slip, axle, mean)
+
+
+@compiled
+def find_shape_force(curve: TyreCurve, features: BlockFeatures, node: NodeWorkspace) -> None:
     """Compute node.shape_force: how much the force over load at the slips node.slip changes if the
     shape of the tyre curve changes by one standard deviation.
-
-    side_mu (2,) is the friction under the left and right wheels.
     """
     slip = node.slip
-    out = node.shape_force
-    out[4] = out[5] = 0.0
-    for wheel in range(4):
-        mu = side_mu[wheel % 2]
-        g_x = slip.along[wheel]
-        g_y = slip.across[wheel]
-        size = math.sqrt(g_x * g_x + g_y * g_y)
-        theta = size / mu
-        change = (
-            0.0
-            if size < TINY
-            else mu * interpolate_table(curve.shape, theta / (1.0 + theta)) / size
-        )
-        out[wheel] = change * g_x
-        out[4 + wheel // 2] += features.load_share[wheel] * change * g_y
+    for axle in range(2):
+        side = 0.0
+        for wheel in range(2 * axle, 2 * axle + 2):
+            size = lanes_at(slip.size, wheel)
+            shape = interpolate_table(curve.shape, lanes_at(slip.place, wheel))
+            change = select(size < TINY, 0.0, lanes_at(node.mu, wheel % 2) * shape / size)
+            put_lanes(node.shape_force, wheel, change * lanes_at(slip.along, wheel))
+            side += features.load_share[wheel] * change * lanes_at(slip.across, wheel)
+        put_lanes(node.shape_force, 4 + axle, side)
 
 
 @compiled
 def correct_forces(
     row: FloatArray,
     curve: TyreCurve,
-    side_mu: FloatArray,
     features: BlockFeatures,
     node: NodeWorkspace,
+    out: NodeForces,
 ) -> None:
-    """Compute node.force, the measured force over load, and node.slip_at_force, the slip that the
-    tyre curve gives for it. Both are corrected by the filter states in node.point: leak (gravity in
-    a_y when the body rolls), offsets, torque gain and curve shape.
+    """Compute the measured forces over load, and the slip that the tyre curve gives for them. Both
+    are corrected by the filter states in node.point: leak (gravity in a_y when the body rolls),
+    offsets, torque gain and curve shape.
 
     Without torque signals only the sum of the forces on both sides is measured. On a split road
     (different friction left and right) the slippery side is then assumed to take at most
     SPLIT_LIMIT of its friction, and the other side the rest. The unequal forces turn the car, and
     the lateral forces of the axles balance that moment.
     """
-    leak = node.point[NodeState.LEAK_Y]
-    shape = node.point[NodeState.SHAPE]
-    gain = node.point[NodeState.GAIN]
-    bias_x = node.point[NodeState.BIAS_X]
-    bias_y = node.point[NodeState.BIAS_Y]
-    force = node.force
-    slip_at_force = node.slip_at_force
-    moment = 0.0
-    for wheel in range(4):
-        along = (1.0 + gain) * features.force[wheel] - bias_x * features.force_unit[wheel]
-        mu = side_mu[wheel % 2]
-        other = side_mu[1 - wheel % 2]
-        force[wheel] = along
-        if other != mu and features.force_unit[wheel] != 0.0:
-            force[wheel] = share_by_sides(along, SPLIT_LIMIT * mu, SPLIT_LIMIT * other)
-            lever = wheel_position(row, wheel)[1] * features.steer_cos[wheel]
-            moment -= lever * features.loads[wheel] * (force[wheel] - along)
-    turning = moment / (row[Parameter.TO_FRONT] + row[Parameter.TO_REAR])
+    leak = lanes_at(node.point, NodeState.LEAK_Y)
+    shape = lanes_at(node.point, NodeState.SHAPE)
+    bias_y = lanes_at(node.point, NodeState.BIAS_Y)
+    turning = _share_forces(row, features, node, out)
     for axle in range(2):
         left = 2 * axle
         right = 2 * axle + 1
@@ -228,21 +242,53 @@ def correct_forces(
             - bias_y * features.side_unit[axle]
         )
         load = (features.loads[left] + features.loads[right]) * features.steer_cos[left]
-        side += (-turning if axle == 0 else turning) / load
-        across = 0.0 if math.isnan(side) else side
-        mean_along = mean_mu = 0.0
+        side += (-turning if axle == 0 else turning) * (1.0 / load)
+        known = is_measured(features, 4 + axle)
+        across = side if known else 0.0
+        mean_along = 0.0
         for wheel in range(left, right + 1):
-            mu = side_mu[wheel % 2]
-            share = features.load_share[wheel]
-            mean_along += share * force[wheel]
-            mean_mu += share * mu
-            force[wheel] -= shape * node.shape_force[wheel]
-            slip_at_force[wheel] = _slip_at_force(curve, mu, force[wheel], across)
-        force[4 + axle] = side - shape * node.shape_force[4 + axle]
-        slip_at_force[4 + axle] = _slip_at_force(curve, mean_mu, force[4 + axle], mean_along)
+            along = lanes_at(out.force, wheel)
+            mean_along += features.load_share[wheel] * along
+            force = along - shape * lanes_at(node.shape_force, wheel)
+            per_mu = lanes_at(node.per_mu, wheel % 2)
+            mu = lanes_at(node.mu, wheel % 2)
+            put_lanes(out.force, wheel, force)
+            put_lanes(out.slip_at_force, wheel, _slip_at_force(curve, mu, per_mu, force, across))
+        if known:
+            force = side - shape * lanes_at(node.shape_force, 4 + axle)
+            per_mu = lanes_at(node.per_axle_mu, axle)
+            mu = lanes_at(node.axle_mu, axle)
+            put_lanes(out.force, 4 + axle, force)
+            found = _slip_at_force(curve, mu, per_mu, force, mean_along)
+            put_lanes(out.slip_at_force, 4 + axle, found)
 
 
-@compiled
+@inlined
+def _share_forces(
+    row: FloatArray, features: BlockFeatures, node: NodeWorkspace, out: NodeForces
+) -> float:
+    """Compute out.force of the four wheels; return the lateral force of the front axle [N] that
+    balances the moment of unequal forces left and right.
+    """
+    gain = lanes_at(node.point, NodeState.GAIN)
+    bias_x = lanes_at(node.point, NodeState.BIAS_X)
+    moment = 0.0 * gain
+    for wheel in range(4):
+        along = (1.0 + gain) * features.force[wheel] - bias_x * features.force_unit[wheel]
+        force = along
+        if features.force_unit[wheel] != 0.0:
+            mu = lanes_at(node.mu, wheel % 2)
+            other = lanes_at(node.mu, 1 - wheel % 2)
+            shared = share_by_sides(along, SPLIT_LIMIT * mu, SPLIT_LIMIT * other)
+            force = select(mu == other, along, shared)
+            lever = wheel_position(row, wheel)[1] * features.steer_cos[wheel]
+            moment -= lever * features.loads[wheel] * (force - along)
+        put_lanes(out.force, wheel, force)
+    per_base: float = 1.0 / (row[Parameter.TO_FRONT] + row[Parameter.TO_REAR])
+    return moment * per_base
+
+
+@inlined
 def share_by_sides(mean: float, most: float, most_other: float) -> float:
     """Return the force over load [1] of the wheel on one side of an axle, given the mean over both
     sides.
@@ -255,60 +301,45 @@ def share_by_sides(mean: float, most: float, most_other: float) -> float:
         most_other: limit of the other side [1].
     """
     size = abs(mean)
-    if most < most_other:
-        return math.copysign(min(size, most), mean)
-    return math.copysign(size + max(size - most_other, 0.0), mean)
+    more = size + max(size - most_other, 0.0)
+    shared = select(most < most_other, min(size, most), more)
+    return select(mean < 0.0, -shared, shared)
 
 
-@compiled
-def _slip_at_force(curve: TyreCurve, mu: float, force: float, other: float) -> float:
+@inlined
+def _slip_at_force(curve: TyreCurve, mu: float, per_mu: float, force: float, other: float) -> float:
     """Return the slip at which a tyre of friction `mu` has the force over load `force` [1] in one
-    direction, while its force over load at right angles is `other` [1].
+    direction, while its force over load at right angles is `other` [1]; per_mu is 1/mu.
 
     The slip is given as the force over load [1] that a linear tyre would have at it; it is infinite
     at or beyond the peak of the curve.
     """
     size = math.sqrt(force * force + other * other)
-    if math.isnan(size) or size < TINY:
-        return force
-    theta = theta_at(curve, size / mu)
-    return math.copysign(math.inf, force) if math.isinf(theta) else mu * theta * force / size
+    theta = theta_at(curve, size * per_mu)
+    slip = mu * theta * (force / size)
+    slip = select(theta == math.inf, select(force < 0.0, -math.inf, math.inf), slip)
+    return select(size < TINY, force, slip)
 
 
 @compiled
 def find_residuals(
-    curve: TyreCurve,
-    side_mu: FloatArray,
-    features: BlockFeatures,
-    node: NodeWorkspace,
-    out: FloatArray,
+    features: BlockFeatures, slip: NodeSlip, forces: NodeForces, out: FloatArray
 ) -> None:
-    """Compute out (6,): for each measurement row (four wheels, two axles), the distance [1] of the
-    measured slip and force from the tyre curve; NaN if a reading is missing.
+    """Compute out (6, LANES): for each measurement row (four wheels, two axles), the distance [1]
+    of the measured slip and force from the tyre curve; 0 if a reading is missing.
     """
-    slip = node.slip
-    force = node.force
-    slip_at_force = node.slip_at_force
-    for axle in range(2):
-        side_model = side_slip = 0.0
-        for wheel in range(2 * axle, 2 * axle + 2):
-            g_x = slip.along[wheel]
-            g_y = slip.across[wheel]
-            theta = math.sqrt(g_x * g_x + g_y * g_y) / side_mu[wheel % 2]
-            ratio = ratio_at(curve, theta)
-            share = features.load_share[wheel]
-            side_model += share * ratio * g_y
-            side_slip += share * g_y
-            out[wheel] = (
-                math.nan
-                if math.isnan(features.rolling[wheel])
-                else slip.scale_x[axle]
-                * curve_distance(slip_at_force[wheel] - g_x, force[wheel] - ratio * g_x)
-            )
-        row = 4 + axle
-        out[row] = (
-            math.nan
-            if math.isnan(force[row])
-            else slip.scale_y[axle]
-            * curve_distance(slip_at_force[row] - side_slip, force[row] - side_model)
-        )
+    for r in range(ROWS):
+        if not is_measured(features, r):
+            put_lanes(out, r, 0.0)
+            continue
+        force = lanes_at(forces.force, r)
+        slip_at_force = lanes_at(forces.slip_at_force, r)
+        if r < 4:
+            g = lanes_at(slip.along, r)
+            model = lanes_at(slip.ratio, r) * g
+            scale = lanes_at(slip.scale_x, r // 2)
+        else:
+            g = lanes_at(slip.axle_slip, r - 4)
+            model = lanes_at(slip.axle_force, r - 4)
+            scale = lanes_at(slip.scale_y, r - 4)
+        put_lanes(out, r, scale * curve_distance(slip_at_force - g, force - model))

@@ -15,13 +15,15 @@ import math
 
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators.friction_mixture.block.block_features import ROUNDING, at_centre, mean_or
-from edge_agent.estimators.friction_mixture.node.residuals import gained_velocity
+from edge_agent.estimators.friction_mixture.node.covariance import subtract_row, symmetric_at
+from edge_agent.estimators.friction_mixture.node.residuals import gained_by
 from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, Scratch
-from edge_agent.filters.sequential import apply_projection, potter_factors
+from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
+from schemas.runtime.lanes import lanes_at, put_lanes
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 
@@ -141,62 +143,64 @@ def _compute_velocities(
 
 
 @compiled
-def take_rolling(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
-    """Update node j (friction hypothesis) with the velocity derived from the wheels; return the
-    penalty [nat] for the difference from the node's own velocity.
+def take_rolling(
+    memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, group: int
+) -> float:
+    """Update a group of nodes (friction hypotheses) with the velocity derived from the wheels;
+    return the penalty [nat] of each node for the difference from its own velocity.
     """
     rolling = memory.rolling
     constants = design.constants
     features = scratch.features
-    mean = memory.mean[j]
+    mean = memory.mean[group]
+    covariance = memory.covariance[group]
+    row = scratch.node.velocity
     if rolling.stands:
-        variance = STANDING_STD**2
-        _take_velocity(memory, scratch, j, (1.0, 0.0), (-mean[NodeState.VX], variance, math.inf))
-        _take_velocity(memory, scratch, j, (0.0, 1.0), (-mean[NodeState.VY], variance, math.inf))
-        return 0.0
-    cost = 0.0
+        reading = (STANDING_STD**2, math.inf)
+        for axis in range(2):
+            direction = (1.0 - axis, float(axis))
+            _take_velocity(mean, covariance, row, direction, -lanes_at(mean, axis), reading)
+        return 0.0 * lanes_at(mean, 0)
+    cost = 0.0 * lanes_at(mean, 0)
     cos = features.cos
     sin = features.sin
     look = max(constants.agreeing_look / features.duration, 1.0)
     if not math.isnan(rolling.ahead):
-        now = (
-            cos * mean[NodeState.VX]
-            + sin * mean[NodeState.VY]
-            + gained_velocity(features.gain, mean)[0]
-        )
-        reading = (rolling.ahead - now, rolling.ahead_std**2 * look, constants.huber)
-        cost += _take_velocity(memory, scratch, j, (cos, sin), reading)
+        ahead = cos * lanes_at(mean, NodeState.VX) + sin * lanes_at(mean, NodeState.VY)
+        innovation = rolling.ahead - (ahead + gained_by(features.gain, mean)[0])
+        reading = (rolling.ahead_std**2 * look, constants.huber)
+        cost += _take_velocity(mean, covariance, row, (cos, sin), innovation, reading)
     if not math.isnan(rolling.left):
-        now = (
-            cos * mean[NodeState.VY]
-            - sin * mean[NodeState.VX]
-            + gained_velocity(features.gain, mean)[1]
-        )
-        reading = (rolling.left - now, rolling.left_std**2 * look, constants.huber)
-        cost += _take_velocity(memory, scratch, j, (-sin, cos), reading)
+        left = cos * lanes_at(mean, NodeState.VY) - sin * lanes_at(mean, NodeState.VX)
+        innovation = rolling.left - (left + gained_by(features.gain, mean)[1])
+        reading = (rolling.left_std**2 * look, constants.huber)
+        cost += _take_velocity(mean, covariance, row, (-sin, cos), innovation, reading)
     return cost
 
 
 @compiled
 def _take_velocity(
-    memory: MixtureMemory,
-    scratch: Scratch,
-    j: int,
+    mean: FloatArray,
+    covariance: FloatArray,
+    row: FloatArray,
     direction: tuple[float, float],
-    reading: tuple[float, float, float],
+    innovation: float,
+    reading: tuple[float, float],
 ) -> float:
-    """Update node j (friction hypothesis) with a measured velocity along `direction` (x, y).
-    `reading` is (innovation [m/s], variance, threshold of the Huber function that limits outliers).
+    """Update a group of nodes (friction hypotheses) with the difference `innovation` [m/s] of a
+    measured velocity along `direction` (x, y) from that of each node. `reading` is (variance,
+    threshold of the Huber function that limits outliers). row (n, LANES) is scratch.
 
-    Return half of the squared innovation (measurement minus prediction) over its variance [nat].
+    Return half of the squared innovation over its variance [nat].
     """
-    root = scratch.root[j]
-    row = scratch.velocity_row
-    innovation, variance, huber = reading
-    own = 0.0
-    for k in range(row.shape[0]):
-        row[k] = direction[0] * root[NodeState.VX, k] + direction[1] * root[NodeState.VY, k]
-        own += row[k] ** 2
-    total, gain = potter_factors(row, max(variance, (innovation / huber) ** 2 - own))
-    apply_projection(memory.mean[j], root, row, innovation / total, gain)
-    return 0.5 * innovation * innovation / total
+    x, y = direction
+    variance, huber = reading
+    for i in range(mean.shape[0]):
+        by_x = symmetric_at(covariance, i, NodeState.VX)
+        put_lanes(row, i, x * by_x + y * symmetric_at(covariance, i, NodeState.VY))
+    own = x * lanes_at(row, NodeState.VX) + y * lanes_at(row, NodeState.VY)
+    far = innovation * (1.0 / huber)
+    per = 1.0 / (own + max(far * far - own, variance))
+    step = innovation * per
+    subtract_row(mean, covariance, row, per, step)
+    return 0.5 * innovation * step

@@ -11,9 +11,15 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import NamedTuple
 
+from schemas.runtime.records import LANES
+
 NODES = 20  # friction hypotheses, equidistant in the square root of mu: fine where mu is small
 SPLIT_NODES = 30  # hypotheses of a split road: a low and a high friction, either way round
 ALL_NODES = NODES + SPLIT_NODES
+# Nodes lie side by side: node j is lane j % LANES of group j // LANES, and the last group has lanes
+# to spare. A node in use and a node that sleeps may share a group.
+GROUPS = -(-ALL_NODES // LANES)
+PLACES = GROUPS * LANES
 PATCH_NODES = 5  # the first nodes, of ice: mu up to .195
 CURVED = 4  # states in which the rows of measurement are not linear
 # states up to this one are differentiated one by one; the others follow from these and from speeds

@@ -5,13 +5,19 @@ from __future__ import annotations
 import math
 
 from edge_agent.estimators import flags
-from edge_agent.estimators.common.arrays import copy_vector, put_square
 from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD
 from edge_agent.estimators.common.readings import rolling_speed
-from edge_agent.estimators.friction_mixture.state.constants import ALL_NODES, NODES, NodeState
+from edge_agent.estimators.friction_mixture.state.constants import (
+    ALL_NODES,
+    GROUPS,
+    NODES,
+    STATES,
+    NodeState,
+)
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from schemas.runtime.jit import compiled
+from schemas.runtime.lanes import put_lanes
 from schemas.signals import S
 
 UNKNOWN_YAW_VAR = 1.0  # [rad^2/s^2] without a gyroscope
@@ -19,6 +25,18 @@ YAW_STD = 0.002  # [rad/s] white noise of a gyroscope sample
 GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
 # below this speed of vehicle and wheels slip has no meaning, and nothing is concluded
 SLOWEST_M_S = 1.5
+
+
+@compiled
+def spread_moments(memory: MixtureMemory) -> None:
+    """Set mean and covariance of all nodes (filters of one friction hypothesis each) to those of
+    the mixture.
+    """
+    for group in range(GROUPS):
+        for i in range(STATES):
+            put_lanes(memory.mean, (group, i), memory.overall_mean[i])
+            for j in range(i + 1):
+                put_lanes(memory.covariance, (group, i, j), memory.overall_covariance[i, j])
 
 
 @compiled
@@ -54,9 +72,7 @@ def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
         spread**2,
         FIRST_V_STD**2,
     )
-    for j in range(ALL_NODES):
-        copy_vector(memory.mean[j], memory.overall_mean)
-        put_square(memory.covariance[j], covariance)
+    spread_moments(memory)
 
 
 @compiled

@@ -10,14 +10,15 @@ from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators.common.excitation import Excitation
 from edge_agent.estimators.common.readings import INPUTS
 from edge_agent.estimators.friction_mixture.state.constants import (
-    ALL_NODES,
+    GROUPS,
     NODES,
     PATCH_NODES,
+    PLACES,
     STATES,
 )
 from edge_agent.estimators.friction_mixture.state.design import Nominal
 from schemas.numeric import FloatArray, IntArray
-from schemas.runtime.records import RecordArray, records
+from schemas.runtime.records import LaneArray, RecordArray, records
 
 
 class PlanarVector:
@@ -156,11 +157,11 @@ class MixtureMemory:
     split: bool  # whether the split nodes take part
     last: LastInputs
     block: BlockSums
-    mean: Annotated[FloatArray, ALL_NODES, STATES]
-    covariance: Annotated[FloatArray, ALL_NODES, STATES, STATES]
-    weight: Annotated[FloatArray, ALL_NODES]
+    mean: Annotated[LaneArray, GROUPS, STATES]
+    covariance: Annotated[LaneArray, GROUPS, STATES, STATES]  # only its lower half is used
+    weight: Annotated[FloatArray, PLACES]
     visit_weight: Annotated[
-        FloatArray, ALL_NODES
+        FloatArray, PLACES
     ]  # probabilities from the reference prior at the visit's start
     surest: Annotated[
         FloatArray, NODES
@@ -168,7 +169,7 @@ class MixtureMemory:
     information: float  # of them over the prior [nat]
     patch: Annotated[FloatArray, PATCH_NODES]  # probability of a patch of ice here, by node
     penalty: Annotated[
-        FloatArray, ALL_NODES
+        FloatArray, PLACES
     ]  # ledger: charged so far for what a node believes of the vehicle [nat]
     overall_mean: Annotated[FloatArray, STATES]  # moments of the mixture
     overall_covariance: Annotated[FloatArray, STATES, STATES]

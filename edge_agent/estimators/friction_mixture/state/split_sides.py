@@ -14,10 +14,17 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from edge_agent.estimators.friction_mixture.state.constants import ALL_NODES, NODES, SPLIT_NODES
+from edge_agent.estimators.friction_mixture.state.constants import (
+    ALL_NODES,
+    GROUPS,
+    NODES,
+    PLACES,
+    SPLIT_NODES,
+)
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
+from schemas.runtime.records import LANES, LaneArray
 
 LEAST_RATIO = 1.45  # of the higher side's friction to the lower one's, to count as split
 LOW = (0.05, 0.11, 0.17, 0.25, 0.36, 0.50, 0.66)  # edges of the cells of the lower side
@@ -31,6 +38,7 @@ class Sides(NamedTuple):
     """
 
     mu: Annotated[FloatArray, ALL_NODES, 2]  # left, right
+    lanes: Annotated[LaneArray, GROUPS, 2]  # mu with the nodes side by side
     prior: Annotated[FloatArray, ALL_NODES]
     # of a split node's left side, right side and mean in the cells of the nodes of one friction
     share: Annotated[FloatArray, 3, SPLIT_NODES, NODES]
@@ -82,8 +90,11 @@ def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
             pairs.append((left.middle, right.middle))
             mass.append(low.width * high.width)
             share.append([_in_cells(edges, one) for one in (left, right, mean)])
+    side_mu = np.vstack([np.column_stack([mu, mu]), pairs])
+    spare = np.ones((PLACES - ALL_NODES, 2))
     return Sides(
-        np.vstack([np.column_stack([mu, mu]), pairs]),
+        side_mu,
+        LaneArray(np.vstack([side_mu, spare]).reshape(GROUPS, LANES, 2).swapaxes(1, 2)),
         np.concatenate([(1.0 - split_prior) * prior, split_prior * np.array(mass) / sum(mass)]),
         np.ascontiguousarray(np.array(share).transpose(1, 0, 2)),
     )

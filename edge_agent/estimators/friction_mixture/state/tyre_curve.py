@@ -19,7 +19,8 @@ from typing import Annotated, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from schemas.numeric import FloatArray
-from schemas.runtime.jit import compiled
+from schemas.runtime.jit import inlined
+from schemas.runtime.lanes import any_lane, floor, gather, select
 
 CELLS: Final = 1024  # linear between: errors below 1e-6 of the force
 # (c, e) of the Magic Formula: tyres of passenger cars lie between, the brush model two spreads
@@ -84,32 +85,34 @@ def curve_tables(curve: Curve) -> TyreCurve:
     )
 
 
-@compiled
+@inlined
 def interpolate_table(table: FloatArray, place: float) -> float:
-    """Return the value of a table over [0, 1] at `place`, with linear interpolation between its
-    points.
+    """Return the value of a table over [0, 1] at `place`, a number or lanes, with linear
+    interpolation between its points.
     """
-    cells = table.shape[0] - 1
+    cells: int = table.shape[0] - 1
     scaled = place * cells
-    cell = min(int(scaled), cells - 1)
-    share = scaled - cell
-    return float(table[cell] + share * (table[cell + 1] - table[cell]))
+    cell = min(floor(scaled), cells - 1.0)
+    first = gather(table, cell)
+    return first + (scaled - cell) * (gather(table, cell + 1.0) - first)
 
 
-@compiled
-def ratio_at(curve: TyreCurve, theta: float) -> float:
+@inlined
+def ratio_at(curve: TyreCurve, theta: float, place: float) -> float:
     """Return the tyre force over mu*F_z (friction times load), divided by the normalised slip
-    `theta` >= 0; beyond the table the force is constant.
+    `theta` >= 0; beyond the table the force is constant. `place` is theta/(1 + theta).
     """
     last = curve.ratio.shape[0] - 2
-    if theta >= last:
-        return float(curve.ratio[last] * last / theta)
-    return interpolate_table(curve.ratio, theta / (1.0 + theta))
+    ratio = interpolate_table(curve.ratio, place)
+    if any_lane(theta >= last):
+        ratio = select(theta >= last, curve.ratio[last] * last / theta, ratio)
+    return ratio
 
 
-@compiled
+@inlined
 def theta_at(curve: TyreCurve, force: float) -> float:
     """Return the normalised slip on the rising branch of the tyre curve at a given force over
     mu*F_z (friction times load; 0 or more); infinite at and beyond the peak.
     """
-    return math.inf if force >= 1.0 else interpolate_table(curve.inverse, math.sqrt(1.0 - force))
+    theta = interpolate_table(curve.inverse, math.sqrt(max(1.0 - force, 0.0)))
+    return select(force >= 1.0, math.inf, theta)

@@ -10,13 +10,16 @@ from edge_agent.estimators.friction_mixture.state.constants import (
     ACTIVE,
     ALL_NODES,
     CURVED,
+    GROUPS,
     NODES,
+    PLACES,
     ROWS,
     STATES,
 )
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.state.memory import PlanarVector, VelocityGain
+from edge_agent.estimators.friction_mixture.state.memory import VelocityGain
 from schemas.numeric import FloatArray
+from schemas.runtime.records import LaneArray
 
 
 class BlockFeatures:
@@ -48,6 +51,9 @@ class BlockFeatures:
     load_share: Annotated[FloatArray, 4]  # wheel load over axle load [1]
     steer_cos: Annotated[FloatArray, 4]
     steer_sin: Annotated[FloatArray, 4]
+    # velocity of the wheel's centre from the yaw rate, along and across the wheel [m/s]
+    turn_along: Annotated[FloatArray, 4]
+    turn_across: Annotated[FloatArray, 4]
     side: Annotated[FloatArray, 2]  # F_y/F_z of an axle in the wheel's frame [1]; NaN where unknown
     side_leak: Annotated[FloatArray, 2]  # its derivative by the leak [1]
     side_unit: Annotated[FloatArray, 2]  # its derivative by a_y [s^2/m]
@@ -64,43 +70,68 @@ class BlockFeatures:
 
 
 class NodeSlip:
-    """Slips of the wheels and axles, computed for one state vector of a node (filter of one
-    friction hypothesis).
+    """Slips of the wheels and axles for one state vector of each node (filter of one friction
+    hypothesis) of a group, and the forces that the tyre curve gives for them.
     """
 
-    along: Annotated[FloatArray, 4]  # g_x, linear force over load [1]
-    across: Annotated[FloatArray, 4]  # g_y
-    scale_x: Annotated[FloatArray, 2]  # what a wheel's residual is multiplied by, per axle
-    scale_y: Annotated[FloatArray, 2]  # the same for an axle's residual
+    along: Annotated[LaneArray, 4]  # g_x, linear force over load [1]
+    across: Annotated[LaneArray, 4]  # g_y
+    size: Annotated[LaneArray, 4]  # of (g_x, g_y)
+    place: Annotated[LaneArray, 4]  # u of the tables over slip, theta/(1 + theta)
+    ratio: Annotated[LaneArray, 4]  # force over that of a linear tyre [1]
+    axle_slip: Annotated[
+        LaneArray, 2
+    ]  # across, mean of an axle's wheels, as linear force over load
+    axle_force: Annotated[LaneArray, 2]  # of it by the tyre curve, over load [1]
+    scale_x: Annotated[LaneArray, 2]  # what a wheel's residual is multiplied by, per axle
+    scale_y: Annotated[LaneArray, 2]  # the same for an axle's residual
+
+
+class NodeForces:
+    """Measured forces over load [1] of wheels and axles, corrected by the states of each node."""
+
+    force: Annotated[LaneArray, ROWS]
+    slip_at_force: Annotated[LaneArray, ROWS]  # linear force over load that gives it
 
 
 class NodeWorkspace:
-    """Scratch arrays for the update of one node (friction hypothesis)."""
+    """Scratch arrays for the update of one group of nodes (friction hypotheses)."""
 
-    gained: PlanarVector  # mean velocity gained in the block, by the node's mean [m/s]
-    point: Annotated[FloatArray, STATES]
-    slip: NodeSlip
-    shape_force: Annotated[
-        FloatArray, ROWS
-    ]  # force over load by which a tyre one spread sharper differs
-    force: Annotated[FloatArray, ROWS]  # force over load as the node corrects it
-    slip_at_force: Annotated[FloatArray, ROWS]  # linear force over load that gives it
-    residual: Annotated[
-        FloatArray, ROWS
-    ]  # at the mean, then mean of the cubature points, then what is left of it
-    ahead: Annotated[FloatArray, ROWS]
-    behind: Annotated[FloatArray, ROWS]
-    nonlinearity: Annotated[FloatArray, ROWS]  # variance that the rows' curvature adds
-    middle: Annotated[FloatArray, CURVED, ROWS]
-    derivative: Annotated[FloatArray, ACTIVE, ROWS]
-    deviation: Annotated[FloatArray, ROWS, ACTIVE]
-    noise: Annotated[FloatArray, ROWS]  # variance of the rows' noise
+    gained_x: Annotated[LaneArray, 1]  # mean velocity gained in the block, by a node's mean [m/s]
+    gained_y: Annotated[LaneArray, 1]
+    rolling: Annotated[LaneArray, 4]  # R*omega with radius and lag as the node has them [m/s]
+    steering: Annotated[LaneArray, 1]  # true minus measured steering angle of the front axle [rad]
+    mu: Annotated[LaneArray, 2]  # friction on the left and right
+    per_mu: Annotated[LaneArray, 2]
+    axle_mu: Annotated[LaneArray, 2]  # mean over an axle's wheels by load
+    per_axle_mu: Annotated[LaneArray, 2]
+    point: Annotated[LaneArray, STATES]
+    slip: NodeSlip  # at the mean
+    moved_slip: NodeSlip  # at another point
+    forces: NodeForces  # at the mean
+    moved_forces: NodeForces
+    # force over load by which a tyre one spread sharper differs
+    shape_force: Annotated[LaneArray, ROWS]
+    # at the mean, then mean of the cubature points, then innovation
+    residual: Annotated[LaneArray, ROWS]
+    ahead: Annotated[LaneArray, ROWS]
+    behind: Annotated[LaneArray, ROWS]
+    nonlinearity: Annotated[LaneArray, ROWS]  # variance that the rows' curvature adds
+    middle: Annotated[LaneArray, CURVED, ROWS]
+    derivative: Annotated[LaneArray, ACTIVE, ROWS]
+    root: Annotated[LaneArray, STATES, CURVED]  # first columns of the covariance's factor
+    curved: Annotated[LaneArray, ROWS, CURVED]  # deviation of the cubature points in their axes
+    whole: Annotated[LaneArray, ROWS, CURVED]  # the same with the rows' linear part
+    cross: Annotated[LaneArray, STATES, ROWS]  # covariance of the states with the rows
+    gain: Annotated[LaneArray, ROWS]  # inverse variances of the innovations
+    scaled: Annotated[LaneArray, ROWS]
+    spread: Annotated[LaneArray, ROWS, ROWS]  # covariance of the rows
+    noise: Annotated[LaneArray, ROWS]  # variance of the rows' noise
     abrupt: Annotated[
-        FloatArray, ROWS
+        LaneArray, ROWS
     ]  # variance of what came within the block: a bump says nothing of later ones
-    inflated: Annotated[
-        FloatArray, ROWS
-    ]  # of the noise, for correlation in time, for outliers and what was abrupt
+    turned: Annotated[LaneArray, 2, STATES]  # covariance of the predicted velocity with the states
+    velocity: Annotated[LaneArray, STATES]  # covariance of a measured velocity with the states
 
 
 class Scratch:
@@ -110,23 +141,20 @@ class Scratch:
 
     features: BlockFeatures
     node: NodeWorkspace
-    innovation: Annotated[FloatArray, ALL_NODES, ROWS]
-    theoretical: Annotated[FloatArray, ALL_NODES, ROWS]  # variance of it
+    mixing: Annotated[FloatArray, PLACES]  # share of foreign probability by road change
+    share: Annotated[FloatArray, PLACES]  # weight of the active nodes, 0 elsewhere
+    updated: Annotated[LaneArray, GROUPS, 2]  # velocity after the measurements [m/s]
+    apart: Annotated[LaneArray, GROUPS, STATES]  # from the mean of the mixture
     process: Annotated[FloatArray, STATES]  # variances
     keep: Annotated[FloatArray, STATES]
-    log_likelihood: Annotated[FloatArray, ALL_NODES]
-    joint: Annotated[FloatArray, ALL_NODES]  # log of weight times likelihood with the nominal R
-    moved: Annotated[
-        FloatArray, ALL_NODES
-    ]  # change of what the belief about the vehicle costs [nat]
+    log_likelihood: Annotated[FloatArray, PLACES]
+    plain: Annotated[FloatArray, PLACES]  # the same with the nominal R
+    moved: Annotated[FloatArray, PLACES]  # change of what the belief about the vehicle costs [nat]
     predicted: Annotated[FloatArray, ALL_NODES]
     actual_sum: Annotated[FloatArray, 2]
     stated_sum: float  # the axles' with R as the constants state it
     theoretical_sum: Annotated[FloatArray, 2]
-    root: Annotated[FloatArray, ALL_NODES, STATES, STATES]
-    velocity_row: Annotated[
-        FloatArray, STATES
-    ]  # deviation of a velocity in the axes of a root's columns
+    square_sum: float  # normalised innovation squared, by weight
     projected: Annotated[FloatArray, NODES]
     expected: Annotated[FloatArray, NODES]
     blended: Annotated[FloatArray, NODES]

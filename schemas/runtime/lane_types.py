@@ -1,0 +1,345 @@
+"""Numba types of vectors ("lanes") and of their masks, and the machine code of their operators.
+`lanes.py` explains them and is the module to import.
+"""
+
+# ruff: noqa: ANN401, ARG001, ARG002 the interfaces of numba and llvmlite have no types
+# mypy: disable-error-code="no-untyped-call, untyped-decorator"
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable
+from typing import Any, Final
+
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba.core import cgutils, types
+from numba.core.typeconv.castgraph import Conversion
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import lower_builtin, lower_cast, models, register_model
+
+from schemas.runtime.records import LANES
+
+DOUBLE: Final = ir.DoubleType()
+LONG: Final = ir.IntType(64)
+INDEX: Final = ir.IntType(32)
+VECTOR: Final = ir.VectorType(DOUBLE, LANES)
+LONG_VECTOR: Final = ir.VectorType(LONG, LANES)
+BIT_VECTOR: Final = ir.VectorType(ir.IntType(1), LANES)
+ANY_BYTE: Final = 8  # alignment of numbers in memory, which a vector there also has
+FUSED: Final = ("contract",)  # a*b + c may be rounded once
+
+
+class LanesType(types.Type):
+    """Numba type of LANES float64 numbers in one vector."""
+
+    def __init__(self) -> None:
+        super().__init__(name="Lanes")
+
+    def can_convert_from(self, typingctx: Any, other: Any) -> Conversion | None:
+        """Return that a single number can be spread over the lanes."""
+        return Conversion.safe if isinstance(other, types.Float | types.Integer) else None
+
+    def unify(self, typingctx: Any, other: Any) -> LanesType | None:
+        """Return the type of a variable that holds a number first and lanes later."""
+        return self if isinstance(other, types.Float | types.Integer) else None
+
+
+class MaskType(types.Type):
+    """Numba type of LANES truth values, the result of a comparison of lanes."""
+
+    def __init__(self) -> None:
+        super().__init__(name="LanesMask")
+
+    def can_convert_from(self, typingctx: Any, other: Any) -> Conversion | None:
+        """Return that a single truth value can be spread over the lanes."""
+        return Conversion.safe if isinstance(other, types.Boolean) else None
+
+
+LANES_TYPE: Final = LanesType()
+MASK_TYPE: Final = MaskType()
+
+
+@register_model(LanesType)
+class LanesModel(models.PrimitiveModel):
+    """Storage of lanes: an LLVM vector."""
+
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, VECTOR)
+
+
+@register_model(MaskType)
+class MaskModel(models.PrimitiveModel):
+    """Storage of a mask: an LLVM vector of bits."""
+
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, BIT_VECTOR)
+
+
+def spread_value(builder: Any, value: Any, vector: Any) -> Any:
+    """Return a vector with `value` in all lanes."""
+    empty = ir.Constant(vector, ir.Undefined)
+    first = builder.insert_element(empty, value, INDEX(0))
+    places = ir.Constant(ir.VectorType(INDEX, LANES), [INDEX(0)] * LANES)
+    return builder.shuffle_vector(first, empty, places)
+
+
+@lower_cast(types.Float, LanesType)
+@lower_cast(types.Integer, LanesType)
+def cast_number(context: Any, builder: Any, given: Any, wanted: Any, value: Any) -> Any:
+    """Return lanes that all hold a number."""
+    return spread_value(builder, context.cast(builder, value, given, types.float64), VECTOR)
+
+
+@lower_cast(types.Boolean, MaskType)
+def cast_truth(context: Any, builder: Any, given: Any, wanted: Any, value: Any) -> Any:
+    """Return a mask that holds a truth value in all lanes."""
+    return spread_value(builder, cgutils.as_bool_bit(builder, value), BIT_VECTOR)
+
+
+def call_llvm(builder: Any, name: str, *args: Any) -> Any:
+    """Call the LLVM intrinsic `name`, for example "sqrt", for numbers or vectors."""
+    kind = args[0].type
+    function = cgutils.get_or_insert_function(
+        builder.module,
+        ir.FunctionType(kind, [kind] * len(args)),
+        f"llvm.{name}.v{LANES}f64" if kind == VECTOR else f"llvm.{name}.f64",
+    )
+    return builder.call(function, args)
+
+
+def choose_lanes(builder: Any, sign: str, a: Any, b: Any) -> Any:
+    """Return a where `a sign b` holds, and b elsewhere, also where one of them is NaN."""
+    return builder.select(builder.fcmp_ordered(sign, a, b), a, b)
+
+
+def _is_number(kind: Any) -> bool:
+    return isinstance(kind, LanesType | types.Float | types.Integer)
+
+
+def _is_truth(kind: Any) -> bool:
+    return isinstance(kind, MaskType | types.Boolean)
+
+
+def _register(function: Any, arguments: int, given: Any, result: Any, lower: Any) -> None:
+    """Register `lower`, which builds the code of `function` for lanes or masks (type `given`), of
+    which other arguments may be single numbers or truth values.
+    """
+    fits: Callable[[Any], bool] = _is_number if given is LANES_TYPE else _is_truth
+
+    class Template(AbstractTemplate):
+        def generic(self, args: Any, kws: Any) -> Any:
+            if kws or len(args) != arguments or given not in args or not all(map(fits, args)):
+                return None
+            return signature(result, *[given] * arguments)
+
+    infer_global(function)(Template)
+
+    @lower_builtin(function, *[type(given)] * arguments)
+    def _lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return lower(builder, *args)
+
+
+def _register_arithmetic() -> None:
+    lowers: dict[Any, Any] = {
+        operator.add: lambda builder, a, b: builder.fadd(a, b, flags=FUSED),
+        operator.sub: lambda builder, a, b: builder.fsub(a, b, flags=FUSED),
+        operator.mul: lambda builder, a, b: builder.fmul(a, b, flags=FUSED),
+        operator.truediv: lambda builder, a, b: builder.fdiv(a, b),
+        max: lambda builder, a, b: choose_lanes(builder, ">", a, b),
+        min: lambda builder, a, b: choose_lanes(builder, "<", a, b),
+    }
+    lowers[operator.iadd] = lowers[operator.add]
+    lowers[operator.isub] = lowers[operator.sub]
+    lowers[operator.imul] = lowers[operator.mul]
+    for function, lower in lowers.items():
+        _register(function, 2, LANES_TYPE, LANES_TYPE, lower)
+    singles: dict[Any, Any] = {
+        operator.neg: lambda builder, a: builder.fneg(a),
+        abs: lambda builder, a: call_llvm(builder, "fabs", a),
+        math.sqrt: lambda builder, a: call_llvm(builder, "sqrt", a),
+    }
+    for function, lower in singles.items():
+        _register(function, 1, LANES_TYPE, LANES_TYPE, lower)
+
+
+def _register_comparisons() -> None:
+    signs: dict[Any, str] = {
+        operator.lt: "<",
+        operator.le: "<=",
+        operator.gt: ">",
+        operator.ge: ">=",
+        operator.eq: "==",
+    }
+    for function, sign in signs.items():
+        _register(
+            function,
+            2,
+            LANES_TYPE,
+            MASK_TYPE,
+            lambda builder, a, b, sign=sign: builder.fcmp_ordered(sign, a, b),
+        )
+    _register(operator.and_, 2, MASK_TYPE, MASK_TYPE, lambda builder, a, b: builder.and_(a, b))
+    _register(operator.or_, 2, MASK_TYPE, MASK_TYPE, lambda builder, a, b: builder.or_(a, b))
+
+
+_register_arithmetic()
+_register_comparisons()
+
+
+def find_vector(target: Any, builder: Any, sig: Any, values: Any) -> Any:
+    """Return a pointer to the vector of an array at a place: the first two arguments of an
+    intrinsic with the signature `sig`. The place is an index, or one per axis before the lanes.
+    """
+    kind = sig.args[0]
+    held = target.make_array(kind)(target, builder, values[0])
+    shape = cgutils.unpack_tuple(builder, held.shape, kind.ndim)
+    place = sig.args[1]
+    kinds = getattr(place, "types", (place,))
+    parts = cgutils.unpack_tuple(builder, values[1]) if len(kinds) > 1 else [values[1]]
+    row = LONG(0)
+    for axis, (part, given) in enumerate(zip(parts, kinds, strict=True)):
+        index = target.cast(builder, part, given, types.intp)
+        row = builder.add(builder.mul(row, shape[axis]), index)
+    pointer = builder.bitcast(held.data, VECTOR.as_pointer())
+    return builder.gep(pointer, [row], inbounds=True)
+
+
+def type_load(context: Any, array: Any, place: Any) -> Any:
+    """Return signature and code generator of `lanes_at`."""
+
+    def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
+        return builder.load(find_vector(target, builder, sig, values), align=ANY_BYTE)
+
+    return LANES_TYPE(array, place), generate_code
+
+
+def type_store(context: Any, array: Any, place: Any, value: Any) -> Any:
+    """Return signature and code generator of `put_lanes`."""
+
+    def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
+        builder.store(values[2], find_vector(target, builder, sig, values), align=ANY_BYTE)
+        return target.get_dummy_value()
+
+    return types.void(array, place, LANES_TYPE), generate_code
+
+
+def type_select(context: Any, where: Any, first: Any, other: Any) -> Any:
+    """Return signature and code generator of `select`."""
+    wide = any(isinstance(kind, LanesType | MaskType) for kind in (where, first, other))
+    number = LANES_TYPE if wide else types.float64
+    truth = MASK_TYPE if isinstance(where, MaskType) else types.boolean
+
+    def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
+        bit = values[0] if truth is MASK_TYPE else cgutils.as_bool_bit(builder, values[0])
+        return builder.select(bit, values[1], values[2])
+
+    return number(truth, number, number), generate_code
+
+
+def _reduce(combine: Callable[[Any, Any, Any], Any]) -> Any:
+    """Return a code generator that combines the lower with the upper half of the lanes until one
+    number is left, so that the order is fixed.
+    """
+
+    def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
+        value = values[0]
+        width = LANES
+        while width > 1:
+            width //= 2
+            halves = []
+            for begin in (0, width):
+                places = [INDEX(begin + lane) for lane in range(width)]
+                mask = ir.Constant(ir.VectorType(INDEX, width), places)
+                halves.append(builder.shuffle_vector(value, value, mask))
+            value = combine(builder, *halves)
+        return builder.extract_element(value, INDEX(0))
+
+    return generate_code
+
+
+def type_sum(context: Any, value: Any) -> Any:
+    """Return signature and code generator of `sum_lanes`."""
+    return types.float64(LANES_TYPE), _reduce(lambda builder, a, b: builder.fadd(a, b))
+
+
+def type_largest(context: Any, value: Any) -> Any:
+    """Return signature and code generator of `largest_lane`."""
+    return types.float64(LANES_TYPE), _reduce(
+        lambda builder, a, b: choose_lanes(builder, ">", a, b)
+    )
+
+
+def type_any(context: Any, mask: Any) -> Any:
+    """Return signature and code generator of `any_lane`."""
+
+    def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
+        if isinstance(mask, types.Boolean):
+            return values[0]
+        bits = builder.bitcast(values[0], ir.IntType(LANES))
+        found = builder.icmp_unsigned("!=", bits, ir.IntType(LANES)(0))
+        return target.cast(builder, found, types.boolean, types.boolean)
+
+    return types.boolean(mask), generate_code
+
+
+def type_gather(context: Any, table: Any, cell: Any) -> Any:
+    """Return signature and code generator of `gather`."""
+    number = LANES_TYPE if isinstance(cell, LanesType) else types.float64
+
+    def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
+        data = target.make_array(sig.args[0])(target, builder, values[0]).data
+        if number is not LANES_TYPE:
+            return builder.load(builder.gep(data, [builder.fptosi(values[1], LONG)]))
+        places = builder.fptosi(values[1], LONG_VECTOR)
+        found = ir.Constant(VECTOR, ir.Undefined)
+        for lane in range(LANES):
+            place = builder.extract_element(places, INDEX(lane))
+            one = builder.load(builder.gep(data, [place]))
+            found = builder.insert_element(found, one, INDEX(lane))
+        return found
+
+    return number(table, number), generate_code
+
+
+def _constant(long: Any, value: int) -> Any:
+    return ir.Constant(long, [LONG(value)] * LANES) if long == LONG_VECTOR else LONG(value)
+
+
+def _type_function(value: Any, build: Callable[[Any, Any, Any, Any], Any]) -> Any:
+    """Return signature and code generator of a function of a number or lanes; `build` gets the
+    builder, the value, and the LLVM types of the value and of as many integers.
+    """
+    wide = isinstance(value, LanesType)
+    number = LANES_TYPE if wide else types.float64
+    pair = (VECTOR, LONG_VECTOR) if wide else (DOUBLE, LONG)
+
+    def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
+        return build(builder, values[0], *pair)
+
+    return number(number), generate_code
+
+
+def type_floor(context: Any, value: Any) -> Any:
+    """Return signature and code generator of `floor`."""
+    return _type_function(value, lambda builder, x, *_: call_llvm(builder, "floor", x))
+
+
+def type_power_of_two(context: Any, value: Any) -> Any:
+    """Return signature and code generator of `power_of_two`, which writes the exponent's bits."""
+
+    def build_code(builder: Any, x: Any, double: Any, long: Any) -> Any:
+        biased = builder.add(builder.fptosi(x, long), _constant(long, 1023))
+        return builder.bitcast(builder.shl(biased, _constant(long, 52)), double)
+
+    return _type_function(value, build_code)
+
+
+def type_exponent(context: Any, value: Any) -> Any:
+    """Return signature and code generator of `exponent_of`, which reads the exponent's bits."""
+
+    def build_code(builder: Any, x: Any, double: Any, long: Any) -> Any:
+        biased = builder.lshr(builder.bitcast(x, long), _constant(long, 52))
+        return builder.sitofp(builder.sub(biased, _constant(long, 1023)), double)
+
+    return _type_function(value, build_code)

@@ -1,0 +1,93 @@
+"""Numbers side by side in one vector register ("lanes") for compiled functions.
+
+A filter bank runs the same arithmetic for many hypotheses. A vector of LANES numbers, one per
+hypothesis, lets one machine instruction serve all of them (structure of arrays). In compiled code
+such a vector comes from `lanes_at` and behaves like a float: operators, `abs`, `min`, `max` and
+`math.sqrt` work lane by lane, and a float is spread over all lanes. One source thus serves single
+numbers and lanes, and for type checkers lanes are floats. A comparison gives a mask, for which
+`select` replaces a branch.
+
+Multiplication and addition of lanes are fused where the processor can. Nothing else of fast-math is
+allowed: NaN and infinity keep their meaning, and sums keep their order
+(`deploy/docs/decisions/0011-no-fast-math.md`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Final, TypeAlias, cast
+
+from numba.extending import intrinsic
+
+from schemas.numeric import FloatArray
+from schemas.runtime import lane_types
+from schemas.runtime.jit import inlined
+
+Function: TypeAlias = Callable[[float], float]
+
+# lanes_at(array, place): the vector of `array` (..., LANES) at a place, one index per axis before
+# the lanes; of a flat array, the vector number `place`
+lanes_at = cast(Callable[[FloatArray, Any], float], intrinsic(lane_types.type_load))
+# put_lanes(array, place, value): write a vector or, into all lanes, a number
+put_lanes = cast(Callable[[FloatArray, Any, float], None], intrinsic(lane_types.type_store))
+# select(where, first, other): `first` where the mask is true; both are computed
+select = cast(Callable[[bool, float, float], float], intrinsic(lane_types.type_select))
+any_lane = cast(Callable[[bool], bool], intrinsic(lane_types.type_any))
+sum_lanes = cast(Function, intrinsic(lane_types.type_sum))
+largest_lane = cast(Function, intrinsic(lane_types.type_largest))
+# gather(table, cell): elements of a table at whole numbers, which must lie inside
+gather = cast(Callable[[FloatArray, float], float], intrinsic(lane_types.type_gather))
+floor = cast(Function, intrinsic(lane_types.type_floor))
+# power_of_two(k): 2^k of a whole k; exponent_of(x): the whole k with 2^k <= x < 2^(k+1) of x > 0
+power_of_two = cast(Function, intrinsic(lane_types.type_power_of_two))
+exponent_of = cast(Function, intrinsic(lane_types.type_exponent))
+
+LOG2_E: Final = 1.4426950408889634
+# ln 2 in two parts, so that whole multiples of the first are exact
+LN_2_HIGH: Final = 6.93147180369123816490e-01
+LN_2_LOW: Final = 1.90821492927058770002e-10
+MOST_EXPONENT: Final = 700.0  # beyond it 2^k has no exponent of a float
+ROOT_2: Final = math.sqrt(2.0)
+EXP_TERMS: Final = tuple(1.0 / math.factorial(k) for k in range(13, -1, -1))
+LOG_TERMS: Final = tuple(2.0 / k for k in range(21, 0, -2))
+
+
+@inlined
+def exp_lanes(x: float) -> float:
+    """Return e^x for -700 <= x <= 700, with a relative error below 3e-16; a larger or smaller x
+    counts as the nearest limit.
+
+    e^x is 2^k*e^r with a whole k and |r| <= ln(2)/2, and e^r its Taylor polynomial.
+    """
+    x = min(max(x, -MOST_EXPONENT), MOST_EXPONENT)
+    k = floor(x * LOG2_E + 0.5)
+    r = (x - k * LN_2_HIGH) - k * LN_2_LOW
+    return evaluate_polynomial(EXP_TERMS, r) * power_of_two(k)
+
+
+@inlined
+def log_lanes(x: float) -> float:
+    """Return ln(x) of a positive x that is not subnormal; the error is below 3e-16 times the larger
+    of 1 and the result.
+
+    With x = 2^k*m and m around 1, ln(m) is 2*artanh(s) for s = (m - 1)/(m + 1), a series in s^2.
+    """
+    k = exponent_of(x)
+    m = x * power_of_two(-k)
+    large = m > ROOT_2
+    m = select(large, 0.5 * m, m)
+    k = select(large, k + 1.0, k)
+    s = (m - 1.0) / (m + 1.0)
+    return k * LN_2_HIGH + (k * LN_2_LOW + s * evaluate_polynomial(LOG_TERMS, s * s))
+
+
+@inlined
+def evaluate_polynomial(terms: tuple[float, ...], x: float) -> float:
+    """Return the value at x of the polynomial whose coefficients are `terms`, the highest first
+    (Horner's rule).
+    """
+    total = x * 0.0 + terms[0]
+    for term in terms[1:]:
+        total = total * x + term
+    return total

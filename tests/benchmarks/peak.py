@@ -1,0 +1,122 @@
+"""Floating-point peak of one core, and the operations that the default estimator needs."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from edge_agent.estimators.friction_mixture.state.constants import (
+    ACTIVE,
+    CURVED,
+    NODES,
+    ROWS,
+    STATES,
+    Constants,
+)
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import nogil
+from schemas.runtime.lanes import lanes_at, sum_lanes
+from schemas.runtime.records import LANES
+from tests.benchmarks.measure import ROUNDS
+
+CHAINS = 10  # independent sums: more than a core has multiply-adds under way
+TURNS = 1_000_000
+FUSED = 2  # operations of a multiply-add
+WHEELS = 4
+AXLES = 2
+EXPONENTIAL = 33  # operations of `exp_lanes`: range reduction, polynomial, power of two
+CURVE = 6  # of an interpolation in a table
+DISTANCE = 10  # of the distance of a measurement row from the tyre curve
+INVERSE = 8 + CURVE  # of the slip at a force
+
+
+def measure_peak() -> float:
+    """Return the double-precision peak of one core [GFLOP/s]: that of a loop of independent fused
+    multiply-adds in registers, the best of several rounds.
+    """
+    values = np.full((2, LANES), 0.5)
+    add_products(values, 1)
+    spent = []
+    for _ in range(ROUNDS):
+        began = time.perf_counter()
+        add_products(values, TURNS)
+        spent.append(time.perf_counter() - began)
+    return TURNS * CHAINS * LANES * FUSED / min(spent) / 1e9
+
+
+@nogil
+def add_products(values: FloatArray, turns: int) -> float:
+    """Run CHAINS recursions x <- factor*x + term in registers; `values` (2, LANES) are the factor
+    and the term.
+    """
+    factor = lanes_at(values, 0)
+    term = lanes_at(values, 1)
+    a = term + 0.0
+    b = term + 1.0
+    c = term + 2.0
+    d = term + 3.0
+    e = term + 4.0
+    f = term + 5.0
+    g = term + 6.0
+    h = term + 7.0
+    i = term + 8.0
+    j = term + 9.0
+    for _ in range(turns):
+        a = factor * a + term
+        b = factor * b + term
+        c = factor * c + term
+        d = factor * d + term
+        e = factor * e + term
+        f = factor * f + term
+        g = factor * g + term
+        h = factor * h + term
+        i = factor * i + term
+        j = factor * j + term
+    return sum_lanes(a + b + c + d + e + f + g + h + i + j)
+
+
+def count_operations(interval: float) -> float:
+    """Return the floating-point operations per sample of the default estimator at a sampling
+    `interval` [s].
+
+    Counted from the source (`friction_mixture/node`) are the operations for the NODES nodes of one
+    friction on a car with torque signals. A division or root counts as one operation. Spare lanes,
+    mixing after a road change, the sums of a block and the output are not counted, so the share of
+    the peak is a lower limit.
+    """
+    samples = round(Constants().block_time / interval)
+    return NODES * (_count_rows() + _count_covariances()) / samples
+
+
+def _count_rows() -> int:
+    """Return the operations of one node for its measurement rows: residuals at the mean, with
+    steering and radii moved and at the cubature points; forces at the mean and with three states
+    moved.
+    """
+    stiffness = 4 * (EXPONENTIAL + 1) + 8
+    slip = 8 + AXLES * stiffness + WHEELS * 15
+    ratio = WHEELS * (10 + CURVE)
+    force = WHEELS * (9 + INVERSE) + AXLES * (8 + INVERSE)
+    noise = WHEELS * (2 * CURVE + 30)
+    points = 3 + 2 * CURVED
+    moved = 3
+    residuals = ROWS * DISTANCE
+    return points * (slip + ratio + residuals) + moved * residuals + (1 + moved) * force + noise
+
+
+def _count_covariances() -> int:
+    """Return the operations of one node for its covariance: first columns of the factor,
+    covariances with the rows, update by the rows and by two velocities, prediction, and moments.
+    """
+    half = STATES * (STATES + 1) // 2
+    factor = FUSED * STATES * CURVED * (CURVED - 1) // 2
+    linear = ACTIVE - CURVED
+    rows = FUSED * (STATES * ROWS * ACTIVE + ROWS * CURVED * linear)
+    rows += FUSED * ACTIVE * ROWS * (ROWS + 1) // 2
+    conditioned = FUSED * STATES * (ROWS * (ROWS - 1) // 2 + ROWS)
+    update = FUSED * half * ROWS + STATES * ROWS
+    velocities = 2 * (FUSED * half + 6 * STATES)
+    prediction = 2 * half + 22 * STATES
+    moments = 2 * FUSED * half
+    return factor + rows + conditioned + update + velocities + prediction + moments
