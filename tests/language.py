@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from tests.results import list_pages
-from tests.structure import ROOT, list_sources, parse
+from tests.structure import ROOT, list_nodes, list_sources
 
 PACKAGES: Final = ("schemas", "edge_agent", "fleet_service", "deploy", "tests")
 CEILINGS: Final = ROOT / "tests" / "language_ceilings.json"
@@ -101,7 +101,7 @@ class Named(NamedTuple):
 def docstrings(package: str) -> Iterator[Docstring]:
     """Yield the docstrings of a package."""
     for path in list_sources(ROOT, package):
-        for node in ast.walk(parse(path)):
+        for node in list_nodes(path):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 text = ast.get_docstring(node)
                 if text:
@@ -114,7 +114,7 @@ def functions(package: str) -> Iterator[Named]:
     methods.
     """
     for path in list_sources(ROOT, package):
-        for node in ast.walk(parse(path)):
+        for node in list_nodes(path):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not DUNDER.fullmatch(
                 node.name
             ):
@@ -126,10 +126,10 @@ def user_texts(package: str) -> Iterator[Docstring]:
     messages of errors.
     """
     for path in list_sources(ROOT, package):
-        for node in ast.walk(parse(path)):
+        for node in list_nodes(path):
             if not isinstance(node, ast.Call):
                 continue
-            called = ast.unparse(node.func).rpartition(".")[2]
+            called = getattr(node.func, "attr", getattr(node.func, "id", ""))
             shown = [word.value for word in node.keywords if word.arg in ("help", "description")]
             for part in [*node.args, *shown] if called.endswith("Error") else shown:
                 words = [

@@ -41,6 +41,12 @@ def parse(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
+@cache
+def list_nodes(path: Path) -> tuple[ast.AST, ...]:
+    """Return all nodes of a Python file's syntax tree, in the order of `ast.walk`."""
+    return tuple(ast.walk(parse(path)))
+
+
 def list_imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
     """Yield line number and full name of every import in a syntax tree, also inside functions."""
     for node in ast.walk(tree):
@@ -80,7 +86,7 @@ def too_wide(root: Path) -> list[str]:
     """Return the product's functions with too many positional parameters."""
     found = []
     for path in list_sources(root, *PACKAGES):
-        for node in ast.walk(parse(path)):
+        for node in list_nodes(path):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 names = [argument.arg for argument in (*node.args.posonlyargs, *node.args.args)]
                 count = len([name for name in names if name not in ("self", "cls")])
@@ -93,7 +99,7 @@ def ambiguous_classes(root: Path) -> dict[str, list[str]]:
     """Return each class name that several classes have, with their files and lines."""
     places: dict[str, list[str]] = {}
     for path in list_sources(root, *PACKAGES):
-        for node in ast.walk(parse(path)):
+        for node in list_nodes(path):
             if isinstance(node, ast.ClassDef):
                 places.setdefault(node.name, []).append(f"{path.relative_to(root)}:{node.lineno}")
     return {name: found for name, found in places.items() if len(found) > 1}
@@ -130,7 +136,7 @@ PRODUCT: Final = ("schemas", "edge_agent", "fleet_service")
 def functions(root: Path, *packages: str) -> Iterator[tuple[str, FunctionNode]]:
     """Yield place (file, line and name) and syntax node of every function."""
     for path in list_sources(root, *packages):
-        for node in ast.walk(parse(path)):
+        for node in list_nodes(path):
             if isinstance(node, FunctionNode):
                 yield f"{path.relative_to(root)}:{node.lineno} {node.name}", node
 
@@ -167,7 +173,7 @@ def methods_of_largest_class(root: Path) -> Places:
     """
     largest: Places = []
     for path in list_sources(root, *PACKAGES):
-        for node in ast.walk(parse(path)):
+        for node in list_nodes(path):
             if isinstance(node, ast.ClassDef):
                 methods = [item for item in node.body if isinstance(item, FunctionNode)]
                 if len(methods) > len(largest):
@@ -206,7 +212,7 @@ def packed_assignments(root: Path) -> Places:
     """Return the statements that assign a literal tuple to several names: `a, b = x, y`."""
     found = []
     for path in list_sources(root, *PACKAGES):
-        for node in ast.walk(parse(path)):
+        for node in list_nodes(path):
             match node:
                 case ast.Assign(targets=[*_, ast.Tuple()], value=ast.Tuple()):
                     found.append(f"{path.relative_to(root)}:{node.lineno}")
@@ -353,7 +359,7 @@ def only_tests_use(root: Path) -> Places:
     )
     found = []
     for path in texts:
-        for node in ast.walk(parse(path)):
+        for node in list_nodes(path):
             if isinstance(
                 node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
             ) and not node.name.startswith("_"):
