@@ -16,6 +16,7 @@ PACKAGES = pytest.mark.parametrize("package", language.PACKAGES)
 MOST_WORDS = 25_000
 
 
+@pytest.mark.campaign
 @PACKAGES
 def test_language_of_a_package_is_not_worse_than_its_ceilings(package: str) -> None:
     ceilings = language.read_ceilings()["packages"][package]
