@@ -69,7 +69,7 @@ _WATCH: Final = """
   document.addEventListener("DOMContentLoaded", () => new MutationObserver(() => {
     if (!shown && document.body.dataset.drawn >= CELLS) globalThis.shown = performance.now();
     for (const place of globalThis.markers ?? []) {
-      const number = gripmap.now.at_place(...place)[0]?.vehicles;
+      const number = gripmap.state.now.at_place(...place)[0]?.vehicles;
       if (number && !numbers.some(one => one[0] === number)) numbers.push([number, Date.now()]);
     }
   }).observe(document.body, { attributeFilter: ["data-drawn"] }));
@@ -86,13 +86,13 @@ _MOVES: Final = """async () => {
   return 1000 * (painted() - before) / (performance.now() - began);
 }"""
 _OURS: Final = """() => {
-  const draw = gripmap.drawNow;
+  const draw = gripmap.map.drawNow;
   let count = 0;
-  gripmap.drawNow = function () { count++; draw.call(gripmap); };
+  gripmap.map.drawNow = function () { count++; draw.call(gripmap.map); };
   globalThis.painted = () => count;
   globalThis.move = k => {
-    gripmap.view.shift(9 * Math.sin(k / 5), 4 * Math.cos(k / 7));
-    gripmap.view.turn(1 + .01 * Math.sin(k / 9));
+    gripmap.map.view.shift(9 * Math.sin(k / 5), 4 * Math.cos(k / 7));
+    gripmap.map.view.turn(1 + .01 * Math.sin(k / 9));
   };
   globalThis.there = () => document.body.dataset.drawn > 0;
 }"""

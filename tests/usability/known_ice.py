@@ -302,7 +302,7 @@ def _hidden_on_page(ice: KnownIce) -> dict[str, Places]:
 
 # The class in which each place (tile, cell within it, heading) is drawn; -1 if it is not drawn.
 _KINDS: Final = """async ([places, least]) => {
-  const cells = gripmap.cells, found = {}, world = [...cells.known];
+  const cells = gripmap.state.cells, found = {}, world = [...cells.known];
   const at = (tile, local) => {
     for (let k = 0; k < tile.rows.count; k++) {
       if (tile.rows.place[k] >> 2 === local) return tile.kind[k];
@@ -325,8 +325,8 @@ _KINDS: Final = """async ([places, least]) => {
     return -1;
   };
   found.cells = places.map(own);
-  await gripmap.loadRoads();
-  if (gripmap.roads.lines.length) {
+  await gripmap.updates.loadRoads();
+  if (gripmap.state.roads.lines.length) {
     const { columnOf, rowOf } = await import("/static/grid.js");
     const all = { west: 0, east: 1, north: 0, south: 1 };
     const { passing } = await import("/static/paint.js");
@@ -335,13 +335,13 @@ _KINDS: Final = """async ([places, least]) => {
     const valued = passing({ oldest: 0, bounds: false });
     const filters = { ribbons: null, "ribbons without bounds": valued };
     for (const [name, passes] of Object.entries(filters)) {
-      gripmap.roads.lay([...cells.tiles.values()], passes, new Array(8).fill(0), all);
+      gripmap.state.roads.lay([...cells.tiles.values()], passes, new Array(8).fill(0), all);
       found[name] = places.map(place => {
         const [tile, local, sector] = place;
         const column = columnOf(tile) * 128 + columnOf(local);
         const row = rowOf(tile) * 128 + rowOf(local);
-        const piece = gripmap.roads.pieceOf(column, row, sector);
-        return piece ? gripmap.roads.lanes[piece[0]].kind[piece[1]] : own(place);
+        const piece = gripmap.state.roads.pieceOf(column, row, sector);
+        return piece ? gripmap.state.roads.lanes[piece[0]].kind[piece[1]] : own(place);
       });
     }
   }

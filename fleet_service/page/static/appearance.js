@@ -6,17 +6,29 @@ import { clock, say, zone } from "./texts.js";
 
 const HEIGHTS = ["44%", "86%", "9.5rem"];  // of the sheet: half, most, or a strip of the screen
 
-export const isDark = app => (app.theme ?? (app.dark.matches ? "dark" : "light")) === "dark";
+const device = matchMedia("(prefers-color-scheme: dark)");
 
-// Light or dark: as the device has it, or as was chosen here.
-export function dress(app) {
-  const dark = isDark(app), name = dark ? "dark" : "light";
+/** Return true if the page is dark: as was chosen here, else as the device has it. */
+export const isDark = page => (page.state.theme ?? (device.matches ? "dark" : "light")) === "dark";
+
+/** Call `changed` when the device changes between light and dark. */
+export const onDeviceTheme = changed => device.addEventListener("change", changed);
+
+/** Set the colours of document and map to light or dark. Return the name of the theme. */
+export function applyTheme(page) {
+  const name = isDark(page) ? "dark" : "light";
   document.documentElement.dataset.theme = name;
   setTheme(name);
-  Object.assign(byId("theme"), { textContent: dark ? "☀" : "☾", title: say(`theme.${name}`), ariaLabel: say(`theme.${name}`) });
+  return name;
+}
+
+/** Apply the theme, and what depends on it: the button, the key of the map, the picture. */
+export function dress(page) {
+  const name = applyTheme(page);
+  Object.assign(byId("theme"), { textContent: name === "dark" ? "☀" : "☾", title: say(`theme.${name}`), ariaLabel: say(`theme.${name}`) });
   byId("sheet").ariaLabel = say("sheet.more");
   mapKey();
-  app.draw();
+  page.map.draw();
 }
 
 export function lift() {

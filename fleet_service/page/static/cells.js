@@ -36,7 +36,7 @@ export class Cells {
     this.at = at;  // seconds since 1970, or null: now
     this.tiles = new Map();
     this.known = new Set();
-    this.wanted = new Set();
+    this.asking = new Map();  // of each tile that was asked for: when its answer is here
     this.changed = () => {};
     this.borrowed = false;
     this.generation = 0;
@@ -50,32 +50,34 @@ export class Cells {
 
   // All tiles in view at a level; what is there already stays until its successor has come.
   async show(box, level) {
-    const asked = [];
+    const asked = [], awaited = [];
     for (const tile of this.known) {
       const x = columnOf(tile) / TILES, y = rowOf(tile) / TILES;
       if (x + 1 / TILES <= box.west || x >= box.east || y + 1 / TILES <= box.north || y >= box.south) continue;
-      if (this.tiles.get(tile)?.block.level !== level && !this.wanted.has(tile)) asked.push(tile);
+      if (this.tiles.get(tile)?.block.level === level) continue;
+      if (this.asking.has(tile)) awaited.push(this.asking.get(tile)); else asked.push(tile);
     }
-    await this.fetch(asked, level);
+    await Promise.all([this.fetch(asked, level), ...awaited]);
     if (this.tiles.size > MOST_TILES) this.forget(box);
   }
 
-  async fetch(tiles, level) {
-    const generation = this.generation, batches = [];
-    for (let k = 0; k < tiles.length; k += AT_ONCE) batches.push(tiles.slice(k, k + AT_ONCE));
-    tiles.forEach(tile => this.wanted.add(tile));
-    try {
-      for (const batch of batches) {
-        const words = new URLSearchParams({ tiles: batch.join(","), level });
-        if (this.at !== null) words.set("at", this.at);
-        if (this.borrowed && this.at === null && level === CELL_LEVEL) words.set("borrowed", 1);
-        const answer = await fetch(`/blocks?${words}`);
-        if (!answer.ok || generation !== this.generation) return;
-        decode(await answer.arrayBuffer()).forEach(block => this.take(block));
-        this.changed();
-      }
-    } finally {
-      tiles.forEach(tile => this.wanted.delete(tile));
+  // Ask for tiles, whether they are held or not.
+  fetch(tiles, level) {
+    const answered = this.request(tiles, level).finally(() => tiles.forEach(tile => { if (this.asking.get(tile) === answered) this.asking.delete(tile); }));
+    tiles.forEach(tile => this.asking.set(tile, answered));
+    return answered;
+  }
+
+  async request(tiles, level) {
+    const generation = this.generation;
+    for (let k = 0; k < tiles.length; k += AT_ONCE) {
+      const words = new URLSearchParams({ tiles: tiles.slice(k, k + AT_ONCE).join(","), level });
+      if (this.at !== null) words.set("at", this.at);
+      if (this.borrowed && this.at === null && level === CELL_LEVEL) words.set("borrowed", 1);
+      const answer = await fetch(`/blocks?${words}`);
+      if (!answer.ok || generation !== this.generation) return;
+      decode(await answer.arrayBuffer()).forEach(block => this.take(block));
+      this.changed();
     }
   }
 
@@ -117,10 +119,10 @@ export class Cells {
     return Number.isFinite(found.west) ? found : null;
   }
 
-  empty() {
+  // Answers to what was asked before count no more.
+  restart() {
     this.generation++;
-    this.tiles.clear();
-    this.wanted.clear();
+    this.asking.clear();
   }
 
   // All records of a place of a tile, by heading; [] where nobody was.

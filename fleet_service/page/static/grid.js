@@ -8,6 +8,7 @@ export const worldX = longitude => (longitude + 180) / 360;
 export const worldY = latitude => (1 - Math.asinh(Math.tan(latitude * Math.PI / 180)) / Math.PI) / 2;
 export const longitudeOf = x => x * 360 - 180;
 export const latitudeOf = y => Math.atan(Math.sinh(Math.PI * (1 - 2 * y))) * 180 / Math.PI;
+export const degreesOf = (x, y) => [longitudeOf(x), latitudeOf(y)];
 export const metresPerWorld = y => EARTH_M * Math.cos(latitudeOf(y) * Math.PI / 180);
 
 // Every second bit of a number below 2^32.

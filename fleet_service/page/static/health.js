@@ -2,10 +2,10 @@
 import { make } from "./elements.js";
 import { ago, say } from "./texts.js";
 
-export async function healthPanel(app) {
+export async function healthPanel(page) {
   const answer = await fetch("/health");
   const told = await answer.json(), line = text => make("li", {}, text);
-  const regions = told.regions.map(one => line(`${one.region}: ${one.served ? say("health.region.served") : say("health.region.away", { ago: ago(app.live.now() - one.since) })}`));
+  const regions = told.regions.map(one => line(`${one.region}: ${one.served ? say("health.region.served") : say("health.region.away", { ago: ago(page.live.now() - one.since) })}`));
   return [
     make("h2", {}, say("health.head")),
     make("ul", { class: "plain" },

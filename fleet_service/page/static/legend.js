@@ -1,6 +1,7 @@
 // What the colours mean, for somebody who has never seen the page: one ladder from the most dangerous to the unknown.
 import { byId, make } from "./elements.js";
 import { DANGER, HOLLOW, LITTLE } from "./colours.js";
+import { setOption } from "./options.js";
 import { say } from "./texts.js";
 
 const RECENT = [0, 900, 3600, 21600];
@@ -14,19 +15,19 @@ export function mapKey() {
   byId("key").replaceChildren(...DANGER.map(kind => make("div", {}, make("span", { class: `swatch ${kind === HOLLOW ? "hollow" : `k${kind}`}` }), say(`legend.short.${kind}`))), make("div", {}, make("span", { class: "swatch ground" }), say("legend.short.nobody")));
 }
 
-export function legend(app) {
+export function legend(page) {
   const line = (kind, key) => make("li", {}, make("span", { class: `swatch ${kind}` }), make("span", {}, say(key)));
   return [
     make("h2", {}, say("legend.head")), make("p", {}, say("legend.intro")), ladder(),
-    make("ul", { class: "plain" }, app.show.borrowed ? line("borrowed", "legend.borrowed") : null, line("ground", "legend.nobody"), line("away", "legend.away"),
-      line("ring", "legend.alert"), app.settings.overlay ? line("truth", "legend.overlay") : null),
+    make("ul", { class: "plain" }, page.state.show.borrowed ? line("borrowed", "legend.borrowed") : null, line("ground", "legend.nobody"), line("away", "legend.away"),
+      line("ring", "legend.alert"), page.settings.overlay ? line("truth", "legend.overlay") : null),
     make("p", { class: "note" }, say("legend.heading")), make("p", { class: "note" }, say("legend.worst")),
-    make("h2", {}, say("legend.show")), ...shows(app),
+    make("h2", {}, say("legend.show")), ...shows(page),
   ];
 }
 
-function shows(app) {
-  const box = name => make("label", { class: "line" }, make("input", { type: "checkbox", id: `show-${name}`, checked: app.show[name], onchange: e => app.set(name, e.target.checked) }), say(`show.${name}`));
-  const choice = make("select", { id: "show-recent", onchange: e => app.set("recent", Number(e.target.value)) }, ...RECENT.map(s => make("option", { value: String(s), selected: app.show.recent === s }, say(`show.recent.${s}`))));
-  return [box("roads"), box("bounds"), app.settings.overlay ? box("overlay") : null, box("borrowed"), make("label", { class: "line" }, say("show.recent"), choice)].filter(Boolean);
+function shows(page) {
+  const box = name => make("label", { class: "line" }, make("input", { type: "checkbox", id: `show-${name}`, checked: page.state.show[name], onchange: e => setOption(page, name, e.target.checked) }), say(`show.${name}`));
+  const choice = make("select", { id: "show-recent", onchange: e => setOption(page, "recent", Number(e.target.value)) }, ...RECENT.map(s => make("option", { value: String(s), selected: page.state.show.recent === s }, say(`show.recent.${s}`))));
+  return [box("roads"), box("bounds"), page.settings.overlay ? box("overlay") : null, box("borrowed"), make("label", { class: "line" }, say("show.recent"), choice)].filter(Boolean);
 }

@@ -1,6 +1,7 @@
 // The first panel: what is slippery now, how much is unknown, and where there are data.
 import { shortList } from "./alerts.js";
 import { byId, make } from "./elements.js";
+import { showPlace } from "./navigation.js";
 import { areaList } from "./search.js";
 import { sharesOf, slipperyStretches } from "./stretches.js";
 import { say } from "./texts.js";
@@ -8,24 +9,24 @@ import { stretchWords } from "./words.js";
 
 const MOST = 3, MOST_STRETCHES = 6;
 
-export function overviewPanel(app) {
-  const alerts = app.alerts.length, more = alerts > MOST ? make("button", { type: "button", onclick: () => app.open("alerts") }, say("overview.more", { count: alerts })) : null;
-  const late = byId("live").dataset.state === "late" && app.live.state?.heard, past = app.past || late ? make("p", { class: "note" }, say(app.past ? "alerts.none.past" : "overview.late")) : null;
+export function overviewPanel(page) {
+  const alerts = page.state.alerts.length, more = alerts > MOST ? make("button", { type: "button", onclick: () => page.panels.open("alerts") }, say("overview.more", { count: alerts })) : null;
+  const late = byId("live").dataset.state === "late" && page.live.state?.heard, past = page.state.past || late ? make("p", { class: "note" }, say(page.state.past ? "alerts.none.past" : "overview.late")) : null;
   return [
     make("h2", {}, say(alerts ? "overview.alerts" : "overview.none", { count: alerts })), past,
-    ...(alerts ? [shortList(app, MOST), more] : [make("p", { class: "quiet" }, say(app.areas.length ? "overview.no_alert" : app.live.state?.served ? "overview.nothing" : "overview.unheard"))]),
-    ...(app.asRoads && !app.past && !app.comparing ? inView(app) : []),
-    make("h2", {}, say("areas.head")), ...areaList(app),
+    ...(alerts ? [shortList(page, MOST), more] : [make("p", { class: "quiet" }, say(page.state.areas.length ? "overview.no_alert" : page.live.state?.served ? "overview.nothing" : "overview.unheard"))]),
+    ...(page.map.asRoads && !page.state.past && !page.state.comparing ? inView(page) : []),
+    make("h2", {}, say("areas.head")), ...areaList(page),
   ].filter(Boolean);
 }
 
 // Of the roads in view: slippery stretches without an alert, and the share that nobody knows.
-function inView(app) {
-  const found = slipperyStretches(app.roads, app.view.box, app.alerts), shares = sharesOf(app.roads, app.view.box), more = found.length - MOST_STRETCHES;
-  const item = one => make("li", {}, make("a", { class: "stretch", href: "#stretch", onclick: e => { e.preventDefault(); app.showPlace(one.x, one.y); } },
-    make("span", { class: `swatch k${one.kind}` }), make("span", {}, make("strong", {}, stretchWords(one)), make("small", {}, say("overview.stretch", { what: say(`legend.short.${one.kind}`), length: Math.round(one.length_m), percent: Math.min(99, Math.floor(100 * one.slippery / app.settings.share_steps)), vehicles: one.vehicles })))));
+function inView(page) {
+  const found = slipperyStretches(page.state.roads, page.map.view.box, page.state.alerts), shares = sharesOf(page.state.roads, page.map.view.box), more = found.length - MOST_STRETCHES;
+  const item = one => make("li", {}, make("a", { class: "stretch", href: "#stretch", onclick: e => { e.preventDefault(); showPlace(page, one.x, one.y); } },
+    make("span", { class: `swatch k${one.kind}` }), make("span", {}, make("strong", {}, stretchWords(one)), make("small", {}, say("overview.stretch", { what: say(`legend.short.${one.kind}`), length: Math.round(one.length_m), percent: Math.min(99, Math.floor(100 * one.slippery / page.settings.share_steps)), vehicles: one.vehicles })))));
   return [
-    ...(shares ? [make("h2", {}, say("overview.known")), ...knownBar(shares, app.roads.learned)] : []),
+    ...(shares ? [make("h2", {}, say("overview.known")), ...knownBar(shares, page.state.roads.learned)] : []),
     ...(found.length ? [make("h2", {}, say("overview.stretches")), make("ul", { class: "stretches" }, ...found.slice(0, MOST_STRETCHES).map(item)), more > 0 ? make("p", { class: "note" }, say("overview.stretches.more", { count: more })) : null] : []),
   ];
 }

@@ -10,6 +10,9 @@ import { write } from "./vector.js";
 const CORNER_PX = [60, 140];  // of the buttons at the upper right
 const NEAR_PX = 14, MOST_RECORDS = 9000, LEAST_RIBBON_ZOOM = 14.7, pixels = new Pixels();
 
+/** Take the memory of a picture as large as a canvas, while there is nothing to draw yet. */
+export const reservePicture = canvas => pixels.reserve(canvas.width, canvas.height);
+
 const hatches = {};
 function hatching(pen) {
   if (hatches[themeName()]) return hatches[themeName()];

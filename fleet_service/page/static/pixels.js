@@ -14,13 +14,18 @@ const word = colour => {  // "#rrggbb" as the four bytes of a point
 export class Pixels {
   constructor() { this.canvas = document.createElement("canvas"); }
 
+  // Memory of a picture of so many points.
+  reserve(width, height) {
+    if (this.canvas.width === width && this.canvas.height === height && this.image) return;
+    Object.assign(this.canvas, { width, height });
+    this.image = new ImageData(Math.max(1, width), Math.max(1, height));
+    this.points = new Uint32Array(this.image.data.buffer);
+    this.points.fill(1);  // a machine gives memory only when it is written
+  }
+
   // Begin a picture of so many points, `ratio` to a pixel of the page; opaque where nothing lies below it.
   begin(width, height, ratio, opaque) {
-    if (this.canvas.width !== width || this.canvas.height !== height || !this.image) {
-      Object.assign(this.canvas, { width, height });
-      this.image = new ImageData(Math.max(1, width), Math.max(1, height));
-      this.points = new Uint32Array(this.image.data.buffer);
-    }
+    this.reserve(width, height);
     Object.assign(this, { width, height, ratio, opaque, line: Math.max(1, Math.round(ratio)) });
     this.ground = word(groundColour());
     this.inks = fills().map(word);

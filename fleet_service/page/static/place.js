@@ -2,7 +2,7 @@
 import { BORROWED, MEASURED, NO_NUMBER } from "./blocks.js";
 import { density, history } from "./charts.js";
 import { make } from "./elements.js";
-import { HEADINGS, cellOf } from "./grid.js";
+import { HEADINGS, cellOf, degreesOf } from "./grid.js";
 import { kindOf, rankOf } from "./colours.js";
 import { ago, clock, say, zone } from "./texts.js";
 import { certainty, coordinates } from "./words.js";
@@ -30,57 +30,59 @@ const two = value => value.toFixed(2);
 const down = value => (Math.floor(value * 100 + 1e-6) / 100).toFixed(2);
 const percent = value => value > .995 ? say("percent.over", { n: 99 }) : value < .005 ? say("percent.under", { n: 1 }) : String(Math.ceil(value * 100 - 1e-6));
 
-export function placePanel(app, chosen) {
+/** Return the elements of the panel about the chosen place. */
+export function placePanel(page) {
+  const { chosen } = page.state;
   if (!chosen) return [make("p", {}, say("cell.none"))];
-  const head = placeHead(app, chosen);
+  const head = placeHead(page, chosen);
   if (!chosen.records.length) return [...head, make("p", { class: "nobody" }, say("cell.nobody"))];
   const kind = record => kindOf(record.basis, record.mu, record.lower, record.upper, record.slippery);
   const ordered = [...chosen.records].sort((a, b) => (b.sector === chosen.sector) - (a.sector === chosen.sector) || rankOf(kind(a)) - rankOf(kind(b)));
-  return [...head, ...ordered.map(record => one(app, chosen, numbers(record, app.settings), kind(record)))];
+  return [...head, ...ordered.map(record => one(page, chosen, numbers(record, page.settings), kind(record)))];
 }
 
 // Where it is: road, coordinates to copy, and the number of the cell.
-function placeHead(app, chosen) {
-  const [longitude, latitude] = app.degreesOf(chosen.middleX, chosen.middleY), where = coordinates(longitude, latitude), road = app.roadAt(longitude, latitude);
+function placeHead(page, chosen) {
+  const [longitude, latitude] = degreesOf(chosen.middleX, chosen.middleY), where = coordinates(longitude, latitude), road = page.state.roadAt(longitude, latitude);
   const copy = make("button", { type: "button", onclick: async e => { await navigator.clipboard?.writeText(`${latitude.toFixed(6)}, ${longitude.toFixed(6)}`); e.target.textContent = say("cell.copied"); } }, say("cell.copy"));
   return [make("h2", {}, road || say("tab.cell")), make("p", { class: "line place" }, make("span", { "data-value": "coordinates" }, where), copy)];
 }
 
-function one(app, chosen, cell, kind) {
-  const now = app.cells.at ?? app.live.now(), whole = cell.level === 21, limit = app.settings.colours.slippery;
+function one(page, chosen, cell, kind) {
+  const now = page.state.cells.at ?? page.live.now(), whole = cell.level === 21, limit = page.settings.colours.slippery;
   const list = make("dl", {}), line = (name, value, id) => list.append(make("dt", {}, name), make("dd", { "data-value": id }, value));
   line(say("cell.grip"), cell.mu === null ? say("cell.grip.bound", { lower: down(cell.lower) }) : say("cell.grip.value", { mu: two(cell.mu), lower: down(cell.lower), upper: two(cell.upper) }), "grip");
   if (cell.mu !== null) line(say("cell.slippery"), say("cell.slippery.value", { percent: percent(cell.slippery), limit }), "slippery");
   line(say("cell.basis"), say(`basis.${cell.basis}`), "basis");
-  const speeds = cell.basis === "measured" ? app.settings.sights_m.map(sight => say("cell.speed.value", { speed: Math.floor(3.6 * safeSpeed(cell.lower, sight, app.settings.reaction_s)), sight })) : [say("cell.speed.unknown")];
+  const speeds = cell.basis === "measured" ? page.settings.sights_m.map(sight => say("cell.speed.value", { speed: Math.floor(3.6 * safeSpeed(cell.lower, sight, page.settings.reaction_s)), sight })) : [say("cell.speed.unknown")];
   line(say("cell.speed"), speeds.join("; "), "speed");
   line(say("cell.vehicles"), cell.vehicles === 255 ? "255+" : String(cell.vehicles), "vehicles");
   line(say("cell.age"), say("cell.age.value", { ago: ago(now - cell.last), time: `${clock(cell.last)} ${zone(cell.last)}` }), "age");
-  for (const alert of alertsAt(app, chosen, whole ? HEADINGS[cell.sector] : null)) line(say("cell.alert"), say("cell.alert.value", { count: alert.vehicles, percent: certainty(alert.p_slippery) }), "alert");
+  for (const alert of alertsAt(page, chosen, whole ? HEADINGS[cell.sector] : null)) line(say("cell.alert"), say("cell.alert.value", { count: alert.vehicles, percent: certainty(alert.p_slippery) }), "alert");
   const past = make("div", { class: "history" });
   const section = make("section", { class: "heading", "data-sector": cell.sector },
     make("div", { class: "headline" }, make("span", { class: `swatch ${kind === 7 ? "hollow" : `k${kind}`}` }), make("h3", {}, `${say(`cell.headline.${kind}`)}, ${whole ? say("cell.heading", { heading: say(`heading.${cell.sector}`) }) : say("cell.square")}`)), list,
-    cell.basis === "measured" ? make("p", { class: "note" }, say("cell.speed.note", { reaction: app.settings.reaction_s })) : null,
+    cell.basis === "measured" ? make("p", { class: "note" }, say("cell.speed.note", { reaction: page.settings.reaction_s })) : null,
     make("figure", {}, density(cell, limit), make("figcaption", {}, say(cell.mu === null ? "cell.density.bound" : "cell.density"))), past);
-  if (whole) fillIn(app, chosen, cell, list, past);
+  if (whole) fillIn(page, chosen, cell, list, past);
   return section;
 }
 
 // Alerts of a place, and of a heading where one is named: what one direction found is not said of the other.
-const alertsAt = (app, { x, y }, heading) => app.cells.at !== null ? [] : app.alerts.filter(alert => {
+const alertsAt = (page, { x, y }, heading) => page.state.cells.at !== null ? [] : page.state.alerts.filter(alert => {
   if (heading !== null && !alert.headings.includes(heading)) return false;
-  const [west, south, east, north] = alert.bbox, at = app.degreesOf(x, y);
+  const [west, south, east, north] = alert.bbox, at = degreesOf(x, y);
   return west <= at[0] && at[0] <= east && south <= at[1] && at[1] <= north;
 });
 
 // What only the service and the archive know: exact counts, and how it was before.
-async function fillIn(app, chosen, cell, list, past) {
+async function fillIn(page, chosen, cell, list, past) {
   const name = `${cellOf(chosen.tile, chosen.local)}/${cell.sector}`;
-  if (app.cells.at === null) {
+  if (page.state.cells.at === null) {
     const answer = await fetch(`/cell/${name}`), told = answer.ok ? await answer.json() : null;
     if (told) list.append(make("dt", {}, say("cell.observations")), make("dd", { "data-value": "observations" }, String(told.observations)));
   }
   const answer = await fetch(`/history/${name}`), rows = answer.ok ? await answer.json() : [];
   past.append(make("h3", {}, say("cell.history")));
-  past.append(...(rows.length ? [history(rows, app.settings.colours.slippery), make("p", { class: "note" }, say("cell.history.label"))] : [make("p", {}, say("cell.history.none"))]));
+  past.append(...(rows.length ? [history(rows, page.settings.colours.slippery), make("p", { class: "note" }, say("cell.history.label"))] : [make("p", {}, say("cell.history.none"))]));
 }

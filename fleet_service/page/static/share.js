@@ -6,11 +6,11 @@ import { SIDES } from "./paint.js";
 import { say } from "./texts.js";
 
 // The hash of a link to what the page shows.
-export function linkTo(app) {
-  const { view, show, chosen } = app, words = new URLSearchParams(), state = {
-    x: view.x.toFixed(8), y: view.y.toFixed(8), zoom: view.zoom.toFixed(2), at: app.past?.at, compare: app.comparing ? app.pinned.at ?? "now" : null, tab: app.tab,
-    cell: chosen ? cellOf(chosen.tile, chosen.local) : null, passed: show.bounds ? null : "0", cells: show.roads ? null : "1", theme: app.theme, overlay: show.overlay, borrowed: show.borrowed,
-    recent: show.recent || null, sound: show.sound, route: app.route.map(point => point.map(v => v.toFixed(6)).join(",")).join("|"),
+export function linkTo(page) {
+  const { map: { view }, state: { show, chosen } } = page, words = new URLSearchParams(), state = {
+    x: view.x.toFixed(8), y: view.y.toFixed(8), zoom: view.zoom.toFixed(2), at: page.state.past?.at, compare: page.state.comparing ? page.state.pinned.at ?? "now" : null, tab: page.state.tab,
+    cell: chosen ? cellOf(chosen.tile, chosen.local) : null, passed: show.bounds ? null : "0", cells: show.roads ? null : "1", theme: page.state.theme, overlay: show.overlay, borrowed: show.borrowed,
+    recent: show.recent || null, sound: show.sound, route: page.state.route.map(point => point.map(v => v.toFixed(6)).join(",")).join("|"),
   };
   for (const [name, value] of Object.entries(state)) if (value !== null && value !== undefined && value !== "" && value !== false) words.set(name, value === true ? "1" : String(value));
   return `#${words}`;
@@ -18,28 +18,28 @@ export function linkTo(app) {
 
 export const fromHash = text => Object.fromEntries(new URLSearchParams(text.replace(/^#/, "")));
 
-export function sharePanel(app) {
+export function sharePanel(page) {
   const link = make("input", { type: "text", readonly: "", id: "link", value: location.href, "aria-label": say("share.link") });
   const copy = make("button", { type: "button", onclick: async e => {
     link.select();
     await navigator.clipboard?.writeText(link.value);
     e.target.textContent = say("share.copied");
   } }, say("share.copy"));
-  const save = (id, name, kind, write) => make("button", { type: "button", id, onclick: () => download(name, kind, write(seen(app))) }, say(`share.${id}`));
+  const save = (id, name, kind, write) => make("button", { type: "button", id, onclick: () => download(name, kind, write(seen(page))) }, say(`share.${id}`));
   return [make("h2", {}, say("share.head")), make("label", { class: "line", for: "link" }, say("share.link")), link,
     make("div", { class: "buttons" }, copy, save("geojson", "gripmap.geojson", "application/geo+json", geojson), save("csv", "gripmap.csv", "text/csv", csv), make("button", { type: "button", onclick: () => print() }, say("share.print"))),
     make("p", { class: "note" }, say("share.zoomed_out"))];
 }
 
 // The places in view as rows; what is a mere bound has no mu.
-function seen(app) {
-  const box = app.view.box, rows = [];
-  for (const tile of app.cells.tiles.values()) {
+function seen(page) {
+  const box = page.map.view.box, rows = [];
+  for (const tile of page.state.cells.tiles.values()) {
     const { rows: records, x, y, side } = tile.parts;
     for (let k = 0; k < records.count; k++) {
       if (x[k] > box.east || x[k] + side < box.west || y[k] > box.south || y[k] + side < box.north) continue;
       const raw = Object.fromEntries(["last", "mu", "lower", "upper", "slippery", "basis", "vehicles", "unknown"].map(name => [name, records[name][k]]));
-      const cell = numbers(raw, app.settings), level = tile.block.level;
+      const cell = numbers(raw, page.settings), level = tile.block.level;
       const corner = (cx, cy) => [longitudeOf(x[k] + cx * side), latitudeOf(y[k] + cy * side)], whole = level === 21;
       const sector = records.place[k] & 3, [ax, ay, bx, by] = SIDES[sector], middle = corner(.5, .5);
       const ring = whole ? [middle, corner(ax, ay), corner(bx, by), middle] : [[0, 1], [1, 1], [1, 0], [0, 0], [0, 1]].map(([cx, cy]) => corner(cx, cy));

@@ -4,7 +4,7 @@ import { say } from "./texts.js";
 
 const SILENT_MS = 6000, SLOW_MS = 800;  // until a page that is about to be shown says that it loads
 
-export function stateOf({ live, now, asked }) {
+export function stateOf({ live, state: { now }, map: { asked } }) {
   if (!asked) return performance.now() > SLOW_MS ? "loading" : null;
   if (!live.state) return now.known.size ? null : "loading";
   if (performance.now() - live.beaten > SILENT_MS) return "error";
@@ -13,8 +13,8 @@ export function stateOf({ live, now, asked }) {
   return live.state.served ? "empty" : "no_service";
 }
 
-export function stateCard(app) {
-  const state = stateOf(app), card = byId("card");
+export function stateCard(page) {
+  const state = stateOf(page), card = byId("card");
   if (card.dataset.state === (state ?? "")) return;
   card.dataset.state = document.body.dataset.state = state ?? "";
   card.hidden = !state;

@@ -1,18 +1,19 @@
 // The kept moments as a slider: its last place is now. The moment that is shown is always said.
 import { make } from "./elements.js";
+import { compareMoments, goToMoment } from "./moments.js";
 import { clock, say, zone } from "./texts.js";
 
 const PLAY_MS = 700;
 
 export class Timeline {
-  constructor(footer, app) {
-    this.app = app;
+  constructor(footer, page) {
+    this.page = page;
     this.moments = [];
     this.timer = null;
     this.slider = make("input", { type: "range", id: "slider", min: "0", max: "0", value: "0", "aria-label": say("time.label"), oninput: () => this.chosen() });
     this.shown = make("output", { id: "moment", for: "slider" });
     this.play = make("button", { type: "button", id: "play", onclick: () => this.timer ? this.stop() : this.start() }, say("time.play"));
-    this.compare = make("button", { type: "button", id: "compare", "aria-pressed": "false", onclick: () => app.compare(!app.comparing) }, say("time.compare"));
+    this.compare = make("button", { type: "button", id: "compare", "aria-pressed": "false", onclick: () => compareMoments(page, !page.state.comparing) }, say("time.compare"));
     this.none = make("span", { class: "note" }, say("time.none"));
     addEventListener("beforeprint", () => this.say(true));  // paper has no clock beside it
     addEventListener("afterprint", () => this.say());
@@ -41,21 +42,21 @@ export class Timeline {
   }
 
   say(printed = false) {
-    const stamp = at => `${clock(at)} ${zone(at)}`, now = printed ? say("time.printed", { moment: stamp(this.app.live.now()) }) : say("time.now");
+    const stamp = at => `${clock(at)} ${zone(at)}`, now = printed ? say("time.printed", { moment: stamp(this.page.live.now()) }) : say("time.now");
     const words = this.at === null ? now : say("time.shown", { moment: stamp(this.at) });
     this.shown.textContent = words;
     this.slider.setAttribute("aria-valuetext", words);
     const any = this.moments.length > 0;
     this.none.hidden = any;
-    this.none.textContent = say(this.app.settings.archive ? "time.none.archive" : "time.none");
+    this.none.textContent = say(this.page.settings.archive ? "time.none.archive" : "time.none");
     for (const one of [this.play, this.slider, this.compare]) Object.assign(one, { disabled: !any, hidden: !any });
-    this.compare.textContent = say(this.app.comparing ? "time.compare.stop" : "time.compare");
-    this.compare.setAttribute("aria-pressed", String(this.app.comparing));
+    this.compare.textContent = say(this.page.state.comparing ? "time.compare.stop" : "time.compare");
+    this.compare.setAttribute("aria-pressed", String(this.page.state.comparing));
   }
 
   chosen() {
     this.say();
-    return this.app.goToMoment(this.at);
+    return goToMoment(this.page, this.at);
   }
 
   start() {

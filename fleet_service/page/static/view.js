@@ -1,22 +1,31 @@
 // The window on the world: where it is, how large, and how mouse, fingers and keys move it.
 import { CELL_LEVEL, TILE_LEVEL, latitudeOf, longitudeOf } from "./grid.js";
 
+/** Place and zoom at which the view begins. */
+export const START = { x: .5, y: .35, zoom: 3 };
+
 const LEAST_ZOOM = 2, MOST_ZOOM = 21, TILE_PX = 256, TURN = 1.25, STEP_PX = 60, CONTROLS_PX = 56;
 
+/** Return the box that a window of a size [px] shows around a place, in parts of the world. */
+export function boxOf({ x, y, zoom, width, height }) {
+  const scale = TILE_PX * 2 ** zoom, w = width / 2 / scale, h = height / 2 / scale;
+  return { west: x - w, east: x + w, north: y - h, south: y + h };
+}
+
+/** Return the level of squares of four pixels or more; the finest level where those are cells. */
+export const levelOf = zoom => Math.max(TILE_LEVEL, Math.min(CELL_LEVEL, zoom >= 14.7 ? CELL_LEVEL : Math.floor(zoom) + 6));
+
+/** Window on the world. */
 export class View {
   constructor(canvas) {
-    Object.assign(this, { canvas, x: .5, y: .35, zoom: 3, gone: false, width: 1, height: 1, covered: 0, moved: () => {}, clicked: () => {} });
+    Object.assign(this, { canvas, ...START, gone: false, width: 1, height: 1, covered: 0, moved: () => {}, clicked: () => {} });
     this.fingers = new Map();
     this.listen();
   }
 
   get scale() { return TILE_PX * 2 ** this.zoom; }
-  get box() {
-    const w = this.width / 2 / this.scale, h = this.height / 2 / this.scale;
-    return { west: this.x - w, east: this.x + w, north: this.y - h, south: this.y + h };
-  }
-  // Squares of four pixels or more; the finest level where those are cells.
-  get level() { return Math.max(TILE_LEVEL, Math.min(CELL_LEVEL, this.zoom >= 14.7 ? CELL_LEVEL : Math.floor(this.zoom) + 6)); }
+  get box() { return boxOf(this); }
+  get level() { return levelOf(this.zoom); }
   degrees(pad = 0) {
     const b = this.box, w = (b.east - b.west) * pad, h = (b.south - b.north) * pad, bound = v => Math.min(1, Math.max(0, v));
     return [longitudeOf(bound(b.west - w)), latitudeOf(bound(b.south + h)), longitudeOf(bound(b.east + w)), latitudeOf(bound(b.north - h))];

@@ -26,7 +26,9 @@ def findings(seen: Opened, tabs: tuple[str, ...] = TABS) -> list[str] | None:
     seen.page.evaluate(f"() => {{ {source.read_text()} }}")
     found: list[str] = []
     for tab in tabs:
-        seen.page.evaluate("async tab => { gripmap.open(tab); await gripmap.panel() }", tab)
+        seen.page.evaluate(
+            "async tab => { gripmap.panels.open(tab); await gripmap.panels.refresh() }", tab
+        )
         violations: list[dict[str, Any]] = seen.page.evaluate(_RUN)
         found += [
             f"{tab}: {one['id']} ({one['impact']}): {one['help']}: {node['html'][:200]}"

@@ -135,7 +135,7 @@ def test_a_person_sees_the_file_below_the_map_without_any_network(
         open_page(address) as seen,
     ):
         seen.page.wait_for_selector(READY, state="attached")
-        go = "([x, y, zoom]) => gripmap.view.go(gripmap.view.x = x, gripmap.view.y = y, zoom)"
+        go = "([x, y, zoom]) => gripmap.map.view.go(x, y, zoom)"
         x, y = seen.page.evaluate(
             "([la, lo]) => [(lo + 180) / 360, (1 - Math.asinh(Math.tan(la * Math.PI / 180)) / "
             "Math.PI) / 2]",

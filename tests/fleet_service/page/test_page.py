@@ -66,7 +66,9 @@ def near(seen: Opened, cell: int, zoom: float = 18.0) -> None:
     """Zoom the page's map in on a cell, until its heading sectors are drawn separately."""
     latitude, longitude = (float(v) for v in grid.centre(cell))
     seen.page.evaluate(
-        "([x, y, z]) => { gripmap.goTo(x, y); gripmap.view.go(gripmap.view.x, gripmap.view.y, z) }",
+        "async ([x, y, z]) => { const { view } = gripmap.map;"
+        " const { goTo } = await import('/static/navigation.js');"
+        " goTo(gripmap, x, y); view.go(view.x, view.y, z) }",
         [longitude, latitude, zoom],
     )
 
@@ -171,7 +173,8 @@ def test_far_away_the_ice_is_still_what_is_seen(page: RunningPage, drive: Drive)
                 "document.body.dataset.kinds.split(',')[0] > 0",
             )
             waits(
-                seen, f"[...gripmap.now.tiles.values()].every(tile => tile.block.level === {level})"
+                seen,
+                f"[...gripmap.state.now.tiles.values()].every(one => one.block.level === {level})",
             )
         look(seen, "far")
 
@@ -218,7 +221,7 @@ def test_a_place_says_its_interval_basis_vehicles_and_safe_speed(
         assert seen.page.locator(".chart .density").count() == 2
         look(seen, "place")
         near(seen, cell_of("passed"))
-        waits(seen, f"gripmap.cells.at_place(...Object.values({_place('passed')})).length")
+        waits(seen, f"gripmap.state.cells.at_place(...Object.values({_place('passed')})).length")
         seen.page.locator("#map").click()
         waits(
             seen,
@@ -229,7 +232,7 @@ def test_a_place_says_its_interval_basis_vehicles_and_safe_speed(
         assert told["grip"].startswith("at least 0.")
         assert "slippery" not in told
         assert seen.page.locator(".chart .density").count() == 0
-        seen.page.evaluate("gripmap.choose(0, 0); gripmap.open('cell')")
+        seen.page.evaluate("gripmap.choose(0, 0); gripmap.panels.open('cell')")
         assert (
             seen.page.locator("#panel .nobody").inner_text()
             == "No vehicle was here: the grip is unknown."
@@ -256,8 +259,8 @@ def test_what_happens_is_pushed_and_an_alert_appears_with_its_reason(
         assert re.search(r"Ice, eastbound and westbound, at [\d.]+° N", said)
         assert re.search(r"\d+ % sure that it is slippery", said)
         assert " vehicles" in said
-        assert not seen.page.evaluate("gripmap.show.sound"), "off unless it was asked for"
-        seen.page.evaluate("gripmap.view.go(.1, .1, 5)")
+        assert not seen.page.evaluate("gripmap.state.show.sound"), "off unless it was asked for"
+        seen.page.evaluate("gripmap.map.view.go(.1, .1, 5)")
         seen.page.get_by_role("button", name="show on the map").click()
         waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
         look(seen, "alerts")
@@ -360,7 +363,7 @@ def test_a_route_is_clicked_or_dropped_and_tells_what_is_unknown(
 
 
 _FITTED: Final = """(() => {
-  const { view, now } = gripmap, extent = now.extent;
+  const { map: { view }, state: { now } } = gripmap, extent = now.extent;
   const held = [...now.known].every(tile => now.tiles.has(tile));
   if (!extent || !held) return false;
   const wide = (extent.east - extent.west) * view.scale / view.width;
@@ -381,11 +384,12 @@ def test_a_link_holds_the_whole_state(page: RunningPage, drive: Drive) -> None:
         seen.page.locator("#tab-share").click()
         link = seen.page.locator("#link").input_value()
     with open_map(page, link.removeprefix(page.address)) as again:
-        waits(again, "gripmap.chosen")
+        waits(again, "gripmap.state.chosen")
         state: dict[str, Any] = again.page.evaluate(
-            "({ x: gripmap.view.x, zoom: gripmap.view.zoom, tab: gripmap.tab, bounds: "
-            "gripmap.show.bounds,"
-            " cell: gripmap.chosen.tile * 16384 + gripmap.chosen.local })"
+            "({ x: gripmap.map.view.x, zoom: gripmap.map.view.zoom, tab: gripmap.state.tab,"
+            " bounds: "
+            "gripmap.state.show.bounds,"
+            " cell: gripmap.state.chosen.tile * 16384 + gripmap.state.chosen.local })"
         )
         assert state["cell"] == cell_of("ice")
         assert (state["zoom"], state["tab"], state["bounds"]) == (18.5, "share", False)
@@ -437,7 +441,7 @@ def test_keys_alone_are_enough(page: RunningPage, drive: Drive) -> None:
         waits(seen, "document.querySelector('[data-value=basis]')?.textContent === 'measured'")
         seen.page.locator("#tab-cell").focus()
         seen.page.keyboard.press("ArrowRight")
-        assert seen.page.evaluate("gripmap.tab") == "alerts"
+        assert seen.page.evaluate("gripmap.state.tab") == "alerts"
 
 
 def test_a_phone_shows_map_and_words_without_scrolling_sideways(
@@ -448,7 +452,7 @@ def test_a_phone_shows_map_and_words_without_scrolling_sideways(
         near(seen, cell_of("ice"), 17)
         waits(seen, "document.body.dataset.kinds.split(',')[0] > 0")
         size = seen.page.evaluate(
-            "[document.documentElement.scrollWidth, innerWidth, gripmap.view.height]"
+            "[document.documentElement.scrollWidth, innerWidth, gripmap.map.view.height]"
         )
         assert size[0] <= size[1]
         assert size[2] > 200

@@ -101,7 +101,7 @@ def test_a_sound_is_heard_of_a_new_alert_only_where_it_was_asked_for(
         for one in (seen.page, silent):
             one.evaluate(_HEARD)
             # called before the loop goes on
-            until(lambda: one.evaluate("gripmap.heardAlerts"))  # noqa: B023
+            until(lambda: one.evaluate("gripmap.state.hasAlerts"))  # noqa: B023
         seen.page.locator("#tab-alerts").click()
         assert not seen.page.locator("#sound").is_checked()
         seen.page.locator("#sound").check()
@@ -153,7 +153,7 @@ def test_a_dropped_gpx_is_a_route(page: RunningPage, drive: Drive) -> None:
         gpx = f'<gpx xmlns="http://www.topografix.com/GPX/1/1"><rte>{points}</rte></gpx>'
         assert seen.page.evaluate(_DROP, gpx), "the browser does not open it instead"
         waits(seen, "document.getElementById('route-share')")
-        assert seen.page.evaluate("gripmap.tab") == "route"
+        assert seen.page.evaluate("gripmap.state.tab") == "route"
         assert "km/h with 50 m of sight" in seen.page.locator("#route-worst").inner_text()
 
 
@@ -168,8 +168,8 @@ def test_on_a_wall_screen_everything_is_larger_and_the_map_fills_it(
         waits(seen, f"document.getElementById('map').width > {WALL['width'] // 2}")
         size = seen.page.evaluate(
             "[document.documentElement.scrollWidth, document.documentElement.scrollHeight, "
-            "gripmap.view.width,"
-            " gripmap.view.height, parseFloat(getComputedStyle(document.body).fontSize)]"
+            "gripmap.map.view.width,"
+            " gripmap.map.view.height, parseFloat(getComputedStyle(document.body).fontSize)]"
         )
         assert size[0] <= WALL["width"]
         assert size[1] <= WALL["height"]
@@ -237,10 +237,10 @@ def test_map_of_two_continents_opens_on_one_of_them(
     until(lambda: page.service and page.service.service.engine.counts[Kind.OBSERVATION] > before)
     with open_map(page) as seen:
         waits(seen, "document.querySelectorAll('#panel .area').length === 2")
-        assert seen.page.evaluate("gripmap.view.zoom") > 14
+        assert seen.page.evaluate("gripmap.map.view.zoom") > 14
         assert sum(kinds(seen)) == street.count_known("ice", "dry")
         seen.page.locator("#panel .area").nth(1).click()
-        waits(seen, "Math.abs(gripmap.degreesOf(gripmap.view.x, gripmap.view.y)[0] + 122.42) < .1")
+        waits(seen, "Math.abs(gripmap.map.view.x * 360 - 180 + 122.42) < .1")
 
 
 def test_page_opened_on_an_empty_map_shows_the_first_cells_large(
@@ -248,10 +248,10 @@ def test_page_opened_on_an_empty_map_shows_the_first_cells_large(
 ) -> None:
     with open_map(page) as seen:
         waits(seen, "document.getElementById('card').dataset.state === 'empty'")
-        assert seen.page.evaluate("gripmap.view.zoom") < 5
+        assert seen.page.evaluate("gripmap.map.view.zoom") < 5
         drive("ice", "dry")
         waits(seen, f"document.body.dataset.drawn === '{street.count_known('ice', 'dry')}'")
-        assert seen.page.evaluate("gripmap.view.zoom") > 14
+        assert seen.page.evaluate("gripmap.map.view.zoom") > 14
 
 
 def test_page_exports_triangles_with_columns_of_the_service(
@@ -286,7 +286,7 @@ def test_page_starts_before_the_archive_of_its_service(
 
 def test_unvisited_place_has_words_without_a_bar(page: RunningPage) -> None:
     with open_map(page) as seen:
-        seen.page.evaluate("gripmap.choose(0, 0); gripmap.open('cell')")
+        seen.page.evaluate("gripmap.choose(0, 0); gripmap.panels.open('cell')")
         waits(seen, "document.querySelector('#panel .nobody')")
         ground = seen.page.evaluate(
             "getComputedStyle(document.querySelector('#panel .nobody')).backgroundColor"
@@ -297,8 +297,11 @@ def test_unvisited_place_has_words_without_a_bar(page: RunningPage) -> None:
 def test_whole_map_twice_is_the_same_view(page: RunningPage, drive: Drive) -> None:
     drive()
     with open_map(page) as seen:
-        seen.page.evaluate("for (let k = 0; k < 4; k++) gripmap.view.turn(.5)")
-        view = "[gripmap.view.zoom, gripmap.view.x, gripmap.view.y]"
-        both = f"async () => {{ await gripmap.all(); const one = {view}; "
-        views = seen.page.evaluate(f"{both} await gripmap.all(); return [one, {view}]; }}")
+        seen.page.evaluate("for (let k = 0; k < 4; k++) gripmap.map.view.turn(.5)")
+        view = "[gripmap.map.view.zoom, gripmap.map.view.x, gripmap.map.view.y]"
+        views = seen.page.evaluate(
+            "async () => { const { showAll } = await import('/static/navigation.js'); "
+            f"await showAll(gripmap); const one = {view}; "
+            f"await showAll(gripmap); return [one, {view}]; }}"
+        )
         assert views[0] == pytest.approx(views[1], abs=1e-6)

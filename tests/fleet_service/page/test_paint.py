@@ -94,7 +94,7 @@ def test_a_guess_is_framed_by_a_thin_line_whatever_was_painted_before(
             seen, f"document.body.dataset.kinds?.split(',')[{ICE}] >= {street.count_known('ice')}"
         )
         assert seen.page.evaluate(
-            "[...gripmap.now.tiles.values()].some(tile => tile.block.version > 1)"
+            "[...gripmap.state.now.tiles.values()].some(tile => tile.block.version > 1)"
         )
         seen.page.evaluate(
             "() => { globalThis.dashed = []; const real = "
@@ -122,29 +122,30 @@ def test_a_route_hides_no_cell(page: RunningPage, drive: Drive) -> None:
             near(seen, cell_of("ice", 2), zoom)
             waits(
                 seen,
-                f"document.body.dataset.alerts === '1' && gripmap.view.zoom === {zoom} && "
-                "!gripmap.frame",
+                f"document.body.dataset.alerts === '1' && gripmap.map.view.zoom === {zoom} && "
+                "!gripmap.map.frame",
             )
             before = seen.page.evaluate(_POINTS, ice)
             seen.page.evaluate(
-                "async ends => { await gripmap.setRoute(ends); gripmap.alerts = []; "
-                "gripmap.drawNow() }",
+                "async ends => { const { setRoute } = await import('/static/route.js'); "
+                "await setRoute(gripmap, ends); gripmap.state.alerts = []; "
+                "gripmap.map.drawNow() }",
                 ends,
             )
             dots = 2 * 100  # at its ends
             assert seen.page.evaluate(_POINTS, ice) >= before - dots, zoom
             assert seen.page.evaluate(_COLOURED) > before
             look(seen, f"route_{zoom:g}")
-            seen.page.evaluate("gripmap.setRoute([]); gripmap.drawNow()")
+            seen.page.evaluate("gripmap.state.route = []; gripmap.map.drawNow()")
 
 
 def test_before_any_service_spoke_the_world_is_hatched_and_not_empty(bare: str) -> None:
     with open_page(bare) as seen:
         seen.page.wait_for_selector(READY, state="attached")
-        waits(seen, "gripmap.live.state && !gripmap.frame")
+        waits(seen, "gripmap.live.state && !gripmap.map.frame")
         waits(seen, f"({_ALL})() > 10000")
         assert seen.page.locator("#live").inner_text() == "○ no update yet"
-        seen.page.evaluate("gripmap.panel()")
+        seen.page.evaluate("gripmap.panels.refresh()")
         assert "No service answers, so nothing is known" in seen.page.locator("#panel").inner_text()
         assert not seen.page.locator("#play").is_visible(), "there is no past to play"
 
@@ -155,7 +156,7 @@ def test_what_one_direction_found_is_not_said_of_the_other(page: RunningPage, dr
         near(seen, cell_of("ice"))
         waits(seen, "document.body.dataset.alerts === '1'")
         waits(seen, f"document.body.dataset.kinds.split(',')[{ICE}] == {street.count_known('ice')}")
-        seen.page.evaluate("gripmap.alerts[0].headings = ['west']")
+        seen.page.evaluate("gripmap.state.alerts[0].headings = ['west']")
         seen.page.locator("#map").click()
         waits(seen, "document.querySelectorAll('.heading').length === 2")
         found: dict[str, int] = seen.page.evaluate(

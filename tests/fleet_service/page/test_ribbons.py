@@ -27,17 +27,17 @@ STREET: Final = "Main Street"
 _DRAWN: Final = "document.body.dataset.kinds?.split(',')[{kind}] == {count}"
 # Screen position of the middle of a drawn ribbon of one kind, on a lane to the east.
 _RIBBON: Final = """kind => {
-  const { roads, view } = gripmap;
+  const { state: { roads }, map: { view } } = gripmap;
   for (const lane of roads.lanes) {
     const i = lane.kind.indexOf(kind);
     if (i < 0 || lane.x[i + 1] <= lane.x[i]) continue;
-    const off = view.width ? gripmap.asRoads : 0;
+    const off = view.width ? gripmap.map.asRoads : 0;
     const x = (lane.x[i] + lane.x[i + 1]) / 2, y = (lane.y[i] + lane.y[i + 1]) / 2;
     return [view.left(x), view.top(y), off];
   }
 }"""
 _UNDER: Final = """kind => {
-  const { roads, alerts } = gripmap, found = alerts.flatMap(alert => roads.under(alert));
+  const { roads, alerts } = gripmap.state, found = alerts.flatMap(alert => roads.under(alert));
   return roads.lanes.flatMap(lane => [...lane.kind.keys()].filter(i => lane.kind[i] === kind)
     .map(i => found.some(one => one.lane === lane && one.first - 2 <= i && i <= one.end + 1)));
 }"""
@@ -109,7 +109,7 @@ def test_overview_names_slippery_stretches_and_the_unknown_share(
         assert 98 <= sum(percent.values()) <= 102
         assert percent["unknown"] > 0, "the passed part"
         assert percent["never"] > 0, "the ends of the road"
-        seen.page.evaluate("gripmap.alerts = []; gripmap.panel()")
+        seen.page.evaluate("gripmap.state.alerts = []; gripmap.panels.refresh()")
         waits(seen, "document.querySelectorAll('.stretch').length >= 2")
         words = seen.page.locator(".stretch").first.inner_text()
         assert re.search(
@@ -119,7 +119,7 @@ def test_overview_names_slippery_stretches_and_the_unknown_share(
         )
         look(seen, "overview")
         seen.page.locator(".stretch").first.click()
-        waits(seen, "gripmap.tab === 'cell' && document.querySelector('[data-value=basis]')")
+        waits(seen, "gripmap.state.tab === 'cell' && document.querySelector('[data-value=basis]')")
         assert seen.page.locator(".heading h3").first.inner_text().startswith("Ice")
 
 
@@ -128,9 +128,10 @@ def test_time_bar_and_key_cover_no_cell_of_the_whole_map(page: RunningPage, driv
     with open_map(page) as seen:
         waits(seen, "document.body.dataset.alerts === '1'")
         seen.page.locator("#controls button").last.click()
-        waits(seen, "!gripmap.frame")
+        waits(seen, "!gripmap.map.frame")
         found: list[Any] = seen.page.evaluate(
-            "(() => { const { view, now } = gripmap, { south, east } = now.extent;"
+            "(() => { const { map: { view }, state } = gripmap;"
+            " const { south, east } = state.now.extent;"
             " return [view.top(south), document.getElementById('foot').offsetTop, view.left(east),"
             " document.getElementById('controls').offsetLeft] })()"
         )
@@ -144,7 +145,7 @@ def test_paper_takes_the_whole_picture_of_the_screen(page: RunningPage, drive: D
         size = "(map => [map.width, map.height])(document.getElementById('map'))"
         before = seen.page.evaluate(size)
         seen.page.emulate_media(media="print")
-        seen.page.evaluate("gripmap.resize()")
+        seen.page.evaluate("gripmap.map.resize()")
         assert seen.page.evaluate(size) == before
         fit = "getComputedStyle(document.getElementById('map')).objectFit"
         assert seen.page.evaluate(fit) == "contain", "neither cut nor stretched"

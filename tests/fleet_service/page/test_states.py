@@ -26,6 +26,12 @@ LAPTOP: Final[Any] = {"width": 1366, "height": 768}
 _ICE_DRAWN: Final = f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}"
 
 
+# Number of buttons at the first picture that a page draws.
+_FIRST_PICTURE: Final = """document.addEventListener("DOMContentLoaded", () => new MutationObserver(
+  () => { globalThis.buttonsBefore ??= document.getElementById("controls").childElementCount; }
+).observe(document.body, { attributeFilter: ["data-drawn"] }))"""
+
+
 def keep_picture(seen: Opened, name: str) -> Path:
     """Store a picture of the page in a state, and return its path."""
     FOLDER.mkdir(parents=True, exist_ok=True)
@@ -66,7 +72,7 @@ def test_map_without_a_service_says_so_and_is_hatched(bare: str) -> None:
     with open_page(bare) as seen:
         seen.page.wait_for_selector(READY, state="attached")
         assert "No fleet service answers" in card(seen, "no_service")
-        assert seen.page.evaluate("gripmap.away.length") > 0
+        assert seen.page.evaluate("gripmap.state.away.length") > 0
         keep_picture(seen, "no-service")
 
 
@@ -86,6 +92,33 @@ def test_slow_map_says_that_it_loads(page: RunningPage, drive: Drive) -> None:
         seen.page.unroute("**/blocks*")
         seen.page.wait_for_selector(READY, state="attached")
         waits(seen, "document.getElementById('card').hidden")
+
+
+def test_link_is_drawn_before_there_are_buttons(page: RunningPage, drive: Drive) -> None:
+    """The buttons wait for the first picture of a link, but not if its cells take long."""
+    drive("ice")
+    with open_map(page) as seen:
+        show_ice(seen)
+        link: str = seen.page.evaluate(
+            "new Promise(done => setTimeout(() => done(location.href), 300))"
+        )
+    with open_page("about:blank") as seen:
+        seen.page.add_init_script(_FIRST_PICTURE)
+        seen.page.goto(link)
+        seen.page.wait_for_selector(READY, state="attached")
+        waits(seen, _ICE_DRAWN)
+        assert seen.page.evaluate("buttonsBefore") == 0
+        blocks = [url for url in seen.requests if "/blocks" in url]
+        assert seen.requests.index(blocks[0]) < seen.requests.index(f"{page.address}moments")
+    with open_page("about:blank") as seen:
+        held = list[Any]()
+        seen.page.route("**/blocks*", lambda route: held.append(route))
+        seen.page.goto(link)
+        seen.page.wait_for_selector("#tab-alerts")
+        for one in held:
+            one.continue_()
+        seen.page.unroute("**/blocks*")
+        waits(seen, _ICE_DRAWN)
 
 
 def test_map_of_a_silent_server_is_called_stale(page: RunningPage, drive: Drive) -> None:
