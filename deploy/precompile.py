@@ -20,6 +20,7 @@ from typing import Final
 from edge_agent import known_estimators
 
 SERVICE: Final = "from fleet_service.app.precompile import warm_up; warm_up()"
+LIBRARY: Final = "from edge_agent.app.native_library import use_agent_library; use_agent_library()"
 AGENT: Final = "import sys; from edge_agent.cli import main; sys.exit(main())"
 DRIVE: Final = (
     "straight",
@@ -55,6 +56,8 @@ def main(words: list[str]) -> int:
         ]
         for done in (*service, *replays):
             lines += done.result()
+        if not papers:
+            lines += _run_process(folder, LIBRARY)  # of the kernels that the replay has compiled
     print(f"compiled in {time.monotonic() - began:.0f} s", *lines, sep="\n", flush=True)
     return 0
 

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 import pyarrow as pa
 
-from schemas import grid, mugrid
+from schemas import message_columns, mugrid
 from schemas.signals import CONTEXT_UNITS, UNITS, per_wheel
 from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU
 
@@ -43,129 +43,24 @@ I8 = pa.int8()
 I32 = pa.int32()
 I64 = pa.int64()
 
-# 2^-23 degrees of latitude are 13 mm
-_MU_STEP = 2.0**-10
-_DEGREE_STEP = 2.0**-23
-_RADIAN_STEP = 2.0**-9
-_SPEED_STEP = 2.0**-6
-_MU_RANGE: Final = (0.0, 2.0)  # 2 is more than a road tyre reaches on any road
-_SPEED_RANGE: Final = (-100.0, 100.0)
-_MAX_I32: Final = 2**31 - 1
+_ARROW: Final = {
+    message_columns.TIME: NS,
+    message_columns.LIKELIHOOD: LIKELIHOOD,
+    message_columns.F32: F32,
+    message_columns.F64: F64,
+    message_columns.I8: I8,
+    message_columns.I32: I32,
+    message_columns.I64: I64,
+}
 
-_MU = (
-    Field("mu", F32, "-", "peak adhesion coefficient, median; NaN if unknown", _MU_STEP, _MU_RANGE),
-    Field("mu_lower", F32, "-", "5 % quantile of mu", _MU_STEP, _MU_RANGE),
-    Field("mu_upper", F32, "-", "95 % quantile of mu", _MU_STEP, _MU_RANGE),
-)
-_POSE = (
-    Field("latitude", F64, "deg", "WGS 84", _DEGREE_STEP, (-grid.MAX_LATITUDE, grid.MAX_LATITUDE)),
-    Field("longitude", F64, "deg", "WGS 84", _DEGREE_STEP, (-180.0, 180.0)),
-    Field(
-        "position_std",
-        F32,
-        "m",
-        "standard deviation of the position, each axis",
-        2.0**-5,
-        (0.0, 100.0),
-    ),
-    Field("yaw", F32, "rad", "counter-clockwise from east", _RADIAN_STEP, (-1000.0, 1000.0)),
-)
 
-# One visit of one vehicle to one cell.
-OBSERVATION: Final = (
-    Field("enter_time", NS, "ns since 1970, UTC", "time of the first sample in the cell"),
-    Field("leave_time", NS, "ns since 1970, UTC", "time of the last sample in the cell"),
-    Field("cell", I64, "quadint z21", "map cell, about 19 m wide at the equator"),
-    Field(
-        "sector",
-        I8,
-        "0 east, 1 north, 2 west, 3 south",
-        "heading sector of the vehicle",
-        range=(0, grid.SECTORS - 1),
-    ),
-    *_POSE,
-    Field("yaw_std", F32, "rad", "standard deviation of yaw", 2.0**-12, (0.0, 10.0)),
-    Field("speed", F32, "m/s", "mean speed over the visit", _SPEED_STEP, (0.0, 100.0)),
-    *_MU,
-    Field(
-        "mu_utilised",
-        F32,
-        "-",
-        "largest grip that any wheel used in the visit; mu is at least this",
-        _MU_STEP,
-        _MU_RANGE,
-    ),
-    Field(
-        "log_likelihood",
-        LIKELIHOOD,
-        "1/16 nat below the maximum",
-        "log p(measurements | mu) on the 32 bins of the friction grid; absent if not sent",
-    ),
-    Field("health", I32, "flags", "bits of schemas.signals.Health", range=(0, _MAX_I32)),
-    Field(
-        "tyre_season",
-        I8,
-        "0 unknown, 1 summer, 2 winter, 3 all-season",
-        "season of the vehicle's tyres",
-        range=(0, 3),
-    ),
-    Field("air_temperature", F32, "degC", "outside; NaN if not measured", 2.0**-4, (-90.0, 80.0)),
-    Field(
-        "abs_active", I8, "-1 unknown, 0 no, 1 yes", "anti-lock braking intervened", range=(-1, 1)
-    ),
-    Field(
-        "used_longitudinal",
-        F32,
-        "-",
-        "longitudinal part of mu_utilised, positive when driving; NaN if unknown",
-        _MU_STEP,
-        (-2.0, 2.0),
-    ),
-    Field(
-        "used_lateral",
-        F32,
-        "-",
-        "lateral part of mu_utilised, positive to the left; NaN if unknown",
-        _MU_STEP,
-        (-2.0, 2.0),
-    ),
-    Field(
-        "esc_active", I8, "-1 unknown, 0 no, 1 yes", "stability control intervened", range=(-1, 1)
-    ),
-    Field(
-        "tcs_active", I8, "-1 unknown, 0 no, 1 yes", "traction control intervened", range=(-1, 1)
-    ),
-    Field(
-        "wiper",
-        F32,
-        "0 off … 1 continuous",
-        "front wipers, mean over the visit; NaN if unknown",
-        2.0**-6,
-        (0.0, 1.0),
-    ),
-)
+def _make_field(column: message_columns.MessageColumn) -> Field:
+    """Return the column of a table that holds a column of a message."""
+    return Field(**column._asdict() | {"type": _ARROW[column.type]})
 
-# Position and motion of a vehicle.
-STATE: Final = (
-    Field("time", NS, "ns since 1970, UTC", "time of the sample"),
-    *_POSE,
-    Field(
-        "vx", F32, "m/s", "longitudinal speed at the centre of gravity", _SPEED_STEP, _SPEED_RANGE
-    ),
-    Field("vy", F32, "m/s", "lateral speed at the centre of gravity", _SPEED_STEP, _SPEED_RANGE),
-    Field("yaw_rate", F32, "rad/s", "positive to the left", 2.0**-12, (-20.0, 20.0)),
-    Field("sideslip", F32, "rad", "atan2(vy, vx)", 2.0**-12, (-4.0, 4.0)),
-    *_MU,
-    Field("health", I32, "flags", "bits of schemas.signals.Health", range=(0, _MAX_I32)),
-    Field(
-        "p_slippery",
-        F32,
-        "-",
-        f"P(mu < {SLIPPERY_MU}); NaN if unknown",
-        2.0**-10,
-        (0.0, 1.0),
-    ),
-)
+
+OBSERVATION: Final = tuple(_make_field(column) for column in message_columns.OBSERVATION)
+STATE: Final = tuple(_make_field(column) for column in message_columns.STATE)
 
 # Origin of a row: the identity of its batch. In the archive the vehicle is a keyed hash.
 IDENTITY: Final = (

@@ -162,6 +162,7 @@ PURE_SCHEMAS = {
     "numeric",
     "runtime.jit",
     "runtime.lanes",
+    "runtime.prefetch",
     "runtime.records",
     "signals",
     "stopping",

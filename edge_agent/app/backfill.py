@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.app.estimates_file import EstimatesFile, prepare_path
+from edge_agent.app.estimates_file import EstimatesFile
 from edge_agent.app.estimator_factory import bank_of
+from edge_agent.app.output_path import prepare_path
 from edge_agent.inputs.doctor.adopt import prepare_log
 from edge_agent.inputs.signal_log import read_log
 from schemas.errors import InputError

@@ -4,7 +4,6 @@ sample.
 
 from __future__ import annotations
 
-import os
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +15,7 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
 from edge_agent.app.mcap_file import McapTableWriter
+from edge_agent.app.output_path import prepare_path
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.runtime.durable import open_durably
@@ -34,30 +34,6 @@ ENDINGS: Final[dict[str, Any]] = {
 WHEEL_COLUMNS = tuple(
     f"{wheel}{end}" for wheel in per_wheel("mu") for end in ("", "_lower", "_upper")
 )
-
-
-def prepare_path(field: str, path: Path) -> Path:
-    """Create the folder in which the file `path` will lie, and return the path.
-
-    Raises:
-        InputError: the path is a folder, or its folder cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        reason = (
-            "is a folder"
-            if path.is_dir()
-            else ""
-            if os.access(path.parent, os.W_OK)
-            else "no permission"
-        )
-    except OSError as error:
-        reason = error.strerror or str(error)
-    if reason:
-        raise InputError(
-            field, f"cannot write {path} ({reason})", "name a file in a writable folder"
-        )
-    return path
 
 
 def write_table(field: str, path: Path, table: pa.Table) -> None:

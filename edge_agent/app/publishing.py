@@ -37,7 +37,7 @@ def open_publisher(
     Raises:
         InputError: Zenoh rejects its settings, or the outbox is in use or unusable.
     """
-    from edge_agent.app.estimates_file import prepare_path
+    from edge_agent.app.output_path import prepare_path
     from edge_agent.publish.outbox import Outbox
     from edge_agent.publish.publisher import Publisher
     from schemas.runtime.zenoh_session import configuration

@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Learn a calibration, validate it on held-out drives, and write the vehicle file; return 0."""
-    from edge_agent.app.estimates_file import prepare_path
+    from edge_agent.app.output_path import prepare_path
     from edge_agent.calibration.held_out import learn_validated
     from edge_agent.inputs.correct import scale_axles
     from edge_agent.inputs.doctor.findings import diagnose

@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     unknown.
     """
     from edge_agent.app.backfill import vehicle_file_of
-    from edge_agent.app.estimates_file import prepare_path
+    from edge_agent.app.output_path import prepare_path
     from edge_agent.inputs.bring_in import profile_of
     from edge_agent.inputs.doctor.findings import diagnose
     from edge_agent.inputs.doctor.fix import apply_findings, list_corrections

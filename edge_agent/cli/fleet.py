@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from edge_agent.ahead.lookout import Lookout
     from edge_agent.app.agent import Agent, AgentOptions, AgentSource
-    from edge_agent.app.estimates_file import prepare_path
+    from edge_agent.app.output_path import prepare_path
     from edge_agent.cli.live import LookoutPart, warm_up_simulation, warning_lines
     from edge_agent.lab.simulation import SimulatedFleet
     from edge_agent.lab.simulation.blocks import blocks

@@ -47,12 +47,13 @@ def run(args: argparse.Namespace) -> int:
     """Import the recordings into a signal log, write a draft profile, or list the profiles; return
     0.
     """
-    from edge_agent.app.estimates_file import prepare_path
-    from edge_agent.inputs.bring_in import database_of, read_source, write_log
+    from edge_agent.app.output_path import prepare_path
+    from edge_agent.inputs.bring_in import read_source, write_log
     from edge_agent.inputs.doctor.adopt import align_import
     from edge_agent.inputs.merge import merge_recordings
     from edge_agent.inputs.names import draft_profile
     from edge_agent.inputs.profile import load_profile, shipped_profiles
+    from edge_agent.inputs.readers.dbc import database_of
     from schemas.errors import InputError
     from schemas.vehicle import load_vehicle
 

@@ -7,17 +7,20 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 import zenoh
 
-from edge_agent.ahead.lookout import Lookout
 from edge_agent.ahead.path import Pose
 from edge_agent.observe.pipeline import Pipeline
 from edge_agent.publish.vss import RoadFrictionOutput
 from schemas.config import AgentConfig
 from schemas.runtime import progress_messages
 from schemas.runtime.process import LogLine, line_logger
-from schemas.wire.ahead import GripWarning
+
+if TYPE_CHECKING:
+    from edge_agent.ahead.lookout import Lookout
+    from schemas.wire.ahead import GripWarning
 
 
 def warm_up_simulation(scenario: str, rate_hz: float, rough: float = 0.0) -> None:

@@ -184,9 +184,9 @@ def _write_report(
     import pyarrow as pa
 
     from edge_agent.app import drive_report
-    from edge_agent.app.estimates_file import prepare_path
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.app.library import to_table
+    from edge_agent.app.output_path import prepare_path
 
     prepare_path("out", args.out)
     found = {}

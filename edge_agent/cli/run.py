@@ -94,6 +94,9 @@ def run(args: argparse.Namespace) -> int:
     arrives; return the exit code.
     """
     with progress_messages.show_status("loading"):
+        from edge_agent.app.native_library import use_agent_library
+
+        use_agent_library()
         from edge_agent.app.agent import Agent, AgentSource
         from edge_agent.cli.common import checked_name
         from edge_agent.inputs.live.sources import KINDS, is_live

@@ -54,7 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate a manoeuvre and write its log, or list the manoeuvres; return 0."""
-    from edge_agent.app.estimates_file import prepare_path, write_table
+    from edge_agent.app.estimates_file import write_table
+    from edge_agent.app.output_path import prepare_path
     from edge_agent.lab.simulation import MANOEUVRES, DriveSetup, Fault, simulate_manoeuvre
     from schemas.errors import InputError
 

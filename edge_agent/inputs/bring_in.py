@@ -15,9 +15,9 @@ import pyarrow.parquet as pq
 
 from edge_agent.inputs.memory import bounded_memory
 from edge_agent.inputs.merge import Merged
-from edge_agent.inputs.profile import FOLDER, Channel, Profile
+from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.inputs.readers import can_log, can_text, gnss, mdf, racelogic, rosbag, tabular
-from edge_agent.inputs.readers.dbc import Database, read_dbc
+from edge_agent.inputs.readers.dbc import Database
 from edge_agent.inputs.recording import Recording, foreign_errors
 from schemas.errors import InputError
 from schemas.signals import CHANNELS, CONTEXT
@@ -118,20 +118,6 @@ def _decode_frames(
     )
     with foreign_errors(path, "CAN log"):
         return can_log.decode_log(frames, path.name, database, wanted, buses)
-
-
-def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Database | None:
-    """Return the CAN database at the path `given` on the command line; without this path, the
-    profile's database; else None.
-    """
-    if given is not None:
-        return read_dbc(given)
-    if profile is None or profile.dbc is None:
-        return None
-    beside = folder / profile.dbc
-    return read_dbc(
-        beside if beside.exists() or not (FOLDER / profile.dbc).exists() else FOLDER / profile.dbc
-    )
 
 
 def profile_of(log: Path) -> Profile:

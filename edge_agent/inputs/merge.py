@@ -19,9 +19,9 @@ from typing import Final
 import numpy as np
 
 from edge_agent.inputs.context import context_values, held_readings
+from edge_agent.inputs.log_columns import GROUND
 from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.inputs.recording import Recording, Series
-from edge_agent.inputs.signal_log import GROUND
 from edge_agent.inputs.units import QUANTITY, ZEROS, to_si, unit_of_channel
 from schemas.errors import InputError
 from schemas.numeric import FloatArray

@@ -11,7 +11,7 @@ go backwards.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -23,15 +23,18 @@ import pyarrow.parquet as pq
 
 from edge_agent.inputs.block import Block, to_utc_ns
 from edge_agent.inputs.context import context_values
+from edge_agent.inputs.log_columns import (
+    FRONT_STEERING,
+    GROUND,
+    NEEDED,
+    REAR_STEERING,
+    fill_steering,
+)
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
-from schemas.signals import CHANNELS, CONTEXT, S, per_wheel
+from schemas.signals import CHANNELS, CONTEXT
 from schemas.thresholds import NS
 
-GROUND: Final = "gnss_speed"  # beside the channels; only the signal doctor reads it
-NEEDED: Final = ("ax", "ay", "yaw_rate", *per_wheel("omega"))
-FRONT_STEERING: Final = per_wheel("delta")[:2]
-REAR_STEERING: Final = per_wheel("delta")[2:]
 # 2.4 MB of signals: bounds memory, and is long enough for the per-block cost to vanish
 BLOCK_ROWS: Final = 16_384
 
@@ -202,19 +205,3 @@ def _check_log(table: pa.Table, signals: FloatArray) -> None:
         raise InputError(
             front[0], "has no reading in any row", "record the channel, or correct its conversion"
         )
-
-
-def fill_steering(signals: FloatArray, missing: Sequence[bool]) -> None:
-    """Fill the steering angles of wheels without a column, in place; `missing` (4,) is True for
-    these wheels.
-
-    A front wheel gets the angle of the other front wheel, a rear wheel gets zero. Columns without
-    readings are not filled.
-    """
-    if missing[0]:
-        signals[:, S.DELTA] = signals[:, S.DELTA + 1]
-    if missing[1]:
-        signals[:, S.DELTA + 1] = signals[:, S.DELTA]
-    for wheel in (2, 3):
-        if missing[wheel]:
-            signals[:, S.DELTA + wheel] = 0.0

@@ -45,7 +45,8 @@ from fleet_service.fusion.votes import (
 )
 from fleet_service.fusion.weather import Weather
 from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
-from schemas.runtime.jit import prefetch, refcount_free, refcount_free_inlined
+from schemas.runtime.jit import refcount_free, refcount_free_inlined
+from schemas.runtime.prefetch import prefetch
 from schemas.runtime.records import RecordArray
 
 

@@ -1,5 +1,8 @@
-"""Compilation of numerical functions ("kernels") with numba; all packages compile them through this
+"""Decorators that compile numerical functions ("kernels"); all packages compile them through this
 module.
+
+A kernel is compiled by Numba, or, in a process that has called `use_native_kernels`, taken from a
+shared library that was compiled before. Such a process loads no compiler.
 """
 
 from __future__ import annotations
@@ -7,41 +10,35 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
+import platform
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Final, ParamSpec, TypeVar, cast
+from typing import Final, ParamSpec, TypeVar, cast
 
-import numba
-from llvmlite import ir  # type: ignore[import-untyped]
-from numba.core import cgutils, event, types
-from numba.core.caching import FunctionCache
-from numba.extending import intrinsic
-from numpy.typing import NDArray
+from schemas.runtime.native_kernels import Library, NativeIntrinsic, NativeKernel
 
-from schemas.runtime import progress_messages
-
-
-class _Told(event.Listener):
-    """Listener to events of numba that reports each compilation to the user, because it takes
-    time.
-    """
-
-    def on_start(self, event: event.Event) -> None:
-        """Report a compilation as the current activity, and once per process as a message."""
-        progress_messages.report_once(progress_messages.COMPILING)
-        progress_messages.set_status(f"compiling {event.data['dispatcher'].__name__}")
-
-    def on_end(self, event: event.Event) -> None:
-        """Do nothing; the listener interface requires this method."""
-
-
-event.register("numba:compile", _Told())  # type: ignore[no-untyped-call]
 LINE: Final = 64  # bytes that a processor reads at once
+# fields of /proc/cpuinfo by which LLVM chooses instructions
+PROCESSOR: Final = ("vendor_id", "cpu family", "model", "flags", "CPU", "Features")
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+
+class _Native:
+    """Library whose kernels this process uses; None: all kernels are compiled by Numba."""
+
+    library: Library | None = None
+
+
+def use_native_kernels(library: Library) -> None:
+    """Take the kernels of all modules that are imported from now on from a shared library. A kernel
+    that it lacks is compiled by Numba at its first call.
+    """
+    _Native.library = library
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
@@ -89,35 +86,18 @@ def refcount_free_inlined(function: Callable[P, R]) -> Callable[P, R]:
     return _compile(function, nogil=True, forceinline=True, references=False)
 
 
-# the types are Numba's own
-def _prefetch(context: Any, array: Any, row: Any, line: Any) -> Any:  # noqa: ANN401, ARG001
-    def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ANN401
-        kind = signature.args[0]
-        long = ir.IntType(64)
-        whole = ir.IntType(32)
-        data = target.make_array(kind)(target, builder, values[0])
-        place = [values[1], *[long(0)] * (kind.ndim - 1)]
-        pointer = cgutils.get_item_pointer(  # type: ignore[no-untyped-call]
-            target, builder, kind, data, place
-        )
-        begin = builder.ptrtoint(pointer, long)
-        address = builder.inttoptr(
-            builder.add(begin, builder.mul(values[2], long(LINE))), cgutils.voidptr_t
-        )
-        hint = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, whole, whole, whole])
-        function = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
-            builder.module, hint, "llvm.prefetch.p0"
-        )
-        # to read, into every cache, data
-        builder.call(function, [address, whole(0), whole(3), whole(1)])
-        return target.get_dummy_value()
+def load_intrinsic(module: str, name: str) -> object:
+    """Return the Numba intrinsic (function that consists of given machine code) whose definition
+    is the attribute `name` of `module`. A process that uses native kernels loads it when Numba
+    needs it.
+    """
 
-    return types.void(array, types.int64, types.int64), generate
+    def load_with_numba() -> object:
+        from numba.extending import intrinsic
 
+        return intrinsic(getattr(import_module(module), name))
 
-# `prefetch(array, row, line)` in compiled code: let a LINE of `array[row]` come meanwhile. For
-# arrays of one or two dimensions; a hint, so that `row` may lie outside.
-prefetch = cast(Callable[[NDArray[Any], Any, int], None], intrinsic(_prefetch))
+    return load_with_numba() if _Native.library is None else NativeIntrinsic(load_with_numba)
 
 
 def entry_point(kernel: Callable[P, R]) -> Callable[P, R]:
@@ -127,6 +107,8 @@ def entry_point(kernel: Callable[P, R]) -> Callable[P, R]:
     The function must have been called before. Every argument must have the same type as in that
     call, because types are not checked again.
     """
+    if isinstance(kernel, NativeKernel):
+        return cast(Callable[P, R], kernel)
     made = next(iter(kernel.overloads.values()))  # type: ignore[attr-defined]
     return cast(Callable[P, R], made.entry_point)
 
@@ -138,37 +120,45 @@ def _compile(
     forceinline: bool = False,
     references: bool = True,
 ) -> Callable[P, R]:
-    kept = "NUMBA_CACHE_DIR" in os.environ or cache_root() is not None
-    if kept and "NUMBA_CACHE_DIR" not in os.environ:
-        package = function.__module__.partition(".")[0]
-        numba.config.CACHE_DIR = kernel_cache(package)  # type: ignore[attr-defined]
-    options: dict[str, Any] = {"nogil": nogil, "forceinline": forceinline, "_nrt": references}
-    kernel = numba.njit(cache=kept, error_model="numpy", **options)(function)
-    if kept:
-        kernel._cache = _Cache(function)  # type: ignore[no-untyped-call] # no public way
-    return cast(Callable[P, R], kernel)
+    options = {"nogil": nogil, "forceinline": forceinline, "_nrt": references}
+
+    def compile_with_numba() -> Callable[P, R]:
+        from schemas.runtime.numba_kernels import make_kernel
+
+        cache = _cache_of(function.__module__.partition(".")[0])
+        return make_kernel(function, cache, options)
+
+    library = _Native.library
+    if library is None:
+        return compile_with_numba()
+    return cast(Callable[P, R], NativeKernel(function, library, compile_with_numba))
 
 
-class _Cache(FunctionCache):
-    """Numba's cache with two fixes: a full disk does not raise, and closures get stable keys."""
+def _cache_of(package: str) -> str | None:
+    """Return the folder for a package's compiled functions, or None if none can be written."""
+    if given := os.environ.get("NUMBA_CACHE_DIR"):
+        return given
+    return None if cache_root() is None else kernel_cache(package)
 
-    def _index_key(self, sig: object, codegen: Any) -> object:  # noqa: ANN401 numba's own types
-        """Return the cache key; for a closure it contains the names of the enclosed objects.
-        Numba's own key for a closure differs in each process.
-        """
-        cells = self._py_func.__closure__
-        if cells is None:
-            return super()._index_key(sig, codegen)  # type: ignore[no-untyped-call]
-        held = (cell.cell_contents for cell in cells)
-        names = tuple(
-            f"{getattr(one, '__module__', '')}.{getattr(one, '__qualname__', one)}" for one in held
-        )
-        return sig, codegen.magic_tuple(), (self._py_func.__code__.co_code, names)
 
-    def save_overload(self, sig: object, data: object) -> None:
-        """Save a function's compiled code in the cache; ignore errors of the disk."""
-        with suppress(OSError):
-            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+def native_library_path(package: str) -> Path | None:
+    """Return the path of the shared library of a package's kernels, in the same cache; the name
+    contains digests of all source files and of the processor's features. Return None if the cache
+    cannot be written.
+    """
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    folder = Path(given) if given else cache_root()
+    name = f"{Path(kernel_cache(package)).name}-{_processor_digest()}.so"
+    return None if folder is None else folder / name
+
+
+def _processor_digest() -> str:
+    """Return a digest of the processor's model and features, on which its machine code depends."""
+    lines = {platform.machine()}
+    with suppress(OSError):
+        first, _, _ = Path("/proc/cpuinfo").read_text().partition("\n\n")
+        lines |= {line for line in first.splitlines() if line.startswith(PROCESSOR)}
+    return hashlib.blake2b("\n".join(sorted(lines)).encode(), digest_size=4).hexdigest()
 
 
 @functools.cache

@@ -18,30 +18,33 @@ import math
 from collections.abc import Callable
 from typing import Any, Final, TypeAlias, cast
 
-from numba.extending import intrinsic
-
 from schemas.numeric import FloatArray
-from schemas.runtime import lane_types
-from schemas.runtime.jit import inlined
+from schemas.runtime.jit import inlined, load_intrinsic
 
 Function: TypeAlias = Callable[[float], float]
 
+
+def intrinsic_of(name: str) -> object:
+    """Return the intrinsic whose type and machine code `lane_types` defines under `name`."""
+    return load_intrinsic("schemas.runtime.lane_types", name)
+
+
 # lanes_at(array, place): the vector of `array` (..., LANES) at a place, one index per axis before
 # the lanes; of a flat array, the vector number `place`
-lanes_at = cast(Callable[[FloatArray, Any], float], intrinsic(lane_types.type_load))
+lanes_at = cast(Callable[[FloatArray, Any], float], intrinsic_of("type_load"))
 # put_lanes(array, place, value): write a vector or, into all lanes, a number
-put_lanes = cast(Callable[[FloatArray, Any, float], None], intrinsic(lane_types.type_store))
+put_lanes = cast(Callable[[FloatArray, Any, float], None], intrinsic_of("type_store"))
 # select(where, first, other): `first` where the mask is true; both are computed
-select = cast(Callable[[bool, float, float], float], intrinsic(lane_types.type_select))
-any_lane = cast(Callable[[bool], bool], intrinsic(lane_types.type_any))
-sum_lanes = cast(Function, intrinsic(lane_types.type_sum))
-largest_lane = cast(Function, intrinsic(lane_types.type_largest))
+select = cast(Callable[[bool, float, float], float], intrinsic_of("type_select"))
+any_lane = cast(Callable[[bool], bool], intrinsic_of("type_any"))
+sum_lanes = cast(Function, intrinsic_of("type_sum"))
+largest_lane = cast(Function, intrinsic_of("type_largest"))
 # gather(table, cell): elements of a table at whole numbers, which must lie inside
-gather = cast(Callable[[FloatArray, float], float], intrinsic(lane_types.type_gather))
-floor = cast(Function, intrinsic(lane_types.type_floor))
+gather = cast(Callable[[FloatArray, float], float], intrinsic_of("type_gather"))
+floor = cast(Function, intrinsic_of("type_floor"))
 # power_of_two(k): 2^k of a whole k; exponent_of(x): the whole k with 2^k <= x < 2^(k+1) of x > 0
-power_of_two = cast(Function, intrinsic(lane_types.type_power_of_two))
-exponent_of = cast(Function, intrinsic(lane_types.type_exponent))
+power_of_two = cast(Function, intrinsic_of("type_power_of_two"))
+exponent_of = cast(Function, intrinsic_of("type_exponent"))
 
 LOG2_E: Final = 1.4426950408889634
 # ln 2 in two parts, so that whole multiples of the first are exact

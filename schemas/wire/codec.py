@@ -19,7 +19,7 @@ from google.protobuf import json_format
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from schemas import tables
+from schemas import message_columns
 from schemas.errors import WireError
 from schemas.proto import gripmap_pb2 as pb
 
@@ -64,7 +64,11 @@ NEEDED: Final = {
     Kind.OBSERVATION: ("enter_time", "latitude", "longitude"),
     Kind.STATE: ("time", "latitude", "longitude"),
 }
-_FIELDS: Final = {Kind.OBSERVATION: tables.OBSERVATION, Kind.STATE: tables.STATE}
+_COLUMNS: Final = {
+    Kind.OBSERVATION: message_columns.OBSERVATION,
+    Kind.STATE: message_columns.STATE,
+}
+_TYPES: Final = {message_columns.TIME: "int64", message_columns.LIKELIHOOD: "uint8"}
 _PB_KIND: Final = {Kind.OBSERVATION: pb.KIND_OBSERVATION, Kind.STATE: pb.KIND_STATE}
 _KIND_OF: Final = {number: kind for kind, number in _PB_KIND.items()}
 
@@ -86,9 +90,8 @@ def column_types(kind: Kind) -> dict[str, np.dtype[Any]]:
     """Return name and NumPy type of every column of a batch. Times are int64 [ns]; the likelihood
     is uint8, (n, 32).
     """
-    special: dict[Any, type] = {tables.NS: np.int64, tables.LIKELIHOOD: np.uint8}
     return {
-        f.name: np.dtype(special.get(f.type) or f.type.to_pandas_dtype()) for f in _FIELDS[kind]
+        column.name: np.dtype(_TYPES.get(column.type, column.type)) for column in _COLUMNS[kind]
     }
 
 

@@ -22,10 +22,10 @@ import numpy as np
 from edge_agent.inputs.block import Block
 from edge_agent.inputs.context import context_signals, held_readings
 from edge_agent.inputs.live.feed import TICK_S, Feed, HostClock
+from edge_agent.inputs.log_columns import GROUND, fill_steering
 from edge_agent.inputs.merge import COURSE_SPEED, SPARSE, found_in, make_channel, sample_at_rows
 from edge_agent.inputs.profile import Profile
 from edge_agent.inputs.recording import Recording, Series
-from edge_agent.inputs.signal_log import GROUND, fill_steering
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, CONTEXT, per_wheel

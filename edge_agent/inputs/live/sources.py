@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import parse_qsl
 
-from edge_agent.inputs.bring_in import database_of
 from edge_agent.inputs.context import lasting_signals
 from edge_agent.inputs.live.can_bus import CanFeed, Decoder
 from edge_agent.inputs.live.databroker import DatabrokerFeed
@@ -29,7 +28,7 @@ from edge_agent.inputs.live.gpsd import GpsdFeed
 from edge_agent.inputs.live.ros2 import Ros2Feed, RosTopics
 from edge_agent.inputs.profile import Profile, load_profile
 from edge_agent.inputs.readers.can_log import no_database
-from edge_agent.inputs.readers.dbc import Database
+from edge_agent.inputs.readers.dbc import Database, database_of
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 

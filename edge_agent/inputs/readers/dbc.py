@@ -18,6 +18,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_agent.inputs.profile import FOLDER, Profile
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
@@ -198,3 +199,17 @@ def _parse_signal(found: re.Match[str]) -> tuple[Signal | None, str]:
         return None, mux
     sound = signal.name and 0 < signal.size <= 64 and signal.start < 8 * LONGEST
     return (signal if sound and np.isfinite([signal.factor, signal.offset]).all() else None), mux
+
+
+def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Database | None:
+    """Return the CAN database at the path `given` on the command line; without this path, the
+    profile's database; else None.
+    """
+    if given is not None:
+        return read_dbc(given)
+    if profile is None or profile.dbc is None:
+        return None
+    beside = folder / profile.dbc
+    return read_dbc(
+        beside if beside.exists() or not (FOLDER / profile.dbc).exists() else FOLDER / profile.dbc
+    )

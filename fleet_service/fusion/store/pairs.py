@@ -13,7 +13,8 @@ from fleet_service.fusion.belief import BOUND, VALUE
 from fleet_service.fusion.store.records import NONE, PAIRS, State
 from fleet_service.fusion.store.table import AHEAD, pair_place
 from schemas.numeric import IntArray
-from schemas.runtime.jit import compiled, prefetch, refcount_free_inlined
+from schemas.runtime.jit import compiled, refcount_free_inlined
+from schemas.runtime.prefetch import prefetch
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
 

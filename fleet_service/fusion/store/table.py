@@ -23,7 +23,8 @@ import numpy as np
 from fleet_service.fusion.store.cells import begin_slot
 from fleet_service.fusion.store.records import NONE, Rows
 from schemas.numeric import IntArray
-from schemas.runtime.jit import compiled, prefetch, refcount_free_inlined
+from schemas.runtime.jit import compiled, refcount_free_inlined
+from schemas.runtime.prefetch import prefetch
 from schemas.runtime.records import RecordArray
 
 LEAST: Final = 1024  # places of a new table

@@ -1,0 +1,32 @@
+"""Paths of files that the agent writes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from schemas.errors import InputError
+
+
+def prepare_path(field: str, path: Path) -> Path:
+    """Create the folder in which the file `path` will lie, and return the path.
+
+    Raises:
+        InputError: the path is a folder, or its folder cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        reason = (
+            "is a folder"
+            if path.is_dir()
+            else ""
+            if os.access(path.parent, os.W_OK)
+            else "no permission"
+        )
+    except OSError as error:
+        reason = error.strerror or str(error)
+    if reason:
+        raise InputError(
+            field, f"cannot write {path} ({reason})", "name a file in a writable folder"
+        )
+    return path

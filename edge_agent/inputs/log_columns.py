@@ -1,0 +1,30 @@
+"""Names of the columns of a signal log, and filling of steering angles without a column."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from schemas.numeric import FloatArray
+from schemas.signals import S, per_wheel
+
+GROUND: Final = "gnss_speed"  # beside the channels; only the signal doctor reads it
+NEEDED: Final = ("ax", "ay", "yaw_rate", *per_wheel("omega"))
+FRONT_STEERING: Final = per_wheel("delta")[:2]
+REAR_STEERING: Final = per_wheel("delta")[2:]
+
+
+def fill_steering(signals: FloatArray, missing: Sequence[bool]) -> None:
+    """Fill the steering angles of wheels without a column, in place; `missing` (4,) is True for
+    these wheels.
+
+    A front wheel gets the angle of the other front wheel, a rear wheel gets zero. Columns without
+    readings are not filled.
+    """
+    if missing[0]:
+        signals[:, S.DELTA] = signals[:, S.DELTA + 1]
+    if missing[1]:
+        signals[:, S.DELTA + 1] = signals[:, S.DELTA]
+    for wheel in (2, 3):
+        if missing[wheel]:
+            signals[:, S.DELTA + wheel] = 0.0

@@ -1,0 +1,260 @@
+"""Build of a shared library of native kernels (see `native_kernels`) with Numba, LLVM and the
+system's linker.
+
+A recorder takes the place of the library while a program calls its kernels. It records them with
+the types of their arguments. Each becomes a C function of the library, with the machine code that
+Numba itself would run.
+"""
+
+# the types are Numba's and LLVM's own
+# ruff: noqa: ANN401
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+import llvmlite.binding as llvm  # type: ignore[import-untyped]
+import numba
+import numpy as np
+from numba.core import codegen, cpu, types
+from numba.extending import intrinsic
+
+from schemas.runtime.native_kernels import (
+    HEADER,
+    LINKER,
+    Library,
+    NativeKernel,
+    describe_type,
+    symbol_of,
+)
+
+LINKED: Final = ("-shared", "-nostartfiles", "-Wl,-z,noexecstack")
+ADAPTER: Final = "call_kernel"
+RUNTIME: Final = (
+    "NRT_",
+    "numba_",
+    "Py",
+)  # of Numba and Python: only a kernel that fails calls them
+RESULTS: Final = (types.none, types.int64)
+
+
+class CallRecorder(Library):
+    """Empty library that records the calls of kernels and does not run them."""
+
+    def __init__(self) -> None:
+        super().__init__(None)
+        self.calls: dict[str, tuple[NativeKernel, tuple[Any, ...]]] = {}
+
+    def call_missing(self, kernel: NativeKernel, arguments: tuple[Any, ...]) -> int:
+        """Record a call of a kernel, and return 0 as its result."""
+        symbol = symbol_of(kernel.name, describe_type(arguments, []))
+        self.calls.setdefault(symbol, (kernel, arguments))
+        return 0
+
+
+def build_library(recorder: CallRecorder, path: Path) -> None:
+    """Compile and link the recorded kernels, and write the shared library `path`. Only a process
+    that ends afterwards may call this function, because Numba can no longer compile in it.
+
+    Raises:
+        OSError, subprocess.CalledProcessError: there is no linker, or it fails.
+    """
+    calls: list[tuple[str, Any, tuple[Any, ...], Any]] = []
+    for symbol, (native, arguments) in recorder.calls.items():
+        overload = _compile_kernel(native.numba_kernel, arguments)
+        if overload.signature.return_type in RESULTS:
+            calls.append((symbol, native.numba_kernel, arguments, overload))
+    _stop_before_machine_code()
+    whole = llvm.parse_assembly("")
+    for symbol, kernel, arguments, overload in calls:
+        returns = overload.signature.return_type != types.none
+        adapter = _compile_adapter(kernel, arguments, symbol, returns=returns)
+        _merge_modules(whole, overload, adapter, symbol)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    code = _emit_object(whole, [symbol for symbol, *_ in calls], calls[0][-1].library.codegen)
+    _link_object(code, path)
+
+
+def _compile_kernel(kernel: Any, arguments: tuple[Any, ...]) -> Any:
+    """Compile a kernel for arguments of the types of `arguments`; return Numba's result."""
+    typeof: Any = numba.typeof
+    kinds = tuple(typeof(argument) for argument in arguments)
+    kernel.compile(kinds)
+    return kernel.overloads[kinds]
+
+
+def _stop_before_machine_code() -> None:
+    """Let Numba leave each function that it compiles as it is: neither merge it with the functions
+    that it calls nor optimise it nor make machine code.
+
+    A kernel is compiled before. Its code must not change after that: where multiplication and
+    addition are fused, the optimiser decides on the last bit.
+    """
+    library: Any = codegen.JITCodeLibrary
+    library.finalize = _mark_finalized
+    library.get_pointer_to_function = lambda *_: 0
+    target: Any = cpu.CPUContext
+    target.create_cpython_wrapper = lambda *_, **__: None
+    target.get_executable = lambda *_: [].append  # of the type that Numba asks for, and new
+
+
+def _mark_finalized(library: Any) -> None:
+    library._finalized = True
+
+
+def _pointer_of(context: Any, word: Any, element: Any) -> Any:  # noqa: ARG001
+    pointer = types.CPointer(element.instance_type)  # type: ignore[no-untyped-call]
+
+    def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        return builder.inttoptr(values[0], target.get_value_type(pointer))
+
+    return pointer(types.int64, element), generate
+
+
+def _float_of(context: Any, word: Any) -> Any:  # noqa: ARG001
+    def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        return builder.bitcast(values[0], target.get_value_type(types.float64))
+
+    return types.float64(types.int64), generate
+
+
+class _Adapter:
+    """Source text of a function that makes a kernel's arguments from words and calls the kernel."""
+
+    def __init__(self, kernel: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+        self._words = HEADER
+        self._known: dict[str, Any] = {
+            "kernel": kernel,
+            "carray": numba.carray,  # type: ignore[attr-defined]
+            "pointer_of": intrinsic(_pointer_of),
+            "float_of": intrinsic(_float_of),
+        }
+        self._call = f"kernel({', '.join(self._expression(one) for one in arguments)})"
+
+    def make_function(self, *, returns: bool) -> Callable[..., Any]:
+        """Return the function: it calls the kernel, stores the result, and sets the mark."""
+        result = "words[1] = " if returns else ""
+        text = f"def {ADAPTER}(words):\n    {result}{self._call}\n    words[0] = 1\n"
+        exec(text, self._known)
+        return self._known[ADAPTER]  # type: ignore[no-any-return]
+
+    def _next_word(self) -> str:
+        self._words += 1
+        return f"words[{self._words - 1}]"
+
+    def _name_of(self, value: Any) -> str:
+        name = f"known_{len(self._known)}"
+        self._known[name] = value
+        return name
+
+    def _expression(self, value: Any) -> str:
+        """Return the expression for an argument; the order of words is that of
+        `describe_type`.
+        """
+        if isinstance(value, np.ndarray):
+            element = self._name_of(numba.from_dtype(value.dtype))
+            address = f"pointer_of({self._next_word()}, {element})"
+            shape = "".join(f"{self._next_word()}, " for _ in range(value.ndim))
+            return f"carray({address}, ({shape}))"
+        if isinstance(value, tuple):
+            parts = "".join(f"{self._expression(part)}, " for part in value)
+            make = "" if type(value) is tuple else self._name_of(type(value))
+            return f"{make}({parts})"
+        word = self._next_word()
+        return f"float_of({word})" if isinstance(value, float) else word
+
+
+def _compile_adapter(kernel: Any, arguments: tuple[Any, ...], symbol: str, *, returns: bool) -> Any:
+    """Compile a C function with the name `symbol` that calls a kernel; return Numba's library of
+    it.
+    """
+    function = _Adapter(kernel, arguments).make_function(returns=returns)
+    words = types.CPointer(types.int64)  # type: ignore[no-untyped-call]
+    made: Any = numba.cfunc(types.void(words), error_model="numpy")(function)
+    made._library._final_module.get_function(made.native_name).name = symbol
+    return made._library
+
+
+def _merge_modules(whole: Any, overload: Any, adapter: Any, symbol: str) -> None:
+    """Add a kernel, its adapter and the functions that the adapter calls to the module `whole`. The
+    kernel contains the functions that it calls itself.
+    """
+    visible = {symbol, overload.fndesc.llvm_func_name}
+    code = overload.library._get_module_for_linking().clone()
+    _hide_functions(code, visible, "internal")
+    whole.link_in(code)
+    seen = {overload.library}
+    found = [adapter]
+    while found:
+        library = found.pop()
+        if library not in seen:
+            seen.add(library)
+            found.extend(library._linking_libraries)
+            code = library._final_module.clone()
+            _hide_functions(code, visible, "weak_odr")
+            whole.link_in(code)
+
+
+def _hide_functions(module: Any, visible: set[str], linkage: str) -> None:
+    for function in module.functions:
+        if not function.is_declaration:
+            function.linkage = "external" if function.name in visible else linkage
+
+
+def _emit_object(whole: Any, symbols: list[str], numba_codegen: Any) -> bytes:
+    """Return object code of a module, of which only `symbols` are visible. Processor and options
+    are those with which Numba makes machine code.
+    """
+    for function in [one for one in whole.functions if one.is_declaration]:
+        if function.name.startswith(RUNTIME):
+            whole.link_in(llvm.parse_assembly(_empty_definition(str(function))))
+    for one in (*whole.functions, *whole.global_variables):
+        if not one.is_declaration:
+            one.linkage = "external" if one.name in symbols else "internal"
+    options: dict[str, Any] = {}
+    numba_codegen._customize_tm_options(options)
+    machine = llvm.Target.from_triple(llvm.get_process_triple()).create_target_machine(
+        cpu=options["cpu"], features=options["features"], opt=3, reloc="pic"
+    )
+    code: bytes = machine.emit_object(whole)
+    return code
+
+
+def _empty_definition(declaration: str) -> str:
+    """Return the definition of a declared function that does nothing and returns zero."""
+    line = next(one for one in declaration.splitlines() if one.startswith("declare"))
+    line = re.sub(r"\s#\d+$", "", line.rstrip())
+    result = line.split()[1]
+    value = "ret void" if result == "void" else f"ret {result} zeroinitializer"
+    return f"{line.replace('declare', 'define', 1)} {{\n  {value}\n}}\n"
+
+
+def _link_object(code: bytes, path: Path) -> None:
+    """Link object code to a shared library; `path` appears only when it is complete."""
+    made = path.with_suffix(f".{os.getpid()}")
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder) / "kernels.o"
+        source.write_bytes(code)
+        try:
+            words = [
+                LINKER,
+                "-shared",
+                "-nostartfiles",
+                "-Wl,-z,noexecstack",
+                "-o",
+                str(made),
+                str(source),
+                "-lm",
+            ]
+            subprocess.run(words, check=True, capture_output=True)
+            made.replace(path)
+        finally:
+            with suppress(OSError):
+                made.unlink()

@@ -1,0 +1,91 @@
+"""Compilation of kernels by Numba, with its cache of compiled functions on disk."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, ParamSpec, TypeVar, cast
+
+import numba
+from numba.core import event, types
+from numba.core.caching import FunctionCache
+from numba.core.registry import cpu_target
+from numba.extending import typeof_impl
+
+from schemas.runtime import progress_messages
+from schemas.runtime.native_kernels import NativeIntrinsic, NativeKernel
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class _Told(event.Listener):
+    """Listener to events of numba that reports each compilation to the user, because it takes
+    time.
+    """
+
+    def on_start(self, event: event.Event) -> None:
+        """Report a compilation as the current activity, and once per process as a message."""
+        progress_messages.report_once(progress_messages.COMPILING)
+        progress_messages.set_status(f"compiling {event.data['dispatcher'].__name__}")
+
+    def on_end(self, event: event.Event) -> None:
+        """Do nothing; the listener interface requires this method."""
+
+
+event.register("numba:compile", _Told())  # type: ignore[no-untyped-call]
+
+
+@typeof_impl.register(NativeKernel)
+def _typeof_native_kernel(kernel: NativeKernel, _: object) -> types.Dispatcher:
+    """Let compiled code call the Numba version of a native kernel."""
+    dispatcher: Any = kernel.numba_kernel
+    return types.Dispatcher(dispatcher)
+
+
+@typeof_impl.register(NativeIntrinsic)
+def _typeof_native_intrinsic(made: NativeIntrinsic, _: object) -> types.Type:
+    """Let compiled code call Numba's version of an intrinsic, which may be loaded only now."""
+    intrinsic = made.numba_intrinsic
+    for context in (cpu_target.typing_context, cpu_target.target_context):
+        context.refresh()
+    typing: Any = cpu_target.typing_context
+    kind: types.Type = typing.resolve_value_type(intrinsic)
+    return kind
+
+
+def make_kernel(
+    function: Callable[P, R], cache: str | None, options: dict[str, Any]
+) -> Callable[P, R]:
+    """Compile `function` with Numba's `options`: cached in the folder `cache`, no fast-math, IEEE
+    division.
+    """
+    if cache is not None and "NUMBA_CACHE_DIR" not in os.environ:
+        numba.config.CACHE_DIR = cache  # type: ignore[attr-defined]
+    kernel = numba.njit(cache=cache is not None, error_model="numpy", **options)(function)
+    if cache is not None:
+        kernel._cache = _Cache(function)  # type: ignore[no-untyped-call] # no public way
+    return cast(Callable[P, R], kernel)
+
+
+class _Cache(FunctionCache):
+    """Numba's cache with two fixes: a full disk does not raise, and closures get stable keys."""
+
+    def _index_key(self, sig: object, codegen: Any) -> object:  # noqa: ANN401 numba's own types
+        """Return the cache key; for a closure it contains the names of the enclosed objects.
+        Numba's own key for a closure differs in each process.
+        """
+        cells = self._py_func.__closure__
+        if cells is None:
+            return super()._index_key(sig, codegen)  # type: ignore[no-untyped-call]
+        held = (cell.cell_contents for cell in cells)
+        names = tuple(
+            f"{getattr(one, '__module__', '')}.{getattr(one, '__qualname__', one)}" for one in held
+        )
+        return sig, codegen.magic_tuple(), (self._py_func.__code__.co_code, names)
+
+    def save_overload(self, sig: object, data: object) -> None:
+        """Save a function's compiled code in the cache; ignore errors of the disk."""
+        with suppress(OSError):
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]

@@ -1,0 +1,103 @@
+"""Tests of the agent's shared library of kernels, and of the modules that an agent loads."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_agent.app import native_library
+from edge_agent.lab.simulation import SimulatedFleet
+from schemas.runtime import jit
+
+# a running agent must load none of these
+HEAVY = ("grpc", "llvmlite", "numba", "pandas", "pyarrow", "rich", "scipy", "yaml")
+VEHICLES = 2
+DRIVE = f"""import hashlib, sys
+import numpy as np
+{{before}}
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.inputs.block import Block
+from edge_agent.observe.pipeline import Pipeline
+from schemas.config import AgentConfig
+from schemas.signals import CONTEXT
+from schemas.vehicle import load_vehicle
+
+drive = np.load(sys.argv[1])
+t, signals = drive["t"], drive["signals"]
+context = np.random.default_rng(0).integers(0, 2, (*t.shape, len(CONTEXT))).astype(float)
+bank = bank_of("aco-fckf", [load_vehicle("class:compact")] * {VEHICLES})
+pipeline = Pipeline(bank, {VEHICLES}, AgentConfig())
+digest = hashlib.sha256()
+records = 0
+for first in range(0, len(t), 10):
+    part = slice(first, first + 10)
+    flags = context[part] if first % 200 < 100 else None
+    block = Block(t[part], np.rint(t[part] * 1e9).astype(np.int64), signals[part], flags)
+    estimates, *kinds = pipeline.step(block)
+    arrays = [getattr(estimates, name) for name in type(estimates).__slots__]
+    arrays += [column for kind in kinds for column in kind.columns.values()]
+    for array in (*arrays, *pipeline.beliefs()):
+        digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+    records += sum(len(kind.vehicle) for kind in kinds)
+last = pipeline.finish()
+for column in last.columns.values():
+    digest.update(column.tobytes())
+print(digest.hexdigest(), records + len(last.vehicle))
+"""
+NATIVE = "from edge_agent.app.native_library import use_agent_library; assert use_agent_library()"
+LOADED = f"""
+import edge_agent.app.trip, edge_agent.cli.live, edge_agent.cli.run, edge_agent.publish.publisher
+import edge_agent.app.agent, edge_agent.inputs.live.rows, edge_agent.inputs.live.sources
+print(*[name for name in {HEAVY} if name in sys.modules])
+"""
+
+
+def run_python(code: str, *words: str) -> list[str]:
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, text=True, check=True
+    )
+    return done.stdout.splitlines()
+
+
+@pytest.mark.campaign
+@pytest.mark.timeout(600)  # it compiles, where nothing is cached
+def test_a_native_agent_gives_the_same_bits_without_numba(tmp_path: Path) -> None:
+    """A drive must give the same estimates, records and beliefs by the shared library as by Numba,
+    bit by bit. The agent that uses the library must not load the heavy modules.
+    """
+    t, signals = SimulatedFleet("hills", VEHICLES, 3, 100.0, rough=0.5, winter=0.5).step(2000)
+    drive = str(tmp_path / "drive.npz")
+    np.savez(drive, t=t, signals=signals)
+    native, loaded = run_python(DRIVE.format(before=NATIVE) + LOADED, drive)
+    (by_numba,) = run_python(DRIVE.format(before=""), drive)
+    assert native == by_numba
+    assert int(native.split()[1]) > 20
+    assert loaded == ""
+
+
+@pytest.mark.parametrize("missing", ["linker", "folder"])
+def test_without_a_linker_or_a_folder_numba_compiles(
+    missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", os.fspath(tmp_path) if missing == "linker" else os.environ["PATH"])
+    monkeypatch.setattr(
+        native_library,
+        "native_library_path",
+        lambda _: tmp_path / "library.so" if missing == "linker" else None,
+    )
+    assert not native_library.use_agent_library()
+    assert jit._Native.library is None
+
+
+def test_a_library_that_cannot_be_loaded_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "library.so").write_bytes(b"no library")
+    monkeypatch.setattr(native_library, "native_library_path", lambda _: tmp_path / "library.so")
+    assert not native_library.use_agent_library()
+    assert jit._Native.library is None

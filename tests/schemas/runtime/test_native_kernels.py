@@ -1,0 +1,134 @@
+"""Tests of shared libraries of kernels: results, failures, and calls that a library lacks."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas.runtime.native_kernels import OtherTypesError, describe_type
+
+KERNELS = """import sys
+from typing import NamedTuple
+import numpy as np
+from schemas.runtime.jit import compiled, nogil
+
+class Pair(NamedTuple):
+    values: object
+    factor: float
+
+@compiled
+def halve(x):
+    return 0.5 * x
+
+@nogil
+def add_all(out, pair, counts):
+    total, (first, last) = 0, counts
+    for i in range(first, last):
+        out[i] += pair.factor * halve(pair.values[i])
+        total += i
+    return total
+
+@compiled
+def refuse(x):
+    if x < 0:
+        raise ValueError("negative")
+    return x
+
+@compiled
+def mean(x):
+    return x.mean()
+
+def call_kernels():
+    out, values = np.zeros(4), np.arange(4.0)
+    print(add_all(out, Pair(values, 3.0), (1, 4)), out.tolist(), refuse(1))
+    try:
+        print(refuse(-1))
+    except (ArithmeticError, ValueError) as error:
+        print(type(error).__name__)
+    print("numba" in sys.modules)
+    print(mean(values))
+    print(add_all(out, Pair(values[::-1], 3.0), (1, 4)), out.tolist(), "numba" in sys.modules)
+"""
+BUILD = """import sys, numpy as np
+from pathlib import Path
+from schemas.runtime.jit import use_native_kernels
+from schemas.runtime.native_build import CallRecorder, build_library
+recorder = CallRecorder()
+use_native_kernels(recorder)
+import kernels
+kernels.add_all(np.zeros(4), kernels.Pair(np.zeros(4), 1.0), (0, 4))
+kernels.refuse(1)
+kernels.mean(np.zeros(4))
+build_library(recorder, Path(sys.argv[1]))
+"""
+USE = """import sys
+from pathlib import Path
+from schemas.runtime.jit import use_native_kernels
+from schemas.runtime.native_kernels import Library
+use_native_kernels(Library(Path(sys.argv[1])))
+import kernels
+kernels.call_kernels()
+"""
+
+
+def run_python(folder: Path, code: str, *words: str) -> list[str]:
+    """Run Python code in a process with the module `kernels`, and return its output's lines."""
+    root = Path(__file__).parents[3]
+    environment = os.environ | {
+        "PYTHONPATH": f"{folder}{os.pathsep}{root}",
+        "NUMBA_CACHE_DIR": str(folder / "cache"),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout.splitlines()
+
+
+@pytest.mark.campaign
+def test_a_library_runs_kernels_without_numba(tmp_path: Path) -> None:
+    """The library must give the results of Numba without importing it. It must report a kernel that
+    raises. Numba must run a kernel that the library lacks: one with a result that is no integer, or
+    with an array of another layout.
+    """
+    (tmp_path / "kernels.py").write_text(KERNELS)
+    library = str(tmp_path / "library.so")
+    run_python(tmp_path, BUILD, library)
+    result = "6 [0.0, 1.5, 3.0, 4.5] 1"
+    assert run_python(tmp_path, USE, library) == [
+        result,
+        "ArithmeticError",
+        "False",
+        "1.5",
+        "6 [0.0, 4.5, 4.5, 4.5] True",
+    ]
+    by_numba = run_python(tmp_path, "import kernels; kernels.call_kernels()")
+    assert by_numba[:2] == [result, "ValueError"]
+
+
+def test_types_are_told_apart_and_parts_become_words() -> None:
+    words: list[int] = []
+    array = np.zeros((2, 3))
+    assert describe_type((array, (1, 2.0)), words) == "tuple(<f8[2],tuple(int,float))"
+    assert words == [array.ctypes.data, 2, 3, 1, 1 << 62]
+
+
+@pytest.mark.parametrize("value", [np.zeros((2, 2)).T[:1], np.zeros(4)[::2], True, "text", 1 << 63])
+def test_a_value_that_no_library_takes_is_refused(value: object) -> None:
+    with pytest.raises(OtherTypesError):
+        describe_type(value, [])
+
+
+def test_an_array_that_must_not_be_written_is_refused() -> None:
+    array = np.zeros(2)
+    array.flags.writeable = False
+    with pytest.raises(OtherTypesError):
+        describe_type(array, [])
