@@ -25,8 +25,11 @@ LONG: Final = ir.IntType(64)
 INDEX: Final = ir.IntType(32)
 VECTOR: Final = ir.VectorType(DOUBLE, LANES)
 LONG_VECTOR: Final = ir.VectorType(LONG, LANES)
+POINTER_VECTOR: Final = ir.VectorType(ir.PointerType(), LANES)
 BIT_VECTOR: Final = ir.VectorType(ir.IntType(1), LANES)
 ANY_BYTE: Final = 8  # alignment of numbers in memory, which a vector there also has
+INVERSE_BITS: Final = 0x7FDE623822FC16E6
+INVERSE_ROOT_BITS: Final = 0x5FE6EB50C7B537A9
 FUSED: Final = ("contract",)  # a*b + c may be rounded once
 
 
@@ -292,12 +295,15 @@ def type_gather(context: Any, table: Any, cell: Any) -> Any:
         if number is not LANES_TYPE:
             return builder.load(builder.gep(data, [builder.fptosi(values[1], LONG)]))
         places = builder.fptosi(values[1], LONG_VECTOR)
-        found = ir.Constant(VECTOR, ir.Undefined)
-        for lane in range(LANES):
-            place = builder.extract_element(places, INDEX(lane))
-            one = builder.load(builder.gep(data, [place]))
-            found = builder.insert_element(found, one, INDEX(lane))
-        return found
+        offsets = builder.shl(places, _constant(LONG_VECTOR, 3))
+        begin = spread_value(builder, builder.ptrtoint(data, LONG), LONG_VECTOR)
+        pointers = builder.inttoptr(builder.add(begin, offsets), POINTER_VECTOR)
+        everywhere = ir.Constant(BIT_VECTOR, [ir.IntType(1)(1)] * LANES)
+        kind = ir.FunctionType(VECTOR, [POINTER_VECTOR, INDEX, BIT_VECTOR, VECTOR])
+        name = f"llvm.masked.gather.v{LANES}f64.v{LANES}p0"
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
+        unused = ir.Constant(VECTOR, ir.Undefined)
+        return builder.call(function, [pointers, INDEX(ANY_BYTE), everywhere, unused])
 
     return number(table, number), generate_code
 
@@ -323,6 +329,28 @@ def _type_function(value: Any, build: Callable[[Any, Any, Any, Any], Any]) -> An
 def type_floor(context: Any, value: Any) -> Any:
     """Return signature and code generator of `floor`."""
     return _type_function(value, lambda builder, x, *_: call_llvm(builder, "floor", x))
+
+
+def type_guess(context: Any, value: Any) -> Any:
+    """Return signature and code generator of `guess_inverse`: the bits of the result are a constant
+    minus the bits of the argument, which inverts the exponent.
+    """
+
+    def build_code(builder: Any, x: Any, double: Any, long: Any) -> Any:
+        bits = builder.sub(_constant(long, INVERSE_BITS), builder.bitcast(x, long))
+        return builder.bitcast(bits, double)
+
+    return _type_function(value, build_code)
+
+
+def type_root_guess(context: Any, value: Any) -> Any:
+    """Return signature and code generator of `guess_inverse_root`; it also halves the exponent."""
+
+    def build_code(builder: Any, x: Any, double: Any, long: Any) -> Any:
+        half = builder.lshr(builder.bitcast(x, long), _constant(long, 1))
+        return builder.bitcast(builder.sub(_constant(long, INVERSE_ROOT_BITS), half), double)
+
+    return _type_function(value, build_code)
 
 
 def type_power_of_two(context: Any, value: Any) -> Any:

@@ -107,7 +107,7 @@ def test_covariances_with_rows_are_those_of_the_whole_factor(seed: int) -> None:
     rng = np.random.default_rng(seed)
     covariance = covariances(seed)
     node = records(NodeWorkspace, 1)[0]
-    node["curved"] = rng.normal(size=(ROWS, CURVED, LANES))
+    node["curved"] = rng.normal(size=(CURVED, ROWS, LANES))
     node["derivative"] = rng.normal(size=(ACTIVE, ROWS, LANES))
     node["derivative"][:CURVED] = np.nan
     factorize_first(covariance, node["root"])
@@ -115,7 +115,7 @@ def test_covariances_with_rows_are_those_of_the_whole_factor(seed: int) -> None:
     for lane in range(LANES):
         root = np.linalg.cholesky(covariance[..., lane])
         deviation = node["derivative"][CURVED:, :, lane].T @ root[CURVED:ACTIVE]
-        deviation[:, :CURVED] += node["curved"][..., lane]
+        deviation[:, :CURVED] += node["curved"][..., lane].T
         assert node["root"][..., lane] == pytest.approx(root[:, :CURVED], abs=1e-12)
         assert node["cross"][..., lane] == pytest.approx(root @ deviation.T, abs=1e-9)
         spread = np.tril(deviation @ deviation.T)

@@ -17,6 +17,8 @@ from schemas.runtime.lanes import (
     exp_lanes,
     floor,
     gather,
+    inverse_of,
+    inverse_root_of,
     lanes_at,
     largest_lane,
     log_lanes,
@@ -27,7 +29,7 @@ from schemas.runtime.lanes import (
 from schemas.runtime.records import LANES, LaneArray, records
 
 ROWS = 500
-EXACT = 4e-16  # relative error of exponential, and error of logarithm
+EXACT = 5e-16  # relative error of exponential, inverse and root, and error of logarithm
 
 
 class LaneRecord:
@@ -68,6 +70,13 @@ def run_functions(x: FloatArray, powers: FloatArray, logs: FloatArray) -> None:
     for i in range(x.shape[0]):
         put_lanes(powers, i, exp_lanes(lanes_at(x, i)))
         put_lanes(logs, i, log_lanes(abs(lanes_at(x, i))))
+
+
+@nogil
+def run_inverses(x: FloatArray, inverses: FloatArray, roots: FloatArray) -> None:
+    for i in range(x.shape[0]):
+        put_lanes(inverses, i, inverse_of(lanes_at(x, i)))
+        put_lanes(roots, i, inverse_root_of(lanes_at(x, i)))
 
 
 @nogil
@@ -114,6 +123,23 @@ def test_exponential_and_logarithm_are_exact_to_rounding(scale: float) -> None:
     assert np.abs(powers / np.exp(x) - 1.0).max() < EXACT
     expected = np.log(np.abs(x))
     assert (np.abs(logs - expected) / np.maximum(np.abs(expected), 1.0)).max() < EXACT
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 100.0])
+def test_inverse_and_inverse_root_are_exact_to_rounding(scale: float) -> None:
+    x = np.exp(numbers(scale))
+    inverses = np.empty_like(x)
+    roots = np.empty_like(x)
+    run_inverses(x, inverses, roots)
+    assert np.abs(inverses * x - 1.0).max() < EXACT
+    assert np.abs(roots * np.sqrt(x) - 1.0).max() < EXACT
+
+
+def test_zero_times_its_inverse_root_is_zero() -> None:
+    x = np.zeros((1, LANES))
+    roots = np.empty_like(x)
+    run_inverses(x, np.empty_like(x), roots)
+    assert np.all(x * roots == 0.0)
 
 
 def test_exponential_ends_at_its_limits() -> None:

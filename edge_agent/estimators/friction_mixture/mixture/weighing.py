@@ -79,8 +79,10 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
     steady = design.constants.steady_share
     features.novelty = steady + (1.0 - steady) * features.new
     for kind in range(2):
-        scratch.actual_sum[kind] = scratch.theoretical_sum[kind] = 0.0
-    scratch.stated_sum = scratch.square_sum = 0.0
+        put_lanes(scratch.actual_lanes, kind, 0.0)
+        put_lanes(scratch.theoretical_lanes, kind, 0.0)
+    put_lanes(scratch.stated_lanes, 0, 0.0)
+    put_lanes(scratch.square_lanes, 0, 0.0)
     turn = (math.cos(memory.block.angle), math.sin(memory.block.angle))
     groups = (active_nodes(memory) + LANES - 1) // LANES
     for group in range(groups):
@@ -94,11 +96,16 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
             velocity = lanes_at(memory.mean, (group, axis))
             put_lanes(scratch.updated, (group, axis), velocity)
         predict_nodes(memory, scratch, group, turn)
+    for kind in range(2):
+        scratch.actual_sum[kind] = sum_lanes(lanes_at(scratch.actual_lanes, kind))
+        scratch.theoretical_sum[kind] = sum_lanes(lanes_at(scratch.theoretical_lanes, kind))
+    scratch.stated_sum = sum_lanes(lanes_at(scratch.stated_lanes, 0))
+    squares = sum_lanes(lanes_at(scratch.square_lanes, 0))
     rows = 0
     for r in range(ROWS):
         rows += 1 if is_measured(features, r) else 0
     memory.log_likelihood = mixture_likelihood(scratch, groups) if rows > 0 else 0.0
-    memory.nis = scratch.square_sum / rows if rows > 0 else 0.0
+    memory.nis = squares / rows if rows > 0 else 0.0
 
 
 @compiled

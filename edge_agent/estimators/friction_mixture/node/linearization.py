@@ -29,7 +29,7 @@ from edge_agent.estimators.friction_mixture.state.tyre_curve import TyreCurve, i
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, NodeWorkspace
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, inlined
-from schemas.runtime.lanes import lanes_at, log_lanes, put_lanes, select
+from schemas.runtime.lanes import inverse_of, lanes_at, log_lanes, put_lanes, select
 
 
 @compiled
@@ -221,7 +221,7 @@ def slope_along(slope: float, ratio: float, square: float, whole: float) -> floa
         square: squared slip in the direction, as linear force over load [1].
         whole: squared slip in all directions [1].
     """
-    mean = (slope * square + ratio * (whole - square)) / whole
+    mean = (slope * square + ratio * (whole - square)) * inverse_of(whole)
     return select(whole < TINY, 1.0, max(mean, FLATTEST))
 
 
@@ -236,4 +236,4 @@ def slip_noise_correction(slope: float) -> float:
     curve, where hardly any slip noise enters. It would favour nodes (friction hypotheses) by which
     the wheels slide.
     """
-    return 0.5 - slope * slope / (1.0 + slope * slope)
+    return 0.5 - slope * slope * inverse_of(1.0 + slope * slope)

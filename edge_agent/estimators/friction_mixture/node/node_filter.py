@@ -4,7 +4,7 @@ the friction under its left and right wheels.
 Legend
     m, P        mean (n,) and covariance (n, n)
     B           measurement deviations of the cubature points, in the axes of the first CURVED
-                columns of the factor of P                             (6, CURVED)
+                columns of the factor of P                             (CURVED, 6)
     D           derivative of the rows by a state that they depend on linearly
     h           covariance of the states with a row                     (n,)
     S           covariance of the rows without noise                    (6, 6)
@@ -25,7 +25,6 @@ from typing import NamedTuple
 from edge_agent.estimators.friction_mixture.node.covariance import (
     factorize_first,
     predict_covariance,
-    symmetric_at,
 )
 from edge_agent.estimators.friction_mixture.node.linearization import linearize_nodes
 from edge_agent.estimators.friction_mixture.node.residuals import (
@@ -34,6 +33,12 @@ from edge_agent.estimators.friction_mixture.node.residuals import (
     find_slips,
     gained_by,
     is_measured,
+)
+from edge_agent.estimators.friction_mixture.node.row_vectors import (
+    add_row,
+    multiply_row,
+    put_row,
+    scale_row,
 )
 from edge_agent.estimators.friction_mixture.state.constants import (
     ACTIVE,
@@ -52,7 +57,7 @@ from edge_agent.estimators.friction_mixture.state.workspace import (
 )
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, inlined
-from schemas.runtime.lanes import lanes_at, log_lanes, put_lanes, sum_lanes
+from schemas.runtime.lanes import lanes_at, log_lanes, put_lanes
 
 REAR_ROWS = (2, 3, 5)
 DOUBTED = 0.05  # of distrust_noise, at the brink of it
@@ -159,12 +164,17 @@ def weigh_rows(
         squares += residual * residual / total
         product *= 2.0 * math.pi * total
         kind = 0 if r < 4 else 1
-        scratch.actual_sum[kind] += sum_lanes(share * residual * residual)
-        scratch.theoretical_sum[kind] += sum_lanes(share * total)
+        _add_lanes(scratch.actual_lanes, kind, share * residual * residual)
+        _add_lanes(scratch.theoretical_lanes, kind, share * total)
         if kind == 1:
-            scratch.stated_sum += sum_lanes(share * (total - surplus * noise))
-    scratch.square_sum += sum_lanes(share * squares)
+            _add_lanes(scratch.stated_lanes, 0, share * (total - surplus * noise))
+    _add_lanes(scratch.square_lanes, 0, share * squares)
     return -0.5 * (squares + log_lanes(product))
+
+
+@inlined
+def _add_lanes(sums: FloatArray, place: int, value: float) -> None:
+    put_lanes(sums, place, lanes_at(sums, place) + value)
 
 
 @compiled
@@ -196,7 +206,7 @@ def spread_points(
         for r in range(ROWS):
             ahead = lanes_at(node.ahead, r)
             behind = lanes_at(node.behind, r)
-            put_lanes(node.curved, (r, column), (0.5 / scale) * (ahead - behind))
+            put_lanes(node.curved, (column, r), (0.5 / scale) * (ahead - behind))
             put_lanes(node.middle, (column, r), 0.5 * (ahead + behind))
     for r in range(ROWS):
         centre = 0.0
@@ -215,31 +225,28 @@ def find_covariances(covariance: FloatArray, node: NodeWorkspace) -> None:
     """Compute node.cross, the covariance of the states with each row (h), and node.spread, that of
     the rows with each other (S).
     """
+    derivative = node.derivative
     for i in range(STATES):
-        for r in range(ROWS):
-            total = 0.0
-            for column in range(CURVED):
-                total += lanes_at(node.root, (i, column)) * lanes_at(node.curved, (r, column))
-            for state in range(CURVED, ACTIVE):
-                by_state = lanes_at(node.derivative, (state, r))
-                total += symmetric_at(covariance, i, state) * by_state
-            put_lanes(node.cross, (i, r), total)
+        total = scale_row(node.curved, 0, lanes_at(node.root, (i, 0)))
+        for column in range(1, CURVED):
+            total = add_row(total, node.curved, column, lanes_at(node.root, (i, column)))
+        for state in range(CURVED, min(i + 1, ACTIVE)):
+            total = add_row(total, derivative, state, lanes_at(covariance, (i, state)))
+        for state in range(max(i + 1, CURVED), ACTIVE):
+            total = add_row(total, derivative, state, lanes_at(covariance, (state, i)))
+        put_row(node.cross, i, total)
+    for column in range(CURVED):
+        total = scale_row(node.curved, column, 1.0)
+        for state in range(CURVED, ACTIVE):
+            total = add_row(total, derivative, state, lanes_at(node.root, (state, column)))
+        put_row(node.whole, column, total)
     for r in range(ROWS):
-        for column in range(CURVED):
-            total = lanes_at(node.curved, (r, column))
-            for state in range(CURVED, ACTIVE):
-                by_state = lanes_at(node.derivative, (state, r))
-                total += by_state * lanes_at(node.root, (state, column))
-            put_lanes(node.whole, (r, column), total)
-    for r in range(ROWS):
-        for q in range(r + 1):
-            total = 0.0
-            for column in range(CURVED):
-                total += lanes_at(node.curved, (r, column)) * lanes_at(node.whole, (q, column))
-            for state in range(CURVED, ACTIVE):
-                by_state = lanes_at(node.derivative, (state, r))
-                total += by_state * lanes_at(node.cross, (state, q))
-            put_lanes(node.spread, (r, q), total)
+        total = scale_row(node.whole, 0, lanes_at(node.curved, (0, r)))
+        for column in range(1, CURVED):
+            total = add_row(total, node.whole, column, lanes_at(node.curved, (column, r)))
+        for state in range(CURVED, ACTIVE):
+            total = add_row(total, node.cross, state, lanes_at(derivative, (state, r)))
+        put_row(node.spread, r, total)
 
 
 @compiled
@@ -334,11 +341,10 @@ def _subtract_rows(covariance: FloatArray, node: NodeWorkspace) -> None:
     """Subtract from the covariances what all rows explain: h*h'*gain of each."""
     for i in range(STATES):
         for r in range(ROWS):
-            put_lanes(node.scaled, r, lanes_at(node.cross, (i, r)) * lanes_at(node.gain, r))
+            put_lanes(node.scaled, (0, r), lanes_at(node.cross, (i, r)) * lanes_at(node.gain, r))
+        scaled = scale_row(node.scaled, 0, 1.0)
         for j in range(i + 1):
-            left = lanes_at(covariance, (i, j))
-            for r in range(ROWS):
-                left -= lanes_at(node.scaled, r) * lanes_at(node.cross, (j, r))
+            left = lanes_at(covariance, (i, j)) - multiply_row(scaled, node.cross, j)
             put_lanes(covariance, (i, j), left)
 
 

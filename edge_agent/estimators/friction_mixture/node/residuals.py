@@ -42,7 +42,14 @@ from edge_agent.estimators.friction_mixture.state.workspace import (
 )
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, inlined
-from schemas.runtime.lanes import exp_lanes, lanes_at, put_lanes, select
+from schemas.runtime.lanes import (
+    exp_lanes,
+    inverse_of,
+    inverse_root_of,
+    lanes_at,
+    put_lanes,
+    select,
+)
 
 # of its friction, that the slippery side gives before the other side takes the rest
 SPLIT_LIMIT = 0.9
@@ -63,8 +70,9 @@ def curve_distance(along: float, across: float) -> float:
 
     If `along` is infinite (the force exceeds the peak), return `across`.
     """
-    size = math.sqrt(along * along + across * across)
-    distance = select(size < TINY, 0.0, across * abs(along) / size)
+    square = along * along + across * across
+    distance = across * abs(along) * inverse_root_of(square)
+    distance = select(square < TINY * TINY, 0.0, distance)
     return select(abs(along) == math.inf, across, distance)
 
 
@@ -155,7 +163,7 @@ def find_slips(
             sin = features.steer_sin[wheel]
             along = cos * vx + sin * vy + features.turn_along[wheel]
             across = cos * vy - sin * vx + features.turn_across[wheel]
-            per_speed = 1.0 / max(abs(along), SLOWEST_M_S)
+            per_speed = inverse_of(max(abs(along), SLOWEST_M_S))
             if is_measured(features, wheel):
                 faster = lanes_at(node.rolling, wheel) - along
                 put_lanes(slip.along, wheel, slope_x * faster * per_speed)
@@ -181,9 +189,10 @@ def find_ratios(
         for wheel in range(2 * axle, 2 * axle + 2):
             g_x = lanes_at(slip.along, wheel)
             g_y = lanes_at(slip.across, wheel)
-            size = math.sqrt(g_x * g_x + g_y * g_y)
+            square = g_x * g_x + g_y * g_y
+            size = square * inverse_root_of(square)
             theta = size * lanes_at(node.per_mu, wheel % 2)
-            place = theta / (1.0 + theta)
+            place = theta * inverse_of(1.0 + theta)
             ratio = ratio_at(curve, theta, place)
             put_lanes(slip.size, wheel, size)
             put_lanes(slip.place, wheel, place)
@@ -206,7 +215,8 @@ def find_shape_force(curve: TyreCurve, features: BlockFeatures, node: NodeWorksp
         for wheel in range(2 * axle, 2 * axle + 2):
             size = lanes_at(slip.size, wheel)
             shape = interpolate_table(curve.shape, lanes_at(slip.place, wheel))
-            change = select(size < TINY, 0.0, lanes_at(node.mu, wheel % 2) * shape / size)
+            change = lanes_at(node.mu, wheel % 2) * shape * inverse_of(size)
+            change = select(size < TINY, 0.0, change)
             put_lanes(node.shape_force, wheel, change * lanes_at(slip.along, wheel))
             side += features.load_share[wheel] * change * lanes_at(slip.across, wheel)
         put_lanes(node.shape_force, 4 + axle, side)
@@ -314,11 +324,12 @@ def _slip_at_force(curve: TyreCurve, mu: float, per_mu: float, force: float, oth
     The slip is given as the force over load [1] that a linear tyre would have at it; it is infinite
     at or beyond the peak of the curve.
     """
-    size = math.sqrt(force * force + other * other)
-    theta = theta_at(curve, size * per_mu)
-    slip = mu * theta * (force / size)
+    square = force * force + other * other
+    per_size = inverse_root_of(square)
+    theta = theta_at(curve, square * per_size * per_mu)
+    slip = mu * theta * (force * per_size)
     slip = select(theta == math.inf, select(force < 0.0, -math.inf, math.inf), slip)
-    return select(size < TINY, force, slip)
+    return select(square < TINY * TINY, force, slip)
 
 
 @compiled

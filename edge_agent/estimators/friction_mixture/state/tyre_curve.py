@@ -20,7 +20,7 @@ import numpy as np
 
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import inlined
-from schemas.runtime.lanes import any_lane, floor, gather, select
+from schemas.runtime.lanes import any_lane, floor, gather, inverse_root_of, select
 
 CELLS: Final = 1024  # linear between: errors below 1e-6 of the force
 # (c, e) of the Magic Formula: tyres of passenger cars lie between, the brush model two spreads
@@ -114,5 +114,6 @@ def theta_at(curve: TyreCurve, force: float) -> float:
     """Return the normalised slip on the rising branch of the tyre curve at a given force over
     mu*F_z (friction times load; 0 or more); infinite at and beyond the peak.
     """
-    theta = interpolate_table(curve.inverse, math.sqrt(max(1.0 - force, 0.0)))
+    square = max(1.0 - force, 0.0)
+    theta = interpolate_table(curve.inverse, square * inverse_root_of(square))
     return select(force >= 1.0, math.inf, theta)

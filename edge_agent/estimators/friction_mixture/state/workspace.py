@@ -120,11 +120,11 @@ class NodeWorkspace:
     middle: Annotated[LaneArray, CURVED, ROWS]
     derivative: Annotated[LaneArray, ACTIVE, ROWS]
     root: Annotated[LaneArray, STATES, CURVED]  # first columns of the covariance's factor
-    curved: Annotated[LaneArray, ROWS, CURVED]  # deviation of the cubature points in their axes
-    whole: Annotated[LaneArray, ROWS, CURVED]  # the same with the rows' linear part
+    curved: Annotated[LaneArray, CURVED, ROWS]  # deviation of the cubature points in their axes
+    whole: Annotated[LaneArray, CURVED, ROWS]  # the same with the rows' linear part
     cross: Annotated[LaneArray, STATES, ROWS]  # covariance of the states with the rows
     gain: Annotated[LaneArray, ROWS]  # inverse variances of the innovations
-    scaled: Annotated[LaneArray, ROWS]
+    scaled: Annotated[LaneArray, 1, ROWS]
     spread: Annotated[LaneArray, ROWS, ROWS]  # covariance of the rows
     noise: Annotated[LaneArray, ROWS]  # variance of the rows' noise
     abrupt: Annotated[
@@ -151,10 +151,14 @@ class Scratch:
     plain: Annotated[FloatArray, PLACES]  # the same with the nominal R
     moved: Annotated[FloatArray, PLACES]  # change of what the belief about the vehicle costs [nat]
     predicted: Annotated[FloatArray, ALL_NODES]
-    actual_sum: Annotated[FloatArray, 2]
+    # sums over the nodes by weight, of the wheels and of the axles, first lane by lane
+    actual_lanes: Annotated[LaneArray, 2]
+    theoretical_lanes: Annotated[LaneArray, 2]
+    stated_lanes: Annotated[LaneArray, 1]
+    square_lanes: Annotated[LaneArray, 1]
+    actual_sum: Annotated[FloatArray, 2]  # squared innovations
+    theoretical_sum: Annotated[FloatArray, 2]  # their variances
     stated_sum: float  # the axles' with R as the constants state it
-    theoretical_sum: Annotated[FloatArray, 2]
-    square_sum: float  # normalised innovation squared, by weight
     projected: Annotated[FloatArray, NODES]
     expected: Annotated[FloatArray, NODES]
     blended: Annotated[FloatArray, NODES]

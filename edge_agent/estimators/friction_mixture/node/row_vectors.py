@@ -1,0 +1,61 @@
+"""Vectors of one number per measurement row (ROWS = 6), in registers while a loop adds to them.
+
+They are tuples, because elements of an array are read from memory again after each write to any
+array. Each number is lanes: one value per node of a group.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import inlined
+from schemas.runtime.lanes import lanes_at, put_lanes
+
+Row: TypeAlias = tuple[float, float, float, float, float, float]
+
+
+@inlined
+def scale_row(rows: FloatArray, i: int, factor: float) -> Row:
+    """Return `factor` times vector i of `rows` (n, ROWS, LANES)."""
+    return (
+        factor * lanes_at(rows, (i, 0)),
+        factor * lanes_at(rows, (i, 1)),
+        factor * lanes_at(rows, (i, 2)),
+        factor * lanes_at(rows, (i, 3)),
+        factor * lanes_at(rows, (i, 4)),
+        factor * lanes_at(rows, (i, 5)),
+    )
+
+
+@inlined
+def add_row(total: Row, rows: FloatArray, i: int, factor: float) -> Row:
+    """Return `total` plus `factor` times vector i of `rows` (n, ROWS, LANES)."""
+    return (
+        total[0] + factor * lanes_at(rows, (i, 0)),
+        total[1] + factor * lanes_at(rows, (i, 1)),
+        total[2] + factor * lanes_at(rows, (i, 2)),
+        total[3] + factor * lanes_at(rows, (i, 3)),
+        total[4] + factor * lanes_at(rows, (i, 4)),
+        total[5] + factor * lanes_at(rows, (i, 5)),
+    )
+
+
+@inlined
+def multiply_row(row: Row, rows: FloatArray, i: int) -> float:
+    """Return the scalar product of `row` and vector i of `rows` (n, ROWS, LANES)."""
+    first = row[0] * lanes_at(rows, (i, 0)) + row[1] * lanes_at(rows, (i, 1))
+    middle = row[2] * lanes_at(rows, (i, 2)) + row[3] * lanes_at(rows, (i, 3))
+    last = row[4] * lanes_at(rows, (i, 4)) + row[5] * lanes_at(rows, (i, 5))
+    return first + middle + last
+
+
+@inlined
+def put_row(rows: FloatArray, i: int, row: Row) -> None:
+    """Write `row` to vector i of `rows` (n, ROWS, LANES)."""
+    put_lanes(rows, (i, 0), row[0])
+    put_lanes(rows, (i, 1), row[1])
+    put_lanes(rows, (i, 2), row[2])
+    put_lanes(rows, (i, 3), row[3])
+    put_lanes(rows, (i, 4), row[4])
+    put_lanes(rows, (i, 5), row[5])
