@@ -27,6 +27,7 @@ from fleet_service.fusion.store.records import (
     PEER,
     REPORTER,
     REPORTERS_USED,
+    SETTLED,
     SOURCE,
     VEHICLE,
     WINDOW,
@@ -48,6 +49,7 @@ _RECORDS: Final = {
     "windows": WINDOW,
     "entries": ENTRY,
     "pairs": PAIR,
+    "settled": SETTLED,
     "reporters": REPORTER,
     "peers": PEER,
     "names": VEHICLE,
@@ -72,6 +74,7 @@ def image_of(fusion: Fusion) -> Image:
         "windows": state.windows,
         "entries": state.entries,
         "pairs": state.pairs,
+        "settled": state.settled,
         "reporters": live.reporters[: int(state.used[REPORTERS_USED])],
         "peers": store.peers[: store.vehicles],
         "names": store.names[: store.vehicles],
@@ -79,6 +82,11 @@ def image_of(fusion: Fusion) -> Image:
     image: Image = {name: {"bytes": _record_bytes(array)} for name, array in records.items()}
     image["belief"] = {"bins": live.belief[: store.size].reshape(-1)}
     image["base_belief"] = {"bins": base.belief.reshape(-1)}
+    image["settled_reports"] = {
+        "key": state.settled_keys,
+        "std": state.settled_std,
+        "begin": state.settled_begin.reshape(-1),
+    }
     image["free_windows"] = {"row": state.free_windows[: int(state.used[FREE_WINDOWS])]}
     image["free_entries"] = {"row": state.free_entries[: int(state.used[FREE_ENTRIES])]}
     image["used"] = {
@@ -127,6 +135,10 @@ def fusion_of(image: Image, lateness_s: float) -> Fusion:
         entries=records["entries"],
         free_entries=_pad_rows(image["free_entries"]["row"], len(records["entries"])),
         pairs=records["pairs"],
+        settled=records["settled"].copy(),  # owns its memory, so that it can be resized
+        settled_keys=image["settled_reports"]["key"].copy(),
+        settled_std=image["settled_reports"]["std"].copy(),
+        settled_begin=image["settled_reports"]["begin"].reshape(-1, 2).copy(),
         used=image["used"]["count"].copy(),
     )
     fusion.store = Store.of(state, records["peers"], records["names"], size, vehicles, forgotten_at)

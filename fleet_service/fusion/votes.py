@@ -28,7 +28,6 @@ from fleet_service.fusion.belief import (
     unpack_belief,
 )
 from fleet_service.fusion.shared import UNKNOWN_SHAPE, fade_weights, note_value
-from fleet_service.fusion.store.pairs import oldest_remembered, returning_bit
 from fleet_service.fusion.store.records import (
     AGED,
     FINE,
@@ -41,6 +40,7 @@ from fleet_service.fusion.store.records import (
     USED,
     Rows,
 )
+from fleet_service.fusion.store.settled import oldest_remembered, returning_bit
 from fleet_service.fusion.weather import Weather, road_time
 from schemas import mugrid
 from schemas.numeric import Float32Array

@@ -32,6 +32,7 @@ from fleet_service.fusion.store.records import (
     Int32Array,
     State,
 )
+from fleet_service.fusion.store.settled import guess_row
 from fleet_service.fusion.store.table import AHEAD, first_place
 from fleet_service.fusion.trust import compare_reports, judge_flag
 from fleet_service.fusion.votes import (
@@ -139,7 +140,7 @@ def _absorb_votes(
         slot = votes.slot[k]
         if marks.left_out[row]:
             continue
-        pair = pair_of(pairs, state.used, slot, arrivals.vehicle[row])
+        pair = pair_of(state, slot, arrivals.vehicle[row])
         if not marks.seen[row] and pairs[pair].waiting >= votes.most:
             marks.left_out[row] = True
             continue
@@ -214,6 +215,7 @@ def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, begin: int, 
         entry = state.free_entries[used[FREE_ENTRIES] - 1 - (k - begin)]
         prefetch(state.entries, entry, 0)
         prefetch(state.entries, entry, 1)
+        prefetch(state.settled_begin, slot, 0)
         window = state.free_windows[used[FREE_WINDOWS] - 1 - (k - begin)]
         prefetch(base.cells, window, 0)
         prefetch(base.belief, window, 0)
@@ -223,6 +225,11 @@ def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, begin: int, 
         reporters = max(live.cells[votes.slot[k]].reporters, 0)
         prefetch(live.reporters, reporters, 1)
         prefetch(live.reporters, reporters, 2)
+        slot = min(votes.slot[k], len(state.settled_begin) - 2)
+        if slot >= 0:
+            row = guess_row(state, slot, arrivals.vehicle[votes.row[k]])
+            prefetch(state.settled_keys, row - 8, 0)
+            prefetch(state.settled_keys, row + 8, 0)
     for k in range(begin, end):
         prefetch(state.entries, windows[max(live.cells[votes.slot[k]].window, 0)].tail, 0)
 

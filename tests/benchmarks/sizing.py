@@ -75,7 +75,7 @@ def main(vehicles: int, messages: int) -> None:
         content = MemoryContent(
             vehicles=store.vehicles,
             cells=store.size,
-            pairs=int(store.state.used[PAIRS]),
+            pairs=int(store.state.used[PAIRS]) + len(store.state.settled),
             waiting=store.waiting,
         )
         print(json.dumps(content._asdict() | {"bytes": read_resident_bytes() - before}))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion.store.cells import rows_of_lines
-from fleet_service.fusion.store.pairs import count_staying, mark_returned, move_pairs
+from fleet_service.fusion.store.pairs import move_pairs
 from fleet_service.fusion.store.records import (
     FREE_ENTRIES,
     FREE_WINDOWS,
@@ -25,6 +25,12 @@ from fleet_service.fusion.store.records import (
     Int32Array,
     Rows,
     State,
+)
+from fleet_service.fusion.store.settled import (
+    count_settling,
+    drop_reports,
+    find_resting,
+    insert_reports,
 )
 from fleet_service.fusion.store.table import PAIRS_MOST, places_for
 from schemas.numeric import IntArray
@@ -56,17 +62,37 @@ def grow_windows(state: State, most: int) -> State:
     return state._replace(windows=windows, base=base, free_windows=free)
 
 
-def rebuild_pairs(state: State, names: RecordArray, now: int, most: int) -> State:
-    """Return the fusion's state without the pair records (one per vehicle and cell) that are too
-    old at `now` [s], and with room for `most` pair records. `names` are the records of the
-    vehicles.
+def grow_pairs(state: State, most: int) -> State:
+    """Return the fusion's state with room for at least `most` active pairs (vehicles in cells)."""
+    return _move_pairs(state, max(int(state.used[PAIRS]), most), only_waiting=False)
+
+
+def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State:
+    """Return the fusion's state with all pairs (vehicles in cells) settled that have no observation
+    in a window, and without reports that are not remembered at `now` [s]. `names` (V,) are the
+    records of the vehicles, and `size` is the number of slots (cells and sectors) in use.
     """
-    old = state.pairs
-    count = count_staying(old, now)
-    new = no_pairs(places_for(max(count, most), PAIRS_MOST))
-    dropped = move_pairs(state.entries, old, new, now)
-    mark_returned(state, old["slot"][dropped], names["key"][old["vehicle"][dropped]])
-    state.used[PAIRS] = count
+    most = int(state.used[PAIRS])  # of which there will be as many again
+    reports, values = drop_reports(state, names, now)
+    begins = np.empty((size + 1, 2), np.uint32)
+    begins[: len(state.settled_begin)] = state.settled_begin
+    begins[len(state.settled_begin) :] = reports, values
+    state = state._replace(settled_begin=begins)
+    resting = find_resting(state.pairs)
+    slot = state.pairs["slot"][resting].astype(np.int64)
+    resting = resting[np.argsort(slot << 32 | state.pairs["vehicle"][resting])]
+    more, more_values = count_settling(state, names, resting, now)
+    # in place, because a copy would take as much memory again
+    state.settled.resize(reports + more, refcheck=False)
+    state.settled_keys.resize(reports + more, refcheck=False)
+    state.settled_std.resize(values + more_values, refcheck=False)
+    insert_reports(state, resting, now, reports, values, len(names))
+    return _move_pairs(state, most, only_waiting=True)
+
+
+def _move_pairs(state: State, most: int, *, only_waiting: bool) -> State:
+    new = no_pairs(places_for(most, PAIRS_MOST))
+    state.used[PAIRS] = move_pairs(state.entries, state.pairs, new, int(only_waiting))
     return state._replace(pairs=new)
 
 
@@ -91,7 +117,7 @@ def rebuild_reporters(state: State, size: int, least: int) -> State:
 
 
 def no_pairs(places: int) -> RecordArray:
-    """Return an empty table of pair records (one per vehicle and cell)."""
+    """Return an empty table of active pairs (records of a vehicle in a cell)."""
     pairs = rows_of_lines(places, PAIR)
     pairs["slot"] = NONE
     return pairs

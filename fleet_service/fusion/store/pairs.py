@@ -1,26 +1,18 @@
-"""Store of the earlier reports of a pair, which is one vehicle in one cell. Recent reports form a
-linked list, because a late one may still come between them. One record sums up the older reports.
+"""Store of the earlier reports of an active pair, which is one vehicle in one cell. Recent reports
+form a linked list, because a late one may still come between them. One record sums up the older
+reports.
 """
 
 from __future__ import annotations
 
-from typing import Final
-
-import numpy as np
-
-from fleet_service.fusion import constants as c
-from fleet_service.fusion.belief import BOUND, VALUE
+from fleet_service.fusion.belief import VALUE
 from fleet_service.fusion.store.records import NONE, PAIRS, State
+from fleet_service.fusion.store.settled import activate_reports
 from fleet_service.fusion.store.table import AHEAD, pair_place
-from schemas.numeric import IntArray
 from schemas.runtime.jit import compiled, refcount_free_inlined
 from schemas.runtime.prefetch import prefetch
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
-
-_VALUES_S: Final = int(c.FORGOTTEN_S)
-_BOUNDS_S: Final = int(c.VOTE_RENEWAL_S)
-_FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its multiples lie far apart
 
 
 @refcount_free_inlined
@@ -39,10 +31,11 @@ def comes_before(entries: RecordArray, a: int, b: int) -> bool:
 
 
 @refcount_free_inlined
-def pair_of(pairs: RecordArray, used: IntArray, slot: int, vehicle: int) -> int:
-    """Return the row of the pair of `slot` (cell and sector) and `vehicle`; create the pair (record
-    of a vehicle in a cell) if it does not exist.
+def pair_of(state: State, slot: int, vehicle: int) -> int:
+    """Return the row of the active pair (record of a vehicle in a cell) of `slot` (cell and sector)
+    and `vehicle`. If the pair is not active, it becomes active.
     """
+    pairs = state.pairs
     pair = pair_place(pairs, slot, vehicle)
     if pairs[pair].slot == NONE:
         pairs[pair].slot = slot
@@ -51,7 +44,8 @@ def pair_of(pairs: RecordArray, used: IntArray, slot: int, vehicle: int) -> int:
         pairs[pair].waiting = 0
         pairs[pair].time[0] = 0
         pairs[pair].time[1] = 0
-        used[PAIRS] += 1
+        state.used[PAIRS] += 1
+        activate_reports(state, pair)
     return pair
 
 
@@ -95,45 +89,11 @@ def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
         entries[entries[entry].after].before = NONE
 
 
-@refcount_free_inlined
-def oldest_remembered(now: int, kind: int) -> int:
-    """Return the time [s] of the oldest report of a kind (BOUND or VALUE) that is still remembered
-    at `now` [s]. Older reports have no effect, whether or not their record is already deleted.
-    """
-    return int(now - now % c.FORGOTTEN_EVERY_S - (_VALUES_S if kind == VALUE else _BOUNDS_S))
-
-
-@refcount_free_inlined
-def _must_stay(pairs: RecordArray, place: int, now: int) -> bool:
-    """Return True if the record of a vehicle and cell must stay: the vehicle has reported there so
-    lately that the report is remembered at `now` [s], or has observations there that are younger
-    than the checkpoint (the time before which observations are final).
-    """
-    pair = pairs[place]
-    return bool(
-        pair.last != NONE
-        or pair.time[BOUND] >= oldest_remembered(now, BOUND)
-        or pair.time[VALUE] >= oldest_remembered(now, VALUE)
-    )
-
-
 @compiled
-def count_staying(pairs: RecordArray, now: int) -> int:
-    """Return the number of records of a vehicle in a cell that must stay in memory, see
-    `_must_stay`.
+def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, only_waiting: int) -> int:
+    """Move the records of active pairs to another table. If `only_waiting` is 1, move only those
+    with an observation in a window. Return their number.
     """
-    count = 0
-    for place in range(len(pairs)):
-        count += pairs[place].slot != NONE and _must_stay(pairs, place, now)
-    return count
-
-
-@compiled
-def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, now: int) -> IntArray:
-    """Move the records of a vehicle in a cell that must stay (see `_must_stay`) to another table.
-    Return the row numbers of the other pairs in the old table, one array.
-    """
-    dropped = np.empty(len(old), np.int64)
     count = 0
     for begin in range(0, len(old), AHEAD):
         end = min(begin + AHEAD, len(old))
@@ -141,39 +101,13 @@ def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, now: in
             if old[place].slot != NONE and old[place].last != NONE:
                 prefetch(entries, old[place].last, 0)
         for place in range(begin, end):
-            if old[place].slot == NONE:
+            if old[place].slot == NONE or (only_waiting and old[place].last == NONE):
                 continue
-            if not _must_stay(old, place, now):
-                dropped[count] = place
-                count += 1
-                continue
+            count += 1
             to = pair_place(new, old[place].slot, old[place].vehicle)
             new[to] = old[place]
             entry = int(old[place].last)
             while entry != NONE:
                 entries[entry].pair = to
                 entry = int(entries[entry].before)
-    return dropped[:count]
-
-
-@refcount_free_inlined
-def returning_bit(number: int) -> np.uint64:
-    """Return the bit that represents a vehicle in `Cells.returned`; several vehicles share a
-    bit.
-    """
-    return np.uint64(1) << ((np.uint64(number) * _FIBONACCI) >> np.uint64(58))
-
-
-@compiled
-def mark_returned(state: State, slots: IntArray, numbers: IntArray) -> None:
-    """Record in each cell (slots (k,)) that a vehicle (numbers (k,)) has visited it. This is done
-    before the vehicle's reports there are deleted, so that a later report does not count it as a
-    new vehicle.
-    """
-    for k in range(len(slots)):
-        slot = slots[k]
-        bit = returning_bit(numbers[k])
-        state.live.cells[slot].returned |= bit
-        window = state.live.cells[slot].window
-        if window != NONE:
-            state.base.cells[window].returned |= bit
+    return count

@@ -12,7 +12,8 @@ Terms
     value, bound  observation that measures the friction; one that only gives a lower bound of it
     checkpoint    latest time minus the allowed delay; observations before it are final
     window        list of the observations of a slot after the checkpoint, in order of time
-    pair          one vehicle in one slot
+    pair          one vehicle in one slot; active while one of its observations is in a window or
+                  became final lately, then settled
 
 Records store some numbers as small integers. "In units of 1/FINE" means that the stored integer is
 the number times FINE, rounded. The same holds for USED, SHARED and others.
@@ -192,9 +193,9 @@ class WindowRecord:
 
 
 class PairRecord:
-    """Summary of the reports of one vehicle in one slot (a pair) that are older than the checkpoint
-    and therefore final. A record is half a cache line long, so that no record crosses the border of
-    a line.
+    """Active pair: summary of the reports of one vehicle in one slot that are older than the
+    checkpoint and therefore final. A record is half a cache line long, so that no record crosses
+    the border of a line.
 
     Attributes:
         slot, vehicle: slot and index of the vehicle; a free place of the table has slot NONE.
@@ -214,6 +215,19 @@ class PairRecord:
     time: Annotated[UIntArray, 2]
     mean: Annotated[UInt16Array, 2]
     spent: Annotated[UInt16Array, 2]
+
+
+class SettledRecord:
+    """Last report of one kind of a settled pair.
+
+    Attributes:
+        time: last 16 bits of the time [s] of the report; `settled` restores the others.
+        mean, spent: as in `PairRecord`.
+    """
+
+    time: np.uint16
+    mean: np.uint16
+    spent: np.uint16
 
 
 class SourcesRecord:
@@ -277,6 +291,7 @@ CELL: Final = record_type(CellRecord)
 ENTRY: Final = record_type(EntryRecord)
 WINDOW: Final = record_type(WindowRecord)
 PAIR: Final = record_type(PairRecord)
+SETTLED: Final = record_type(SettledRecord)
 SOURCE: Final = record_type(SourcesRecord)
 REPORTER: Final = record_type(ReportersRecord)
 PEER: Final = record_type(PeersRecord)
@@ -298,9 +313,10 @@ class Rows(NamedTuple):
     reporters: RecordArray
 
 
-# Places of `State.used`: how many windows and entries are free, how many pairs and rows of
-# reporters are in use.
-FREE_WINDOWS, FREE_ENTRIES, PAIRS, REPORTERS_USED = range(4)
+# Places of `State.used`: how many windows and entries are free, how many active pairs and rows of
+# reporters are in use; time [s] before which no settled report was made; number of vehicles when
+# pairs were last settled.
+FREE_WINDOWS, FREE_ENTRIES, PAIRS, REPORTERS_USED, SETTLED_SINCE, SETTLED_VEHICLES = range(6)
 
 
 class State(NamedTuple):
@@ -312,8 +328,15 @@ class State(NamedTuple):
             windows, one row per row of `windows`; of the reporters only the sources are copied.
         windows, entries: pools (arrays with free rows) of `WindowRecord` and `EntryRecord`.
         free_windows, free_entries: stacks of the pools' free rows.
-        pairs: hash table that contains the pair records.
-        used: (4,) counts, see FREE_WINDOWS.
+        pairs: hash table that contains the records of active pairs.
+        settled: `SettledRecord` of each report of the settled pairs, (k,), sorted by slot, vehicle
+            and kind.
+        settled_keys: vehicle and kind of each settled report, (k,): four times the vehicle's
+            index, plus two times the kind, plus one if the pair is active again.
+        settled_std: `std` (see `PairRecord`) of the settled reports that are values, in order.
+        settled_begin: rows of `settled` and of `settled_std` at which the reports of each slot
+            begin, (m + 1, 2). Slots from m on, which are new, have no settled pairs.
+        used: (6,) counts, see FREE_WINDOWS.
     """
 
     live: Rows
@@ -323,4 +346,8 @@ class State(NamedTuple):
     entries: RecordArray
     free_entries: Int32Array
     pairs: RecordArray
+    settled: RecordArray
+    settled_keys: UIntArray
+    settled_std: UInt16Array
+    settled_begin: UIntArray
     used: IntArray

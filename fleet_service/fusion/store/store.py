@@ -10,11 +10,12 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.store.cells import Cells, cells_of, no_beliefs, rows_of_lines
 from fleet_service.fusion.store.growth import (
     grow_entries,
+    grow_pairs,
     grow_rows,
     grow_windows,
     no_pairs,
-    rebuild_pairs,
     rebuild_reporters,
+    settle_pairs,
 )
 from fleet_service.fusion.store.records import (
     CELL,
@@ -27,6 +28,7 @@ from fleet_service.fusion.store.records import (
     PEER,
     REPORTER,
     REPORTERS_USED,
+    SETTLED,
     SOURCE,
     VEHICLE,
     WINDOW,
@@ -73,7 +75,11 @@ class Store:
             entries=np.zeros(0, ENTRY),
             free_entries=_NOTHING,
             pairs=no_pairs(LEAST),
-            used=np.zeros(4, np.int64),
+            settled=np.zeros(0, SETTLED),
+            settled_keys=np.zeros(0, np.uint32),
+            settled_std=np.zeros(0, np.uint16),
+            settled_begin=np.zeros((1, 2), np.uint32),
+            used=np.zeros(6, np.int64),
         )
         self.peers = no_peers(0)
         self.names: RecordArray = np.zeros(0, VEHICLE)
@@ -203,17 +209,23 @@ class Store:
                 live=live._replace(reporters=grow_rows(live.reporters, most))
             )
         if is_full(int(used[PAIRS]) + rows, len(self.state.pairs), PAIRS_MOST):
-            self.state = rebuild_pairs(self.state, self.names, 0, int(used[PAIRS]) + rows)
+            self.state = grow_pairs(self.state, int(used[PAIRS]) + rows)
 
     def forget(self, checkpoint_s: int) -> None:
-        """Delete old data, once per quarter of an hour of the checkpoint time: records of a vehicle
-        in a cell that are not remembered (`pairs.oldest_remembered`), and lists of a cell's recent
-        reporters older than an hour (`trust.compare_reports`, `Fusion.sources`).
+        """Delete old data, once per quarter of an hour of the checkpoint time: reports of a vehicle
+        in a cell that are not remembered (`settled.oldest_remembered`), and lists of a cell's
+        recent reporters older than an hour (`trust.compare_reports`, `Fusion.sources`). Settle
+        resting pairs then, and whenever they are many.
         """
         now = checkpoint_s - checkpoint_s % c.FORGOTTEN_EVERY_S
+        state = self.state
+        resting = int(state.used[PAIRS]) - self.waiting
+        # resting pairs take five times the memory of settled ones, and settling reads all
+        some = (len(state.settled) + self.size) // 32
+        if now != self.forgotten_at or resting > max(LEAST, self.waiting, some):
+            self.state = settle_pairs(state, self.names[: self.vehicles], self.size, now)
         if now != self.forgotten_at:
             self.forgotten_at = now
-            self.state = rebuild_pairs(self.state, self.names, now, 0)
             self.state = rebuild_reporters(self.state, self.size, now - _HOUR - _AHEAD)
 
     def untouched(self, before: int) -> BoolArray:
@@ -224,6 +236,8 @@ class Store:
         pairs = self.state.pairs
         found = (cells["time"] < before) & (cells["window"] == NONE) & (cells["reporters"] == NONE)
         found[pairs["slot"][pairs["slot"] != NONE]] = False
+        begins = self.state.settled_begin[:, 0]
+        found[: len(begins) - 1] &= begins[1:] == begins[:-1]
         return np.asarray(found)
 
     def drop(self, gone: BoolArray) -> IntArray:
@@ -238,13 +252,16 @@ class Store:
         belief = no_beliefs(len(stay))
         cells = rows_of_lines(len(stay), CELL)
         belief[:], cells[:] = live.belief[stay], live.cells[stay]
-        self.state = self.state._replace(live=live._replace(belief=belief, cells=cells))
+        begins = self.state.settled_begin
+        begins = begins[np.append(stay[stay < len(begins) - 1], len(begins) - 1)]
+        live = live._replace(belief=belief, cells=cells)
+        self.state = self.state._replace(live=live, settled_begin=begins)
         for pointing in (self.state.windows["slot"], self.state.pairs["slot"]):
             used = pointing != NONE
             pointing[used] = place[pointing[used]]
         self.size = len(stay)
         self._slots = table_of(cells, self.size, self.size)
-        self.state = rebuild_pairs(self.state, self.names, 0, 0)
+        self.state = grow_pairs(self.state, 0)
         return place
 
 

@@ -30,7 +30,7 @@ from schemas.runtime.records import RecordArray
 LEAST: Final = 1024  # places of a new table
 # share of the places that rows take: eight of them are a line, and probes cost little
 ROWS_MOST: Final = 0.8
-PAIRS_MOST: Final = 0.6  # ... that pairs take, of which two are a line: two or three probes
+PAIRS_MOST: Final = 0.7  # ... that pairs take, of which two are a line: two or three probes
 _LOWER: Final = 0xFFFFFFFF
 _TAG: Final = 0x7FFFFFFF
 # rows whose memory is prefetched before they are worked on, so that it comes for all at once

@@ -15,13 +15,17 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from fleet_service.app.engine import Engine
-from fleet_service.fusion.store.records import PAIRS
+from fleet_service.fusion import Fusion
+from fleet_service.fusion.constants import FORGOTTEN_EVERY_S
 from fleet_service.ingest.inbox import Message
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
+from tests.benchmarks.fusion import SECOND, START, make_visits
 from tests.benchmarks.ingest import make_messages
-from tests.benchmarks.measure import read_resident_bytes
+from tests.benchmarks.measure import SEED, read_resident_bytes
 
 MANY: Final = 40_000  # messages of each part
 ROWS: Final = 10
@@ -90,12 +94,20 @@ def main(kind: str) -> None:
                 engine.settlement.flush()
         engine.settlement.flush()
         assert engine.counts[Kind.OBSERVATION] == (MANY + FEW) * ROWS, engine.counts
-        state = engine.state.fusion.store.state
-        print(
-            read_resident_bytes() - before,
-            engine.state.fusion.size,
-            state.pairs.nbytes / state.used[PAIRS],
-        )
+        grown = read_resident_bytes() - before
+        fusion = engine.state.fusion
+        print(grown, fusion.size, _measure_pair(fusion))
+
+
+def _measure_pair(fusion: Fusion) -> float:
+    """Return the bytes of the table of (cell, vehicle) pairs for each pair, after all have settled
+    because a vehicle reports a quarter of an hour later.
+    """
+    later_s = (fusion.next_epoch - START) / SECOND + FORGOTTEN_EVERY_S
+    fusion.update(make_visits(np.random.default_rng(SEED), 1, 1, later_s, 1.0))
+    state = fusion.store.state
+    arrays = (state.settled, state.settled_keys, state.settled_std)
+    return sum(array.nbytes for array in arrays) / len(state.settled)
 
 
 if __name__ == "__main__":

@@ -6,13 +6,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from fleet_service.fusion import Fusion
+from fleet_service.fusion.store import store
+from fleet_service.fusion.store.growth import settle_pairs
 from fleet_service.fusion.store.records import GRIP, ICE, NONE, PAIRS, REPORTERS_USED, VEHICLE
 from fleet_service.fusion.store.table import PAIRS_MOST, fill_table, rows_of
 from schemas import mugrid
 from schemas.numeric import FloatArray
 from tests.fleet_service.examples import CELL, SECOND, START, at_least, belief, observations, value
+from tests.fleet_service.fusion.test_order import delay_arrivals, drive
 
 LATENESS_S = 120.0
 HOUR = 3600.0
@@ -114,8 +119,10 @@ def count_pairs_after(evidence: FloatArray, hours: float) -> tuple[int, int]:
     times = np.arange(60.0, hours * HOUR, 60.0)
     for time in times.tolist():
         fusion.update(observations([time], [2], at_least([0.3]), CELL + 1))
-    pairs = fusion.store.state.pairs
-    found = int((pairs["slot"] == fusion.slots_of(np.array([CELL]), np.array([0]))[0]).sum())
+    slot = fusion.slots_of(np.array([CELL]), np.array([0]))[0]
+    active = fusion.store.state.pairs["slot"] == slot
+    settled = np.diff(fusion.store.state.settled_begin[:, 0])[slot]
+    found = int(active.sum() + settled)
     fusion.update(observations([hours * HOUR], [1], evidence, CELL))
     return found, int(fusion.live.vehicles[0])
 
@@ -130,6 +137,73 @@ def test_bounds_are_remembered_for_an_hour_and_values_for_three(
 ) -> None:
     assert count_pairs_after(evidence, kept_h) == (1, 1)
     assert count_pairs_after(evidence, gone_h) == (0, 1), "forgotten, and not counted twice"
+
+
+def repeat_after_settling(evidence: FloatArray, *, forgets: bool) -> Fusion:
+    """Return a fusion in which 300 vehicles passed a cell and one of them, number 0, repeats its
+    report 40 minutes later; it has lost all settled pairs if it `forgets`.
+    """
+    fusion = Fusion(LATENESS_S)
+    fusion.update(observations(0.1 * np.arange(300), np.arange(300), evidence.repeat(300, 0), CELL))
+    fusion.update(observations([1200.0], [500], at_least([0.3]), CELL + 1))
+    assert len(fusion.store.state.settled) == 300
+    assert fusion.store.state.used[PAIRS] == 1
+    if forgets:
+        fusion.store.state.settled_begin[:] = 0
+    fusion.update(observations([2400.0], [0], evidence, CELL))
+    return fusion
+
+
+@pytest.mark.parametrize("evidence", [at_least([0.5]), value([0.5])], ids=["bound", "value"])
+def test_a_vehicle_with_a_settled_pair_stays_one_witness(evidence: FloatArray) -> None:
+    fusion = repeat_after_settling(evidence, forgets=False)
+    control = repeat_after_settling(evidence, forgets=True)
+    assert fusion.live.vehicles[0] == 300
+    assert control.live.vehicles[0] == 301
+    power, whole = (
+        float(f.store.state.entries["power"][f.store.state.windows["tail"][f.live.window[0]]])
+        for f in (fusion, control)
+    )
+    assert power == pytest.approx(1.0 - np.exp(-2400.0 / 3600.0), abs=1e-3)
+    assert whole == 1.0
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 400))
+def test_settling_has_no_effect_on_any_cell_in_any_order(seed: int, parts: int) -> None:
+    """Pairs settle after each batch in one fusion, and never in the other one."""
+    o = drive(seed, 1500, 3000.0)
+    straight = Fusion(LATENESS_S)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store, "settle_pairs", lambda state, *_: state)
+        straight.update(o)
+    assert not len(straight.store.state.settled)
+    mixed = Fusion(LATENESS_S)
+    for rows in np.array_split(delay_arrivals(o, 110.0, seed), parts):
+        mixed.update(o.take(rows))
+        kept = mixed.store
+        if kept.forgotten_at:
+            kept.state = settle_pairs(kept.state, kept.names, mixed.size, kept.forgotten_at)
+    assert len(mixed.store.state.settled) > 50
+    there = mixed.slots_of(straight.cell[: straight.size], straight.sector[: straight.size])
+    for name in ("belief", "visits", "vehicles", "values", "untrusted"):
+        np.testing.assert_array_equal(
+            getattr(straight.live, name)[: straight.size], getattr(mixed.live, name)[there]
+        )
+
+
+def test_pairs_that_never_meet_take_a_few_bytes() -> None:
+    fusion = Fusion(LATENESS_S)
+    vehicles = 20_000
+    evidence = at_least([0.3] * vehicles)
+    evidence[::7] = value([0.7])
+    fusion.update(observations(np.linspace(0.0, 60.0, vehicles), np.arange(vehicles), evidence))
+    fusion.update(observations([1200.0], [vehicles], at_least([0.3])))
+    state = fusion.store.state
+    arrays = (state.settled, state.settled_keys, state.settled_std)
+    assert state.used[PAIRS] == 1
+    assert len(state.settled) == vehicles
+    assert sum(array.nbytes for array in arrays) <= 10.3 * vehicles
 
 
 def test_a_vehicle_that_repeats_its_bound_within_the_hour_adds_little() -> None:

@@ -1,0 +1,285 @@
+"""Settled pairs: the last reports of a vehicle in a slot (cell and sector), all of which are final,
+as sorted records without free space. A pair whose vehicle returns becomes active again
+(`pairs.pair_of`). Compiled.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.belief import BOUND, VALUE
+from fleet_service.fusion.store.records import NONE, SETTLED_SINCE, SETTLED_VEHICLES, State
+from fleet_service.fusion.store.table import AHEAD
+from schemas.numeric import IntArray
+from schemas.runtime.jit import compiled, refcount_free_inlined
+from schemas.runtime.prefetch import prefetch
+from schemas.runtime.records import RecordArray
+
+_VALUES_S: Final = int(c.FORGOTTEN_S)
+_BOUNDS_S: Final = int(c.VOTE_RENEWAL_S)
+_FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its multiples lie far apart
+# flag of a key: the pair is active again, so the report is not valid
+_MOVED: Final = np.uint32(1)
+
+
+@refcount_free_inlined
+def oldest_remembered(now: int, kind: int) -> int:
+    """Return the time [s] of the oldest report of a kind (BOUND or VALUE) that is still remembered
+    at `now` [s]. Older reports have no effect, whether or not their record is already deleted.
+    """
+    return int(now - now % c.FORGOTTEN_EVERY_S - (_VALUES_S if kind == VALUE else _BOUNDS_S))
+
+
+@refcount_free_inlined
+def _to_int(number: np.unsignedinteger[Any]) -> int:
+    """Convert an unsigned number. Numba computes with signed and unsigned numbers together in
+    floating point.
+    """
+    return int(np.int64(number))
+
+
+@refcount_free_inlined
+def _make_key(vehicle: int, kind: int) -> np.uint32:
+    """Return the key of a settled report: index of the vehicle, kind, and the flag _MOVED."""
+    return np.uint32(4 * vehicle + 2 * kind)
+
+
+@refcount_free_inlined
+def _full_time(stored: np.uint16, since: int) -> int:
+    """Return the time [s] of a settled report from its last 16 bits. `since` [s] is at most 18 h
+    before it (`State.used[SETTLED_SINCE]`).
+    """
+    return int(since + ((_to_int(stored) - since) & 0xFFFF))
+
+
+@refcount_free_inlined
+def guess_row(state: State, slot: int, vehicle: int) -> int:
+    """Return the row at which the settled reports of a vehicle in a slot probably begin, if there
+    are any. Rows are sorted by the vehicle's index, which is below `used[SETTLED_VEHICLES]`.
+    """
+    begin = _to_int(state.settled_begin[slot, 0])
+    rows = _to_int(state.settled_begin[slot + 1, 0]) - begin
+    share = np.float32(vehicle) / np.float32(max(state.used[SETTLED_VEHICLES], 1))
+    return begin + min(int(np.float32(rows) * share), rows - 1)
+
+
+@refcount_free_inlined
+def _find_first(state: State, slot: int, vehicle: int) -> int:
+    """Return the first row of a slot with settled reports of a vehicle, or of one with a higher
+    index. The search begins at the probable row and doubles its steps, because each cache line
+    outside takes time.
+    """
+    keys = state.settled_keys
+    begin = _to_int(state.settled_begin[slot, 0])
+    end = _to_int(state.settled_begin[slot + 1, 0])
+    key = _make_key(vehicle, BOUND)
+    low = begin
+    high = end
+    step = 4
+    row = guess_row(state, slot, vehicle)
+    if begin < end and keys[row] < key:
+        while row < end and keys[row] < key:
+            low = row + 1
+            row += step
+            step *= 2
+        high = min(row, end)
+    else:
+        while row >= begin and keys[row] >= key:
+            high = row
+            row -= step
+            step *= 2
+        low = max(row + 1, begin)
+    while low < high:
+        middle = (low + high) >> 1
+        if keys[middle] < key:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@refcount_free_inlined
+def activate_reports(state: State, pair: int) -> None:
+    """Move the settled reports of a pair, if there are any, to its record (row `pair` of the table
+    of pairs), which has just become active.
+    """
+    this = state.pairs[pair]
+    slot = int(this.slot)
+    if slot >= len(state.settled_begin) - 1:
+        return
+    keys = state.settled_keys
+    end = _to_int(state.settled_begin[slot + 1, 0])
+    row = _find_first(state, slot, this.vehicle)
+    while row < end and _to_int(keys[row] >> 2) == this.vehicle:
+        kind = _to_int(keys[row] >> 1) & 1
+        this.time[kind] = _full_time(state.settled[row].time, state.used[SETTLED_SINCE])
+        this.mean[kind] = state.settled[row].mean
+        this.spent[kind] = state.settled[row].spent
+        if kind == VALUE:
+            value = _to_int(state.settled_begin[slot, 1])
+            for other in range(_to_int(state.settled_begin[slot, 0]), row):
+                value += _to_int(keys[other] >> 1) & 1
+            this.std = state.settled_std[value]
+        keys[row] |= _MOVED
+        row += 1
+
+
+@refcount_free_inlined
+def _move_report(state: State, row: int, to: int, value: int, to_value: int) -> int:
+    """Move a settled report from one row to another one; and if it is a value, its standard
+    deviation, which has rows of its own. Return 1 for a value, else 0.
+    """
+    state.settled_keys[to] = state.settled_keys[row]
+    state.settled[to] = state.settled[row]
+    is_value = _to_int(state.settled_keys[to] >> 1) & 1
+    if is_value:
+        state.settled_std[to_value] = state.settled_std[value]
+    return is_value
+
+
+@compiled
+def drop_reports(state: State, names: RecordArray, now: int) -> tuple[int, int]:
+    """Delete the settled reports that are not remembered at `now` [s], and those of pairs that are
+    active again. The others move to the beginning of the arrays. Return their number, and the
+    number of values among them. `names` are the records of the vehicles.
+    """
+    begins = state.settled_begin
+    keys = state.settled_keys
+    since = state.used[SETTLED_SINCE]
+    reports = 0
+    values = 0
+    value = 0
+    begin = 0
+    for slot in range(len(begins) - 1):
+        end = _to_int(begins[slot + 1, 0])
+        begins[slot, 0] = reports
+        begins[slot, 1] = values
+        staying = NONE
+        for row in range(begin, end):
+            kind = _to_int(keys[row] >> 1) & 1
+            vehicle = _to_int(keys[row] >> 2)
+            value += kind
+            if keys[row] & _MOVED:
+                continue
+            if _full_time(state.settled[row].time, since) >= oldest_remembered(now, kind):
+                staying = vehicle
+                values += _move_report(state, row, reports, value - 1, values)
+                reports += 1
+            elif staying != vehicle and (row + 1 == end or _to_int(keys[row + 1] >> 2) != vehicle):
+                _mark_returned(state, slot, names[vehicle].key)
+        begin = end
+    begins[-1, 0] = reports
+    begins[-1, 1] = values
+    return reports, values
+
+
+@compiled
+def find_resting(pairs: RecordArray) -> IntArray:
+    """Return the rows of the active pairs without an observation in a window."""
+    out = np.empty(len(pairs), np.int64)
+    count = 0
+    for row in range(len(pairs)):
+        if pairs[row].slot != NONE and pairs[row].last == NONE:
+            out[count] = row
+            count += 1
+    return out[:count].copy()
+
+
+@compiled
+def count_settling(
+    state: State, names: RecordArray, resting: IntArray, now: int
+) -> tuple[int, int]:
+    """Return the number of reports of pairs (rows `resting` (k,), sorted by slot and vehicle) that
+    are remembered at `now` [s], and the number of values among them. Pairs without such a report
+    are recorded in their cells as visitors.
+    """
+    bounds = 0
+    values = 0
+    for k in range(len(resting)):
+        prefetch(state.pairs, resting[min(k + AHEAD, len(resting) - 1)], 0)
+        this = state.pairs[resting[k]]
+        has_bound = this.time[BOUND] >= oldest_remembered(now, BOUND)
+        has_value = this.time[VALUE] >= oldest_remembered(now, VALUE)
+        bounds += has_bound
+        values += has_value
+        if not has_bound and not has_value:
+            _mark_returned(state, this.slot, names[this.vehicle].key)
+    return bounds + values, values
+
+
+@compiled
+def insert_reports(
+    state: State, resting: IntArray, now: int, reports: int, values: int, vehicles: int
+) -> None:
+    """Insert the reports of pairs (rows `resting` (k,), sorted by slot and vehicle) that are
+    remembered at `now` [s] into the settled reports, beginning with the last one.
+
+    There are `reports` settled reports, `values` of which are values; the arrays have room for the
+    additional ones at their ends. `vehicles` is the number of known vehicles.
+    """
+    begins = state.settled_begin
+    keys = state.settled_keys
+    end = reports
+    value = values
+    to = len(keys)
+    to_value = len(state.settled_std)
+    k = len(resting) - 1
+    for slot in range(len(begins) - 2, -1, -1):
+        begin = _to_int(begins[slot, 0])
+        begins[slot + 1, 0] = to
+        begins[slot + 1, 1] = to_value
+        while k >= 0 and state.pairs[resting[k]].slot == slot:
+            prefetch(state.pairs, resting[max(k - AHEAD, 0)], 0)
+            this = state.pairs[resting[k]]
+            k -= 1
+            for kind in (VALUE, BOUND):
+                if this.time[kind] < oldest_remembered(now, kind):
+                    continue
+                key = _make_key(this.vehicle, kind)
+                while end > begin and keys[end - 1] > key:
+                    end -= 1
+                    to -= 1
+                    is_value = _move_report(state, end, to, value - 1, to_value - 1)
+                    value -= is_value
+                    to_value -= is_value
+                to -= 1
+                keys[to] = key
+                state.settled[to].time = this.time[kind] & 0xFFFF
+                state.settled[to].mean = this.mean[kind]
+                state.settled[to].spent = this.spent[kind]
+                if kind == VALUE:
+                    to_value -= 1
+                    state.settled_std[to_value] = this.std
+        if to == end:  # all others are at their places
+            break
+        while end > begin:
+            end -= 1
+            to -= 1
+            is_value = _move_report(state, end, to, value - 1, to_value - 1)
+            value -= is_value
+            to_value -= is_value
+    state.used[SETTLED_SINCE] = oldest_remembered(now, VALUE)
+    state.used[SETTLED_VEHICLES] = vehicles
+
+
+@refcount_free_inlined
+def returning_bit(number: int) -> np.uint64:
+    """Return the bit that represents a vehicle in `Cells.returned`; several vehicles share a
+    bit.
+    """
+    return np.uint64(1) << ((np.uint64(number) * _FIBONACCI) >> np.uint64(58))
+
+
+@refcount_free_inlined
+def _mark_returned(state: State, slot: int, number: int) -> None:
+    """Record in a cell that a vehicle (permanent number) has visited it. This is done before the
+    vehicle's reports there are deleted, so that a later report does not count it as a new vehicle.
+    """
+    bit = returning_bit(number)
+    state.live.cells[slot].returned |= bit
+    window = state.live.cells[slot].window
+    if window != NONE:
+        state.base.cells[window].returned |= bit
