@@ -15,6 +15,7 @@ from pathlib import Path
 from schemas.runtime import progress_messages
 from schemas.runtime.jit import native_library_path, use_native_kernels
 from schemas.runtime.native_kernels import LINKER, Library
+from schemas.runtime.process import end_with_parent
 
 
 def use_agent_library() -> bool:
@@ -71,4 +72,5 @@ def build_agent_library(path: Path) -> None:
 
 
 if __name__ == "__main__":
+    end_with_parent()
     build_agent_library(Path(sys.argv[1]))

@@ -21,7 +21,6 @@ import numpy as np
 
 LINKER: Final = "cc"
 HEADER: Final = 2  # words before the arguments: the mark, and the result
-SIZE: Final = 8  # bytes of a word
 LARGEST: Final = 1 << 63
 
 

@@ -7,6 +7,7 @@ import ctypes
 import json
 import logging
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from typing import Any, Final, Literal, NoReturn, TextIO
 
 Form = Literal["text", "json"]
 _MMAP_THRESHOLD: Final = -3  # M_MMAP_THRESHOLD of glibc's malloc.h
+_SET_PARENT_DEATH_SIGNAL: Final = 1  # PR_SET_PDEATHSIG of prctl
 _LARGE: Final = 4 << 20  # bytes; a turn's own arrays are smaller
 
 
@@ -60,6 +62,12 @@ def trim_memory() -> None:
     """
     with suppress(AttributeError, OSError):
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def end_with_parent() -> None:
+    """Let the system end this process when its parent ends, on Linux."""
+    with suppress(AttributeError, OSError):
+        ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
 
 
 def force_exit(code: int) -> NoReturn:

@@ -27,6 +27,8 @@ EDGE = (sys.executable, "-m", "edge_agent.cli")
 FIRST = """import sys
 from pathlib import Path
 from edge_agent.app.native_library import use_agent_library
+from schemas.runtime.process import limit_memory
+limit_memory()
 use_agent_library()
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.signal_log import read_log
@@ -77,8 +79,8 @@ def simulate_drive(folder: Path, name: str, seed: int, seconds: float) -> tuple[
 
 
 def measure_start(folder: Path) -> list[Figure]:
-    """Measure the time of `--help`, and of the first estimate of a new process whose compiled code
-    is cached.
+    """Measure the time of `--help`, and of the first estimate of a new process that is set up as
+    `edge-agent run` does and whose compiled code is cached.
     """
     files = [str(path) for path in simulate_drive(folder, "short", 0, 2.0)]
 
