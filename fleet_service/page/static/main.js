@@ -18,6 +18,7 @@ import { Timeline } from "./timeline.js";
 import { Updates } from "./updates.js";
 import { START, boxOf, levelOf } from "./view.js";
 
+const PHONE_PX = 800, SIDE_PX = 400, SHEET = .44;  // as in style.css: panel beside the map, or share of a phone's screen below it
 const BARE_MS = 300;  // so long may the first picture keep the buttons waiting
 
 /** The page: state, map, panels, updates from the server, and timeline. */
@@ -113,11 +114,12 @@ class Page {
 // The place and zoom of a link.
 const placeOf = words => ["x", "y", "zoom"].map(name => numberIn(words, name, START[name]));
 
-// Ask for the cells of a link before there is a map: the window is at least as large. They come while the page is set up.
+// Ask for the cells of a link before the map has a size; they come while the page is set up. The panel covers what is not asked for.
 function askEarly(now, words) {
   if (!words.x || [words.at, words.compare, words.borrowed].some(one => one !== undefined)) return;
   const [x, y, zoom] = placeOf(words);
-  now.show(boxOf({ x, y, zoom, width: innerWidth, height: innerHeight }), levelOf(zoom)).catch(() => {});
+  const isPhone = innerWidth <= PHONE_PX, width = isPhone ? innerWidth : innerWidth - SIDE_PX, height = isPhone ? innerHeight * (1 - SHEET) : innerHeight;
+  now.show(boxOf({ x, y, zoom, width, height }), levelOf(zoom)).catch(() => {});
 }
 
 const now = new Cells(), listed = now.list();
