@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from hypothesis import settings
 
 from deploy.router import open_router
 from fleet_service.app.service import Service
@@ -18,9 +17,6 @@ from schemas.config import ServiceConfig, ZenohSettings
 from schemas.runtime.zenoh_session import open_session
 from tests.buckets import BucketServer, bucket_server
 from tests.waiting import until
-
-settings.register_profile("compiled", deadline=None)  # the first example waits for the compiler
-settings.load_profile("compiled")
 
 PUT_S = 0.1
 

@@ -22,13 +22,13 @@ PATHS = ("protobuf posterior", "json posterior", "protobuf likelihood", "json li
 
 
 @pytest.mark.parametrize("path", PATHS)
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(st.floats(0.0, 0.53))  # from .54 on the posterior of .9 is a value
 def test_a_hundred_vehicles_are_no_more_than_one_by_every_path(path: str, used: float) -> None:
     assert situations.bound_excess(used, path) <= c.UTILISED_STD
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.floats(0.1, 0.9), st.integers(1, 400))
 def test_any_number_of_bounds_leaves_belief_flat_above_the_grip_used(
     used: float, vehicles: int
@@ -43,7 +43,7 @@ def test_any_number_of_bounds_leaves_belief_flat_above_the_grip_used(
     assert upper >= interval(mugrid.PRIOR)[1] - 0.02
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.floats(0.1, 0.9), st.integers(1, 200))
 def test_grip_used_counts_where_a_contradicted_estimator_reports_nothing(
     used: float, vehicles: int

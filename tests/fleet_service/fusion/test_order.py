@@ -66,7 +66,7 @@ def difference(a: Fusion, b: Fusion) -> float:
     return float(np.abs(a.beliefs(np.arange(a.size), now) - b.beliefs(there, now)).max())
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10**6), st.integers(1, 40))
 @pytest.mark.campaign
 def test_any_order_within_the_window_gives_the_same_beliefs(seed: int, parts: int) -> None:

@@ -168,7 +168,7 @@ def test_a_vehicle_with_a_settled_pair_stays_one_witness(evidence: FloatArray) -
     assert whole == 1.0
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 10**6), st.integers(1, 400))
 def test_settling_has_no_effect_on_any_cell_in_any_order(seed: int, parts: int) -> None:
     """Pairs settle after each batch in one fusion, and never in the other one."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_service.ingest.batch_decoder import decode_many
@@ -20,7 +20,6 @@ from schemas.errors import WireError
 from schemas.proto import gripmap_pb2 as pb
 from schemas.wire import ENCODING, MESSAGES, NEEDED, Kind, column_types, decode
 
-compiled = settings(deadline=None)  # the first example waits for the compiler
 KINDS = st.sampled_from(list(Kind))
 _I64 = st.integers(-(2**63), 2**63 - 1)
 _I32 = st.one_of(st.integers(-3, 5), st.integers(-(2**31), 2**31 - 1))
@@ -82,7 +81,6 @@ def is_agreed(kind: Kind, payload: bytes) -> bool:
     return True
 
 
-@compiled
 @given(KINDS.flatmap(lambda kind: st.tuples(st.just(kind), draw_message(kind))))
 def test_what_the_module_writes_is_understood_and_read_to_the_last_bit(
     case: tuple[Kind, Any],
@@ -91,7 +89,6 @@ def test_what_the_module_writes_is_understood_and_read_to_the_last_bit(
     assert is_agreed(kind, message.SerializeToString())
 
 
-@compiled
 @given(
     KINDS.flatmap(lambda kind: st.tuples(st.just(kind), draw_message(kind))),
     st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255)), max_size=4),
@@ -111,7 +108,6 @@ def test_damaged_bytes_are_left_to_the_module_or_read_as_it_reads_them(
     is_agreed(kind, bytes(payload[:place]) + inserted + bytes(payload[place:]))
 
 
-@compiled
 @given(st.binary(max_size=200), KINDS)
 def test_any_bytes_at_all_are_left_to_the_module_or_read_as_it_reads_them(
     payload: bytes, kind: Kind

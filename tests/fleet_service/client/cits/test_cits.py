@@ -124,7 +124,7 @@ def any_denm(draw: strategies.DrawFn) -> Denm:
     )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(any_denm())
 def test_two_other_encoders_write_the_same_bytes(sent: Denm) -> None:
     data = encode_denm(sent)
@@ -139,7 +139,7 @@ def test_two_other_encoders_write_the_same_bytes(sent: Denm) -> None:
     assert management.get("termination") == sent.termination
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(any_denm())
 def test_an_encoded_denm_is_read_as_it_was(sent: Denm) -> None:
     read = decode_denm(encode_denm(sent))
