@@ -1,4 +1,4 @@
-"""Settings of all tests: property tests draw the same examples in every run, without a time limit."""
+"""Settings of all tests: property tests draw fixed examples, without a time limit."""
 
 from __future__ import annotations
 
