@@ -2,7 +2,18 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import settings
+
+from schemas.runtime import jit
 
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.load_profile("fixed")
+
+
+@pytest.fixture(autouse=True)
+def _use_numba_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let each test begin with Numba's kernels: an agent that an earlier test ran in this process
+    took those of the shared library.
+    """
+    monkeypatch.setattr(jit._Native, "library", None)
