@@ -243,16 +243,7 @@ def _link_object(code: bytes, path: Path) -> None:
         source = Path(folder) / "kernels.o"
         source.write_bytes(code)
         try:
-            words = [
-                LINKER,
-                "-shared",
-                "-nostartfiles",
-                "-Wl,-z,noexecstack",
-                "-o",
-                str(made),
-                str(source),
-                "-lm",
-            ]
+            words = [LINKER, *LINKED, "-o", str(made), str(source), "-lm"]
             subprocess.run(words, check=True, capture_output=True)
             made.replace(path)
         finally:

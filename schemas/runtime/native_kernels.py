@@ -63,7 +63,7 @@ class NativeKernel:
         """The Numba version of the kernel; it is compiled at its first use."""
         return self._compile()
 
-    def __call__(self, *arguments: Any) -> Any:  # noqa: ANN401 a kernel takes what it takes
+    def __call__(self, *arguments: Any) -> Any:  # noqa: ANN401 differs by kernel
         """Run the kernel, and return its result: None or an integer."""
         words = [0, 0]
         try:

@@ -119,7 +119,7 @@ export class Cells {
     return Number.isFinite(found.west) ? found : null;
   }
 
-  // Answers to what was asked before count no more.
+  // Answers to earlier requests are ignored from now on.
   restart() {
     this.generation++;
     this.asking.clear();

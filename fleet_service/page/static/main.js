@@ -39,7 +39,7 @@ class Page {
     now.changed = () => this.map.draw();
   }
 
-  /** Show the first picture, and then load what it does not need. */
+  /** Show the first picture, and then load the parts that it does not need. */
   async start() {
     const { map, panels, state, updates } = this, words = fromHash(location.hash);
     const isPast = words.at !== undefined || words.compare !== undefined;
@@ -107,14 +107,14 @@ class Page {
     if (this.state.tab === "cell") this.panels.refresh();
   }
 
-  /** Write the state into the address, so that it is a link to what is shown. */
+  /** Write the state into the address, so that the address is a link to this view. */
   remember() { if (this.map.view.gone || this.state.cells.known.size) history.replaceState(null, "", linkTo(this)); }
 }
 
 // The place and zoom of a link.
 const placeOf = words => ["x", "y", "zoom"].map(name => numberIn(words, name, START[name]));
 
-// Ask for the cells of a link before the map has a size; they come while the page is set up. The panel covers what is not asked for.
+// Ask for the cells of a link before the map has a size; they arrive while the page is set up. Cells below the panel are not requested.
 function askEarly(now, words) {
   if (!words.x || [words.at, words.compare, words.borrowed].some(one => one !== undefined)) return;
   const [x, y, zoom] = placeOf(words);

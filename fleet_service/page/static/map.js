@@ -1,4 +1,4 @@
-// The large map: its two canvases, the view, and what is drawn when.
+// The large map: its two canvases, its view, and the order of drawing.
 import { moveDivider } from "./appearance.js";
 import { BaseMap } from "./basemap.js";
 import { byId } from "./elements.js";

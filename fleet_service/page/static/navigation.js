@@ -31,7 +31,7 @@ export function fitTo({ map }, points) {
   map.view.fit({ west: Math.min(...xs), east: Math.max(...xs), north: Math.min(...ys), south: Math.max(...ys) });
 }
 
-/** Show all cells, and those that come, until somebody looks elsewhere. */
+/** Show all cells, also new ones, until the user moves the map. */
 export async function showAll({ map, state }) {
   for (let zoom = null, k = 0; k < ROUNDS && zoom !== map.view.zoom; k++) {  // again to the cells, where only their tiles or squares were known before
     zoom = map.view.zoom;
@@ -51,7 +51,7 @@ export async function showFirst(page) {
   await map.look();
 }
 
-/** Show new cells outside the view, unless somebody chose where to look. */
+/** Extend the view to new cells, unless the user has moved the map. */
 export function followCells(page) {
   const { map: { view }, state } = page, { box } = view, extent = view.gone || state.past ? null : state.now.extent;
   if (!extent) return;

@@ -96,7 +96,7 @@ export class Updates {
   /** Show which regions have no service, by what the server reports every two seconds. */
   beat({ away, served, now }) {
     const { state, map, panels } = this.page, words = byId("away");
-    state.away = away.length || served ? away : [{ box: WORLD }];  // nobody ever answered: no emptiness
+    state.away = away.length || served ? away : [{ box: WORLD }];  // no service has answered, so nothing is known to be empty
     words.hidden = !away.length;
     if (away.length) words.textContent = say("away", { count: away.length, ago: ago(now - Math.min(...away.map(one => one.since))) });
     panels.tick();

@@ -28,7 +28,8 @@ from schemas.signals import CONTEXT
 from schemas.vehicle import load_vehicle
 
 drive = np.load(sys.argv[1])
-t, signals = drive["t"], drive["signals"]
+t = drive["t"]
+signals = drive["signals"]
 context = np.random.default_rng(0).integers(0, 2, (*t.shape, len(CONTEXT))).astype(float)
 bank = bank_of("aco-fckf", [load_vehicle("class:compact")] * {VEHICLES})
 pipeline = Pipeline(bank, {VEHICLES}, AgentConfig())
