@@ -1,5 +1,5 @@
-"""Friction mixture (grid of friction hypotheses): compiled function for many vehicles, and output
-of the estimates.
+"""Friction mixture (grid of friction hypotheses) for many vehicles: the estimator bank with its
+compiled function, and the functions that write the estimates to its output.
 """
 
 from __future__ import annotations

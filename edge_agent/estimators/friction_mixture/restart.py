@@ -1,5 +1,5 @@
-"""Start and restart of a filter: at the first sample, after a gap in time, and when wheel speeds
-contradict every friction hypothesis (node) for a long time.
+"""Start and restart of a vehicle's filter: at the first sample, after a gap in time, and when the
+wheel speeds contradict every friction hypothesis (node) for a long time.
 """
 
 from __future__ import annotations
@@ -116,8 +116,8 @@ def forget_vehicle(memory: MixtureMemory) -> None:
 def reset_to_wheel_speed(
     memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
 ) -> int:
-    """Reset the motion where it is far from the speed of wheels that agree and roll freely; return
-    the health flags.
+    """Reset the motion estimate if it is far from the speed of wheels that agree and roll freely;
+    return the health flags.
 
     If wheels have agreed for a long time, vehicle states and friction are reset together with the
     motion. If wheels have just begun to roll without force, after a slide, only the motion is
@@ -163,8 +163,8 @@ def free_speed(memory: MixtureMemory, features: BlockFeatures) -> float:
 
 @compiled
 def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> int:
-    """Restart the motion at `speed` [m/s], or at the current estimate if `speed` is NaN. Reset all
-    other states and the friction to the prior.
+    """Restart the motion estimate at `speed` [m/s], or at its current value if `speed` is NaN.
+    Reset all other states and the friction to the prior.
     """
     forget_vehicle(memory)  # what was learned while lost is as wrong as the motion was
     restart_motion(memory, speed, LOST_SPREAD_M_S)

@@ -1,10 +1,10 @@
 """Processing of one sample of one vehicle: add the sample to the sums of the block (the samples
 within 0.05 s) and, at the end of the block, run one step of the friction mixture (all hypotheses).
 
-Order at the end of a block: road change; then one pass over the nodes, a group at a time: mixing,
-measurement update at the state of the block's beginning, prediction to the block's end; update of
-the node weights with evidence that counts more at larger tyre forces; adaptation of R; moments of
-the mixture. Within a block, the same exact kinematics advance the velocity.
+At the end of a block, the steps are: possible change of the road; for each group of nodes mixing,
+measurement update at the state of the block's beginning, and prediction to the block's end; update
+of the node probabilities; adaptation of the measurement noise R; mean and covariance of the
+mixture. Between block ends, the velocity is advanced by integrating the accelerometers.
 """
 
 from __future__ import annotations
@@ -81,7 +81,8 @@ def step(
 @compiled
 def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Process the block (the samples within 0.05 s) that ends: run one step of the friction mixture
-    (all hypotheses) with its sums. The next block begins at the time of the last sample.
+    (all hypotheses) with the sums over its samples. The next block begins at the time of the last
+    sample.
     """
     features = scratch.features
     features.duration = memory.last.time - memory.block.time
@@ -206,7 +207,8 @@ def mean_velocity(memory: MixtureMemory) -> tuple[float, float]:
 def turned_velocity(
     memory: MixtureMemory, gain: VelocityGain, cos: float, sin: float
 ) -> tuple[float, float]:
-    """Return the mixture's current (v_x, v_y) [m/s] in vehicle axes.
+    """Return the mixture's velocity (v_x, v_y) [m/s] at the current time, in the current vehicle
+    axes.
 
     Since the block (0.05 s) began, the vehicle has turned by an angle with this cosine and sine,
     and has gained the velocity `gain`.

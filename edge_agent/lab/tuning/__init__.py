@@ -1,3 +1,3 @@
-"""Tuning of the fuzzy memberships: ant colony optimisation, random search for comparison,
-objectives, and files of tuned memberships that state how they were found.
+"""Tuning of the fuzzy memberships (parameters of the fuzzy sets): ant colony optimisation, random
+search for comparison, objectives, and the files of tuned memberships with a record of their search.
 """

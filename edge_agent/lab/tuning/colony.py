@@ -1,5 +1,5 @@
-"""Ant colony on a graph of positions (paper 004, III.C). The module is pure; random generator and
-objective are arguments.
+"""Ant colony optimisation on a graph of possible values (paper 004, III.C). The module has no side
+effects; random generator and objective are arguments.
 
 Each variable ("vertex") has a list of possible values ("positions"). An ant goes from vertex to
 vertex and chooses one position at each; its path is one vector of values.
@@ -13,14 +13,14 @@ vertex and chooses one position at each; its path is one vector of values.
     η       visibility: prior preference of a position  (V, K)   -
     A       positions that exist at the vertex          (V, K)   -
     ρ       evaporation per iteration                            -
+    α, θ₀   weights of pheromone and of visibility               -
 
-Departures from the paper. The paper calls ρ the residual and uses it as evaporation in (32). Here
-(32) is used, and the paper's .284 is the part that remains, so that ρ = .716: with few iterations
-the colony must learn fast. Pheromone belongs to (vertex, position), not to edges, because the
-objective depends on positions and not on their sequence. Deposits depend on the rank of an ant, and
-the best path so far also receives a deposit. Pheromone stays within bounds. Therefore the scale of
-the objective does not matter, and the colony cannot stagnate (rank-based, elitist and max-min ant
-systems).
+Departures from the paper. The paper calls ρ = .284 the residual, but uses it as evaporation in
+(32). Here .284 is the part that remains, so ρ = .716 in (32), because the colony must learn within
+few iterations. Pheromone belongs to (vertex, position), not to edges, because the objective depends
+on positions and not on their sequence. Deposits depend on the rank of an ant, so the scale of the
+objective does not matter. The best path so far also receives a deposit. Pheromone stays within
+bounds, so the colony cannot stagnate. (These are the rank-based, elitist and max-min ant systems.)
 """
 
 from collections.abc import Callable
@@ -39,7 +39,8 @@ HIGHEST = 1.0
 
 @dataclass(frozen=True)
 class Habits:
-    """Parameters of the ant colony: weights of pheromone and visibility, evaporation, and deposits.
+    """Parameters of the ant colony: weights of pheromone and of visibility (prior preference),
+    evaporation, and deposits.
 
     Raises:
         InputError: a parameter is out of its range.
@@ -198,8 +199,8 @@ def optimise(
 def _laid_pheromone(
     paths: list[IntArray], values: list[float], weights: FloatArray, ledger: Ledger, habits: Habits
 ) -> FloatArray:
-    """Return the pheromone Δτ (V, K) deposited in one iteration: by its best ants according to
-    rank, and by the best path so far.
+    """Return the pheromone Δτ (V, K) that one iteration deposits: its best ants deposit by rank,
+    and the best path so far receives a fixed share.
     """
     order = np.argsort(-np.asarray(values), kind="stable")[: len(weights)]
     best = ledger.best_path if ledger.best_path is not None else paths[0]

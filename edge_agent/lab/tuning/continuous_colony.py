@@ -1,7 +1,7 @@
-"""Ant colony for continuous variables, ACO_R (Socha and Dorigo, European J. of Operational Research
-2008). The module is pure.
+"""Ant colony optimisation for continuous variables, ACO_R (Socha and Dorigo, European J. of
+Operational Research 2008). The module has no side effects.
 
-In `colony`, each vertex (variable) has a short list of positions (possible values). The corners of
+In the module `colony`, each variable has a short list of possible values. However, the corners of
 fuzzy sets are continuous quantities. Therefore this colony stores the k best vectors (archive) in
 place of pheromone. An ant chooses vector l of the archive with a probability that decreases with
 the vector's rank. It then draws each variable from a normal distribution around that vector.
@@ -93,8 +93,8 @@ class SearchTally:
         return np.asarray(np.clip(vector, self.lower, self.upper))
 
     def uniform(self, rng: np.random.Generator) -> FloatArray:
-        """Return a random vector (V,), uniform over the whole range of the variables, that the
-        problem admits.
+        """Return a random vector (V,) that the problem admits, uniform over the whole range of
+        every variable.
 
         Raises:
             InputError: no vector out of REDRAWS draws is admissible.

@@ -1,5 +1,5 @@
 """(1+1) evolution strategy with the one-fifth rule (Rechenberg 1973), for comparison with the ant
-colonies. The module is pure.
+colonies. The module has no side effects.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ def optimise(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> Result:
-    """Search for the vector with the largest objective, with ants·iterations evaluations one after
-    the other. `ants` times `iterations` is the number of evaluations, as in the colonies; the
-    result is the best vector.
+    """Search for the vector with the largest objective, and return the best one found.
+
+    The search evaluates ants·iterations vectors one after the other. The two numbers only set this
+    total; the names are those of the ant colonies, so that all searches can be called alike.
     """
     tally = SearchTally(problem)
     begin = tally.uniform(rng) if problem.start is None else np.asarray(problem.start, float)
@@ -52,8 +53,8 @@ def optimise(
 def _mutate_vector(
     tally: SearchTally, parent: FloatArray, step: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Return a random variation of the vector `parent` (V,) that the problem admits; return
-    `parent` if none is found.
+    """Return a random variation of the vector `parent` (V,) that the problem admits, or `parent`
+    itself if none is found.
     """
     for _ in range(REDRAWS):
         child = tally.fit(rng.normal(parent, step * (tally.upper - tally.lower)))

@@ -8,12 +8,12 @@ Legend
     NIS         v' S^-1 v over its expectation [1]
 
 IS and l_v are proper scores: in expectation, stating the true distribution gives the best score.
-Inflating R does not improve them, in contrast to paper 004's equation 33 (variance mismatch) and
-errors against the truth. IS is the score of Gneiting and Raftery (JASA 2007). The innovations need
-no true friction. However, they look only one update ahead and do not show persistent errors: a
-tuning on l_v alone reduces R to white noise, and friction intervals become too narrow. Therefore
-the objective `predictive` adds a cost for the deviation of NIS from its expectation. README.md,
-section "Choices", explains the default objective.
+Therefore inflating R does not improve them. Paper 004's objective (equation 33, variance mismatch)
+is not a proper score, and neither is the error of an estimate. IS is the score of Gneiting and
+Raftery (JASA 2007). l_v does not need the true friction. However, it looks only one update ahead
+and does not show persistent errors: a tuning on l_v alone reduces R to that of white noise, and
+friction intervals become too narrow. Therefore the objective `predictive` subtracts a cost for the
+deviation of NIS from its expectation. README.md, section "Choices", explains the default objective.
 
 The simulated cars are inaccurate: misaligned sensors, slopes, clock delays, and in towns half of
 the cars have no torque. The drives of a search and the held-out drives share no seed, no vehicle
@@ -115,8 +115,9 @@ class TuningSet:
 
 @dataclass(frozen=True)
 class TuningScores:
-    """Scores of memberships (fuzzy sets) on simulated drives; the first two are NaN if the true
-    friction is unknown."""
+    """Scores of memberships (parameters of the fuzzy sets) on simulated drives. Interval score and
+    coverage are NaN if the true friction is unknown.
+    """
 
     interval_score: float  # less is better [1]
     coverage: float  # share of samples whose truth lies in the 90 % interval [1]
@@ -152,7 +153,7 @@ OBJECTIVES: Final[dict[str, Callable[[TuningScores], float]]] = {
 
 
 def record(drives: Sequence[TuningDrive], duration_s: float) -> TuningSet:
-    """Simulate the drives, each `duration_s` [s] long, and return them as a set."""
+    """Simulate the drives, each `duration_s` [s] long, and return them as one set for tuning."""
     signals = []
     truth = []
     used = []
@@ -204,8 +205,8 @@ def record_all(name: str, duration_s: float) -> TuningSet:
 
 
 def record_town(seed: int, cars: int, duration_s: float) -> TuningSet:
-    """Simulate cars in a town drawn by the seed, starting after WARM_S; return their drives. A
-    share of the cars is inaccurate.
+    """Simulate cars in a town that is drawn randomly by the seed, and return their drives. The
+    first WARM_S seconds are left out. The share ROUGH_SHARE of the cars is inaccurate.
     """
     fleet = SimulatedFleet(drawn_town(seed), cars, seed, RATE_HZ, rough=ROUGH_SHARE)
     fleet.step(round(WARM_S * RATE_HZ))
@@ -257,9 +258,12 @@ def scores_of(memberships: Memberships, drives: TuningSet, estimator: str) -> Tu
 def detection_scores(
     lower: FloatArray, upper: FloatArray, truth: FloatArray, used: FloatArray
 ) -> dict[str, float]:
-    """Return `surface_score`, `false_ice` and `missed_ice` of intervals (T, N).
+    """Return three scores of 90 % friction intervals (T, N).
 
-    `surface_score` is NaN if no surface class occurs.
+    `surface_score` is the interval score, averaged over the kinds of surface; NaN if no kind
+    occurs. `false_ice` is the share of samples on wet and dry road whose interval lies below
+    SLIPPERY_MU. `missed_ice` is the share of samples on clearly slippery road, with enough grip in
+    use, whose interval does not.
     """
     score = interval_score(lower, upper, truth)
     surfaces = [(truth > above) & (truth <= most) for above, most in SURFACES.values()]
@@ -301,9 +305,9 @@ def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
 
 
 def choices(positions: int) -> tuple[FloatArray, ...]:
-    """Return an array of `positions` candidate values for every vertex (corner of a fuzzy set) and
-    every noise scale. They are evenly spaced within the bounds; the one nearest to the default
-    value is replaced with the default.
+    """Return an array of `positions` candidate values for every corner of a fuzzy set ("vertex")
+    and every noise scale. They are evenly spaced within the bounds; the value nearest to the
+    default is replaced by the default.
     """
     default = Memberships().to_vector()
     found = []

@@ -1,5 +1,6 @@
-"""Recorded drives as input of a search. They have no true friction, so memberships are scored only
-by the prediction of the next measurements.
+"""Recorded drives as input of a search for memberships (parameters of the fuzzy sets). The true
+friction of recorded drives is unknown. Therefore memberships are scored only by how well the filter
+predicts the next measurements.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ HELD_OUT: Final = 3  # the last of so many parts of the recordings judge
 def own_drives(
     logs: Sequence[tuple[SignalLog, Vehicle]], duration_s: float
 ) -> tuple[TuningSet, TuningSet]:
-    """Return (parts for the search, held-out parts) of recordings that are cut into parts of
-    `duration_s` [s].
+    """Cut recordings into parts of `duration_s` [s]; return the parts for the search and the
+    held-out parts.
 
     The last third of the parts is held out. Recordings may have any sampling rate; all parts have
     as many samples as the slowest recording has in that time.

@@ -1,5 +1,5 @@
-"""The tuning of paper 004 as in the paper: sixteen lower vertices (feet of the fuzzy sets), three
-noise levels, and a choice of objectives.
+"""The tuning of paper 004 as printed: sixteen lower vertices (feet of the fuzzy sets), three noise
+levels, and a choice of objectives.
 
 The drive is the double lane change at 80 km/h on the printed tyre, with P_0 = .2*I, Q = .1*T^2.
 Noise variance and R are .1, .05 and .01 in turn (section IV.A). Objectives, larger is better:
@@ -55,8 +55,8 @@ class LevelDrive:
 def record_levels(
     spec: DriveSpec, seeds: Sequence[int], setting: Setting = AS_PRINTED
 ) -> list[LevelDrive]:
-    """Simulate a drive without errors, and return one copy for each noise level with its noise
-    added.
+    """Simulate a drive without errors. Return one set of drives per noise level: one copy of the
+    drive per seed, with white noise of this level added.
     """
     exact = ideal(spec)
     levels = []
@@ -81,9 +81,9 @@ def likelihood(sets: Sets, drive: LevelDrive) -> float:
 
 
 def mismatch(sets: Sets, drive: LevelDrive) -> float:
-    """Run paper 004's filter with the given fuzzy sets on a drive; return the tuning objective of
-    the paper's equation (33), with the absolute mismatch |e| of the variance of the innovations
-    (measurement minus prediction).
+    """Run paper 004's filter with the given fuzzy sets on a drive. Return the tuning objective of
+    the paper's equation (33): 1/(1 + |e|), where e is the actual minus the theoretical variance of
+    the innovations (measurement minus prediction).
     """
     batch = drive.batch
     filters = make_bank(batch.vehicles, sets, drive.setting)

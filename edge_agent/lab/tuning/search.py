@@ -1,10 +1,10 @@
-"""Parts that all search methods share: a graph of possible values, a record of evaluations, the
-result and its history.
+"""Parts that all search methods share: the graph of possible values, the record of evaluations, and
+the result with its history.
 
 A search looks for the best vector, with one value per vertex (variable). Each vertex has its own
-short list of possible values, its positions. A path selects one position per vertex: it is an array
-of V indices, and the positions with these indices form a vector. A search does not depend on
-filters: the objective is any function of the vector, and larger is better.
+short list of possible values, its positions. A path is an array of V indices that selects one
+position per vertex; the selected positions form a vector. A search does not depend on filters: the
+objective is any function of the vector, and larger is better.
 """
 
 from collections.abc import Callable, Sequence
@@ -106,14 +106,17 @@ class Graph:
         return cls(positions, np.isfinite(positions))
 
     def vector(self, path: IntArray) -> FloatArray:
-        """Return the vector of values (V,) that a path (V,) selects."""
+        """Return the vector of values (V,) that a path (V,) selects. A path has one index per
+        vertex (variable).
+        """
         return self.positions[np.arange(len(path)), path]
 
 
 @dataclass
 class Ledger:
-    """Record of all evaluated paths with their objectives, of the best path, and of the iterations.
-    The objective of a path is computed only once.
+    """Record of a search: all evaluated paths with their objectives, the best path, and the
+    iterations. A path is an array of V indices that selects one value per variable. Its objective
+    is computed only once.
     """
 
     objective: Objective
@@ -125,8 +128,9 @@ class Ledger:
     history: list[Iteration] = field(default_factory=list)
 
     def draw(self, sample: Callable[[], IntArray]) -> IntArray:
-        """Return a path (V,) that `sample` draws at random and whose vector is admissible. Draw up
-        to REDRAWS times to find a path that was not evaluated before.
+        """Draw paths (V,) with `sample` until one has not been evaluated before and its vector is
+        admissible, at most REDRAWS times; return this path. If there is none, return a drawn path
+        that has been evaluated.
 
         Raises:
             InputError: no drawn path is admissible.

@@ -1,4 +1,5 @@
-"""Comparison of search methods with equal budgets on the filter of paper 004.
+"""Comparison of search methods that may each evaluate the objective equally often, on the filter of
+paper 004.
 
     random       uniform over the graph's positions             (`random_search`)
     uniform      uniform over the whole range
@@ -58,7 +59,9 @@ def uniform_search(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> Result:
-    """Return the best of ants·iterations uniform draws from the whole range of the variables."""
+    """Draw ants·iterations vectors uniformly from the whole range of the variables, and return the
+    best of them.
+    """
     tally = SearchTally(problem)
     for _ in range(iterations):
         found = []

@@ -1,5 +1,5 @@
-"""Study of paper 004's tuning with its own filter and noise, for correct and wrong measurement
-noise R: untuned sets, random search, ant colony.
+"""Study of paper 004's tuning with its own filter and noise. It compares untuned fuzzy sets, random
+search and ant colony, for correct and wrong measurement noise R of the filter.
 
 The filter is `paper-aco-fckf` as in the paper's experiments: white noise only on a_x, a_y and r,
 exact inputs, start at the true state. R can therefore be exactly right, ten times too small or ten
@@ -235,7 +235,9 @@ def search(
     seed: int,
     progress: Progress | None = None,
 ) -> Result:
-    """Search for the best vertices (corners of the fuzzy sets) by a method of WAYS."""
+    """Search for the best vertices (corners of the fuzzy sets) by the method `way`, "random" or
+    "colony".
+    """
     return WAYS[way](
         problem,
         ants=ants,

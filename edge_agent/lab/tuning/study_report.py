@@ -1,5 +1,6 @@
-"""Report of the study as figures, a table, a plot and a file of tuned memberships: several searches
-of each kind, all scored on held-out drives.
+"""Report of the tuning study as figures, a table, a plot and a file of tuned memberships
+(parameters of the fuzzy sets). Each kind of search runs several times, and all results are scored
+on held-out drives.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Study:
 
     def memberships(self, way: str) -> list[Memberships]:
         """Return the memberships (fuzzy sets) found by each search of the kind `way`. If `way` is
-        in GIVEN (sets that are given, not searched), return its only memberships.
+        in GIVEN (fuzzy sets that are given, not searched), return only those.
         """
         if way in GIVEN:
             return [GIVEN[way]]
@@ -67,8 +68,8 @@ class Study:
 
     def best(self, way: str) -> Memberships:
         """Return the best memberships (fuzzy sets) found by the searches of the kind `way`, judged
-        by the objective on the drives of the search. If `way` is in GIVEN, return its only
-        memberships.
+        by the objective on the drives of the search. If `way` is in GIVEN (fuzzy sets that are
+        given, not searched), return those.
         """
         if way in GIVEN:
             return GIVEN[way]
@@ -104,8 +105,9 @@ def run(
 
 
 def figures(done: Study) -> list[Figure]:
-    """Return the figures of the study per kind of search: the scores under each condition on
-    held-out drives, the objective on both sets of drives, and the progress of the searches.
+    """Return the figures of the study for each kind of search: the scores under each condition of
+    the measurement noise on held-out drives, the objective on both sets of drives, and the progress
+    of the searches.
     """
     listed = []
     overalls: dict[str, list[float]] = {}
@@ -152,8 +154,8 @@ def _mean_sd(name: str, values: Sequence[float], unit: str) -> list[Figure]:
 
 
 def markdown(listed: Sequence[Figure]) -> str:
-    """Return a Markdown table with a row per condition and measure and a column per kind of search,
-    from the figures only.
+    """Return a Markdown table of the figures `listed`, with a row per condition and measure and a
+    column per kind of search.
     """
     values = {figure.name: figure.value for figure in listed}
 
@@ -178,9 +180,9 @@ def markdown(listed: Sequence[Figure]) -> str:
 
 
 def scores(done: Study, way: str) -> dict[str, Score]:
-    """Return the scores that the file of tuned memberships states: those of the best memberships of
-    a kind of search, averaged over all conditions of R, for the search drives and the held-out
-    drives.
+    """Return the scores that the file of tuned memberships (fuzzy sets) states, for the search
+    drives and for the held-out drives. They are those of the best memberships found by the kind of
+    search `way`, averaged over all conditions of the measurement noise R.
     """
     found = {}
     for drives, recorded in (("train", done.train), ("held_out", done.held_out)):

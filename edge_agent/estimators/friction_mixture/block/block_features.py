@@ -46,8 +46,10 @@ LIKELY = 2.0  # and of what is unknown of the radii
 
 @compiled
 def strained_noise(trust: Trust, constants: Constants) -> float:
-    """Return the factor on R (measurement noise) of the axles that follows from the strain
-    (deviation of the states from their prior)."""
+    """Return the factor on the measurement noise R of the axle forces. It grows with the strain
+    (deviation of the vehicle and sensor states from their prior), because a car that deviates in
+    its known errors also has larger unknown ones.
+    """
     factor = (trust.strain / constants.strain_usual) ** constants.strain_power
     return float(min(max(factor, constants.strain_least), constants.strain_most))
 
@@ -89,8 +91,8 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
 
 @compiled
 def _turn_wheel(row: FloatArray, features: BlockFeatures, wheel: int) -> None:
-    """Compute the velocity of a wheel's centre that comes from the yaw rate, in the wheel's axes
-    [m/s].
+    """Compute the part of the velocity of a wheel's centre that the car's yaw rate causes, along
+    and across the wheel [m/s].
     """
     x, y = wheel_position(row, wheel)
     ahead = -y * features.yaw_rate
@@ -277,8 +279,9 @@ def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
 @compiled
 def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> None:
     """Write the standard deviation of each measurement residual to `features.noise_std`, and the
-    noise of the slips. The residual is a total-least-squares distance between slip and force, so
-    the noise of slip and of force each enter with half of their variance.
+    noise of the slips. A residual is the total-least-squares distance of the measured point (slip,
+    force) from the tyre curve. Therefore the noise of slip and the noise of force each enter with
+    half of their variance.
     """
     row = memory.row
     constants = design.constants
@@ -369,11 +372,11 @@ def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
 
 @compiled
 def _compute_information(constants: Constants, features: BlockFeatures) -> None:
-    """Compute features.informs_x and informs_y of both axles. They are factors, 0 to 1, that reduce
-    how strongly the filter's stiffness states change the slips of the axle.
+    """Compute features.informs_x and features.informs_y of both axles: factors, 0 to 1, on the
+    effect that the filter's stiffness states have on the computed slips of the axle.
 
-    The factors are near 0 at small forces, because the stiffness that slip then suggests is only
-    noise.
+    The factors are near 0 at small forces. There the slip is mostly noise, and without the factors
+    the filter would learn a wrong stiffness from it.
     """
     for axle in range(2):
         along = max(abs(features.force[2 * axle]), abs(features.force[2 * axle + 1]))
@@ -388,8 +391,8 @@ def _compute_information(constants: Constants, features: BlockFeatures) -> None:
 def unexplained_slip_difference(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures
 ) -> float:
-    """Return the largest slip difference between the left and right wheel of an axle, over both
-    axles, minus the part that their forces explain.
+    """Compare the slip of the left and right wheel of each axle. Return the largest difference over
+    both axles, minus the part that the wheels' forces explain.
 
     Slip is expressed as the force over load of a linear tyre [1]. Wheels of unequal radius always
     differ in slip. Therefore the estimated difference of the radii is subtracted, with an allowance
@@ -424,8 +427,8 @@ def unexplained_slip_difference(
 
 @compiled
 def grip_demand(features: BlockFeatures) -> float:
-    """Return the larger force over load of the two axles [1]; a missing lateral force counts as
-    zero.
+    """Return the larger force over load of the two axles [1]; the force is the longitudinal and
+    lateral one together. A missing lateral force counts as zero.
 
     The forces of the two wheels of an axle are added, because force over load of an almost unloaded
     inner wheel would be unreliable.

@@ -3,8 +3,8 @@
 Which axles are driven is learned from their slip. When a car accelerates, its driven axle turns
 faster than the other one, by the slip that its force needs. Brisk driving distinguishes front, rear
 and all-wheel drive within a second. When a car brakes, the front axle takes the larger share on all
-cars. On low friction a wheel slips more than its force requires. Therefore an axle that slips more
-than a kind of drive predicts is no evidence against this kind of drive; an axle that slips less is.
+cars. On low friction a wheel slips more than its force requires. Therefore more slip than a kind of
+drive predicts is no evidence against this kind; less slip is.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, fl
 
 @compiled
 def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
-    """Update the probabilities of front, rear and all-wheel drive of a car from the slip of the
+    """Update the probabilities that a car has front, rear or all-wheel drive, from the slip of its
     axles in the block (the samples within 0.05 s).
     """
     row = memory.row

@@ -1,1 +1,3 @@
-"""Weights of the nodes: evidence, trust, change of the road and ice patches."""
+"""Probabilities (weights) of the friction hypotheses: evidence, trust in the model, changes of the
+road, and ice patches.
+"""

@@ -6,9 +6,9 @@ road changes only once in hundreds of metres, so that learned friction lasts. Wi
 alone, the lower end would fall to ice only long after the car has passed a patch.
 
 Therefore this module stores, for each ice node (hypothesis of low friction), the probability that
-the car is now on a patch. Within the length of a patch this probability grows to the prior of the
-node minus the mixture's weight. Evidence against ice reduces it. Only the reported lower end uses
-this probability.
+the car is now on a patch. Over the length of a patch this probability grows to the prior
+probability of the node, minus the probability that the mixture gives it already. Evidence against
+ice reduces it. Only the reported lower end uses this probability.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def grow_patches(memory: MixtureMemory, design: MixtureDesign, metres: float) -> None:
-    """Increase the probabilities that the car is on a short ice patch, for `metres` driven."""
+    """Increase the probabilities that the car is now on a short ice patch, according to the metres
+    driven since the last call.
+    """
     share = 1.0 - math.exp(-metres / design.constants.patch_length)
     for j in range(PATCH_NODES):
         memory.patch[j] += share * (max(design.prior[j] - memory.weight[j], 0.0) - memory.patch[j])

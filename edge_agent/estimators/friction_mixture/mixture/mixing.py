@@ -89,7 +89,7 @@ def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
 
 @compiled
 def _put_moments(memory: MixtureMemory, node: int) -> None:
-    """Set mean and covariance of a node to those of the whole mixture."""
+    """Set mean and covariance of a node (friction hypothesis) to those of the whole mixture."""
     group = node // LANES
     lane = node % LANES
     for i in range(STATES):
@@ -102,9 +102,11 @@ def _put_moments(memory: MixtureMemory, node: int) -> None:
 def apply_road_change(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, metres: float
 ) -> None:
-    """Account for a possible change of the road within `metres`: move probability between nodes
-    (friction hypotheses), and compute scratch.mixing, the share of each node's state that
-    `mix_nodes` then mixes with the states of the nodes from which its probability comes.
+    """Account for a possible change of the road within `metres`: move probability between the nodes
+    (friction hypotheses).
+
+    Also compute scratch.mixing, per node the share of its probability that came from other nodes.
+    `mix_nodes` then replaces this share of the node's state by that of the whole mixture.
     """
     count = active_nodes(memory)
     constants = design.constants
@@ -134,7 +136,9 @@ def apply_road_change(
 
 @compiled
 def share_weights(memory: MixtureMemory, scratch: Scratch) -> None:
-    """Write the weights of the active nodes to scratch.share, and 0 for the others."""
+    """Write the weights (probabilities) of the active nodes (friction hypotheses in use) to
+    scratch.share, and 0 for the others.
+    """
     count = active_nodes(memory)
     for j in range(PLACES):
         scratch.share[j] = memory.weight[j] if j < count else 0.0
@@ -142,8 +146,8 @@ def share_weights(memory: MixtureMemory, scratch: Scratch) -> None:
 
 @compiled
 def mix_nodes(memory: MixtureMemory, scratch: Scratch, group: int) -> None:
-    """Mix the states of a group of nodes (friction hypotheses) with that of the whole mixture in
-    the shares scratch.mixing.
+    """Replace, in each node (friction hypothesis) of a group, the share scratch.mixing of its state
+    by the state of the whole mixture, for nodes to which a road change has moved probability.
     """
     zeta = lanes_at(scratch.mixing, group)
     zeta = select(zeta < LEAST_MIXING, 0.0, zeta)
@@ -211,7 +215,7 @@ def reset_diverged(
 
 @compiled
 def _copy_node(memory: MixtureMemory, target: int, source: int) -> None:
-    """Set mean and covariance of one node to those of another."""
+    """Set mean and covariance of the node (friction hypothesis) `target` to those of `source`."""
     mean = memory.mean
     covariance = memory.covariance
     group = target // LANES

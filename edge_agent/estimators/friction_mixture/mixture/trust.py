@@ -11,15 +11,15 @@ also an input of the rules that decide how much of the evidence on friction is u
 that the axles' innovations have FACTOR times the stated variance. The second happens with delayed
 steering signals or on the banking of a race track. Ice that explains the data does not count
 against the model, nor do unusual states alone. The sum of the log-likelihood ratios against the
-model is `odd` [nat]; old terms fade within minutes. Straight driving, during which the model cannot
-fail, does not count in favour of the model. While `odd` is at its limit `odd_least`, the filter
-draws no conclusions: the friction interval returns to the prior, the axles do not affect the
+model is `odd` [nat]; old terms fade within minutes. Straight driving does not count in favour of
+the model, because the model cannot fail there. Once `odd` reaches the threshold `odd_least`, the
+filter draws no conclusions: the friction interval returns to the prior, the axles do not affect the
 motion, and states learned meanwhile are reset. The test leaves out slides, slippery road and
 walking pace (`unexplained_ratio`).
 
-After `patience` [s] without a possible test the model is tried again. Each further contradiction
-makes that time four times as long, because sensors do not repair themselves. A motion reset by the
-wheel speeds counts as half a contradiction.
+While the filter draws no conclusions, the model cannot be tested. After `patience` [s] the filter
+tries it again. Each further contradiction makes that time four times as long, because sensors do
+not repair themselves. A motion reset by the wheel speeds counts as half a contradiction.
 """
 
 from __future__ import annotations
@@ -102,12 +102,13 @@ def update_consistency(
 
 @compiled
 def unexplained_ratio(memory: MixtureMemory, design: MixtureDesign, ratio: float) -> float:
-    """Return the part of `ratio` (squared innovations, that is, measurement minus prediction, of
-    the axles over their variance) that counts as a contradiction of the model, because neither a
+    """Return the part of `ratio` that counts as a contradiction of the model, because neither a
     slide nor slippery road explains it.
 
-    While a wheel slides, or the road is estimated to be slippery, the axles' forces differ from the
-    model for a while. Tight turns at walking pace are outside the model's range.
+    `ratio` is the sum of the axles' squared innovations (measurement minus prediction) over their
+    stated variance. While a wheel slides, or the road is estimated to be slippery, the axles'
+    forces differ from the model for a while. Tight turns at walking pace are outside the model's
+    range and do not count either.
     """
     speed = abs(memory.overall_mean[NodeState.VX])
     moving = min(max((speed - SLOW_FOOT) / (SLOW_PEAK - SLOW_FOOT), 0.0), 1.0)
@@ -128,8 +129,8 @@ def slippery_probability(memory: MixtureMemory, design: MixtureDesign) -> float:
 
 @compiled
 def mixture_cost(mean: FloatArray, nominal: Nominal) -> float:
-    """Return half the sum of the squared deviations of the mixture's vehicle and sensor states,
-    `mean` (n,), from their prior, in standard deviations [nat].
+    """Return half the chi-square of the mixture's vehicle and sensor states against their prior
+    [nat]: half the sum of squared deviations in standard deviations. `mean` (n,) are the states.
     """
     total = 0.0
     for i in range(NodeState.LN_KX, mean.shape[0]):
@@ -172,16 +173,16 @@ def nominal_agreement(trust: Trust, constants: Constants) -> float:
 
 @compiled
 def used_evidence_share(trust: Trust, constants: Constants) -> float:
-    """Return the share of the evidence on friction that is used: it decreases as evidence grows
-    that the measurements contradict the model, and is 0 once this is accepted.
+    """Return the share of the evidence on friction that the filter uses. It decreases as evidence
+    against the model grows, and is 0 once the consistency test declares a contradiction.
     """
     return max(1.0 - (trust.odd / constants.odd_least) ** 2, 0.0)
 
 
 @compiled
 def axles_ratio(ratio: float) -> float:
-    """Return the log-likelihood ratio [nat] of two hypotheses about the innovations (measurement
-    minus prediction) of the axles: their variance is FACTOR times the stated one, against the
-    stated one. `ratio` is the sum of their squares over the stated variance.
+    """Return the log-likelihood ratio [nat] of two hypotheses about the variance of the axles'
+    innovations (measurement minus prediction): FACTOR times the stated variance, or the stated
+    variance. `ratio` is the sum of the squared innovations over the stated variance.
     """
     return (1.0 - 1.0 / FACTOR) * ratio - math.log(FACTOR)

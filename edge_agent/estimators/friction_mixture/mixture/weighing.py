@@ -1,10 +1,10 @@
-"""Weights of the friction hypotheses (nodes) after a block of 0.05 s: likelihoods that fuzzy rules
-weaken (temper), and adaptation of the measurement noise R.
+"""Weights (probabilities) of the friction hypotheses (nodes) after a block of 0.05 s. Fuzzy rules
+weaken (temper) the likelihoods, and the measurement noise R is adapted.
 
 While nothing changes, errors of the tyre curve and of offsets repeat from block to block. Therefore
 the evidence of such blocks counts less. Where a bend becomes icy the forces stay the same and the
-slip grows, so a change of either counts as new. Where an axle has slid and grips again at the same
-force, the ice has probably ended (`mixing.py`).
+slip grows, so a change of force or of slip makes the evidence count in full. Where an axle has slid
+and grips again at the same force, the ice has probably ended (`mixing.py`).
 """
 
 from __future__ import annotations
@@ -125,12 +125,12 @@ def mixture_likelihood(scratch: Scratch, groups: int) -> float:
 
 @compiled
 def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Replace scratch.log_likelihood [nat] of each node by the evidence of the block (0.05 s) that
-    counts: rules weaken (temper) the likelihood.
+    """Replace scratch.log_likelihood [nat] of each node (friction hypothesis) by the evidence that
+    counts for the block (0.05 s): rules weaken (temper) the likelihood.
 
-    A node (friction hypothesis) below the grip in use gets its penalty however small the tyre
-    forces are. Once the filter accepts that measurements contradict the model, no evidence is used.
-    Without accelerations, yaw rate or steering, sliding cannot be distinguished from rolling, so no
+    A node whose friction is below the grip in use is always penalised, at any tyre force. Once the
+    filter accepts that measurements contradict the model, no evidence is used. Without
+    accelerations, yaw rate or steering, sliding cannot be distinguished from rolling, so no
     evidence on friction is used either.
     """
     constants = design.constants
@@ -162,14 +162,15 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
 
 @compiled
 def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
-    """Return the charge [nat] of a node: how much its log-likelihood is reduced because its vehicle
-    states moved away from the prior.
+    """Return how much the log-likelihood of a node (friction hypothesis) is reduced [nat] because
+    the measurement moved its vehicle states away from their prior.
 
-    `price` is the change of the node's penalty. A negative charge (refund) never exceeds the amount
-    charged before. Tempered evidence charges this cost only in part, while the measurement has
-    changed the node's state in full. Without this penalty, on drives with little grip demand a low
-    friction would remain probable with a stiffness or an offset three standard deviations from the
-    prior.
+    `price` is the increase of the node's penalty by the block (0.05 s). A negative result (refund)
+    never exceeds the amount charged before.
+
+    Reason: tempered (weakened) evidence contains only a part of this cost, although the measurement
+    changed the states in full. Without the charge, a low friction would remain probable on drives
+    with little grip demand, with a stiffness or an offset three standard deviations from the prior.
     """
     charged = max(price, -memory.penalty[node])
     memory.penalty[node] += charged
@@ -228,8 +229,9 @@ def saturation(slip: float, mu: float) -> float:
 
 @compiled
 def advance_usual(usual: FloatArray, i: int, now: float, keep: float) -> float:
-    """Return the absolute difference between a value `now` and its usual value usual[i], and move
-    usual[i] towards `now`: it keeps the share `keep`. Return 0 if `now` is NaN.
+    """Return the absolute difference between a value `now` and its usual value usual[i] (a moving
+    average), and move usual[i] towards `now`. `keep` is the weight of the old value. Return 0 if
+    `now` is NaN.
     """
     if math.isnan(now):
         return 0.0

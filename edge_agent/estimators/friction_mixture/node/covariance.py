@@ -1,5 +1,6 @@
-"""Covariances of a group of nodes (friction hypotheses) side by side: factor, measurement update,
-prediction and mixing. Only the lower half of a covariance P (n, n, LANES) is read and written.
+"""Covariances of the filters of a group of nodes (friction hypotheses), computed together: factor,
+measurement update, prediction and mixing. Only the lower half of a covariance P (n, n, LANES) is
+read and written; LANES is the number of nodes in a group.
 
 Legend
     m, P     means (n,) and covariances (n, n) of the states
@@ -7,9 +8,10 @@ Legend
     a, nu    variance of the innovation (measurement minus prediction), and innovation
     z        share of a node's state that is replaced by that of the whole mixture [1]
 
-The update is P <- P - h*h'/a. A difference can lose digits: with 1e-16 rounding, a row that reduces
-a variance to the 1e-6th part leaves ten digits, and no block reduces it further. Between the blocks
-(0.05 s) the process noise restores the rank, and a pivot of the factor is never below a limit.
+The update is P <- P - h*h'/a. The difference loses digits: rounding is 1e-16, so ten digits remain
+if the measurements reduce a variance by a factor of 1e6. The measurements of one block (0.05 s)
+never reduce it more. Between blocks the process noise restores the rank, and a pivot of the factor
+is never below a limit.
 """
 
 from __future__ import annotations
@@ -78,8 +80,8 @@ def mix_states(
     overall_mean: FloatArray,
     overall_covariance: FloatArray,
 ) -> None:
-    """Mix the states of the nodes with that of the whole mixture in the shares z: mean (n, LANES)
-    and covariance are changed in place.
+    """Replace the share z of each node's state by the state of the whole mixture (moment matching).
+    `mean` (n, LANES) and `covariance` are changed in place.
     """
     for i in range(mean.shape[0]):
         apart = z * (1.0 - z) * (overall_mean[i] - lanes_at(mean, i))
@@ -154,8 +156,9 @@ def _turn_column(
     bias_x: float,
     bias_y: float,
 ) -> tuple[float, float]:
-    """Return the first two elements of F*c for a column c of a covariance, given as the elements of
-    velocity (v_x, v_y), leak and offsets.
+    """Return the first two elements of F*c, where F is the prediction matrix and c a column of a
+    covariance. Only those elements of c that count are given: velocity (v_x, v_y), leak (share of
+    a_y that is gravity) and accelerometer offsets.
     """
     cos, sin = turn
     vx, vy = velocity

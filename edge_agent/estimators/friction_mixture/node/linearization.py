@@ -1,5 +1,5 @@
-"""Linearisation of the measurement rows of a group of nodes (friction hypotheses) at their means:
-noise of the rows, and derivatives by the states that the rows depend on linearly.
+"""Linearisation of the six measurement equations (rows) of a group of nodes (friction hypotheses)
+at their means: noise of the rows, and derivatives by the states that enter linearly.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ def linearize_nodes(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> float:
-    """For a group of nodes (friction hypotheses) at their `mean` (n, LANES), compute tyre forces
-    over load, residuals, noise, and node.derivative (of the measurement rows by the linear states).
-    Return the penalty [nat] of each node for sliding wheels.
+    """Linearise the measurement rows of a group of nodes (friction hypotheses) at their `mean` (n,
+    LANES): compute tyre forces over load, residuals, noise, and node.derivative, the derivatives of
+    the rows by the linear states. Return the penalty [nat] of each node for sliding wheels.
 
     The leak (gravity in a_y when the body rolls) and the offset of a_y change the same forces.
-    Therefore the derivative by the one is computed from the derivative by the other.
+    Therefore the derivative by the leak is a multiple of the derivative by the offset.
     """
     constants = design.constants
     for i in range(STATES):
@@ -71,7 +71,9 @@ def _differentiate_forces(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Compute the derivatives of the rows by the states that correct the measured forces."""
+    """Compute the derivatives of the measurement rows (residuals of wheels and axles) by the states
+    that correct the measured forces.
+    """
     all_torques = True
     for wheel in range(4):
         all_torques = all_torques and features.force_unit[wheel] == 0.0
@@ -114,7 +116,9 @@ def _differentiate_steering(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Compute the derivatives of the rows by the states that change the steering angle."""
+    """Compute the derivatives of the measurement rows (residuals of wheels and axles) by the states
+    that change the steering angle.
+    """
     step = 0.5 * design.nominal.std[NodeState.STEER]
     derivative = node.derivative
     out = derivative[NodeState.STEER]
@@ -210,8 +214,8 @@ def weigh_slopes(
 
 @inlined
 def slope_along(slope: float, ratio: float, square: float, whole: float) -> float:
-    """Return the derivative [1] of the tyre's force in one direction by that of a linear tyre with
-    the same slip.
+    """Return the derivative [1] of the tyre's force along one direction by the slip along this
+    direction, with slip expressed as the force of a linear tyre.
 
     It is 1 at small slip, 0 on the flat part of the curve, and limited to at least FLATTEST.
 

@@ -1,5 +1,5 @@
-"""Filters of a group of nodes side by side: each is a cubature Kalman filter of the vehicle, given
-the friction under its left and right wheels.
+"""Filters of a group of nodes (friction hypotheses) that are computed together. Each is a cubature
+Kalman filter of the vehicle, for given friction under its left and right wheels.
 
 Legend
     m, P        mean (n,) and covariance (n, n)
@@ -109,7 +109,9 @@ def update_nodes(
 def put_friction(
     design: MixtureDesign, features: BlockFeatures, node: NodeWorkspace, group: int
 ) -> None:
-    """Write the friction of the nodes under wheels and axles, and its inverse."""
+    """Write the friction of a group of nodes (hypotheses) under each wheel and axle, and its
+    inverse, to `node`.
+    """
     for side in range(2):
         mu = lanes_at(design.sides.lanes, (group, side))
         put_lanes(node.mu, side, mu)
@@ -129,8 +131,9 @@ def weigh_rows(
     share: float,
     inflation: float,
 ) -> float:
-    """Compute innovation, variance and inflated noise of each row, and add them to the sums of the
-    block, weighted by the nodes' probabilities `share`. Return the log-likelihood with the plain R.
+    """Compute innovation, variance and inflated noise of each measurement row, and add them to the
+    sums of the block (0.05 s), weighted by the nodes' probabilities `share`. Return the
+    log-likelihood with the measurement noise R as it is before inflation.
 
     The noise of the axles' rows is increased further if these rows contradict the model, and while
     the inputs are steady. With steady inputs, errors of the tyre curve and of offsets repeat from
@@ -222,8 +225,8 @@ def spread_points(
 
 @compiled
 def find_covariances(covariance: FloatArray, node: NodeWorkspace) -> None:
-    """Compute node.cross, the covariance of the states with each row (h), and node.spread, that of
-    the rows with each other (S).
+    """Compute node.cross, the covariance of the states with each measurement row (h), and
+    node.spread, the covariance of the rows with each other (S).
     """
     derivative = node.derivative
     for i in range(STATES):
@@ -264,9 +267,9 @@ def doubted_noise(trust: Trust, constants: Constants) -> float:
 
 @compiled
 def rear_noise(memory: MixtureMemory, constants: Constants) -> float:
-    """Return the factor on R (measurement noise) of the rear axle's rows. It is above 1 while the
-    front axle is already on another surface than the rear axle, because then one friction cannot
-    explain both.
+    """Return the factor on R (measurement noise) of the rear axle's measurement rows. It is above 1
+    while the front axle is already on another surface, because then no single friction explains
+    both axles.
     """
     return constants.rear_unlike if memory.last.time < memory.slip.rear_unlike_until else 1.0
 
@@ -321,8 +324,8 @@ def take_rows(
 
 @inlined
 def _condition_rows(node: NodeWorkspace, r: int, per: float) -> None:
-    """Condition the rows after r on row r, whose variance is 1/per: their innovations, covariances
-    with each other, and covariances with the states.
+    """Condition the measurement rows after r on row r, whose variance is 1/per: update their
+    innovations, their covariances with each other, and their covariances with the states.
     """
     for q in range(r + 1, ROWS):
         share = lanes_at(node.spread, (q, r)) * per
@@ -338,7 +341,9 @@ def _condition_rows(node: NodeWorkspace, r: int, per: float) -> None:
 
 @inlined
 def _subtract_rows(covariance: FloatArray, node: NodeWorkspace) -> None:
-    """Subtract from the covariances what all rows explain: h*h'*gain of each."""
+    """Subtract from the state covariances the part that the measurement rows explain: h*h'*gain for
+    each row.
+    """
     for i in range(STATES):
         for r in range(ROWS):
             put_lanes(node.scaled, (0, r), lanes_at(node.cross, (i, r)) * lanes_at(node.gain, r))

@@ -12,11 +12,12 @@ Legend
 
 Rows: the longitudinal residuals of four wheels, then the lateral residuals of two axles. In the
 linear range e weights slip and force equally. On the flat part and beyond the peak only the force
-counts, so the row of a sliding wheel measures its friction (errata, what made the difference, 1).
-An axle has one mean slip; its wheels share the lateral force in proportion to load. The states of a
-node (gravity leaking into a_y, gain of torque, shape of the tyre) correct the measured force.
+counts, so the row of a sliding wheel measures its friction (errata, section "what made the
+difference", item 1). An axle has one mean slip; its wheels share the lateral force in proportion to
+load. The states of a node (gravity leaking into a_y, gain of torque, shape of the tyre) correct the
+measured force.
 
-All functions work on a group of nodes side by side (`schemas.runtime.lanes`).
+All functions compute a group of nodes at once (`schemas.runtime.lanes`).
 """
 
 from __future__ import annotations
@@ -80,9 +81,10 @@ def curve_distance(along: float, across: float) -> float:
 def gained_velocity(
     gain: VelocityGain, leak_y: float, bias_x: float, bias_y: float
 ) -> tuple[float, float]:
-    """Return the velocity (forward, left) [m/s] gained in the block (0.05 s), corrected by leak
-    (gravity that tilted accelerometers measure) and offsets of the sensors, to which the road's
-    slope and bank (lateral slope) belong [m/s^2].
+    """Return the velocity (forward, left) [m/s] that the vehicle gains in the block (0.05 s),
+    integrated from the accelerometers and corrected by two kinds of states: leak (share of a_y that
+    is gravity felt by the rolled body), and sensor offsets including the road's slope and bank
+    (lateral slope) [m/s^2].
 
     An offset of a_y has the same effect as an offset of a_x, rotated by 90 degrees.
     """
@@ -136,8 +138,8 @@ def find_slips(
     node: NodeWorkspace,
     slip: NodeSlip,
 ) -> None:
-    """Compute the slips of the wheels at node.point: velocity and stiffness of each node of a group
-    at the beginning of the block (0.05 s).
+    """Compute the slips of the wheels from the velocity and stiffness in node.point, the states of
+    each node (friction hypothesis) at the beginning of the block (0.05 s).
 
     `mean` (n, LANES) are the nodes' means. Where the force is too small to distinguish stiffness
     from slip noise, the logarithm of stiffness in node.point is moved towards that of `mean`.
@@ -180,8 +182,8 @@ def find_slips(
 def find_ratios(
     curve: TyreCurve, features: BlockFeatures, node: NodeWorkspace, slip: NodeSlip
 ) -> None:
-    """Compute the forces that the tyre curve gives at the slips `slip`: of the wheels relative to
-    those of linear tyres, and of the axles.
+    """Compute the forces that the tyre curve gives at the slips `slip`: for each wheel the ratio to
+    the force of a linear tyre, and for each axle the lateral force.
     """
     for axle in range(2):
         model = 0.0
@@ -303,7 +305,8 @@ def share_by_sides(mean: float, most: float, most_other: float) -> float:
     """Return the force over load [1] of the wheel on one side of an axle, given the mean over both
     sides.
 
-    The sides are equal until the slippery side reaches its limit.
+    Both sides carry the same force until the slippery side reaches its limit; the other side then
+    carries the rest.
 
     Args:
         mean: mean of both sides, signed [1].

@@ -1,5 +1,5 @@
-"""Motion without a tyre model, in three cases: all wheels stand, all wheels roll alike, or the rear
-axle does not slide.
+"""Velocity of the car without a tyre model, in three cases: all wheels stand, all wheels roll
+alike, or the rear axle does not slide.
 
 A tyre beyond its peak does not keep a constant slip: it locks or spins up within a tenth of a
 second unless a controller acts, and four tyres never do so alike. Therefore, if four wheels agree
@@ -146,8 +146,9 @@ def _compute_velocities(
 def take_rolling(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, group: int
 ) -> float:
-    """Update a group of nodes (friction hypotheses) with the velocity derived from the wheels;
-    return the penalty [nat] of each node for the difference from its own velocity.
+    """Update a group of nodes (friction hypotheses) with the velocity that rolling wheels imply.
+    Return a penalty [nat] per node, which grows with the difference of this velocity from the
+    node's estimate.
     """
     rolling = memory.rolling
     constants = design.constants
@@ -187,9 +188,11 @@ def _take_velocity(
     innovation: float,
     reading: tuple[float, float],
 ) -> float:
-    """Update a group of nodes (friction hypotheses) with the difference `innovation` [m/s] of a
-    measured velocity along `direction` (x, y) from that of each node. `reading` is (variance,
-    threshold of the Huber function that limits outliers). row (n, LANES) is scratch.
+    """Apply a measured velocity along `direction` (x, y) to the filters of a group of nodes
+    (friction hypotheses). `innovation` [m/s] is the measured velocity minus that of each node.
+
+    `reading` is the variance and the threshold of the Huber function, which limits outliers. `row`
+    (n, LANES) is scratch memory.
 
     Return half of the squared innovation over its variance [nat].
     """

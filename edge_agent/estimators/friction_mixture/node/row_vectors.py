@@ -1,7 +1,8 @@
-"""Vectors of one number per measurement row (ROWS = 6), in registers while a loop adds to them.
+"""Operations on vectors with one number per measurement row (ROWS = 6: four wheels, two axles).
 
-They are tuples, because elements of an array are read from memory again after each write to any
-array. Each number is lanes: one value per node of a group.
+The vectors are tuples, so that the compiler keeps them in registers during a loop. Elements of an
+array would be read from memory again after each write to any array. Each number stands for LANES
+values, one per node (friction hypothesis) of a group.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ Row: TypeAlias = tuple[float, float, float, float, float, float]
 
 @inlined
 def scale_row(rows: FloatArray, i: int, factor: float) -> Row:
-    """Return `factor` times vector i of `rows` (n, ROWS, LANES)."""
+    """Return `factor` times vector i of `rows` (n, ROWS, LANES), one number per measurement row."""
     return (
         factor * lanes_at(rows, (i, 0)),
         factor * lanes_at(rows, (i, 1)),
@@ -30,7 +31,7 @@ def scale_row(rows: FloatArray, i: int, factor: float) -> Row:
 
 @inlined
 def add_row(total: Row, rows: FloatArray, i: int, factor: float) -> Row:
-    """Return `total` plus `factor` times vector i of `rows` (n, ROWS, LANES)."""
+    """Return the vector `total` plus `factor` times vector i of `rows` (n, ROWS, LANES)."""
     return (
         total[0] + factor * lanes_at(rows, (i, 0)),
         total[1] + factor * lanes_at(rows, (i, 1)),
@@ -52,7 +53,7 @@ def multiply_row(row: Row, rows: FloatArray, i: int) -> float:
 
 @inlined
 def put_row(rows: FloatArray, i: int, row: Row) -> None:
-    """Write `row` to vector i of `rows` (n, ROWS, LANES)."""
+    """Write the vector `row` to place i of `rows` (n, ROWS, LANES)."""
     put_lanes(rows, (i, 0), row[0])
     put_lanes(rows, (i, 1), row[1])
     put_lanes(rows, (i, 2), row[2])

@@ -1,1 +1,3 @@
-"""Results of the mixture: interval, beliefs on the friction grid and evidence of a visit."""
+"""Results of the friction mixture: reported interval, friction beliefs, and evidence of a visit
+(passage of one map cell).
+"""

@@ -1,11 +1,11 @@
 """The reported friction interval, with levels at both ends that give the stated coverage.
 
 The filter weakens (tempers) evidence so that a repeated error does not count twice. Therefore,
-after many measurements, the node probabilities are wider than the actual errors. Without
-measurements they equal the prior, which has the right width. The level of the upper end moves from
-one case to the other with the information gained, which is the divergence of the node probabilities
-from the prior (Kullback and Leibler 1951). It moves further if the car behaves as its vehicle file
-predicts (`trust.nominal_agreement`).
+after many measurements, the node probabilities (of the friction hypotheses) are spread wider than
+the actual errors. Without measurements they equal the prior, which has the right width. Therefore
+the quantile level of the upper end decreases with the information gained, which is the divergence
+of the node probabilities from the prior (Kullback and Leibler 1951). It decreases further if the
+car behaves as its vehicle file predicts (`trust.nominal_agreement`).
 
 P(mu < SLIPPERY_MU) is computed from the same node probabilities. Therefore it tends to be too close
 to that of the prior.
@@ -66,7 +66,8 @@ def find_interval(
 
 @compiled
 def upper_end(design: MixtureDesign, weight: FloatArray, likeness: float) -> float:
-    """Return the upper end of the friction interval for node probabilities (NODES,).
+    """Return the upper end of the friction interval for the probabilities `weight` (NODES,) of the
+    friction hypotheses.
 
     The quantile level is chosen so that the true friction lies above the result in at most one case
     of twenty.

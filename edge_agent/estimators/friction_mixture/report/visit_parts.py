@@ -1,12 +1,12 @@
 """Friction jumps inside a visit (passage of one map cell): detection, and evidence of the part of
 the visit before the surface changed.
 
-The belief of a visit starts from the prior and follows the road, so at the end it describes only
-the last surface. In addition, the most informative belief of the visit so far is kept, measured by
-its information over the prior. If almost all of the current belief lies at frictions that this kept
-belief excludes, the friction has jumped. Then the kept belief becomes the evidence of the part that
-ends, and the next part begins. A belief in transition between the two surfaces neither replaces the
-kept belief nor counts as a jump.
+The friction belief of a visit starts from the prior and follows the road, so at the end it
+describes only the last surface. In addition, the most informative belief of the visit so far is
+kept; D measures the information. If almost all of the current belief lies at frictions that this
+kept belief excludes, the friction has jumped. Then the kept belief becomes the evidence of the part
+that ends, and the next part begins. A belief in transition between the two surfaces neither
+replaces the kept belief nor counts as a jump.
 
 Legend
     w, s       probabilities of the nodes in the visit, and those of the kept belief   (K,)

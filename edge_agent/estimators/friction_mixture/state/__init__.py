@@ -1,1 +1,1 @@
-"""Constants, tables and memory of the friction mixture, and functions of them alone."""
+"""Constants, tables and memory of the friction mixture, and functions that need nothing else."""

@@ -1,5 +1,5 @@
-"""All constants of the friction mixture with unit and reason, as a table for readers and as a
-record for the compiled functions.
+"""All constants of the friction mixture with unit and reason: a record that people read and that
+the compiled functions use.
 
 Values marked (vehicle) follow from typical uncertainty of a vehicle and its sensors: mass 3 %,
 inertia 5 %, stiffness 10 to 12 %, torque 3 %, and white noise and offsets of ordinary inertial

@@ -1,5 +1,5 @@
-"""Tables of the default estimator, computed once from its constants for the compiled functions;
-they do not change while driving.
+"""Tables of the default estimator for the compiled functions. They are computed once from its
+constants and do not change while driving.
 """
 
 from __future__ import annotations

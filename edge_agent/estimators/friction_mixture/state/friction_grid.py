@@ -34,9 +34,9 @@ def node_table(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 class RoadChange(NamedTuple):
-    """Probabilities that the road changes within a step: to any friction (`hazard`), from a node
-    without neighbours to any friction (`leaving`, in addition), and to a neighbouring node
-    (`drift`, approximately).
+    """Probabilities that the road changes within a step. `hazard`: from any node (friction
+    hypothesis) to any friction. `leaving`: in addition, from a node without neighbours to any
+    friction. `drift`: to a neighbouring node (approximately).
     """
 
     hazard: float
@@ -52,12 +52,12 @@ def change_road(
     change: RoadChange,
     out: FloatArray,
 ) -> None:
-    """Compute the probabilities `out` (K,) of K nodes (assumed friction values), which were `w`,
-    after a possible road change.
+    """Compute the probabilities `out` (K,) of K nodes (friction hypotheses) after a possible road
+    change; before it they were `w`.
 
-    Only the first `chain` nodes have neighbours, with which they exchange probability; only the
-    other nodes change with probability `change.leaving`. The exchange is in detailed balance with
-    the prior: probabilities equal to the prior do not change.
+    Only the first `chain` nodes have neighbours: they exchange probability with them
+    (`change.drift`). The other nodes lose the share `change.leaving`, which goes to all nodes. The
+    exchange keeps probabilities that equal the prior unchanged.
     """
     hazard, leaving, drift = change
     count = w.shape[0]

@@ -1,4 +1,6 @@
-"""Continuation of the filter after a gap in time, and restart of its motion."""
+"""Continuation of a vehicle's filter after a gap in time without samples, and restart of its motion
+estimate.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,7 @@ SLOWEST_M_S = 1.5
 @compiled
 def spread_moments(memory: MixtureMemory) -> None:
     """Set mean and covariance of all nodes (filters of one friction hypothesis each) to those of
-    the mixture.
+    the whole mixture.
     """
     for group in range(GROUPS):
         for i in range(STATES):

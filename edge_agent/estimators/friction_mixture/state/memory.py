@@ -122,7 +122,7 @@ class WheelSlip:
 
 
 class Trust:
-    """Record of the state of the consistency test: does any friction explain the measurements?"""
+    """Record of the consistency test, which asks whether any friction explains the measurements."""
 
     # squared innovations of the axles over their stated variance, smoothed, as far as unexplained
     # [1]

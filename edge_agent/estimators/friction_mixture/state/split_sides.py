@@ -2,8 +2,9 @@
 either way round.
 
 The friction of each side is divided into cells of a coarse grid. A node (friction hypothesis)
-represents a triangular density around the middle of its cell that extends to the middles of the
-neighbouring cells. Therefore both nodes cover a friction that lies between them.
+represents a triangular density of friction. It has its maximum at the middle of its cell and
+extends to the middles of the neighbouring cells. Therefore a friction between two middles is
+covered by both nodes.
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ LEFT, RIGHT, BOTH = range(3)  # whose friction a share of cells is of; BOTH is t
 
 
 class Sides(NamedTuple):
-    """Friction under the left and right wheels by each node (hypothesis): first the nodes with one
-    friction for both sides, then the split nodes with different ones.
+    """Friction under the left and right wheels that each node (hypothesis) assumes. First come the
+    nodes with one friction for both sides, then the split nodes with a different friction on each
+    side.
     """
 
     mu: Annotated[FloatArray, ALL_NODES, 2]  # left, right
@@ -73,7 +75,8 @@ def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
     """Return the friction under both sides and the prior probability of all nodes (friction
     hypotheses). The split nodes together have the prior probability `split_prior`.
 
-    mu and prior (K,) are those of the single-friction nodes.
+    `mu` and `prior` (K,) are friction and prior probability of the nodes with one friction for both
+    sides.
     """
     edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), len(mu) + 1) ** 2
     pairs = []

@@ -1,5 +1,5 @@
-"""Tables of the tyre curve: force, slope, slip at a given force, and the difference in shape
-between tyres.
+"""Tables of the tyre curve (force over slip): force, slope, slip at a given force, and the
+difference in shape between tyres.
 
 Legend
     theta    normalised slip, see edge_agent.dynamics.tyres           [1]
@@ -68,7 +68,7 @@ def check_curve(curve: Curve) -> Curve:
 
 
 def curve_tables(curve: Curve) -> TyreCurve:
-    """Return the tables of a tyre curve, including the difference of shape between tyres."""
+    """Return the tables of a tyre curve, including how tyres of other shape deviate from it."""
     u = np.linspace(0.0, 1.0, CELLS + 1)
     theta = u / np.maximum(1.0 - u, 1e-9)
     f = curve(theta)
@@ -87,8 +87,8 @@ def curve_tables(curve: Curve) -> TyreCurve:
 
 @inlined
 def interpolate_table(table: FloatArray, place: float) -> float:
-    """Return the value of a table over [0, 1] at `place`, a number or lanes, with linear
-    interpolation between its points.
+    """Return the value of a table over [0, 1] at `place`, interpolated linearly between the table's
+    points. `place` is a number, or one number per node of a group.
     """
     cells: int = table.shape[0] - 1
     scaled = place * cells

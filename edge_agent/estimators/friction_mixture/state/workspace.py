@@ -1,5 +1,5 @@
-"""Scratch records for intermediate results of one block of one vehicle. Nothing is kept between
-steps: a step writes each field before it reads it.
+"""Scratch records for intermediate results while one block (0.05 s) of one vehicle is processed.
+Nothing is kept between steps: a step writes each field before it reads it.
 """
 
 from __future__ import annotations
@@ -88,7 +88,9 @@ class NodeSlip:
 
 
 class NodeForces:
-    """Measured forces over load [1] of wheels and axles, corrected by the states of each node."""
+    """Measured forces over load [1] of wheels and axles, corrected by the states of each node
+    (filter of one friction hypothesis).
+    """
 
     force: Annotated[LaneArray, ROWS]
     slip_at_force: Annotated[LaneArray, ROWS]  # linear force over load that gives it
