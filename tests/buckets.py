@@ -105,8 +105,8 @@ def bucket_server(folder: Path) -> Iterator[BucketServer]:
 
 
 def list_copied_files(root: Path) -> dict[str, bytes]:
-    """Return the content of those files of an archive that its bucket copy must
-    contain, by path.
+    """Return the content of those files of an archive that its copy in the bucket must contain, by
+    path.
     """
     from fleet_service.replication.replica_files import FOLDERS
 

@@ -1,5 +1,5 @@
 """Benchmark of the edge agent as separate processes: time to the first answer, cost of a vehicle,
-vehicles per core, and scaling with the number of jobs.
+vehicles per core, and scaling with the number of jobs (worker processes of a replay).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ LOG_S = 60.0
 
 def agent() -> list[Figure]:
     """Measure the edge agent's processes: start time, processor share of one vehicle, vehicles per
-    core, and replay with two jobs.
+    core, and the replay of logs with two jobs (worker processes).
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -201,8 +201,9 @@ def measure_fleet(folder: Path, endpoint: str) -> list[Figure]:
 
 
 def measure_replay(folder: Path) -> list[Figure]:
-    """Measure the throughput of a replay of many logs with two jobs, Parquet included, divided by
-    twice the throughput of the compiled estimator on one core.
+    """Measure the throughput of a replay of many logs with two jobs (worker processes), including
+    the writing of Parquet. Return it divided by twice the throughput of the compiled estimator on
+    one core.
     """
     logs = [simulate_drive(folder, f"log-{seed:02d}", seed, LOG_S) for seed in range(LOGS)]
     log = read_log(logs[0][0])

@@ -117,12 +117,12 @@ def measure_archive(root: Path, rows: int) -> list[Figure]:
 
 
 def _ask_question(name: str, root: Path, options: Options) -> pa.Table:
-    """Answer a question about the archive with a new query engine."""
+    """Answer a query about the archive, called `name`, with a new query engine."""
     return QUESTIONS[name].ask(QueryEngine("duckdb", root, PART), options)
 
 
 def measure_questions(root: Path, readings: Path) -> list[Figure]:
-    """Measure the time of four questions on all rows [s], and that of a question about the past of
+    """Measure the time of four analytic queries on all rows [s], and of a query about the past of
     one cell [ms].
     """
     found = []
@@ -168,8 +168,8 @@ def write_small_archive(root: Path) -> dict[int, pa.Table]:
 
 
 def measure_agreement(root: Path, readings: Path) -> list[Figure]:
-    """Count files that a validator refuses, programs that cannot read the archive, and questions to
-    which the two query engines (DuckDB and Spark) give different answers. Return the counts.
+    """Return three counts: files that a validator refuses, programs that cannot read the archive,
+    and queries to which the two query engines (DuckDB and Spark) give different answers.
     """
     invalid = sum(bool(_find_refusals(path)) for path in _geo_files(root))
     expected = sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["seq"]))

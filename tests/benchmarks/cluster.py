@@ -1,5 +1,5 @@
-"""Benchmark of a second copy: acknowledgement times of a service whose archive has a copy in a
-bucket (object storage), and of one without. They are measured in turn.
+"""Benchmark of the acknowledgement times of a service whose archive has a copy in a bucket (object
+storage), compared with those of a service without a copy. Both are measured alternately.
 
 The bucket is on a real S3 server in a separate process of this machine. A bucket over a network
 adds its network delay.

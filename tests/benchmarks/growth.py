@@ -1,11 +1,10 @@
-"""Benchmark of growth: the engine's processor time at rates from 10³ to 10⁵ observations per
-second.
+"""Benchmark of growth: processor time of the engine (service without network) at rates from 10³ to
+10⁵ observations per second.
 
 A message has ten observations, and each vehicle sends one message per second, so a higher rate
-means more vehicles. The engine (service without network) ingests one second of messages in
-portions. It then does the other work of a second: segment (file of new rows), acknowledgements,
-tiles. The clock is simulated, so that rates above the machine's capacity can be measured. There is
-no network.
+means more vehicles. The engine ingests the messages of one second in portions. It then does the
+other work of a second: it writes a segment (file of new rows), acknowledgements and map tiles. The
+clock is simulated, so that rates above the machine's capacity can be measured. There is no network.
 """
 
 from __future__ import annotations
@@ -41,8 +40,8 @@ SECOND: Final = 10**9
 
 
 def growth() -> list[Figure]:
-    """Measure the processor time for one second of messages at 10³ to 10⁵ observations
-    per second.
+    """Measure the engine's processor time for one second of messages at 10³ to 10⁵ observations per
+    second.
     """
     cost = {rate: second_s(rate, seconds) for rate, seconds in RATES.items()}
     slope = float(np.polyfit(np.log(list(cost)), np.log(list(cost.values())), 1)[0])

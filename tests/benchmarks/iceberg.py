@@ -32,8 +32,8 @@ def table_of(uri: str, kind: Kind) -> Table:
 
 
 def rows_different(root: Path, uri: str) -> int:
-    """Return the number of rows, compared in all columns, that occur more often in the archive's
-    compacted (sorted) files than in the Iceberg tables, or less often.
+    """Return the number of rows that occur more often in the archive's compacted (sorted) files
+    than in the Iceberg tables, or less often. Rows are equal if all columns are.
     """
     different = 0
     for kind in Kind:
@@ -55,8 +55,9 @@ def _count_rows(table: pa.Table) -> Counter[str]:
 
 
 def count_different_rows(folder: Path) -> float:
-    """Return the number of differing rows over four rounds of compaction and registration in
-    Iceberg, and after retention has removed a day.
+    """Return the number of differing rows between archive and Iceberg tables, over four rounds of
+    compaction (sorting of new rows) and registration in Iceberg, and after retention has removed a
+    day.
     """
     root = folder / "archive"
     uri = f"sqlite:///{folder}/tables.db"

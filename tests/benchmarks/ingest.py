@@ -68,8 +68,8 @@ def ingest() -> list[Figure]:
 
 def measure_rates(records: int) -> tuple[tuple[float, float], float, float]:
     """Return medians after a warm-up: observations per wall second and per CPU second of the whole
-    ingest, then of decoding alone with the generated module and with our decoder (both per CPU
-    second).
+    ingest; then observations per CPU second of decoding alone, with the generated module and with
+    our decoder.
     """
     sent = make_messages(COUNTS[records], records, time.time_ns())
     taken = [_time_ingest(sent, records) for _ in range(ROUNDS + 1)][1:]

@@ -86,7 +86,6 @@ def first_memory(first: FloatArray, speed: float) -> FloatArray:
         first: first readings (N, 11): ax, ay, yaw rate, steering angles delta and wheel speeds
             omega.
         speed: initial speed [m/s].
-        memberships: parameters of the fuzzy sets.
     """
     setting = Setting()
     (count, inputs) = first.shape

@@ -351,8 +351,8 @@ def colour_distance() -> float:
 
 
 def count_states() -> float:
-    """Return the number of the page's states that pass their tests; each leaves a picture in
-    `.page/states`.
+    """Return the number of states of the page (such as "no service") that pass their tests. Each
+    test stores a picture in `.page/states`.
     """
     path = "tests/fleet_service/page/test_states.py"
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", path]

@@ -151,8 +151,8 @@ def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
 
 
 def measure_publication() -> dict[str, float]:
-    """Return figures by name of the page's DATEX II publication and features, from a service and
-    six cars on ice that melts.
+    """Return figures by name of the page's DATEX II publication and features, measured with a
+    service and six cars on ice that melts.
 
     `leaked`: number of cells in published situations for which the map has only a lower bound or an
     estimate, and no measurement. `unended`: situations that are still open when their alert is

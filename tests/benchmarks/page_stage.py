@@ -34,7 +34,9 @@ BOUND_SHARE: Final = 0.3
 
 
 class Town:
-    """Cells of a simulated town by tile. Changes are published as a service publishes them."""
+    """Cells of a simulated town by map tile. Changes of cells are published in the form that a
+    service uses.
+    """
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)

@@ -1,5 +1,5 @@
-"""Benchmarks of queries of past maps over Zenoh, and of the map after a restart compared with the
-map before.
+"""Benchmarks of two properties of a service: the time of queries about past maps over Zenoh, and
+the difference between the map before and after a restart.
 """
 
 from __future__ import annotations

@@ -80,19 +80,19 @@ def count_operations(interval: float) -> float:
     """Return the floating-point operations per sample of the default estimator at a sampling
     `interval` [s].
 
-    Counted from the source (`friction_mixture/node`) are the operations for the NODES nodes of one
-    friction on a car with torque signals. A division or root counts as one operation. Spare lanes,
-    mixing after a road change, the sums of a block and the output are not counted, so the share of
-    the peak is a lower limit.
+    Counted from the source (`friction_mixture/node`) are the operations for the NODES nodes
+    (filters of one friction hypothesis each) on a car with torque signals. A division or root
+    counts as one operation. Unused SIMD lanes, mixing after a road change, the sums over a block of
+    samples and the output are not counted, so the share of the peak is a lower limit.
     """
     samples = round(Constants().block_time / interval)
     return NODES * (_count_rows() + _count_covariances()) / samples
 
 
 def _count_rows() -> int:
-    """Return the operations of one node for its measurement rows: residuals at the mean, with
-    steering and radii moved and at the cubature points; forces at the mean and with three states
-    moved.
+    """Return the floating-point operations of one node (filter of one friction hypothesis) that
+    compute its measurement residuals. Residuals are computed at the mean, with steering and wheel
+    radii changed, and at the cubature points; forces at the mean and with three states changed.
     """
     stiffness = 4 * (EXPONENTIAL + 1) + 8
     slip = 8 + AXLES * stiffness + WHEELS * 15
@@ -106,8 +106,9 @@ def _count_rows() -> int:
 
 
 def _count_covariances() -> int:
-    """Return the operations of one node for its covariance: first columns of the factor,
-    covariances with the rows, update by the rows and by two velocities, prediction, and moments.
+    """Return the floating-point operations of one node (filter of one friction hypothesis) for its
+    covariance: first columns of its factor, covariances with the measurements, updates by the
+    measurements and by two velocities, prediction, and moments.
     """
     half = STATES * (STATES + 1) // 2
     factor = FUSED * STATES * CURVED * (CURVED - 1) // 2

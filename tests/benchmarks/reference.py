@@ -1,5 +1,5 @@
-"""Process and measurement functions f and h of the filter in C (kernel.c) in NumPy, for the filters
-of libraries.
+"""NumPy form of the process function f and the measurement function h that the filter in C
+(kernel.c) uses. The filters of other libraries are run with these functions.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ OMEGA = 7
 def move(
     points: FloatArray, row: FloatArray, before: FloatArray, now: FloatArray, gone: float
 ) -> FloatArray:
-    """Return the states (P, 6) after `gone` seconds by Heun's rule. This is the process function f.
+    """Return P states (P, 6) after `gone` seconds, integrated by Heun's rule. This is the process
+    function f.
 
     Args:
         points: states (P, 6).
@@ -58,7 +59,7 @@ def compute_response(
     mu: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return longitudinal, lateral and yaw acceleration, each (P,), of a vehicle with four Dugoff
-    tyres.
+    tyres in P states.
     """
     front = np.array([True, True, False, False])
     left = np.array([1.0, -1.0, 1.0, -1.0])

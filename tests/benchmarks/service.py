@@ -51,8 +51,8 @@ _X, _Y = (
 
 
 def make_batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice: bool) -> Batch:
-    """Return visits to cells of the tile, dated now. They report ice if `ice` is True, otherwise
-    only the grip used.
+    """Return a batch of visits (passes through map cells) of the test tile, dated now. They report
+    ice if `ice` is True, otherwise only how much friction the tyres used.
     """
     cell = grid.interleave(_X + column.astype(np.int64), _Y + row.astype(np.int64))
     latitude, longitude = grid.centre(cell)
@@ -97,7 +97,9 @@ def put_batch(session: zenoh.Session, one: Batch) -> None:
 
 
 def load(endpoint: str) -> None:
-    """Send RATE observations per second, all with little grip used, until this process is ended."""
+    """Send RATE observations per second, in all of which the tyres used little friction, until this
+    process is ended.
+    """
     rng = np.random.default_rng(0)
     seq = 0
     began = time.monotonic()

@@ -1,8 +1,9 @@
 """Benchmark of two services with one region each, compared with one service with both regions: time
 from a burst of messages to its last acknowledgement.
 
-It is measured twice. First with engines alone, in separate processes, on messages in memory. Then
-with whole services over Zenoh, where router and sender use the same cores, unlike in a real fleet.
+The time is measured in two ways. In the first, engines (services without network) run in separate
+processes on messages in memory. In the second, whole services run over Zenoh; router and sender
+then use the same cores, unlike in a real fleet.
 """
 
 from __future__ import annotations

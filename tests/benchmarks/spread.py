@@ -1,5 +1,5 @@
-"""Benchmark of Spark: recorded drives and zones of the map (squares of zoom 7) are processed by
-Spark and in this process, and the results are compared. `make batch-bench` counts the differences.
+"""Benchmark of Spark: recorded drives and map zones (squares of zoom 7) are processed by Spark and
+in this process, and the results are compared. `make batch-bench` counts the differences.
 """
 
 from __future__ import annotations

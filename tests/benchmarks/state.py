@@ -1,9 +1,10 @@
-"""Benchmark of a million cells: a checkpoint during ingest, and a restart from this checkpoint and
-the later rows.
+"""Benchmark of a service with a million cells: writing of a checkpoint (saved state) during ingest,
+and restart from this checkpoint and the rows ingested after it.
 
 The checkpoint is requested by a background thread, as in the service, while another thread
-processes messages. The restart runs in a separate process; its time covers imports, the checkpoint,
-the later rows, loading of compiled code, and the Zenoh session, until the service is ready.
+processes messages. The restart runs in a separate process; its time includes imports, the reading
+of the checkpoint and the later rows, the loading of compiled code, and the opening of the Zenoh
+session, until the service is ready.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ SECOND: Final = 10**9
 
 
 def state() -> list[Figure]:
-    """Measure the saving of a service's state (a checkpoint) of 10⁶ cells during ingest, and a
+    """Measure the saving of a service's state with 10⁶ cells (a checkpoint) during ingest, and a
     restart from it.
     """
     now = START + int(SPAN_S) * SECOND

@@ -105,7 +105,7 @@ def same_filter(drive: Drive) -> float:
 
 def step() -> list[Figure]:
     """Compare the time of one filter step with that of C code and of filter libraries, and measure
-    the cost of a call.
+    the time of a call of the filter bank.
     """
     drive = Drive()
     speed = same_filter(drive)

@@ -1,5 +1,5 @@
-"""Benchmark of thin traffic over many tiles: delay of acknowledgements, and age of a tile for a
-client that queries all tiles.
+"""Benchmark of sparse traffic over many map tiles: delay of acknowledgements, and age of a tile for
+a client that queries all tiles.
 
 1 600 vehicles each drive to and fro in their own row of five tiles, and send a visit every 1.07 s.
 Router, service, vehicles and readers run in separate processes.
@@ -62,8 +62,8 @@ _ROWS = _ACROSS // ROW
 
 
 def make_visit(vehicle: int, turn: int) -> Batch:
-    """Return a batch with an observation of a vehicle in the middle of a tile. The vehicle reaches
-    the next of its tiles in each turn (period between two visits).
+    """Return a batch with an observation of a vehicle in the middle of a map tile. In each turn
+    (period between two visits) the vehicle moves to the next of its tiles.
     """
     first = grid.cell_of(LATITUDE, LONGITUDE, grid.REGION_ZOOM)
     x, y = (int(v) for v in grid.deinterleave(first))
@@ -210,8 +210,8 @@ def _collect_counts(reader: subprocess.Popen[str], got: list[int]) -> None:
 
 
 def tiles() -> list[Figure]:
-    """Measure acknowledgements, published tiles, and a small query behind large ones, at 1 500
-    observations/s over 8 000 tiles.
+    """Measure acknowledgements, published tiles, and a small query that waits behind large ones, at
+    1 500 observations/s over 8 000 tiles.
     """
     puts: dict[str, int] = {}
 

@@ -1,8 +1,9 @@
-"""Substitute for the remote-api plug-in of `zenohd`: the messages with which a client publishes,
-subscribes and queries over WebSocket, passed to a Zenoh session.
+"""Substitute for the remote-api plug-in of `zenohd`. It receives the messages with which a client
+publishes, subscribes and queries over WebSocket, and passes them to a Zenoh session.
 
-The plug-in is a library that `zenohd` loads, so the Python router cannot use it. The layout of the
-messages is that of zenoh-ts 1.10 (`message.ts`), in Zenoh's serialization format.
+The plug-in is a library that `zenohd` loads, so the router in Python (`deploy.router`) cannot use
+it. The layout of the messages is that of zenoh-ts 1.10 (`message.ts`), in Zenoh's serialization
+format.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tests of the demo's figures on small cases."""
+"""Tests of the demo's figures, computed from small made-up drives and maps."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ S = 1_000_000_000
 
 
 def make_visits(*rows: tuple[str, float, int, float, float]) -> pa.Table:
-    """Return a table of visits (vehicle, second, cell, mu, utilisation), each half a second long,
-    in sector 0.
+    """Return a table of visits (passes of a vehicle through a map cell), each half a second long,
+    in heading sector 0. The columns are vehicle, second, cell, friction mu, and utilisation (used
+    share of the friction).
     """
     vehicle, at, cell, mu, used = zip(*rows, strict=True)
     enter = np.array([int(second * S) for second in at])
@@ -164,8 +165,9 @@ def test_demo_page_opens_in_a_browser_with_both_maps_and_figures(tmp_path: Path)
 def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Two passes over new ice of warned drivers and one of an unwarned driver after the first alert
-    must be counted. Earlier passes must not count.
+    """Count drivers that lose grip on new ice. After the first alert, two warned drivers and one
+    unwarned driver pass over the ice: these three passes must be counted, and the earlier passes
+    must not.
     """
     driven = make_visits(
         ("sim-001", 1.0, 7, 0.9, 0.5),

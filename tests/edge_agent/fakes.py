@@ -34,8 +34,8 @@ START_NS = 1_767_225_600_000_000_000  # 2026-01-01
 
 @dataclass(frozen=True)
 class MadeUp:
-    """Synthetic output of an estimator bank (filters of N vehicles), prepared by a test; it does
-    not depend on the vehicles' signals.
+    """Synthetic output of an estimator bank (filters of N vehicles). A test sets its values, which
+    do not depend on the vehicles' signals.
     """
 
     vx: FloatArray

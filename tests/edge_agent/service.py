@@ -103,7 +103,7 @@ class Service:
         self.session.put(keys.ack_key(vehicle), payload, encoding=ACK_ENCODING)
 
     def wait(self, condition: Callable[[list[Batch]], bool]) -> None:
-        """Wait until the received batches satisfy the condition."""
+        """Wait until the batches that this service received satisfy the condition."""
         with self._changed:
             assert self._changed.wait_for(lambda: condition(self.batches), DEADLINE_S), (
                 f"{len(self.batches)} batches"

@@ -1,4 +1,4 @@
-"""Tests of the command line: written files, published messages, and one line per error."""
+"""Tests of the command line: written files, published messages, and one line of text per error."""
 
 from __future__ import annotations
 
@@ -514,7 +514,9 @@ def test_help_imports_nothing_heavy() -> None:
 
 
 def test_estimates_of_a_split_or_odd_log_stay_finite(drive: Path, tmp_path: Path) -> None:
-    """Estimates must be finite without torque, rear steering and half of a wheel's speeds."""
+    """Estimates must be finite although the log lacks the wheel torques, the rear steering angles
+    and every second speed of one wheel.
+    """
     log = pq.read_table(drive / "log.parquet")
     gone = [n for n in log.column_names if n.startswith(("torque", "delta_r", "true"))]
     holes = pa.array(

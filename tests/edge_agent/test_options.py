@@ -272,7 +272,7 @@ def test_the_tests_that_show_an_option_give_it_to_the_command() -> None:
 @pytest.fixture(scope="module")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with two drives, their vehicle files, a file of memberships (parameters of
-    fuzzy sets) and a configuration.
+    fuzzy sets) and a configuration file.
     """
     folder = tmp_path_factory.mktemp("given")
     for k in (0, 1):

@@ -1,5 +1,5 @@
-"""Campaign on a restarted router: a watcher behind it receives every active alert soon after its
-session is back.
+"""Campaign on a restarted router: a client that watches alerts through this router (the watcher)
+must receive every active alert soon after its session is back.
 
 The service is connected to the first router, the watcher to the second. The watcher's router is
 killed, alerts are raised, and the router is started again. The watcher must then receive these
@@ -81,7 +81,9 @@ def run(site: Site) -> list[Figure]:
 
 
 def _make_second_router(there: Stage) -> Part:
-    """Return a second router on a fixed port that clients of the first router do not know."""
+    """Return a second router, connected to the first and started. It keeps its port over restarts;
+    clients of the first router do not know this port.
+    """
     config = Path(there.folder) / "router-b.json"
     settings = zenoh.Config.from_file(str(CONFIG))
     settings.insert_json5("connect/endpoints", json.dumps([there.endpoint]))

@@ -42,7 +42,7 @@ Attack = AbstractContextManager[None]
 
 
 class Target(NamedTuple):
-    """Addresses of the page and the service that are attacked, and of the router."""
+    """Addresses of the page and the service that are attacked, and address of the router."""
 
     host: str
     port: int

@@ -45,7 +45,7 @@ class Census:
 
 class Told(NamedTuple):
     """Content of the load generators' journals: number of records and time [s] of every batch
-    stored in an outbox, and time [s] of every batch that an acknowledgement settled (made final).
+    stored in an outbox, and time [s] at which an acknowledgement settled a batch (made it final).
     """
 
     stored: dict[Name, tuple[int, float]]
@@ -102,8 +102,8 @@ def compare_with_archive(journals: Iterable[Path], archive: Path) -> Census:
 
 
 def _doubled_outside(archive: Path) -> int:
-    """Return the number of rows that appear twice for a foreign program: one that reads all
-    compacted (sorted) files directly and ignores the rules of the archive format.
+    """Return the number of rows that appear twice for a program that does not know the rules of the
+    archive format and reads all compacted (sorted) files directly.
     """
     paths = list(layout.compacted_files(archive, Kind.OBSERVATION))
     whole = [pq.read_table(path, columns=ROW, partitioning=None) for path in paths]

@@ -232,8 +232,8 @@ def _kill_during(what: str) -> Go:
 
 
 def _restore_link(host: Host, random_: random.Random) -> None:
-    """Restore a host's links, after a random time or after the service has noticed its
-    successor.
+    """Restore a host's network links, either after a random time or after the service on this host
+    has noticed that another one took over.
     """
     if random_.random() < 0.5 or host.to_router.is_cut:
         time.sleep(random_.uniform(0.0, 3.0))

@@ -190,7 +190,7 @@ class VirtualTime:
 
 
 class VirtualStop:
-    """Event like `threading.Event` for threads in virtual time: waiting takes virtual time,
+    """Event like `threading.Event` for threads in virtual time. A wait always takes its full time,
     measured by the clock of the waiting process.
     """
 
@@ -207,8 +207,8 @@ class VirtualStop:
         self._is_set = True
 
     def wait(self, seconds: float) -> bool:
-        """Wait for `seconds` by the clock of the simulated process, or until the event is set.
-        Return True if it is set.
+        """Wait for `seconds` by the clock of the simulated process. Return True if the event is set
+        after this time.
         """
         self._world.sleep(seconds / self._world.process.rate)
         return self._is_set

@@ -6,8 +6,9 @@ clock advances by one, but the clock of a lease holder may stand still in every 
 is compulsory: a service that does nothing for a while models a frozen or disconnected one. Uploads
 and renewals take effect in the bucket at any time after they began.
 
-    renew    begins at a moment; if the bucket shows no higher number afterwards, the renewal
-             counts from its beginning; a renewal that was given up may still write its turn later
+    renew    begins at a moment; if the bucket shows no higher number afterwards, the renewal counts
+             from its beginning; a renewal that was given up may still write its turn (counter of
+             renewals in the lease object) later
     ack      only within lease / 2 after the beginning of the last valid renewal, and only for
              batches that are uploaded
     take     a standby that saw the same turn for its lease time creates the next number; if the
@@ -64,14 +65,14 @@ class Service(NamedTuple):
     """State of a service.
 
     Attributes:
-        role: "waiting", "taking" (has created its number, but not listed yet), "serving", or
-            "gone".
-        number: number of its lease; 0 without a lease.
+        role: "waiting", "taking" (has created its number, but has not yet read the objects of the
+            bucket), "serving", or "gone".
+        number: number of its lease (each takeover creates the next one); 0 without a lease.
         age: ticks since the beginning of its last valid renewal, capped.
         begun: age of a renewal that is under way; NOT_YET without one.
         seen: (number, turn) of the lease object that it saw last.
         same: number of ticks for which it has seen the same (number, turn).
-        wait: number of ticks to wait before it lists.
+        wait: number of ticks to wait before it reads the objects of the bucket.
         known: batches that it knows.
         sending: batches whose upload is under way.
         uploaded: own uploads of which it knows that they are in the bucket.
@@ -304,7 +305,7 @@ def _stand_by(world: World, me: int, rules: Rules, most_number: int) -> Iterator
 def _advance_clocks(world: World, slow: int, rules: Rules) -> World:
     """Return the state after a tick: the clocks of all running services advance, except that of the
     service `slow`. A clock is used for the age of a lease, for the wait for a lease, or for the
-    wait before listing.
+    wait before a service reads the bucket's objects.
     """
     out = []
     for me, one in enumerate(world.services):

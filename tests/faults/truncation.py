@@ -1,5 +1,5 @@
-"""Campaign on a damaged newest segment: it is cut at every byte, and its bytes are changed one at a
-time. The service must not count rows that are missing.
+"""Campaign on a damaged newest segment (file of new rows): it is cut at every byte, and its bytes
+are changed one at a time. The service must not count rows that are missing.
 
 The newest segment models one that was written but not yet acknowledged when the power failed: its
 rows may be lost, but rows of older segments may not. A batch whose rows are lost must be accepted

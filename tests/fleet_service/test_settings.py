@@ -36,9 +36,9 @@ Show = Callable[[ServiceConfig, Path], object]
 
 
 def open_engine(config: ServiceConfig, root: Path) -> Iterator[Engine]:
-    """Yield an engine (service without network) with the setting under test that has ingested
-    reports of three cars: with the present time and minutes old, ten minutes old, and dated a
-    minute ahead.
+    """Yield an engine (service without network) with the setting under test. It has ingested four
+    reports of three cars: one second and five minutes old, ten minutes old, and dated a minute
+    ahead.
     """
     with closing(Engine(config, root)) as engine:
         now = time.time_ns()
@@ -102,7 +102,7 @@ def count_queued(made: Service) -> int:
 
 
 def turns(made: Service) -> tuple[int, int]:
-    """Return two numbers from ten simulated passes of the service's main loop, .3 s each: segments
+    """Return two numbers from ten simulated passes of the service's main loop, 0.3 s each: segments
     (files of new rows) written, and rounds in which tiles are published.
     """
     clock = [time.monotonic()]

@@ -138,7 +138,7 @@ def pages_with_errors(house: House) -> float:
 
 def live_page(house: House) -> tuple[str, list[str], list[str]] | None:
     """Open the live page with a service and cars on ice. Return (name, errors, requests to other
-    hosts), or None if there are none.
+    hosts), or None if the page reports no errors and sends no such requests.
     """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     connection = ZenohSettings(connect=endpoints)

@@ -195,8 +195,8 @@ def _replayed_rows(ice: KnownIce, ending: str) -> list[dict[str, Any]]:
 
 
 def _hidden_by_style(ice: KnownIce) -> Places:
-    """Return the known slippery places that no rule of the QGIS style draws, or only that of
-    unknown cells. The filters of a rule are SQL.
+    """Return the known slippery places that the QGIS style does not draw, or draws only by its rule
+    for unknown cells. The filters of a rule are SQL, which the function evaluates.
     """
     text = (ROOT / "deploy" / "examples" / "gripmap.qml").read_text()
     root = ET.fromstring(text[text.index("<qgis") :])
@@ -282,8 +282,9 @@ def _put_missing(router: zenoh.Session, tiles: dict[int, pa.RecordBatch], addres
 
 
 def _hidden_on_page(ice: KnownIce) -> dict[str, Places]:
-    """Return the places that the live page draws hollow or grey: as ribbons, as cells, and as
-    squares of each zoom. Also those of the page's past.
+    """Return, by form of drawing, the places that the live page hides (draws hollow, grey or not at
+    all). The forms are ribbons, cells and squares of each zoom level, for the present map and for a
+    past map.
     """
     names = sorted(ice.places)
     ordered = [[int(grid.tile_of(cell)), cell & 0x3FFF, sector] for cell, sector in names]

@@ -1,5 +1,5 @@
 """Bugs that five new users found by following the documents alone, each with the tests that would
-fail if it came back.
+fail if the bug came back.
 """
 
 from __future__ import annotations

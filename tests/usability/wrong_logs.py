@@ -1,4 +1,6 @@
-"""Recordings with a deliberate fault, replayed as by a new user. Each fault must be mentioned."""
+"""Recordings with a deliberate fault, replayed as by a new user. The replay must mention each
+fault.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """`python -m tests.benchmarks.ahead [--out DIR] [--seeds N] [--quick]`: evaluate the warnings in
-the car, and the map as a prior.
+the car, and the fleet's map as a prior of the friction estimate.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ ENTRY_TOWNS: Final = 4  # of the map as a prior, where the estimator itself driv
 
 
 def measure_ahead(seeds: range, quick: bool) -> list[Figure]:
-    """Return the figures of the warnings and of the map as a prior; each seed draws a town."""
+    """Return the figures of the warnings and of the map as a prior of the friction estimate. Each
+    seed draws a random town.
+    """
     rows: list[Callable[[], list[Figure]]] = [
         lambda: cost.cost_figures(FIGURES, 2e3 if quick else 20e3),
         lambda: latency.latency_figures(
@@ -44,8 +46,8 @@ def measure_ahead(seeds: range, quick: bool) -> list[Figure]:
 
 
 def main() -> int:
-    """Measure the warnings in the car and the map as a prior, and write the figures. Return 0 if
-    every figure meets its target, otherwise 1.
+    """Measure the warnings in the car and the map as a prior of the friction estimate, and write
+    the figures. Return 0 if every figure meets its target, otherwise 1.
     """
     parser = argparse.ArgumentParser(prog="tests.benchmarks.ahead", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path(".evaluation/ahead"))

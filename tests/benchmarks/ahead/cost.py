@@ -1,5 +1,5 @@
-"""Cost of the look ahead for one car and day: megabytes received in a busy city, and processor
-time.
+"""Cost of the look ahead (queries for the map and the alerts of the road ahead) for one car and
+day: megabytes received in a busy city, and processor time.
 
 The city is a grid of streets 100 m apart. Every map place is measured in both directions, and each
 map tile has STANDING active alerts. The car drives DAY_KM through it at city speed. The received

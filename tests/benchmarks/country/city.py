@@ -22,7 +22,7 @@ PREFIX: Final = "country.city"
 
 def simulate_city(sumo: Sumo, folder: Path, seed: int) -> list[Figure]:
     """Simulate the drives of the city, fuse their observations, and compare the map with the true
-    friction. The observations stay in `folder`/NAME for the country.
+    friction. The observations stay in a subfolder of `folder` for the benchmark of a country.
     """
     folder.mkdir(parents=True, exist_ok=True)
 

@@ -100,8 +100,9 @@ def main(kind: str) -> None:
 
 
 def _measure_pair(fusion: Fusion) -> float:
-    """Return the bytes of the table of (cell, vehicle) pairs for each pair, after all have settled
-    because a vehicle reports a quarter of an hour later.
+    """Return the mean size [bytes] of an entry in the table of (cell, vehicle) pairs. Before that,
+    let a vehicle report a quarter of an hour later, so that all earlier visits are settled (moved
+    into this table).
     """
     later_s = (fusion.next_epoch - START) / SECOND + FORGOTTEN_EVERY_S
     fusion.update(make_visits(np.random.default_rng(SEED), 1, 1, later_s, 1.0))

@@ -219,16 +219,14 @@ def _watch_parts(parts: Sequence[Part], services: Sequence[Service], sender: Par
 
 
 def _update_least(before: list[float], parts: Sequence[Part]) -> list[float]:
-    """Return the smallest memory [MB] seen so far of each process except the last (the sender): the
-    smaller of its value in `before` and its memory now.
+    """Return, for each process except the last (the sender), the smallest memory [MB] seen so far:
+    the smaller of its value in `before` and its memory now.
     """
     return [min(then, memory_mb(part)) for then, part in zip(before, parts[:-1], strict=True)]
 
 
 def _last_line(sender: Part) -> dict[str, float]:
-    """Return the last complete line of the output of the process that sends reports, parsed from
-    JSON.
-    """
+    """Return the last complete line that the sending process printed, parsed from JSON."""
     whole = [line for line in sender.read_lines() if line.endswith("}")]
     said: dict[str, float] = json.loads(whole[-1])
     return said

@@ -1,9 +1,9 @@
-"""SUMO's traffic as lanes for the simulated vehicles: each vehicle has its own lane, with the
-speeds that it had in SUMO.
+"""Lanes for the simulated vehicles, made from SUMO's traffic: each vehicle has its own lane, with
+the speeds that it had in SUMO.
 
 SUMO gives only routes and speeds; our vehicle model simulates the tyres. A driver keeps SUMO's
-speed where he believes that the road is dry, and drives slower elsewhere. Where SUMO lets the
-vehicle wait, it creeps.
+speed where the driver believes that the road is dry, and drives slower elsewhere. Where a vehicle
+stands still in SUMO, our vehicle creeps.
 """
 
 from __future__ import annotations
@@ -103,7 +103,9 @@ def _make_drive(rows: pd.DataFrame) -> Drive | None:
 
 
 def make_streets(found: list[Drive], seed: int) -> Streets:
-    """Return streets along these drives, on random hills, with some wet, snowy and icy parts."""
+    """Return a scenario with streets along these drives, on random hills, with some wet, snowy and
+    icy parts.
+    """
     allowed = [np.maximum(one.speed, SLOWEST) ** 2 / USUAL_Q for one in found]
     lanes = network_of(
         [one.line for one in found], [[k] for k in range(len(found))], len(found), allowed

@@ -115,8 +115,8 @@ def learn_and_narrow(cars: int, seed: int, judged_s: int = JUDGED_S) -> Narrowed
 
 
 def _drive_fleet(fleet: SimulatedFleet, seconds: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Simulate a drive of a fleet for `seconds`; return times (T, N), signals (T, N, 18), and the
-    true mean friction of the wheels (T, N).
+    """Simulate a drive of a fleet for `seconds`; return times (T, N), sensor signals (T, N, 18),
+    and the true mean friction of the wheels (T, N).
     """
     parts = []
     for _ in range(seconds):

@@ -118,8 +118,8 @@ def write_profile(kind: str, folder: Path) -> tuple[str, Path | None]:
 
 
 def count_lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
-    """Return (number of samples lost between a source and the rows that the agent builds, number of
-    samples sent).
+    """Return two numbers: samples lost between a source and the rows (samples of all channels) that
+    the agent builds, and samples sent.
 
     A sample is lost if its message was not received, or if its reading arrived after its row had
     been built.

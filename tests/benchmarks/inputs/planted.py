@@ -2,7 +2,7 @@
 find and name them.
 
 The sizes of the faults are those seen in imported third-party logs: units, signs, offsets, a clock
-.4 s off, status bits in a wheel speed, exchanged columns, and a vehicle file with another tyre
+0.4 s off, status bits in a wheel speed, exchanged columns, and a vehicle file with another tyre
 radius.
 """
 

@@ -1,4 +1,6 @@
-"""Test of the clients in other languages with a router and a service."""
+"""Benchmark part that tests the map clients in other programming languages with a router and a
+service.
+"""
 
 from __future__ import annotations
 

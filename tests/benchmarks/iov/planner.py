@@ -1,4 +1,6 @@
-"""Simulated drives onto ice, with and without the speed limit that a planner receives."""
+"""Simulated drives onto ice, with and without the speed limit that the agent publishes for a
+planner.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ STRAIGHT: Final = 1000  # [m] of road
 
 def measure_planner(_folder: Path, quick: bool) -> list[Figure]:
     """Simulate drives onto ice of unknown friction that the map knows with a 90 % interval. Return
-    the shares of drives that can stop within sight, with and without the limit.
+    the shares of drives that can stop within sight, with and without the agent's speed limit.
     """
     draw = np.random.default_rng(SEED)
     drives = 200 if quick else 2000
@@ -58,8 +60,8 @@ def measure_planner(_folder: Path, quick: bool) -> list[Figure]:
 
 
 def _speed_at(begin: int, speed: float, safe: FloatArray, *, limited: bool) -> float:
-    """Return the speed [m/s] at position `begin` [m] of a car that obeys the limit with delay and
-    gentle braking.
+    """Return the speed [m/s] at position `begin` [m] of a car that obeys the speed limit after a
+    delay and with gentle braking.
     """
     limit = SteadyLimit()
     obeyed = math.inf

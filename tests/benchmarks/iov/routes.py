@@ -41,8 +41,8 @@ class StreetTown:
     streets: list[tuple[int, int]]
 
     def line(self, street: tuple[int, int]) -> routing.RoadLine:
-        """Return a street of the town as a directed polyline, as the computation of route costs
-        takes it.
+        """Return a street of the town as a directed polyline, in the form that the computation of
+        route costs takes.
         """
         first, last = self.crossings[list(street)]
         return routing.RoadLine(np.array([first[0], last[0]]), np.array([first[1], last[1]]))

@@ -1,5 +1,5 @@
-"""Tests of the fuzzy adaptation: the noise R grows within bounds when innovations (measurement
-minus prediction) are too large, and invalid tables are refused.
+"""Tests of the fuzzy adaptation: the measurement noise R grows within bounds when innovations
+(measurement minus prediction) are too large, and invalid tables are refused.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests of the rule table of paper 001 and of the weighted window of paper 002."""
+"""Tests of the rule table of paper 001, and of the noise estimate of paper 002, which weights the
+last innovations (measurement minus prediction) by their size.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the campaign on warnings ahead, on a small scale."""
+"""Tests of the evaluation of warnings ahead (`tests.benchmarks.ahead`) in short runs."""
 
 from __future__ import annotations
 

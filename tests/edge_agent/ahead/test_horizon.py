@@ -1,5 +1,5 @@
 """Tests of the horizon (friction of the road ahead of a car): conversion of metres to cells,
-unknown cells that stay unknown, ageing, the cache, and the safe speed.
+unknown cells that stay unknown, ageing of the map's values, the cache, and the safe speed.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def test_a_route_goes_on_where_the_car_is_and_is_none_for_who_left_it() -> None:
 def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
     ahead: float, turned: float, spacing: float
 ) -> None:
-    """The route has a right angle to the left after 120 m. A car that cuts this corner or drives on
-    straight for some metres must still count as on the route.
+    """The route has a right angle to the left after 120 m. A car that turns before this corner, or
+    only some metres after it, must still count as on the route.
     """
     way = np.arange(0.0, 120.0 + spacing / 2, spacing)
     x = np.concatenate([way, np.full(len(way) - 1, 120.0)])
@@ -85,8 +85,9 @@ def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
 
 @pytest.mark.parametrize("turned", [0.0, 90.0, 180.0])
 def test_a_route_that_begins_here_is_not_left_by_how_the_car_stands(turned: float) -> None:
-    """A car whose heading differs from that of the route's beginning must count as on the route. A
-    navigation system leaves out the part already driven, so the route may begin at the next corner.
+    """A car must count as on its route although its heading differs from that of the route's
+    beginning. A navigation system leaves out the part already driven, so the route may begin at the
+    next corner.
     """
     path = GivenRoute(*line()).ahead(HOME._replace(yaw=HOME.yaw + math.radians(turned)), 300.0)
     assert path is not None

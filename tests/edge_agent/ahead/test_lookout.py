@@ -60,7 +60,7 @@ class Driving:
         self.lookout.see([Pose(float(latitude[0]), float(longitude[0]), HOME.yaw, 14.0, now)])
 
     def drive_until(self, condition: Callable[[Outlook], object]) -> Outlook:
-        """Report the car's pose repeatedly until its outlook (warnings and friction of the road
+        """Report the car's pose repeatedly until its outlook (warnings, and friction of the road
         ahead) meets the condition, and return this outlook.
         """
 

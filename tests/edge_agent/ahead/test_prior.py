@@ -24,8 +24,8 @@ FLAT = np.zeros((1, mugrid.BINS))
 
 
 def sharp(mu: float, std: float = 0.06) -> FloatArray:
-    """Return the map's belief about a cell, (32,), with median `mu` and a 90 % interval of `mu` ±
-    1.6·`std`.
+    """Return the map's belief about a cell: probabilities (32,) on the friction grid with median
+    `mu` and a 90 % interval of `mu` ± 1.6·`std`.
     """
     said = (np.array([value]) for value in (mu - 1.6 * std, mu, mu + 1.6 * std, float(mu < 0.4)))
     return np.asarray(belief_of(*said)[0])

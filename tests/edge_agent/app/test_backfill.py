@@ -1,5 +1,5 @@
-"""Tests of the replay of many recorded drives: each is written to its own file, several run at a
-time, and a bad drive does not stop the others.
+"""Tests of the replay of many recorded drives: each drive's estimates are written to a file of
+their own, several run at a time, and a bad drive does not stop the others.
 """
 
 from __future__ import annotations

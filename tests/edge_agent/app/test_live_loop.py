@@ -179,8 +179,8 @@ def test_a_simulated_source_hands_its_context_to_the_observations(
 
 
 class WaitingClock(threading.Event):
-    """Clock that only waiting advances, as on a machine of unlimited speed, and the event on which
-    the loop waits.
+    """Simulated clock that is also the event on which the live loop waits. Only waiting advances
+    it, as if all computation took no time.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,6 @@
-"""Tests of the agent's shared library of kernels, and of the modules that an agent loads."""
+"""Tests of the agent's shared library of compiled kernels, and tests of which modules an agent
+loads.
+"""
 
 from __future__ import annotations
 

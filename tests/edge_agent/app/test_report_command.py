@@ -1,4 +1,6 @@
-"""Test of the option of `edge-agent replay` that compares estimators in a report."""
+"""Test of the option of `edge-agent replay` that adds further estimators to a report for
+comparison.
+"""
 
 from __future__ import annotations
 

@@ -159,8 +159,8 @@ def test_memberships_of_the_papers_filter_gain_on_held_out_drives() -> None:
 
 @pytest.mark.campaign
 def test_scores_in_the_shipped_file_are_those_of_the_filter_as_it_is() -> None:
-    """The scores in the shipped file must be those of the present filter. If the filter changed
-    after the tuning, run the command in the file again.
+    """The scores in the shipped file must be those of the present filter. If the filter was changed
+    after the tuning, this test fails; run the command that the file states again.
     """
     document = load_tuned(FOLDER / "aco-fckf.json").document
     found = scores_of(

@@ -28,8 +28,8 @@ def drive() -> Recorded:
 
 
 def offset_judge(vehicle: Vehicle, drive: Drive) -> Prediction:
-    """Return a made-up score of a vehicle's calibration on a drive, in place of a real prediction.
-    A calibrated offset of a_x improves the score, and calibrated wheel radii make it worse.
+    """Return a made-up score of a vehicle's calibration on a drive, in place of a real prediction
+    error. A calibrated offset of a_x improves the score, and calibrated wheel radii make it worse.
     """
     known = vehicle.calibration
     if known is None:

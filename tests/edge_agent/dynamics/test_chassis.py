@@ -1,4 +1,6 @@
-"""Tests of the body on four tyres, of the brush tyre curve and of the electric drive wheel."""
+"""Tests of the dynamics of a car body on four tyres, of the brush tyre curve and of the electric
+drive wheel.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests of the preparation of samples for the papers' filters: grip used in the last second, and
-cosines of the steering angles.
+"""Tests of the preparation of samples for the papers' filters, which adds the grip used in the last
+second and the cosines of the steering angles.
 """
 
 from __future__ import annotations

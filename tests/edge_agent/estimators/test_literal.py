@@ -1,5 +1,5 @@
-"""Tests of the friction filters of papers 000 and 003 as printed: they reach the printed errors;
-the effects of numerical precision and of the tyre model are checked.
+"""Tests of the friction filters of papers 000 and 003 as printed: they must reach the errors that
+the papers print. The effects of numerical precision and of the tyre model are also checked.
 """
 
 from __future__ import annotations

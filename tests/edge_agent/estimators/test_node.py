@@ -1,5 +1,5 @@
-"""Tests that compare parts of a group of nodes (filters of one friction hypothesis each) with
-textbook formulas: update, prediction, mixing and tyre curve.
+"""Tests that compare the parts of a group of nodes (filters of one friction hypothesis each) with
+textbook formulas. The parts are update, prediction, mixing and tyre curve.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ SEEDS = (0, 1, 2)
 
 
 def covariances(seed: int) -> FloatArray:
-    """Return LANES random covariances, side by side (STATES, STATES, LANES)."""
+    """Return LANES random covariances (STATES, STATES, LANES), one per SIMD lane (position in a
+    vector).
+    """
     factor = np.random.default_rng(seed).normal(size=(LANES, STATES, STATES))
     return np.ascontiguousarray(
         np.moveaxis(factor @ factor.swapaxes(1, 2) + 0.1 * np.eye(STATES), 0, -1)
@@ -54,7 +56,9 @@ def covariances(seed: int) -> FloatArray:
 
 
 def whole(covariance: FloatArray, lane: int) -> FloatArray:
-    """Return the covariance of one lane, of which only the lower half is stored."""
+    """Return the full covariance matrix of one SIMD lane, of which `covariance` stores only the
+    lower half.
+    """
     lower = np.tril(covariance[..., lane])
     return np.asarray(lower + np.tril(lower, -1).T)
 
@@ -98,7 +102,10 @@ def test_rows_taken_one_by_one_are_the_textbook_update(seed: int, missing: tuple
 def take_all_rows(
     features: BlockFeatures, mean: FloatArray, covariance: FloatArray, node: NodeWorkspace
 ) -> None:
-    """Apply all rows, and write the loss of each node over node.gain."""
+    """Update mean and covariance of each node (filter of one friction hypothesis) by all
+    measurement rows, and write the loss (negative log-likelihood) that results for each node into
+    `node.gain`.
+    """
     put_lanes(node.gain, 0, take_rows(features, mean, covariance, node, 0.0))
 
 

@@ -54,9 +54,10 @@ class Bend:
         self.memory["friction"]["median"] = mu
 
     def drive_block(self, slip: float, *, force: float = BEND, seconds: float = BLOCK_S) -> float:
-        """Drive for `seconds` with a lateral slip and a lateral force, both over load. Return the
-        degree (0 to 1) to which the last block of samples belongs to the fuzzy set "new", that is,
-        differs from the usual.
+        """Drive for `seconds` with the lateral force `force`, and with the lateral slip that the
+        filter expects at the force `slip`; both forces are divided by the load. Return the degree
+        (0 to 1) to which the last block of samples belongs to the fuzzy set "new", that is, differs
+        from the usual.
         """
         slope = self.memory["row"][0, Parameter.SLOPE_Y]
         across = -slip / slope * SPEED_M_S

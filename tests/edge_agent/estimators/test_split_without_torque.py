@@ -1,5 +1,5 @@
-"""Tests on roads with different friction on the two sides in a car without wheel torque: the yaw
-balance shows which side is slippery.
+"""Tests of stops on a split road (different friction left and right) in a car without wheel torque
+signals: the yaw balance must show which side is slippery.
 """
 
 from __future__ import annotations

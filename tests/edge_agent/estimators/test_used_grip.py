@@ -1,4 +1,6 @@
-"""Tests of the reported grip in use, also if torque is known on one axle only."""
+"""Tests of the reported grip in use (share of the friction that the tyres use), also if torque is
+known on one axle only.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +35,8 @@ def stop(mu: float) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def speed_error(mu: float, missing: slice, *, engine_only: bool = False) -> float:
-    """Return the RMS error of v_x [m/s] in a stop. If `engine_only`, the known torque does not
-    include the brakes.
+    """Return the RMS error of the estimated v_x [m/s] in a stop without the signals (columns) in
+    `missing`. If `engine_only`, the known torque does not include the brakes.
     """
     t, signals, vx = stop(mu)
     signals = signals.copy()

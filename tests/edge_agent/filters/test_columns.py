@@ -1,5 +1,5 @@
-"""Tests that the cubature filter with points in columns equals the one with points in rows: same
-points, same prediction.
+"""Tests that the cubature filter that stores its points in columns equals the one that stores them
+in rows: same points, same prediction.
 """
 
 from __future__ import annotations

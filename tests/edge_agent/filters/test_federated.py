@@ -1,5 +1,5 @@
 """Tests of federated filters by identities and linear filters: information sharing, fusion,
-downdates, and points by singular values.
+covariance downdates, and sigma points from singular values.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of corrections that a replay of a log applies because the signal doctor measured them: late
-sensors, a locked rear axle, wheel radii per axle.
+"""Tests of corrections that a replay of a log applies because the signal doctor (a check of
+recorded signals) measured the errors: delayed sensors, a locked rear axle, wheel radii per axle.
 """
 
 from __future__ import annotations

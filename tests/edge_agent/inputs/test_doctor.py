@@ -1,5 +1,5 @@
-"""Tests of the signal doctor: it names deliberate faults, accepts correct drives and the recorded
-minute, and proposes right corrections.
+"""Tests of the signal doctor (a check of recorded signals): it names deliberate faults, accepts
+correct drives and the recorded minute, and proposes right corrections.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def test_a_mistake_is_named_on_ice_too(winter: Recorded, name: str) -> None:
 
 @pytest.mark.timeout(600)  # the kernels of the default estimator may have to be compiled
 def test_the_first_drive(tmp_path: Path, router: Router, service: Service, capsys: Output) -> None:
-    """Run the commands of the tutorial on the recorded minute."""
+    """Run the commands of the tutorial on the recorded minute; every command must succeed."""
     log, page, out = (
         str(tmp_path / name) for name in ("drive.parquet", "check.html", "estimates.parquet")
     )

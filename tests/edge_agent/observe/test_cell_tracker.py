@@ -1,5 +1,5 @@
-"""Tests of visits: one cell and sector after the other, robust to jitter, and no visit without a
-position.
+"""Tests of the division of a drive into visits (passes through a map cell in one heading sector):
+they follow each other, they are robust to jitter, and there is no visit without a position.
 """
 
 from __future__ import annotations

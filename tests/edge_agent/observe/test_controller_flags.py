@@ -1,4 +1,6 @@
-"""Tests of controller flags: implausible flags have no weight, others are passed on unchanged."""
+"""Tests of controller flags (ABS and others): implausible flags are set to unknown, others are
+passed on unchanged.
+"""
 
 from __future__ import annotations
 

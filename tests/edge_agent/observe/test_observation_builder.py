@@ -194,8 +194,8 @@ def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
 
 
 def observe_grip(observed: np.ndarray, east: np.ndarray) -> list[float]:
-    """Return the grip reported for each visit (passage of a cell) of a car that drives east along
-    `east` (T, 1) [m] at 100 Hz and uses a grip of `observed` (T,).
+    """Return the used grip (share of friction) reported for each visit (passage of a cell) of a car
+    that drives east along `east` (T, 1) [m] at 100 Hz and uses a grip of `observed` (T,).
     """
     flat = np.zeros_like(east)
     block = ground(east, flat, flat, rate_hz=100.0, fix_every=10)
@@ -250,7 +250,7 @@ def test_visit_with_a_friction_jump_reports_both_and_grip_of_the_lesser(
 ) -> None:
     """The road changes from ice to dry within the vehicle's passage through the second cell. The
     observation must allow both frictions. Its used grip must be that of the ice, although the
-    brakes used .7 before the change was detected.
+    brakes used 0.7 before the change was detected.
     """
     samples = 40
     east = np.arange(samples)[:, None] * 0.5

@@ -1,5 +1,5 @@
-"""Tests of a damaged outbox file: it is renamed and counted, its readable rows are recovered, and
-the agent continues.
+"""Tests of a damaged outbox file: it is renamed and counted, its readable batches are recovered,
+and the agent continues.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ Order: TypeAlias = list[tuple[str, Literal["ascending", "descending"]]]
 
 def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
     """Return a description of the first difference between the answers of two query engines (DuckDB
-    and Spark) to a question, or None if they agree.
+    and Spark) to a question (predefined query), or None if they agree.
     """
     if one.schema.names != other.schema.names or one.num_rows != other.num_rows:
         return (

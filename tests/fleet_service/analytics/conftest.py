@@ -106,8 +106,8 @@ def links(rows: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def asked(archive: Path) -> Callable[..., pa.Table]:
-    """Return a function that answers an analytics question about the archive: `asked("grip",
-    at=...)`.
+    """Return a function that answers a question (predefined query) about the archive:
+    `asked("grip", at=...)`.
     """
 
     def ask(name: str, engine: str = "duckdb", part: Extract = PART, **options: object) -> pa.Table:

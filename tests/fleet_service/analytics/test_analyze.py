@@ -63,7 +63,9 @@ MAP = {
 
 
 def list_explained(question: str) -> set[str]:
-    """Return the columns of a question's answer that the documentation explains."""
+    """Return the columns of the answer to a question (predefined query) that the documentation
+    explains.
+    """
     page = (ROOT / "deploy" / "docs" / "reference" / "questions.md").read_text(encoding="utf-8")
     rows = [line.split("|") for line in page.splitlines() if line.startswith(f"| `{question}` |")]
     assert all(row[4].strip() for row in rows)

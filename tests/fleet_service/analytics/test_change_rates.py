@@ -1,6 +1,7 @@
-"""Tests of the question `change-rates`, which fits how often and how fast the friction of roads
-changes: the fit finds the rates of a simulated process, its 90 % interval contains the true rate as
-often as stated, and pairs of successive values of a cell are counted correctly.
+"""Tests of the question (predefined query) `change-rates`, which fits how often and how fast the
+friction of roads changes: the fit finds the rates of a simulated process, its 90 % interval
+contains the true rate as often as stated, and pairs of successive values of a cell are counted
+correctly.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ PI = 0.3  # slippery share of roads
 
 
 def pairs_of_a_day(rng: np.random.Generator, rate: float, count: int) -> FloatArray:
-    """Return counts (bins of elapsed time, 4), as `fit` takes them, of simulated pairs of readings
-    of a road that changes at the rate `rate` [1/s].
+    """Return counts of simulated pairs of readings of a road that changes at the rate `rate` [1/s]:
+    an array (bins of elapsed time, 4) with the columns that `fit` takes.
     """
     apart = np.exp(rng.uniform(0.0, np.log(LONGEST_S), count))
     first = rng.random(count) < PI
@@ -100,8 +101,8 @@ def test_pairs_are_values_in_a_row_by_different_vehicles(asked: Ask, rows: pd.Da
 
 
 def test_roads_change_faster_where_ice_comes_and_goes(asked: Ask, stations: Path) -> None:
-    """The synthetic roads freeze at four o'clock and thaw at eight. A rate must be found below
-    freezing, and no rate in the afternoon.
+    """The synthetic roads freeze at four o'clock and thaw at eight. The answer must contain changes
+    and their rate for the morning, and neither for the afternoon.
     """
     for options in ({}, {"stations": stations}):
         found = asked("change-rates", **options).to_pandas().set_index(["by", "class"])

@@ -25,8 +25,9 @@ PLACED = [name for name, question in QUESTIONS.items() if question.colour]
 
 @pytest.fixture(scope="module")
 def pages(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Return the HTML page of every question whose answer has cells, by name. The page named
-    `frames` shows an animation: the answer to the question `replay` at several times.
+    """Return the HTML page of every question (predefined query) whose answer has cells, by name.
+    The page named `frames` shows an animation: the answer to the question `replay` at several
+    times.
     """
     folder = tmp_path_factory.mktemp("pages")
     more: dict[str, list[str]] = {name: [] for name in PLACED} | {"frames": ["--step", "21600"]}

@@ -1,5 +1,5 @@
-"""Tests of each question: the answer equals one computed in pandas or plain Python, and finds the
-events that the synthetic archive contains.
+"""Tests of each question (predefined query): the answer equals one computed in pandas or plain
+Python, and finds the events that the synthetic archive contains.
 """
 
 from __future__ import annotations

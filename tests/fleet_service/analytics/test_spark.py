@@ -1,5 +1,5 @@
-"""`make spark-test`: tests that Spark reads the archive and answers every question as DuckDB does.
-They need Java and take a minute.
+"""`make spark-test`: tests that Spark reads the archive and answers every question (predefined
+query) as DuckDB does. They need Java and take a minute.
 """
 
 from __future__ import annotations

@@ -58,8 +58,8 @@ class Fleet:
         session.declare_subscriber(f"{keys.ROOT}/alert/**", self._record_alert)
 
     def await_services(self, *regions: int) -> Fleet:
-        """Wait until services for the regions receive published messages and queries. Return the
-        fleet.
+        """Wait until services for the regions receive published messages and queries. Return this
+        client.
         """
         for region in regions or (REGION,):
             for name in (
@@ -233,8 +233,8 @@ def test_what_is_not_ours_is_counted_and_the_service_goes_on(
 
 
 def seconds() -> Iterator[int]:
-    """Return an iterator of times [ns], one second apart, for the reports of vehicles that follow
-    each other. The last time is not in the future.
+    """Return an iterator of times [ns], one second apart, for successive reports of vehicles. The
+    last time is not in the future.
     """
     return iter(range(now() - 30 * SECOND, now(), SECOND))
 

@@ -1,4 +1,4 @@
-"""Tests of the sizing calculator: estimates grow as the costs do, and bad input is named."""
+"""Tests of the sizing calculator: estimates grow as the costs do, and an error names bad input."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests of the archive: order of fsync, rename and acknowledgement; faults of the disk; lock;
-pseudonyms.
+"""Tests of the archive: order of fsync, rename and acknowledgement; faults of the disk; the lock
+against a second service; pseudonyms of vehicles.
 """
 
 from __future__ import annotations

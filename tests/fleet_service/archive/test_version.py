@@ -53,8 +53,8 @@ def old(tmp_path: Path) -> Path:
 
 
 def same(found: dict[str, Any], made: dict[str, Any]) -> None:
-    """Assert that a map equals the stored one, except for rounding errors of single precision and
-    of another machine's logarithm.
+    """Assert that a map equals the stored one. Rounding errors of single precision, and of another
+    machine's logarithm, are allowed.
 
     The stored beliefs were computed with the present rules. A commit that changes the results of
     these rules must store them again and give the reason.

@@ -1,5 +1,5 @@
-"""Tests of lower bounds: the lower end exceeds the largest grip used by at most the error of that
-report, for any order and number of reports.
+"""Tests of lower bounds: the lower end of a cell's friction interval exceeds the largest grip used
+by at most the error of that report, for any order and number of reports.
 """
 
 from __future__ import annotations

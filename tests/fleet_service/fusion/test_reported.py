@@ -1,4 +1,6 @@
-"""Tests that reported values are described as they were received, before any correction."""
+"""Tests of the values that reports state: they are described as they were received, before the
+service corrects them.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests of errors that all vehicles in one cell have in common: reports of more vehicles do not
-average them out, different manoeuvres do.
+"""Tests of errors that all vehicles in one cell have in common: reports of more vehicles must not
+average them out, but reports from different manoeuvres must.
 """
 
 from __future__ import annotations

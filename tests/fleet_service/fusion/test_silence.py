@@ -1,4 +1,6 @@
-"""Tests of visits without a value: they weaken a belief of ice, but never show grip."""
+"""Tests of visits (passages of a cell) without a friction value: they weaken a belief of ice, but
+never show grip.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,8 @@ UNKNOWN = float(SLIPPERY_SHARE @ mugrid.PRIOR)
 
 def visited(noticed: FloatArray, *, limited: bool = False) -> Fusion:
     """Return a fusion (beliefs about friction) with visits to one cell. First, vehicles report the
-    friction values `noticed`, a minute apart; then QUIET other vehicles pass and use a grip of .05,
-    which is too little to measure friction.
+    friction values `noticed`, a minute apart; then QUIET other vehicles pass and use a grip of
+    0.05, which is too little to measure friction.
     """
     fusion = Fusion(120.0)
     n = len(noticed)

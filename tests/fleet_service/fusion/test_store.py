@@ -111,8 +111,8 @@ def test_old_cells_back_at_the_prior_are_dropped_without_other_effect() -> None:
 
 def count_pairs_after(evidence: FloatArray, hours: float) -> tuple[int, int]:
     """Return the number of remembered pairs (vehicle and cell) `hours` after the only visit of a
-    vehicle, while another vehicle drives elsewhere; and the number of vehicles of the cell when the
-    first vehicle has returned.
+    vehicle, while another vehicle drives elsewhere; and the number of vehicles counted in the cell
+    when the first vehicle has returned.
     """
     fusion = Fusion(LATENESS_S)
     fusion.update(observations([0.0], [1], evidence, CELL))
@@ -140,8 +140,9 @@ def test_bounds_are_remembered_for_an_hour_and_values_for_three(
 
 
 def repeat_after_settling(evidence: FloatArray, *, forgets: bool) -> Fusion:
-    """Return a fusion in which 300 vehicles passed a cell and one of them, number 0, repeats its
-    report 40 minutes later; it has lost all settled pairs if it `forgets`.
+    """Return a fusion (beliefs about all cells) in which 300 vehicles passed a cell and one of
+    them, number 0, repeats its report 40 minutes later. If `forgets`, the fusion lost all settled
+    pairs (compact entries that show which vehicle visited a cell) before the repetition.
     """
     fusion = Fusion(LATENESS_S)
     fusion.update(observations(0.1 * np.arange(300), np.arange(300), evidence.repeat(300, 0), CELL))
@@ -171,7 +172,9 @@ def test_a_vehicle_with_a_settled_pair_stays_one_witness(evidence: FloatArray) -
 @settings(max_examples=10)
 @given(st.integers(0, 10**6), st.integers(1, 400))
 def test_settling_has_no_effect_on_any_cell_in_any_order(seed: int, parts: int) -> None:
-    """Pairs settle after each batch in one fusion, and never in the other one."""
+    """Pairs (vehicle and cell) settle, that is, move into a compact table, after each batch in one
+    fusion and never in the other. All cells must be the same in both.
+    """
     o = drive(seed, 1500, 3000.0)
     straight = Fusion(LATENESS_S)
     with pytest.MonkeyPatch.context() as patch:

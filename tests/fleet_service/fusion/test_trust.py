@@ -17,7 +17,7 @@ LIARS = np.arange(100, 108)
 
 def drive_liars(private: int = 0, *, enrolled: bool = False) -> Fusion:
     """Return a fusion (beliefs about all cells) after reports of twenty honest vehicles and eight
-    liars, which report .25 in four cells. Only the liars visit `private` further cells.
+    liars, which report 0.25 in four cells. Only the liars visit `private` further cells.
     """
     rng = np.random.default_rng(4)
     fusion = Fusion(120.0, enrolled=enrolled)

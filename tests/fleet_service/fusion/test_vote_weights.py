@@ -65,14 +65,14 @@ def test_shape_of_nobody_is_the_prior() -> None:
 def test_gain_error_common_to_value_and_use_is_no_shape(gain_std: float) -> None:
     """A gain error (relative error) that changes a vehicle's friction values and its used grip
     alike must not be learned as a slope, the error of a value per unit of unused grip. In a
-    comparison between vehicles it looks like a slope cov(value, use)/var(use) ≥ .3; in a comparison
-    of one vehicle's visits it cancels.
+    comparison between vehicles it looks like a slope cov(value, use)/var(use) ≥ 0.3; in a
+    comparison of one vehicle's visits it cancels.
     """
     assert learned_slope(make_acquainted(0.0, gain_std, gain_in_use=True)) < 0.12
 
 
 def road_after(slope: float, used: float) -> FloatArray:
-    """Return the belief (32 probabilities of μ) about a new cell after three reported values of .5
+    """Return the belief (32 probabilities of μ) about a new cell after three reported values of 0.5
     from vehicles that used a grip of `used`, in a fleet whose values are too low by `slope` per
     unit of unused μ.
     """
@@ -102,8 +102,9 @@ def test_shape_is_the_slope_and_a_doubt() -> None:
 
 
 def test_doubt_of_an_alarm_ends_once_the_shape_is_known() -> None:
-    """Before it raises an alert, the service assumes a larger error for values measured with little
-    grip use. This extra error must become small once the service knows its fleet.
+    """Before the service raises an alert, it assumes a larger error for values measured with little
+    grip use. This extra error must become small once the service has learned the errors of its
+    fleet.
     """
     unknown = shared.UNKNOWN_SHAPE
     assert unknown.alarm == pytest.approx(0.5, abs=0.01)

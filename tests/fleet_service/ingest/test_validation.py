@@ -36,7 +36,7 @@ def test_ranges_hold_exactly_their_numbers(numbers: set[int]) -> None:
 
 
 class Desk:
-    """Intake of messages as a service has it, with its counters and acknowledgements, but without a
+    """Intake of messages as in a service, with its counters and acknowledgements, but without a
     running service.
     """
 

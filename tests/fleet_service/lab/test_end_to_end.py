@@ -1,5 +1,5 @@
-"""Tests of the end-to-end campaign: it reads the files of the vehicles and compares the map with
-the true friction.
+"""Tests of the end-to-end campaign (simulated vehicles and a service): it reads the files of the
+vehicles and compares the map with the true friction.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the campaign on a small scale: every figure is present, and the parts work as
-documented.
+"""Tests of the evaluation campaign of the fleet service in short runs: every figure is present, and
+the parts work as documented.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the evaluation of the map's value to users: road-hours, alerts and simple rules in towns
-with known friction.
+"""Tests of the evaluation of the map's value to users. It compares the map's warnings with simple
+rules in towns with known friction, by precision, recall and minutes of unnoticed ice.
 """
 
 from __future__ import annotations

@@ -34,7 +34,9 @@ def read_colours(theme: str) -> dict[str, str]:
 
 
 def text_contrasts(theme: str, sight: str) -> dict[str, float]:
-    """Return the contrast of each pair of text and background."""
+    """Return the contrast of each pair of text and background colour in a theme, for a kind of
+    colour vision.
+    """
     named = read_colours(theme)
     return {
         f"{text} on {behind}": contrast(named[text], named[behind], sight) for text, behind in TEXTS
@@ -42,7 +44,9 @@ def text_contrasts(theme: str, sight: str) -> dict[str, float]:
 
 
 def class_contrasts(theme: str, sight: str) -> dict[str, float]:
-    """Return the contrast of fill or edge of each map class against the ground."""
+    """Return the contrast of fill or edge of each map class against the background, in a theme and
+    for a kind of colour vision.
+    """
     named = read_colours(theme)
     edged = re.search(r"EDGED = \[([\d, ]+)\]", (STATIC / "ribbons.js").read_text())
     assert edged is not None
@@ -57,7 +61,9 @@ def class_contrasts(theme: str, sight: str) -> dict[str, float]:
 
 
 def worst_contrasts() -> tuple[float, float]:
-    """Return the smallest contrast of a text, and of a map class, over themes and sights."""
+    """Return the smallest contrast of a text, and of a map class, over all themes and kinds of
+    colour vision.
+    """
     both = [(theme, sight) for theme in THEMES for sight in SIGHTS]
     return (
         min(value for one in both for value in text_contrasts(*one).values()),

@@ -1,5 +1,5 @@
 """Tests of the colours of the live page: they are distinguishable for every kind of colour vision,
-and none of them looks like a promise of grip.
+and none of them is green, which users would read as certain grip.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the page in a real browser, with a real service: views, actions, and warnings that must
-not be missed.
+"""Tests of the page in a real browser, with a real service: views, user actions, and warnings that
+a user must not miss.
 """
 
 from __future__ import annotations

@@ -215,8 +215,8 @@ def _choose(seen: Opened, cell: int) -> None:
 def test_map_of_two_continents_opens_on_one_of_them(
     page: RunningPage, drive: Drive, session: zenoh.Session
 ) -> None:
-    """The cells must be seen at once, and a list must lead to the other area. A view of the whole
-    world would show two dots.
+    """A map with cells on two continents must open on one of them, so that cells are visible at
+    once, and must list the other area. A view of the whole world would show two dots.
     """
     drive("ice", "dry")
     cell = grid.cell_of(np.array([37.77]), np.array([-122.42]))

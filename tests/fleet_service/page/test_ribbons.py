@@ -1,5 +1,5 @@
-"""Tests of roads as ribbons in a real browser: clicks, alerts and the overview agree with the
-drawing.
+"""Tests of roads drawn as ribbons (coloured bands along the road) in a real browser: clicks, alerts
+and the overview agree with the drawing.
 """
 
 from __future__ import annotations

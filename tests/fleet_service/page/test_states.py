@@ -95,7 +95,9 @@ def test_slow_map_says_that_it_loads(page: RunningPage, drive: Drive) -> None:
 
 
 def test_link_is_drawn_before_there_are_buttons(page: RunningPage, drive: Drive) -> None:
-    """The buttons wait for the first picture of a link, but not if its cells take long."""
+    """A page opened by a link must paint the linked map before it creates its buttons. If the map's
+    cells take long to arrive, the buttons must not wait for them.
+    """
     drive("ice")
     with open_map(page) as seen:
         show_ice(seen)

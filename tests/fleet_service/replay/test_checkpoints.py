@@ -122,8 +122,8 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(
 
 
 def read_state(engine: Engine) -> dict[str, NDArray[Any]]:
-    """Return the beliefs and columns from which a map is made as arrays by name, sorted by cell and
-    sector, with the latest minute (epoch) and the time of the newest row.
+    """Return arrays by name: the beliefs and columns from which a map is made, sorted by cell and
+    sector, the latest epoch (minute), and the time of the newest row.
     """
     fusion = engine.state.fusion
     rows = engine.state.fusion.store.state.live
@@ -267,7 +267,8 @@ def _set() -> threading.Event:
 
 def test_rows_after_the_checkpoint_are_replayed_whatever_the_clock(tmp_path: Path) -> None:
     """A restart must replay all rows written after the checkpoint (the service's saved state),
-    although the clock was an hour ahead when the checkpoint was written and was corrected then.
+    although the clock was an hour ahead when the checkpoint was written and was corrected
+    afterwards.
     """
     ahead = time.time_ns() + 3600 * SECOND
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:

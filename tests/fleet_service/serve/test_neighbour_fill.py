@@ -1,5 +1,5 @@
 """Tests of values borrowed from neighbours: the influence falls with distance, the values are never
-more certain than their sources, and they are marked as borrowed.
+more certain than those neighbours, and they are marked as borrowed.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def borrow_beliefs(visited: dict[int, float], route: IntArray | None = ROUTE) ->
 
 
 def widths(cells: CellView) -> dict[int, float]:
-    """Return the width of the friction interval of each cell in a view, by index of the cell in the
-    row of thirty cells.
+    """Return the width of the friction interval of each cell in a view (map cells with their
+    beliefs), by index of the cell in the row of thirty cells.
     """
     lower, upper = (mugrid.quantiles(cells.belief, q) for q in (0.05, 0.95))
     return {

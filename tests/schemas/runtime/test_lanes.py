@@ -1,5 +1,5 @@
-"""Tests of lanes: arithmetic on vectors equals that on numbers, and exponential and logarithm equal
-those of NumPy.
+"""Tests of lanes (numbers side by side in a vector register): arithmetic on vectors equals that on
+numbers, and exponential and logarithm equal those of NumPy.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ EXACT = 5e-16  # relative error of exponential, inverse and root, and error of l
 
 
 class LaneRecord:
-    """Record with lanes behind a field that is no multiple of a cache line."""
+    """Record with lanes (vectors of numbers) after a field whose size is no multiple of a cache
+    line.
+    """
 
     first: float
     pair: Annotated[LaneArray, 2]
@@ -42,7 +44,7 @@ class LaneRecord:
 
 @inlined
 def mix_operations(a: float, b: float) -> float:
-    """Use every operator once, for numbers and for lanes."""
+    """Compute a value with every operator, for numbers or for lanes (vectors of numbers)."""
     total = 0.0
     for k in range(3):
         total += k * a

@@ -1,4 +1,6 @@
-"""Tests that the watch of a session's links follows real routers that are started and stopped."""
+"""Tests of the watch of a session's links (connections to routers): it reports real routers that
+are started and stopped.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Tests of shared libraries of kernels: results, failures, and calls that a library lacks."""
+"""Tests of shared libraries of kernels (compiled functions): results, failures, and calls that a
+library lacks.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +79,9 @@ kernels.call_kernels()
 
 
 def run_python(folder: Path, code: str, *words: str) -> list[str]:
-    """Run Python code in a process with the module `kernels`, and return its output's lines."""
+    """Run Python code in a process that can import the test's module `kernels`, and return its
+    output's lines.
+    """
     root = Path(__file__).parents[3]
     environment = os.environ | {
         "PYTHONPATH": f"{folder}{os.pathsep}{root}",
@@ -95,9 +99,9 @@ def run_python(folder: Path, code: str, *words: str) -> list[str]:
 
 @pytest.mark.campaign
 def test_a_library_runs_kernels_without_numba(tmp_path: Path) -> None:
-    """The library must give the results of Numba without importing it. It must report a kernel that
-    raises. Numba must run a kernel that the library lacks: one with a result that is no integer, or
-    with an array of another layout.
+    """The library must give the results of Numba without importing Numba, and must report an
+    exception in a kernel (compiled function). Numba must run the calls that the library lacks:
+    those with a result that is no integer, or with an array of another layout.
     """
     (tmp_path / "kernels.py").write_text(KERNELS)
     library = str(tmp_path / "library.so")

@@ -47,7 +47,7 @@ SAMPLES = 1200  # 2 s dry, 4 s of ice with a slide of 1 s, 6 s dry
 
 def drive_saying(lower: float, upper: float) -> DetectionDrive:
     """Return a simulated drive of one car over ice, with the output of a made-up estimator that
-    always reports the same interval.
+    always reports the same friction interval.
     """
     ones = np.ones((SAMPLES, 1), np.float32)
     mu = 0.9 * ones

@@ -1,4 +1,4 @@
-"""Tests of the evaluation campaign: all figures and targets exist, measures are correct on small
+"""Tests of the evaluation campaign: all figures and targets exist, scores are correct on small
 cases, and the report is made only from figures.
 """
 
@@ -98,7 +98,7 @@ def fake(mu: float, lower: float, upper: float, like: DriveSet) -> Estimates:
 
 @pytest.fixture(scope="module")
 def jumping() -> DriveSet:
-    """Return two simulated drives in which the road's friction falls from .85 to .5."""
+    """Return two simulated drives in which the road's friction falls from 0.85 to 0.5."""
     return realistic(replace(PAPERS["003.jump"], duration_s=5.0), range(2))
 
 

@@ -35,7 +35,7 @@ def judge(
     used: float = 0.0,
 ) -> LogFigures:
     """Return the evaluation figures of a made-up log: ten seconds at 20 m/s, with a reported
-    friction interval from .4 to .8 (wider at the first sample). With `friction` NaN the true
+    friction interval from 0.4 to 0.8 (wider at the first sample). With `friction` NaN the true
     friction is not measured.
     """
     t = np.arange(0.0, 10.0, 0.01)

@@ -150,8 +150,9 @@ def test_cars_stand_on_the_slope_they_were_put_on() -> None:
 
 
 def test_the_oracle_knows_what_is_told_and_misses_what_is_unknown() -> None:
-    """Most of the oracle's speed error must come from the wheel radius in the vehicle file. Its
-    friction error must be a few hundredths.
+    """The oracle is an estimator that knows everything except the quantities which the vehicle file
+    and the data sheet leave open. Most of its speed error must come from the wheel radius in the
+    vehicle file, and its friction error must be a few hundredths.
     """
     seeds = range(FIGURES, FIGURES + 4)
     speeds = oracle.speed(seeds)

@@ -84,8 +84,9 @@ def test_watching_a_drive_changes_nothing_that_is_said_of_it(
 def test_posterior_of_the_default_has_its_reported_quantiles(
     turning: DriveSet,
 ) -> None:
-    """The ends of the reported friction interval must be the posterior's quantiles at the
-    calibrated levels. The lower end may lie lower, because ice patches lower it.
+    """The ends of the friction interval that the default estimator reports must be the posterior's
+    quantiles at the calibrated levels. The lower end may lie lower, because possible ice patches
+    lower it.
     """
     reported, _ = estimate_with_ranks(bank_of("aco-fckf", turning.vehicles), turning)
     for least, most, output in (

@@ -1,5 +1,6 @@
 """Tests of simulated fleets: results do not depend on the number of vehicles or on the division
-into blocks of samples, cars stay on the road, and they use grip where intended.
+into blocks of samples, cars stay on the road, and they use much friction where the scenario intends
+it.
 """
 
 from __future__ import annotations

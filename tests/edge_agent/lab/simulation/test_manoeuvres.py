@@ -1,4 +1,6 @@
-"""Tests of manoeuvres: each is driven, uses grip as intended, and is reproducible."""
+"""Tests of manoeuvres: the simulated car completes each of them, uses as much friction as intended,
+and drives the same way each time.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests of winter equipment and roads: controllers that cycle, tyres with relaxation, drag at
-lift-off, and winter towns.
+"""Tests of winter equipment and roads: controllers (ABS and others) that switch on and off, tyres
+with relaxation, engine drag when the accelerator is released, and winter towns.
 """
 
 from __future__ import annotations

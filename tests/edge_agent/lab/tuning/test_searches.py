@@ -1,4 +1,6 @@
-"""Tests of the continuous searches, and of the comparison with equal budgets."""
+"""Tests of the tuning searches over continuous parameters, and of their comparison with equal
+numbers of trials.
+"""
 
 from __future__ import annotations
 

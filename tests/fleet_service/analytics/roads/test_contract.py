@@ -1,5 +1,6 @@
-"""Tests of the question `contract`: shortest and longest possible time below the contracted
-friction. A road without measurements never counts as compliant.
+"""Tests of the question (predefined query) `contract`, which returns the shortest and longest
+possible time that a road was below the contracted friction. A road without measurements never
+counts as compliant.
 """
 
 from __future__ import annotations
@@ -189,8 +190,9 @@ def test_options_that_say_nothing_are_refused(
 
 
 def test_a_breach_lies_within_the_measurements() -> None:
-    """The reports cover half an hour and begin in the middle of a time slot. No breach may begin
-    earlier or last longer than the reports.
+    """A breach is a time below the contracted friction. The reports cover half an hour and begin in
+    the middle of a time slot; no breach may begin before the first report or last longer than the
+    reports.
     """
     begin = 100 * SLOT_S + 1300
     span = (begin, begin + 1897)

@@ -1,5 +1,5 @@
 """Tests of reading directed links from an OpenStreetMap extract and from files of lines; other
-input is refused with its name.
+input is refused with an error that names it.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of DENM: encoding, event numbers over restarts, the interchange's properties, and foreign
-DENM as reports of one vehicle.
+"""Tests of DENM (hazard messages): encoding, event numbers that stay the same over restarts,
+properties for the interchange, and DENM of other parties, which count as reports of one vehicle.
 """
 
 from __future__ import annotations
@@ -229,7 +229,7 @@ def stretch(
 
 
 class Run:
-    """Gateway output with a simulated clock. `sent` are its messages; `settles` is True if
+    """Gateway output with a simulated clock. `sent` are its messages; `settles` is True if the
     interchange accepts them.
     """
 
