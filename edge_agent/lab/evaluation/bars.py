@@ -1,5 +1,5 @@
-"""List of the figures of the evaluation campaign: first those with a target, then all other
-measures for context.
+"""List of the figures that the evaluation campaign reports: first those with a target ("bar"), then
+all other measures for context.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class EstimatorBar(NamedTuple):
 
 
 def mean_of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[Results], float]:
-    """Return a function that reads a measure of an estimator in a scenario from the results of the
-    campaign: its mean over all seeds, with ordinary sensors.
+    """Return a function that takes the campaign's results and returns one measure of one estimator
+    in one scenario: the mean over all seeds, with ordinary sensors.
     """
 
     def read_mean(results: Results) -> float:
@@ -45,24 +45,23 @@ def mean_of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[
 
 
 def noise_mean(experiment: str, measure: str) -> Callable[[Results], float]:
-    """Return a function that reads a measure of paper 004's own experiments: its mean over all
-    seeds.
+    """Return a function that takes the campaign's results and returns one measure in an experiment
+    of paper 004, under the paper's conditions: the mean over all seeds.
     """
     return lambda results: mean(results.noise.get((experiment, "paper-aco-fckf"), {}).get(measure))
 
 
 def in_the_world(name: str) -> Callable[[Results], float]:
-    """Return a function that reads, from the results of the campaign, a figure of the default
-    estimator by its name. The figure describes either the towns with inaccurate cars, or cars on a
-    slope.
+    """Return a function that takes the campaign's results and returns the figure `name` of the
+    default estimator in `real_world`: towns with inaccurate cars, or cars that stand on a slope.
     """
     return lambda results: results.world.get(DEFAULT, {}).get(name, math.nan)
 
 
 def worth_of(name: str) -> Callable[[Results], float]:
-    """Return a function that reads the ratio called `name` from the results of the campaign. It is
-    a ratio of two interval scores of friction, for example the score with fuzzy sets divided by the
-    score without them.
+    """Return a function that takes the campaign's results and returns the ratio `name` of two
+    interval scores of friction, for example the score with fuzzy sets divided by the score without
+    them.
     """
     return lambda results: worth.ratio(results.worth, name)
 
@@ -202,8 +201,8 @@ UNITS: Final = {
 
 
 def unit_of(measure: str) -> str:
-    """Return the unit of a measure as text, for example m/s; it follows from the end of the
-    measure's name.
+    """Return the unit of a measure as text, for example m/s, derived from the end of the measure's
+    name.
     """
     if measure.startswith("coverage90"):
         return SHARE
@@ -216,8 +215,9 @@ def unit_of(measure: str) -> str:
 
 
 def figures(results: Results, *, quick: bool) -> list[Figure]:
-    """Return all figures of the evaluation: first those with targets (with `quick`, only the
-    measured ones), then `KIND.SCENARIO.ESTIMATOR.MEASURE` with its standard deviation.
+    """Return all figures of the evaluation. Figures with a target come first (with `quick`, only
+    the measured ones). The others are named `KIND.SCENARIO.ESTIMATOR.MEASURE` and come with a
+    standard deviation.
     """
     barred = [Figure(bar.name, bar.read(results), bar.unit, bar.bar, bar.better) for bar in BARS]
     listed = [figure for figure in barred if not (quick and math.isnan(figure.value))]
@@ -244,8 +244,9 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
 
 
 def _consistency_figures(results: Results) -> list[Figure]:
-    """Return the bounds of NEES and NIS (normalised squared errors and innovations), and for every
-    estimator the share of true frictions below each stated quantile, as figures.
+    """Return the figures on filter consistency: the bounds of NEES and NIS (normalised squared
+    errors and innovations), and for every estimator the share of true frictions below each stated
+    quantile.
     """
     listed = []
     for measure in COMPONENTS if results.seeds else ():

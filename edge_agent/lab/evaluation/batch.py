@@ -27,8 +27,8 @@ FINE_HZ = 500.0
 
 @dataclass(frozen=True)
 class DriveSpec:
-    """A simulated manoeuvre, from a paper or for the default estimator's evaluation: vehicle, speed
-    [m/s], friction, sampling rate, duration.
+    """Specification of a simulated manoeuvre, from a paper or for the default estimator's
+    evaluation: vehicle, speed [m/s], friction, sampling rate, duration.
 
     `road` is the name of the relief (slopes of the road), and `slope` a constant slope added to it.
     `torque` is False if wheel torque is not recorded.
@@ -75,15 +75,15 @@ class DriveSet:
 def realistic(
     scenario: DriveSpec, seeds: Sequence[int], sensors: str | Sensors = USUAL
 ) -> DriveSet:
-    """Simulate one drive per seed with ordinary sensors, and a vehicle file with errors of a few
-    per cent.
+    """Simulate one drive per seed with ordinary sensors. The vehicle file that the estimators get
+    has errors of a few per cent.
     """
     return join_drives([_simulate_drive(scenario, seed, sensors, 1) for seed in seeds])
 
 
 def ideal(scenario: DriveSpec) -> DriveSet:
     """Simulate one drive with error-free sensors and an exact vehicle file. The simulation uses
-    fine time steps and is sampled at the scenario's rate.
+    finer time steps than the sampling interval of the scenario.
     """
     step = max(1, round(FINE_HZ / scenario.rate_hz))
     return join_drives(
@@ -113,7 +113,7 @@ def _simulate_drive(
 
 
 def join_drives(drives: Sequence[tuple[pa.Table, Vehicle]]) -> DriveSet:
-    """Return simulated drives of equal length joined into one set."""
+    """Join simulated drives of equal length into one set."""
 
     def stack_column(name: str) -> FloatArray:
         return np.stack(

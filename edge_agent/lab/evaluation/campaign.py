@@ -36,7 +36,9 @@ FAULTY_SEEDS = 4
 
 @dataclass(frozen=True)
 class PlottedDrive:
-    """The first drive of a scenario and the estimates of all estimators, stored for plots."""
+    """Simulated drives of a scenario and one estimator's estimates of them, stored so that the
+    first drive can be plotted.
+    """
 
     batch: DriveSet
     reported: Estimates
@@ -44,8 +46,9 @@ class PlottedDrive:
 
 @dataclass
 class Results:
-    """Results of the evaluation campaign: measures (such as errors) of the estimates per drive, by
-    (scenario, estimator); `real` with ordinary sensors, `ideal` with error-free sensors.
+    """Results of the evaluation campaign. `real` (with ordinary sensors) and `ideal` (with
+    error-free sensors) hold the measures of the estimates, such as errors, per drive, by (scenario,
+    estimator).
     """
 
     real: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)

@@ -3,13 +3,16 @@ where there is no ice?
 
 Towns are drawn randomly by seed; cars are inaccurate ("rough", ROUGH_FLEET) or accurate ("plain").
 "short" drives last 120 s, and "long" ones 900 s, because some faults that stop a car's reports
-appear only after a long time. All figures of one kind pool the samples of its towns.
+appear only after a long time. A figure for one kind of cars pools the samples of all towns with
+such cars. A visit is the passage of one map cell, with its likelihood of friction.
 
 Legend
     slide       a stretch in which the normalised slip θ of some wheel exceeds SLIDING for at least
                 SLIDE_S
-    value       the visit's likelihood falls by VALUE_NATS or more towards the largest friction
-    favoured    max ln L(μ < .4) - max ln L(μ >= .4) >= FAVOURED_NATS
+    value       visit: its log-likelihood at the largest friction is VALUE_NATS or more below its
+                maximum, so it speaks against grip
+    favoured    visit: it favours a slippery road, max ln L(μ < .4) - max ln L(μ >= .4) >=
+                FAVOURED_NATS
     on ice      visit: its mean friction is at most .2 and changes by less than MOVES; sample:
                 friction <= .2
     excited     visit: some wheel uses more than EXCITED_SHARE of its grip during it
@@ -17,9 +20,9 @@ Legend
                 P(mu < .4) > CALLED_SHARE at some time during it
     settled     not within SETTLED_S of snow and ice
     false event a settled stretch with P(mu < .4) > CALLED_SHARE on wet or dry road; gaps up to
-                EVENT_GAP_S do not end it. Friction is the mean of the wheels, so that a front axle
-                that has just reached ice counts as false; `.off_ice` counts only samples without
-                a wheel on snow or ice
+                EVENT_GAP_S do not end it. Friction is the mean of the wheels, so while only the
+                front axle is on ice, a report may count as false; `.off_ice` counts only samples
+                without a wheel on snow or ice
     false grip  mu_lower more than FALSE_GRIP above the true friction
     stood       ice or snow appeared under the standing car; these cases are evaluated separately
                 and in no other figure
@@ -72,8 +75,8 @@ Stretches: TypeAlias = list[tuple[int, int]]
 
 @dataclass
 class DetectionTally:
-    """Sums of the detection evaluation for one or several towns: sums and counts of values by name,
-    from which means are computed, and lists of detection times [s] by name.
+    """Sums of the detection evaluation over one or several towns. By name of a measure, it holds
+    the sum and count of values, from which the mean is computed, and a list of detection times [s].
     """
 
     total: dict[str, float] = field(default_factory=dict)
@@ -81,15 +84,13 @@ class DetectionTally:
     seconds: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, name: str, values: NDArray[np.generic]) -> None:
-        """Add an array of values to the sum and the count from which the mean called `name` is
-        computed.
+        """Add an array of values to the measure `name`, whose mean is computed from sum and count.
         """
         self.total[name] = self.total.get(name, 0.0) + float(np.sum(values, dtype=np.float64))
         self.count[name] = self.count.get(name, 0) + int(np.size(values))
 
     def add_case(self, name: str, *, holds: bool) -> None:
-        """Count one case in the share called `name`: the share of cases in which `holds` is
-        True.
+        """Count one case in the share called `name`, the share of cases in which `holds` is True.
         """
         self.add(name, np.array([holds]))
 
@@ -102,22 +103,20 @@ class DetectionTally:
             self.seconds.setdefault(name, []).extend(times)
 
     def mean(self, name: str) -> float:
-        """Return the mean of those values of the detection evaluation that have the name `name`;
-        NaN without values.
-        """
+        """Return the mean of all values added under the name `name`; NaN if there are none."""
         return self.total[name] / self.count[name] if self.count.get(name) else float("nan")
 
     def rate(self, over: str, under: str) -> float:
-        """Return the sum with the name `over` divided by the sum with the name `under`; NaN if the
-        latter is zero or missing.
+        """Return the sum stored under the name `over` divided by the sum stored under the name
+        `under`; NaN if the divisor is zero or missing.
         """
         return (
             self.total.get(over, 0.0) / self.total[under] if self.total.get(under) else float("nan")
         )
 
     def quantile(self, name: str, share: float) -> float:
-        """Return the quantile `share` of the detection times [s] with the name `name`; NaN if there
-        are no times.
+        """Return the quantile `share` (0 to 1) of the detection times [s] stored under the name
+        `name`; NaN if there are no times.
         """
         return (
             float(np.quantile(self.seconds[name], share))
@@ -135,8 +134,8 @@ def runs_of(on: NDArray[np.bool_]) -> Stretches:
 
 
 def bridge_gaps(on: NDArray[np.bool_], seconds: float) -> NDArray[np.bool_]:
-    """Return the mask `on` (T,) of samples with gaps (stretches of False) of at most `seconds`
-    filled.
+    """Return the mask `on` (T,) of samples, in which every gap (stretch of False between True) of
+    at most `seconds` is set to True.
     """
     out = on.copy()
     most = round(seconds * RATE_HZ)
@@ -156,8 +155,10 @@ def slides_of(theta: NDArray[np.floating], seconds: float = SLIDE_S) -> Stretche
 
 
 def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
-    """Return the cause of a slide (one of ACTIVITIES): it follows from the larger of the
-    longitudinal and lateral accelerations, and its sign."""
+    """Return the cause of a slide from car n's mean accelerations in the samples first to end:
+    "cornering" if the lateral one is larger, otherwise "braking" or "driving" by the sign of the
+    longitudinal one.
+    """
     along = float(drive.ax[first:end, n].mean())
     across = float(drive.ay[first:end, n].mean())
     if abs(across) > abs(along):
@@ -166,9 +167,9 @@ def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
 
 
 def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTally:
-    """Evaluate the drives of one town, and return their tally (sums and counts). With `oracle`, the
-    oracle (an observer that knows motion and tyre forces) also evaluates the visits (passages of a
-    map cell) on ice with high use of grip.
+    """Evaluate the drives of one town, and return their tally (sums and counts of the evaluation).
+    With `oracle`, also evaluate an oracle (an ideal observer that knows motion and tyre forces) on
+    the visits (passages of a map cell) on ice with high use of grip.
     """
     tally = DetectionTally()
     _judge_samples(tally, drive)
@@ -183,9 +184,9 @@ def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTall
 
 
 def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
-    """Add to the tally, over all samples of the town: coverage of the interval, false ice (grip
-    reported as slippery), false grip (the interval's lower end too far above the true friction) and
-    interval score.
+    """Add to the tally (sums of the evaluation) over all samples of the town: coverage of the
+    friction interval, false ice (grip reported as slippery), false grip (the interval's lower end
+    too far above the true friction) and interval score.
     """
     mu = drive.mu
     apart = ~drive.stood
@@ -261,8 +262,8 @@ def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
 
 
 def _add_seconds(tally: DetectionTally, key: str, activity: str, wait: float) -> None:
-    """Add a time until detection [s] to the evaluation's list for all slides, and to its list for
-    slides with this cause (`activity`).
+    """Add the time until detection of a slide, `wait` [s], to the list `key` for all slides, and to
+    the list for slides with the same cause (`activity`).
     """
     tally.seconds.setdefault(key, []).append(wait)
     tally.seconds.setdefault(f"{key}.{activity}", []).append(wait)
@@ -286,8 +287,9 @@ def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
 def _judge_contradictions(
     tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches
 ) -> None:
-    """Count how often the health flag CONTRADICTION begins, during slides on slippery road and at
-    other times, and in both cases the time [s] without this flag.
+    """Count how often the health flag CONTRADICTION (no friction explains the measurements) begins:
+    once for slides on slippery road and once for all other times. Also add the time [s] without
+    this flag in both cases.
     """
     sliding = np.zeros(len(drive.mu), np.bool_)
     extended = np.zeros(len(drive.mu), np.bool_)
@@ -308,8 +310,8 @@ def _judge_contradictions(
 
 
 def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
-    """Count false reports of slippery road at least SETTLED_S away from snow and ice: those of the
-    estimator, of its belief at each threshold, and of the slip flag (ordinary ABS logic).
+    """Count false reports of slippery road at least SETTLED_S after snow and ice: those of the
+    estimator, of its friction belief at each threshold, and of the slip flag (ordinary ABS logic).
     """
     grips = drive.mu[:, n] > SNOW_MU
     settled = grips & ~recent_maximum(~grips[:, None], SETTLED_S)[:, 0].astype(bool)
@@ -382,7 +384,7 @@ class TownTally(NamedTuple):
 
 @dataclass
 class DetectionResults:
-    """Counts (`DetectionTally`) of the detection evaluation for each simulated town, by the length
+    """Results of the detection evaluation for each simulated town (`DetectionTally`), by the length
     of its drives ("short" or "long") and the kind of its cars ("rough": inaccurate, "plain":
     accurate).
     """
@@ -390,16 +392,17 @@ class DetectionResults:
     towns: dict[tuple[str, str], list[TownTally]] = field(default_factory=dict)
 
     def add(self, length: str, kind: str, town: TownTally) -> None:
-        """Add the tally (sums and counts) of a town, by length of its drives and kind of its
-        cars.
+        """Add the results of a town (sums and counts), under the length of its drives and the kind
+        of its cars.
         """
         self.towns.setdefault((length, kind), []).append(town)
 
     def pool_towns(
         self, lengths: Sequence[str], kind: str, *, winter: bool | None = None
     ) -> DetectionTally:
-        """Return the pooled tally (sums and counts) of all towns of one kind. If `winter` is True
-        or False, only winter towns or only other towns are included.
+        """Return the sum of the tallies (sums and counts) of all towns with this kind of cars and
+        these lengths of drives. If `winter` is True or False, only winter towns or only other towns
+        are included.
         """
         found = DetectionTally()
         for length in lengths:

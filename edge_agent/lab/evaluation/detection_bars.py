@@ -1,5 +1,5 @@
-"""Figures of the detection evaluation: how each one is computed from a tally (sums and counts), its
-unit, and its targets ("bars") for rough and plain cars.
+"""Figures of the detection evaluation: how each figure is computed from a tally (sums and counts),
+its unit, and its targets ("bars") for inaccurate ("rough") and accurate ("plain") cars.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ SHARE: Final = "1"
 
 class DetectionBar(NamedTuple):
     """A figure of the detection evaluation: the drives that it covers, the function that computes
-    it from a tally (sums and counts), its unit, and its targets for both KINDS of cars.
+    it from a tally (sums and counts), its unit, and its targets for inaccurate and for accurate
+    cars (KINDS).
 
     `length`: one of LENGTHS, or "" for both together.
     """
@@ -41,20 +42,22 @@ class DetectionBar(NamedTuple):
 
 
 def mean_of(name: str) -> Callable[[DetectionTally], float]:
-    """Return a function that reads the mean with the name `name` from a tally (sums and counts)."""
+    """Return a function that takes a tally (sums and counts of the evaluation) and returns the mean
+    of the values stored under `name`.
+    """
     return lambda tally: tally.mean(name)
 
 
 def seconds_of(name: str, share: float) -> Callable[[DetectionTally], float]:
-    """Return a function that reads from a tally (values of the evaluation) the quantile `share` of
-    the detection times [s] that are stored under `name`.
+    """Return a function that takes a tally (sums and counts of the evaluation) and returns the
+    quantile `share` of the detection times [s] stored under `name`.
     """
     return lambda tally: tally.quantile(name, share)
 
 
 def rate_of(over: str, under: str) -> Callable[[DetectionTally], float]:
-    """Return a function that reads a rate from a tally (sums by name): 1000 times the sum `over`
-    divided by the sum `under`.
+    """Return a function that takes a tally (sums of the evaluation by name) and returns 1000 times
+    the sum `over` divided by the sum `under`.
     """
     return lambda tally: 1e3 * tally.rate(over, under)
 
@@ -213,8 +216,9 @@ DETECTION: Final = (
 
 
 def detection_figures(results: DetectionResults) -> list[Figure]:
-    """Return the figure `NAME.KIND` (KIND: rough or plain cars) for every entry of DETECTION, with
-    its standard error over towns. Figures with a target come first.
+    """Return the figure `NAME.KIND` for every entry of DETECTION and both kinds of cars (rough:
+    inaccurate, plain: accurate), with its standard error over towns. Figures with a target come
+    first.
 
     `NAME.KIND.winter` and `NAME.KIND.other` are the same figure for the winter towns and the other
     towns, if there are both.

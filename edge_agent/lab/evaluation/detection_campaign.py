@@ -1,5 +1,5 @@
-"""Detection campaign: towns with rough (inaccurate) and plain (accurate) cars, short and long
-drives, evaluated one after the other.
+"""Detection campaign: evaluate the detection of slippery road in towns with rough (inaccurate) and
+plain (accurate) cars, on short and on long drives.
 
 Half of the towns are winter towns, in which all cars have winter equipment. To evaluate chosen
 towns and print a table:

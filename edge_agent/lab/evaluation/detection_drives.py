@@ -2,7 +2,8 @@
 (passages of a map cell) with their likelihoods, and the slip flag (ordinary ABS logic).
 
 The cars are those of `SimulatedFleet`; the agent's own pipeline (`observe`) computes visits and
-likelihoods. A drive is computed in chunks, so that fifteen minutes of sixteen cars fit in memory.
+likelihoods. The drives are computed in chunks, so that fifteen minutes of sixteen cars fit in
+memory.
 """
 
 from __future__ import annotations
@@ -85,8 +86,9 @@ class DetectionDrive:
 
 
 def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> DetectionDrive:
-    """Simulate a fleet for `seconds`, and estimate motion and friction from its signals with the
-    bank of estimators."""
+    """Simulate a fleet for `seconds`, estimate motion and friction from its signals with the
+    estimator bank (one filter per car), and compute the cars' visits (passages of a map cell).
+    """
     vehicles = fleet.vehicles
     config = AgentConfig()
     tracks = new_tracks(len(vehicles))
@@ -161,8 +163,9 @@ def stood_where_it_appeared(
 def _estimate_chunk(
     bank: EstimatorBank, t: FloatArray, signals: FloatArray, closes: BoolArray
 ) -> tuple[Estimates, FloatArray]:
-    """Return three items for one chunk of a drive: the estimates, their likelihoods of friction,
-    and an array (T, N) of how much [nat] the belief favours a slippery road.
+    """Run the estimators on one chunk of a drive. Return the estimates, with the evidence on
+    friction if the estimator computes it, and an array (T, N) of how much [nat] the friction belief
+    favours a slippery road (NaN without belief).
     """
     if bank.beliefs() is None:
         return bank.advance(t, signals, closes), np.full(t.shape, np.nan)
@@ -214,8 +217,9 @@ def _samples_of(
 
 
 def _bytes_of(column: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Return the encoded likelihoods of V visits (passages of a map cell), (V, 32) bytes; flat
-    likelihoods if the estimator computes no likelihood of friction.
+    """Return the encoded likelihoods of V visits (passages of a map cell), (V, 32) bytes. If the
+    estimator computes no likelihood of friction, all bytes are zero, which encodes a flat
+    likelihood.
     """
     found = np.asarray(column, dtype=np.uint8)
     return found if found.shape[1] else np.zeros((len(found), mugrid.BINS), np.uint8)

@@ -1,5 +1,5 @@
-"""Evaluation with sensor faults: each fault, its expected effect, and the response of every
-estimator.
+"""Evaluation with sensor faults: a table of faults with the expected effect of each, and measures
+of how every estimator responds.
 
 The faults are added to the signals of ordinary simulated drives from BEGINS on. The measure `told`
 is the share of drives in which health reports the expected flag.
@@ -42,15 +42,15 @@ def in_order(t: FloatArray) -> FloatArray:
 
 
 def kept_samples(t: FloatArray) -> FloatArray:
-    """Return the time stamps t (T, N) with a gap of three seconds at time BEGINS, as if the samples
-    of that time were missing.
+    """Return the time stamps t (T, N) with three seconds added from time BEGINS on, which looks
+    like a gap of three seconds in the signals.
     """
     return np.where(t < BEGINS, t, t + 3.0)
 
 
 def late_samples(t: FloatArray) -> FloatArray:
-    """Return the time stamps t (T, N), of which from BEGINS to ENDS, every tenth one is 50 ms too
-    old.
+    """Return the time stamps t (T, N) with every tenth one 50 ms too old between the times BEGINS
+    and ENDS.
     """
     number = np.arange(len(t))[:, None]
     return np.where((t >= BEGINS) & (t < ENDS) & (number % 10 == 0), t - 0.05, t)
@@ -155,8 +155,9 @@ def apply_fault(batch: DriveSet, case: Case) -> DriveSet:
 
 
 def case_measures(batch: DriveSet, reported: Estimates, case: Case) -> dict[str, FloatArray]:
-    """Return the measures of a fault case, per drive: `finite` and `told` (1 or 0), and, over the
-    time from BEGINS on: coverage and width of the friction interval, and RMSE of v_x and v_y.
+    """Return the measures of a fault case, one value per drive. `finite` (1 or 0): all estimates
+    are finite and in order. `told` (1 or 0): health reports the expected flag. Over the time from
+    BEGINS on: coverage and width of the friction interval, and RMSE of v_x and v_y.
     """
     after = batch.t[:, 0] >= BEGINS
     whole = np.isfinite(reported.values).all(axis=-1)

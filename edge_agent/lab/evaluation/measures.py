@@ -1,9 +1,10 @@
 """Measures of estimates against the true values; every measure is one number per drive, (N,).
 
-Legend: NEES squared error of (v_x, v_y) over its stated variance, per component [1], 1 if the
-stated standard deviation is right; NIS squared innovation over its stated variance, per row [1]. If
-the filter is consistent, the mean over N drives at one instant lies within chi-squared bounds in 95
-% of all cases (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
+NEES is the squared error of (v_x, v_y) over its stated variance, per component [1]. It is 1 on
+average if the stated standard deviation is right. NIS is the squared innovation (measurement minus
+prediction) over its stated variance, per measurement [1]. If the filter is consistent, the mean
+over N drives at one instant lies within chi-squared bounds in 95 % of all cases (Bar-Shalom, Li,
+Kirubarajan 2001, 5.4).
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ def is_covered(batch: DriveSet, reported: Estimates) -> BoolArray:
 
 
 def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Return, by name, those measures of the estimates that are defined for every kind of drive,
-    (N,) each.
+    """Return the measures of the estimates that every kind of drive has (errors, coverage and width
+    of the friction interval, NIS, NEES), by name, (N,) each.
     """
     end = batch.last(LAST_S)
     found: dict[str, FloatArray] = {}
@@ -76,8 +77,8 @@ def nees(batch: DriveSet, reported: Estimates) -> FloatArray:
 
 
 def bounds(measure: str, drives: int) -> tuple[float, float]:
-    """Return the 95 % bounds for the mean of "nees" or "nis" over this number of drives, for a
-    filter whose stated variances are right.
+    """Return the 95 % bounds for the mean of `measure` ("nees" or "nis") over this number of
+    drives, for a filter whose stated variances are right.
     """
     from scipy.stats import chi2
 

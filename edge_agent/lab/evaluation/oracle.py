@@ -1,5 +1,5 @@
 """Best possible accuracy with these sensors for two targets of the papers, computed by an oracle
-that knows almost everything.
+(an ideal observer) that knows almost everything.
 
 An oracle is a Bayesian estimator that gets the same noisy readings, and the true value of
 everything that is not listed as unknown. Its unknowns are those that the vehicle file and the data
@@ -188,9 +188,8 @@ def _force_curve(shape: float, curvature: float) -> FloatArray:
 def _cost(
     measured: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stiff: float
 ) -> float:
-    """Return −ln of the likelihood of one friction and one shape of the tyre curve, given the wheel
-    speeds and accelerations measured in a drive. The other unknowns (such as stiffness and wheel
-    radius) are integrated out by Laplace's method.
+    """Return −ln of the likelihood of one friction and one shape of the tyre curve (which give the
+    slips `slip`), for the wheel speeds and accelerations measured in a drive.
     """
     t = np.arange(len(v)) / 100.0
     std = np.array(

@@ -1,5 +1,5 @@
-"""The two experiments of paper 004 under its conditions: noise only on a_x, a_y and r, exact
-inputs, start at the true state.
+"""The two experiments of paper 004 under its conditions: noise only on the accelerations a_x, a_y
+and the yaw rate r, exact inputs, start at the true state.
 
 The experiments check the implementation. They do not test whether the filter can estimate friction,
 because friction is known at the start. Therefore the targets and the printed tables are for v_x,
@@ -57,8 +57,8 @@ def variances(t: FloatArray, experiment: str) -> FloatArray:
 def experiments(
     seeds: Sequence[int],
 ) -> tuple[dict[tuple[str, str], dict[str, FloatArray]], dict[str, tuple[DriveSet, Estimates]]]:
-    """Return the measures per drive by (experiment, filter), and the drives for plots by
-    experiment.
+    """Run the experiments of paper 004. Return the measures per drive by (experiment, filter), and
+    the drives for plots by experiment.
 
     "sedan" and "van" are the experiment "constant" with the simulator's own vehicles; with the
     suffix ".variable" they are the experiment "variable". The filters are the paper's, and two for

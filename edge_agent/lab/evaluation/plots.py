@@ -1,5 +1,5 @@
-"""Plots of the evaluation, as in the papers, for the first seed: estimated and true motion,
-friction with its interval, adaptation, fuzzy sets.
+"""Plots of the evaluation, as in the papers, of the drive with the first seed: estimated and true
+motion, friction with its interval, adaptation, fuzzy sets.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def title(scenario: str, drive: PlottedDrive, seed: int) -> str:
 
 
 def _line(estimator: str) -> dict[str, Any]:
-    """Return the line style of an estimator, the same in every plot."""
+    """Return the line style of an estimator. It is the same in every plot."""
     style = line_of(estimator)
     return {"color": style.colour, "linestyle": style.dash, "lw": 1.0}
 
@@ -128,8 +128,8 @@ def _true() -> dict[str, Any]:
 
 
 def _draw_rough_car(world: RealWorldResults, path: Path) -> Path:
-    """Plot one inaccurate car in a hilly town: speed and wheel speed, slope, friction with the
-    default estimator's interval, health.
+    """Plot the drive of one inaccurate car in a hilly town over time: speed and wheel speed, slope,
+    friction with the default estimator's interval, health flags.
     """
     from matplotlib import pyplot as plt
 
@@ -246,7 +246,7 @@ def _draw_consistency(figures: Sequence[Figure], path: Path) -> Path:
 
 
 def _draw_memberships(path: Path) -> Path:
-    """Plot the fuzzy sets before and after the ant colony."""
+    """Plot the fuzzy sets before and after tuning by the ant colony."""
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(3, 2, figsize=(9, 7), layout="constrained")
@@ -305,9 +305,9 @@ def _draw_reliability(figures: Sequence[Figure], path: Path) -> Path:
 
 
 def draw_detection(figures: Sequence[Figure], path: Path) -> Path:
-    """Write the ROC plot: share of passes over slippery road that are found, against the number of
-    false reports (away from snow and ice), for estimator, slip flag (ordinary ABS logic) and oracle
-    (knows motion and forces).
+    """Write the ROC plot of the detection evaluation: share of passes over slippery road that are
+    found, against the number of false reports away from snow and ice. It compares the estimator,
+    the slip flag (ordinary ABS logic) and the oracle (knows motion and forces).
     """
     import matplotlib as mpl
 

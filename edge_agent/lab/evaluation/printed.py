@@ -1,5 +1,5 @@
-"""Numbers printed in the papers, the figures of this evaluation that are compared with them, and
-the reasons why some numbers cannot be reproduced.
+"""Numbers printed in the papers, names of the figures of this evaluation that are compared with
+them, and reasons why some printed numbers cannot be reproduced.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ PRINTED_002: Final = {"sine": (".1008", ".0779"), "jturn": (".0825", ".0117")}
 def printed_row(
     paper: str, scenario: str, estimator: str, measure: str, what: str, value: str
 ) -> Printed:
-    """Return a number printed in a paper together with the figure that this evaluation measures
-    with error-free sensors.
+    """Return a number printed in a paper together with the names of two figures of this evaluation:
+    one with error-free sensors, one with ordinary sensors.
     """
     same = f"ideal.{scenario}.{estimator}.{measure}"
     real = f"real.{scenario}.ESTIMATOR.{measure}"

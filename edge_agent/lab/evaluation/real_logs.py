@@ -7,7 +7,8 @@ of the surface). The figures cover the time in which the car moves, from the thi
 
     informative    share with an interval narrower than INFORMATIVE times the prior's
     right          share of the informative time in which the interval agrees with the known
-                   friction: the true one, else at least the grip in use
+                   friction: it contains the true one; if that is unknown, it reaches up to the grip
+                   that the car used
     ice            share with P(slippery) > CALLED_SHARE although the road was not slippery
     contradicted   share with the health flag CONTRADICTION
     urgent         observations per hour that would be sent immediately, for logs with a position
@@ -172,8 +173,9 @@ def judge_estimates(
     known: float | None,
     urgent: int | None,
 ) -> LogFigures:
-    """Return the evaluation figures of one log, computed from its estimates (T, columns) and the
-    measured true values."""
+    """Return the evaluation figures of one log, computed from its estimates `values` (T, columns)
+    and the measured true values.
+    """
     t = adopted.log.t
     signals = adopted.log.signals
     wheels = np.where(
@@ -222,8 +224,8 @@ def judge_estimates(
 def known_friction(
     t: FloatArray, signals: FloatArray, moving: BoolArray, known: float | None
 ) -> float:
-    """Return a lower limit (T,) of the friction of a log's surface: the larger of CERTAIN times the
-    known value, and the grip that the car used.
+    """Return a lower limit of the friction of a log's surface, one number for the log: the larger
+    of CERTAIN times the known value, and the grip that the car used.
     """
     at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
     along, across = (
@@ -237,8 +239,8 @@ def known_friction(
 
 
 def share_of(what: BoolArray, among: BoolArray) -> float:
-    """Return the share of the samples selected by the mask `among` (T,) in which the mask `what`
-    (T,) is True; NaN if no sample is selected.
+    """Return the share of samples in which the mask `what` (T,) is True, among those that the mask
+    `among` (T,) selects; NaN if no sample is selected.
     """
     return float(np.mean(what[among])) if among.any() else math.nan
 
@@ -252,8 +254,8 @@ def root_mean_square(error: FloatArray, among: BoolArray) -> float:
 
 
 def summarise(found: Sequence[LogFigures]) -> list[Figure]:
-    """Return the evaluation figures over all logs: means weighted by the time of each log; for
-    figures where even one bad log matters, the value of the worst log.
+    """Return the evaluation figures over all logs. Most are means weighted by the duration of each
+    log. Figures for which one bad log is too many are the value of the worst log.
     """
     seconds = np.array([log.seconds for log in found])
 

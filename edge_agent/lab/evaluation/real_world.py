@@ -2,8 +2,8 @@
 slope, for every estimator.
 
 Towns (friction, hills), cars, sensors and clocks are drawn randomly by the seed; half of the cars
-have no torque signal. All figures are means over samples, so that each minute has the same weight
-on any road.
+have no torque signal. All figures are means over samples, so each minute has the same weight in any
+town.
 
 Legend
     surface       class of the mean friction of the four wheels: ice up to .2, snow up to .45, wet
@@ -68,8 +68,8 @@ STANDING_SLOPES: Final = (0.05, 0.08)
 
 @dataclass
 class Tally:
-    """Accumulator of means over samples, by name of the measure: `add` adds values, `means` returns
-    their means.
+    """Accumulator of means over samples, by name of the measure: `add` adds values, and `means`
+    returns the mean of each measure.
     """
 
     total: dict[str, float] = field(default_factory=dict)
@@ -134,8 +134,8 @@ def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
 
 
 def in_use(batch: DriveSet) -> FloatArray:
-    """Return the grip that each car uses as a whole, (T, N) [1]: horizontal acceleration over g,
-    smoothed, minus an allowance for noise.
+    """Return the grip that each car uses as a whole, (T, N) [1]: true horizontal acceleration over
+    g, smoothed, minus an allowance for noise.
     """
     used = np.hypot(batch.truth["true_ax"], batch.truth["true_ay"]) / GRAVITY
     width = max(1, round(SMOOTH_S * RATE_HZ))
@@ -144,7 +144,9 @@ def in_use(batch: DriveSet) -> FloatArray:
 
 
 def recent_maximum(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDOW_S) -> FloatArray:
-    """Return, for each sample, the largest grip `used` (T, N) within the last `seconds`, (T, N)."""
+    """Return, for each sample, the largest value of `used` (T, N) within the last `seconds`, (T,
+    N).
+    """
     samples = round(seconds * RATE_HZ)
     padded = np.concatenate([np.zeros((samples - 1, used.shape[1])), used])
     return np.asarray(
@@ -163,7 +165,9 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
 
 
 def tally_town(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) -> None:
-    """Add an estimator's results in one town to its tally (sums and counts)."""
+    """Add an estimator's results in one town to `tally` (the sums from which its means are
+    computed).
+    """
     mu = batch.mu
     inside = is_covered(batch, reported)
     width = reported.mu_upper - reported.mu_lower
@@ -204,8 +208,8 @@ def tally_town(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatAr
 
 
 def baseline(tally: Tally, batch: DriveSet) -> None:
-    """Add two baselines to the sums: the interval score of the prior interval of friction, and the
-    error of the mean speed of the four wheels as an estimate of v_x.
+    """Add two baselines to `tally` (sums of the evaluation): the interval score of the friction
+    prior, and the error of the mean wheel speed as an estimate of v_x.
     """
     radius = np.array([vehicle.wheel_radius for vehicle in batch.vehicles])
     off = (
@@ -233,8 +237,8 @@ def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSe
 
 
 def fastest(estimator: str, batches: Sequence[DriveSet]) -> float:
-    """Return the largest speed [m/s], in any direction, that the estimator reports for any of the
-    standing cars.
+    """Return the largest speed [m/s], in any direction, that the estimator reports for cars that
+    stand.
     """
     reported = [estimates(bank_of(estimator, batch.vehicles), batch) for batch in batches]
     return max(float(np.hypot(each.vx, each.vy).max()) for each in reported)
@@ -242,8 +246,8 @@ def fastest(estimator: str, batches: Sequence[DriveSet]) -> float:
 
 @dataclass
 class RealWorldResults:
-    """Evaluation figures by estimator and name, with "baseline" (the wheels' speed, the prior's
-    interval) as one of the estimators; and a drive to plot.
+    """Evaluation figures by estimator and name, and one drive to plot. One of the "estimators" is
+    "baseline": the wheels' mean speed as v_x, and the prior's interval as friction.
     """
 
     found: dict[str, dict[str, float]]

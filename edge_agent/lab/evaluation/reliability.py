@@ -1,10 +1,11 @@
-"""Reliability: how often the true friction lies below each stated quantile, at LEVELS.
+"""Reliability: how often the true friction lies below each stated quantile, for the quantiles
+LEVELS.
 
-An estimates file contains three quantiles. An estimator that reports the evidence of a visit gives
-more: a visit that began with the drive starts from the uniform prior, so its likelihood on the
-friction grid is the whole posterior. The likelihood is taken from a copy of the bank, so that the
-drive itself is not affected. For other estimators, a Gaussian is assumed between the quantiles, or
-a uniform distribution if they report the prior.
+Estimates contain only three quantiles. The default estimator gives more: the likelihood of friction
+over a visit (passage of a map cell). Here the visit begins with the drive, from a uniform prior, so
+this likelihood is the whole posterior. To read it, the visit must be ended. This is done in a copy
+of the estimators, so that the drive itself continues unchanged. For other estimators, a Gaussian is
+assumed between the quantiles, or a uniform distribution if they report the prior.
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ EDGES: Final = np.linspace(LOWER, UPPER, BINS + 1)
 
 
 def estimate_with_ranks(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates, FloatArray]:
-    """Return the bank's estimates of the drives, and an array (K, N): for each drive, every
-    EVERY_S, the posterior probability of a friction below the true one (its rank).
+    """Return the estimates of the drives, and an array (K, N) with the rank of the true friction at
+    K times, EVERY_S apart, in N drives. The rank is the posterior probability of a smaller
+    friction.
     """
     samples = len(batch.t)
     step = max(1, round(EVERY_S / float(batch.t[1, 0] - batch.t[0, 0])))
@@ -51,8 +53,8 @@ def join_estimates(parts: list[Estimates]) -> Estimates:
 def _rank_of_truth(
     bank: EstimatorBank, batch: DriveSet, now: int, reported: Estimates
 ) -> FloatArray:
-    """Return, for each of N drives, the posterior probability of a friction below the true one at
-    the sample before index `now`.
+    """Return, for each of N drives, the rank of the true friction at the sample before index `now`:
+    the posterior probability of a smaller friction.
     """
     truth = batch.mu[now - 1]
     closes = np.ones((1, len(truth)), np.bool_)
@@ -82,10 +84,11 @@ def on_the_grid(truth: FloatArray, log_likelihood: FloatArray) -> FloatArray:
 def between_quantiles(
     truth: FloatArray, lower: FloatArray, mu: FloatArray, upper: FloatArray
 ) -> FloatArray:
-    """Return the probability (N,) of friction below the true value `truth`, for Gaussians with
-    these 5, 50 and 95 % quantiles.
+    """Return the probability (N,) of friction below the true value `truth`, for Gaussian
+    distributions with these 5, 50 and 95 % quantiles.
 
-    One of the outer quantiles may be clipped. An interval as wide as the prior's counts as uniform.
+    Either outer quantile may be clipped to the friction range, so the standard deviation comes from
+    the one farther from the median. An interval as wide as the prior's counts as uniform.
     """
     from scipy.stats import norm
 
@@ -96,6 +99,6 @@ def between_quantiles(
 
 def shares(ranks: FloatArray) -> FloatArray:
     """Return, for each of LEVELS, the share of drives and times at which the rank of the true
-    friction is at or below the level, (L,).
+    friction (posterior probability of a smaller friction) is at most this level, (L,).
     """
     return np.asarray((ranks.ravel()[:, None] <= np.array(LEVELS)).mean(axis=0))

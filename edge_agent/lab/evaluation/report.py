@@ -130,7 +130,7 @@ def report(figures: Sequence[Figure], *, seeds: int) -> str:
 
 
 def table(values: dict[str, float]) -> str:
-    """Return a Markdown table of the figures printed in the papers with the figures
+    """Return a Markdown table that compares the figures printed in the papers with the figures
     measured here.
     """
     rows = []
@@ -163,8 +163,8 @@ def number(values: dict[str, float], name: str, *, spread: bool = True) -> str:
 
 
 def own_plants(barred: Sequence[Figure], values: dict[str, float]) -> str:
-    """Return a Markdown table of paper 004's targets and the same figures on the simulator's own
-    vehicle models ("plants").
+    """Return a Markdown table of the figures of paper 004 that have a target: the value under the
+    paper's conditions, and the values with the simulator's own vehicle models ("plants").
     """
     rows = []
     for bar in (figure for figure in barred if figure.name.startswith("papers.004.")):
@@ -180,8 +180,8 @@ def own_plants(barred: Sequence[Figure], values: dict[str, float]) -> str:
 
 
 def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
-    """Return a Markdown table of the targets that have an oracle: target, default estimator,
-    oracle.
+    """Return a Markdown table of those figures with a target for which an oracle (an ideal
+    observer) was run: the target, the value of the default estimator, and that of the oracle.
     """
     rows = []
     for bar in barred:
@@ -192,7 +192,8 @@ def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
 
 
 def world(values: dict[str, float]) -> str:
-    """Return a Markdown table with one row per estimator, for the towns with inaccurate cars."""
+    """Return a Markdown table of the results in towns with inaccurate cars, one row per estimator.
+    """
     shown = {
         "coverage90": "coverage",
         "coverage90.ice": "on ice",
@@ -217,8 +218,8 @@ def world(values: dict[str, float]) -> str:
 
 
 def estimators(values: dict[str, float], prefix: str, suffix: str) -> list[str]:
-    """Return the names of estimators, each once and in order. They are the parts between `prefix`
-    and `suffix` in the names of the figures.
+    """Return the names of the estimators that occur in the names of the figures between `prefix`
+    and `suffix`, each once and in order.
     """
     found = [
         name[len(prefix) : -len(suffix)]
@@ -241,7 +242,7 @@ def scenarios(values: dict[str, float], prefix: str, measures: Sequence[str]) ->
 
 
 def faults(values: dict[str, float]) -> str:
-    """Return a Markdown table with one row per sensor fault."""
+    """Return a Markdown table of the results with sensor faults, one row per fault."""
     shown = ("coverage90", "width", "rmse_vx", "rmse_vy")
     rows = []
     for name, case in CASES.items():

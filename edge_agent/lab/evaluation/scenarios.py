@@ -1,5 +1,5 @@
-"""The scenarios of the evaluation: the papers' manoeuvres with the papers' vehicles, those for the
-default estimator's targets, and manoeuvres of other vehicles.
+"""The scenarios of the evaluation: the papers' manoeuvres with the papers' vehicles, the manoeuvres
+for the default estimator's targets, and manoeuvres of other vehicles.
 
 Data that a paper does not give (tyres, wheel inertia, the vehicle of paper 003) are those of the
 simulator's sedan or of an ordinary car. All four wheels are driven, as in the papers.
@@ -184,8 +184,8 @@ FOREIGN: Final = {
 
 
 def foreign(scenario: DriveSpec, kind: str) -> DriveSpec:
-    """Return the scenario with tyres of the given kind (a key of FOREIGN), which the estimators do
-    not model.
+    """Return the scenario with tyres of the given kind (a key of FOREIGN), which differ from the
+    tyre model of the estimators.
     """
     vehicle = replace(scenario.vehicle, **FOREIGN[kind])  # type: ignore[arg-type]
     return replace(scenario, vehicle=vehicle)

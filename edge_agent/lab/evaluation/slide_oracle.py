@@ -1,8 +1,8 @@
 """Oracle for visits (passages of a map cell): the evidence of an ideal observer that knows the
 motion and the force of every tyre, except for noise.
 
-The oracle does not know the stiffness of the tyre and the shape of its force curve. Its evidence is
-an upper limit of the information that any estimator can gain from a visit.
+The oracle does not know the stiffness of the tyre and the shape of its force curve. Because it
+knows more than any estimator, its evidence is an upper limit of the information in a visit.
 
     f    |F| / F_z, known with noise FORCE_STD
     q    slip times stiffness per load, known with the wheels' noise σ_q
@@ -43,8 +43,8 @@ STIFFNESS_STD: Final = 0.12  # of ln k, as well as the vehicle file is known
 
 
 def tyres_drawn() -> FloatArray:
-    """Return a random sample of tyres (TYRES, 3), the same at each call: shape c, curvature e and
-    stiffness factor k.
+    """Return a random sample of tyres (TYRES, 3): shape c, curvature e and stiffness factor k. It
+    is the same at each call.
     """
     rng = np.random.default_rng(0)
     shape = np.clip(rng.normal(*SHAPE, TYRES), 1.2, 1.8)

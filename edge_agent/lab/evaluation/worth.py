@@ -7,12 +7,15 @@ Legend of the filter variants (for all scores, less is better)
                  adapted; strain and the consistency test as in the default
     none         without any rule, strain and consistency test (`ckf`)
     default      all rules with untuned vertices
-    random       all rules with the vertices found by random search, mean over the searches
-    colony       the same for the ant colony, with equal budget
+    random       all rules with the vertices (corners of the fuzzy sets) found by random search,
+                 mean over the searches
+    colony       all rules with the vertices found by the ant colony, mean over the searches; same
+                 budget as the random search
 
 Each seed gives a town with inaccurate cars and a set of manoeuvres on hills, with its own friction
-and vehicles. A ratio is the ratio of the means over the seeds. Its `.difference` is the mean of the
-differences, paired by seed, and `.difference.se` the standard error of that mean.
+and vehicles. A ratio compares two variants: the mean score of one over all seeds, divided by that
+of the other. Its `.difference` is the mean over seeds of the difference of both scores, and
+`.difference.se` the standard error of that mean.
 """
 
 from __future__ import annotations
@@ -95,8 +98,8 @@ def campaign(
 
 
 def ways() -> dict[str, list[MixtureDesign]]:
-    """Return the filters of each variant by its name; a variant whose vertices (corners of fuzzy
-    sets) come from several searches has one filter per search.
+    """Return, by the name of each variant, the tables of its filters. A variant whose vertices
+    (corners of fuzzy sets) come from several searches has one filter per search.
     """
     untuned = Memberships()
     found = {
@@ -168,16 +171,17 @@ def _score_drives(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[st
 
 
 def ratio(scores: Scores, name: str) -> float:
-    """Return the mean interval score of one variant divided by that of another, over all seeds; NaN
-    if either was not measured.
+    """Return the ratio `name` of two variants: the mean interval score of one over all seeds,
+    divided by that of the other; NaN if either was not measured.
     """
     over, under = (scores.get(way) for way in RATIOS[name])
     return float(over["all"].mean() / under["all"].mean()) if over and under else math.nan
 
 
 def figures(scores: Scores) -> list[Figure]:
-    """Return the figures of the comparison that have no target: standard deviations of the ratios,
-    paired differences of the scores, ratios per surface, and every interval score.
+    """Return the figures of the comparison of filter variants that have no target: standard
+    deviations of the ratios, paired differences of the scores, ratios per surface, and every
+    interval score.
     """
     listed = []
     for name, (over, under) in RATIOS.items():
@@ -206,8 +210,8 @@ def figures(scores: Scores) -> list[Figure]:
 
 
 def barred_figures(scores: Scores) -> list[Figure]:
-    """Return the figures of the comparison: first the ratios, which have targets, then
-    all others.
+    """Return the figures of the comparison of filter variants: first the ratios, which have
+    targets, then all others.
     """
     barred = [Figure(name, ratio(scores, name), "1", bar, "less") for name, bar in BARS.items()]
     plain = [
@@ -219,8 +223,8 @@ def barred_figures(scores: Scores) -> list[Figure]:
 
 
 def comparison_table(values: dict[str, float]) -> str:
-    """Return the ratios of the interval scores as a Markdown table, from the values of the figures
-    by name.
+    """Return a Markdown table of the ratios of interval scores between filter variants, from the
+    values of the figures by name.
     """
     lines = [
         (

@@ -1,5 +1,5 @@
-"""Simulated vehicles: manoeuvres on a test track and fleets on a road network, with the true value
-of every signal.
+"""Simulation of vehicles: single manoeuvres on a test track, and fleets on a road network. It gives
+sensor readings together with the true value of every signal.
 """
 
 from edge_agent.lab.simulation.faults import FAULTS, Fault

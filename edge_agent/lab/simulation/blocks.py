@@ -1,5 +1,6 @@
-"""A simulated fleet as an endless source of blocks (samples of a short time); a recorder receives
-the true values."""
+"""Source of simulated samples: a simulated fleet delivers blocks (samples of a short time) without
+end, and a recorder receives the true values.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +17,8 @@ BLOCK_S = 0.1  # of a live loop: short beside the second that a batch waits
 def blocks(
     fleet: SimulatedFleet, rate_hz: float, recorder: TruthRecorder | None = None
 ) -> Iterator[Block]:
-    """Yield blocks of simulated samples, each BLOCK_S [s] long, without end. Simulated time starts
-    when the first block is requested. `recorder` receives the true values.
+    """Yield blocks of simulated samples without end, each BLOCK_S [s] long. The first block begins
+    at the current time of the computer's clock. `recorder` receives the true values.
     """
     steps = max(1, round(BLOCK_S * rate_hz))
     start_ns = 0

@@ -1,7 +1,7 @@
 """Simulated controllers of a vehicle: ABS, traction control (TCS), drag torque control and ESC.
 
-They act in each integration step of the vehicle model and know the slip exactly: their action is
-modelled, not their sensors.
+They act in each integration step of the vehicle model and know the exact slip, because only their
+effect is modelled, not their sensors.
 
     ABS    If a wheel exceeds its slip limit, its brake torque is reduced at the rate DUMP, then
            held until the slip is half of the limit. It is then increased again: fast up to NEARLY
@@ -67,8 +67,8 @@ def slip_limit(p: FloatArray, i: int) -> float:
 
 @compiled
 def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float) -> None:
-    """Advance the state of all slip controllers in the vehicle's state `x` by `dt` [s], from the
-    wheel slips in `w` (8, 4), the parameters `p` and the inputs `u` (5, 4).
+    """Advance all slip controllers (ABS, traction control) in the vehicle's state `x` by `dt` [s],
+    from the wheel slips in `w` (8, 4), the parameters `p` and the inputs `u` (5, 4).
     """
     x[Motion.ABS_LEFT] = max(x[Motion.ABS_LEFT] - dt, 0.0)
     x[Motion.TCS_LEFT] = max(x[Motion.TCS_LEFT] - dt, 0.0)

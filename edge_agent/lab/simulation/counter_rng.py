@@ -1,10 +1,10 @@
 """Stateless random numbers: each number is a hash of (key, counter).
 
 With a stateful generator, a vehicle's noise would depend on the number of vehicles and on the
-division of a drive into blocks. With a counter-based generator (Salmon et al., "Parallel random
-numbers: as easy as 1, 2, 3", SC 2011) it does not: sample k of channel c of a vehicle is the same
-number in any order of requests. The hash is the finaliser of SplitMix64 (Steele, Lea, Flood, OOPSLA
-2014).
+division of a drive into blocks (samples of a short time). With a counter-based generator (Salmon et
+al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) it does not: sample k of channel c of a
+vehicle is the same number in any order of requests. The hash is the finaliser of SplitMix64
+(Steele, Lea, Flood, OOPSLA 2014).
 
 Counters must be non-negative.
 """

@@ -1,12 +1,12 @@
-"""The driver of a simulated vehicle: follows an endless route, brakes before junctions, and is
-surprised by black ice.
+"""The driver of a simulated vehicle, who follows an endless route and brakes before junctions.
+Black ice surprises the driver, because it looks like the road around it.
 
 The driver steers to a point ahead on the lane (pure pursuit). The target speed follows from the
-lane's speed profile and the budget q. The budget is the share of the *believed* grip that the
-driver uses, limited to a comfortable acceleration. The believed grip follows the appearance of the
-road ahead, falls fast when wheels slide, and recovers slowly. At random times, traffic ahead makes
-the driver brake. Other vehicles are not seen: each vehicle drives as if it were alone, so that a
-drive does not depend on the number of vehicles.
+lane's speed profile and the budget q. The budget is an acceleration: a share of the *believed*
+grip, limited to a comfortable value. The believed grip follows the appearance of the road ahead,
+falls fast when wheels slide, and recovers slowly. At random times, traffic ahead makes the driver
+brake. Other vehicles are not seen: each vehicle drives as if it were alone, so that a drive does
+not depend on the number of vehicles.
 """
 
 from __future__ import annotations
@@ -112,10 +112,11 @@ def ways_of(ways: IntArray, lane: int) -> int:
 
 @compiled
 def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
-    """Advance the route state `g` (lane, and place on it) to the vehicle's position in the state
-    `x`. At the end of a lane, choose the next lane at random.
+    """Advance the route state `g` (lane and point on it) to the position of the vehicle with the
+    state `x`. At the end of a lane, the next lane is chosen at random.
 
-    Return the distance to the next point of the lane [m], at most the distance between two points.
+    Return the distance [m] to the next point of the lane, limited to the distance between two
+    points.
     """
     points, first, size, spacing, ways = lanes
     while True:
@@ -193,8 +194,8 @@ def update_belief(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None
 
 @compiled
 def advance_warning(d: FloatArray, vx: float, dt: float) -> None:
-    """Update, in the driver's state `d`, the stored distance to the stretch of which the driver was
-    warned: it decreases by `vx` * `dt`.
+    """Advance the warning stored in the driver's state `d` by `dt` [s]: reduce the remaining
+    reaction time by `dt`, and the distances to the stretch's begin and end by `vx` * `dt`.
     """
     if d[Driver.WARNED_END] > 0.0:
         d[Driver.WARNED_IN] -= dt
@@ -225,7 +226,8 @@ def traffic_braking(t: float, key: Key) -> float:
 def is_stopping(t: float, share: float, key: Key) -> bool:
     """Return True if the driver is stopping or waiting now.
 
-    In the share `share` of all time windows of length ALERT_S, drawn at random, the driver stops.
+    The driver stops at the beginning of some time windows of length ALERT_S. They are drawn at
+    random, with probability `share` each.
     """
     window = int(t / ALERT_S)
     return bool(
@@ -240,8 +242,8 @@ def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
     """Return the square of the driver's target speed [m^2/s^2] at the start of a stretch of which
     the driver was warned.
 
-    It is the advised speed, limited so that later points of the route require no more braking on
-    the stretch than its expected grip allows.
+    The target speed is the advised speed. It is reduced if later points of the route would
+    otherwise require more braking on the stretch than the expected grip allows.
     """
     row, _ = place_ahead(d, g, lanes, max(d[Driver.WARNED_START], 0.0))
     lane = g[Route.LANE]
@@ -363,7 +365,7 @@ def drive(
     keys: tuple[Key, Key],
 ) -> None:
     """Advance a driver's state and place on the route, `driver` = (d, g), by one sample. Afterwards
-    d[STEER] and d[FORCE] are the actual controls.
+    d[STEER] and d[FORCE] are the road-wheel angle and the force that the driver now demands.
 
     `vehicle` contains its state, parameters and wheels at the last sample; `world` lanes and
     friction table; `now` time [s], length of the sample [s] and acceleration by gravity along the

@@ -289,8 +289,8 @@ class SimulatedFleet:
 
 
 def rough_ones(vehicles: int, share: float) -> BoolArray:
-    """Return an array (N,) that is True for rough (inaccurate) vehicles, which are evenly
-    distributed. The value for vehicle k does not depend on the number of vehicles.
+    """Return an array (N,) that is True for rough (inaccurate) vehicles: the share `share` of all,
+    evenly distributed. The value for vehicle k does not depend on the number of vehicles.
     """
     number = np.arange(vehicles)
     return np.asarray(np.floor((number + 1) * share) > np.floor(number * share))
@@ -340,8 +340,8 @@ def _start_states(
     network: Network, parameters: FloatArray, rngs: list[np.random.Generator]
 ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
     """Return the initial states of N vehicles as arrays with N rows: motion, drivers, routes and
-    wheels. Each starts at a start point of the road network at walking pace, with a driver of its
-    own drawn at random.
+    wheels. Each vehicle starts at 5 m/s on a lane of the road network, with a driver whose habits
+    are drawn at random.
     """
     count = len(rngs)
     vehicles = np.zeros((count, STATES))

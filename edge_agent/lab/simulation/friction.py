@@ -1,9 +1,9 @@
 """Friction of the road as a function of position and time: a background value, and rotated
 rectangles (patches) that replace it.
 
-If patches overlap, the last one in the list counts. Each patch has its true friction (`mu`) and the
-friction that a driver expects from its appearance (`looks`). Black ice looks like the road around
-it, so drivers respond late.
+Where patches overlap, the last one in the list counts. Each patch has its true friction (`mu`) and
+the friction that a driver expects from its appearance (`looks`). Black ice looks like the road
+around it, so drivers respond late.
 """
 
 from __future__ import annotations
@@ -89,9 +89,9 @@ def friction_table(background: float, patches: tuple[Patch, ...]) -> FloatArray:
 
 @compiled
 def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> float:
-    """Return the value of column MU (true friction) or LOOKS (expected friction) at (x, y) [m] and
-    t [s]: that of the topmost patch (last in the list) that covers the point and for which the
-    column is defined.
+    """Return the value of `column`, MU (true friction) or LOOKS (friction that a driver expects),
+    at (x, y) [m] and t [s]. It is that of the last patch in the table that covers the point and for
+    which the column is defined.
     """
     for i in range(table.shape[0] - 1, 0, -1):
         row = table[i]

@@ -63,8 +63,8 @@ class WarnedDrivers:
         return self._routes.get(k)
 
     def hear(self, name: str, warning: GripWarning) -> None:
-        """Store a warning for a driver. The driver responds after the reaction time, which starts
-        with the next block of samples.
+        """Store a warning for the driver of the vehicle called `name`. It is passed to the driver
+        with the next block of samples, and the driver's reaction time starts then.
 
         The method may be called from any thread.
         """
@@ -73,8 +73,8 @@ class WarnedDrivers:
     def heeding(
         self, blocks: Iterator[Block], hear: Callable[[], None] = lambda: None
     ) -> Iterator[Block]:
-        """Yield the blocks of samples of a source unchanged. After each block, call `hear`, then
-        pass the warnings stored since then to the simulated drivers.
+        """Yield the blocks of samples of a source unchanged. After each block, call `hear`, which
+        may store new warnings, and pass all stored warnings to the simulated drivers.
         """
         for number, block in enumerate(blocks):
             if number % EVERY == 0:

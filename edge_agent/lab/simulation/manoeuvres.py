@@ -1,4 +1,5 @@
-"""The manoeuvres of a driver on a test track, as a table of name -> manoeuvre.
+"""The manoeuvres of a driver on a test track, as a table from the name of a manoeuvre to its
+definition.
 
 A manoeuvre is a function of the momentary state. It returns the mean road-wheel angle [rad] and the
 demanded longitudinal acceleration [m/s^2]. The test track starts at the origin and runs along x.
@@ -164,8 +165,8 @@ def braking(now: Moment) -> tuple[float, float]:
 
 
 def split_braking(now: Moment) -> tuple[float, float]:
-    """Brake as in `braking`, on a road with different friction left and right; the driver steers so
-    that the car stays straight.
+    """Brake as in `braking`, on a road with different friction left and right, while the driver
+    steers to keep the car straight.
     """
     return steer_to(now, now.x + preview(now), 0.0), braking(now)[1]
 
@@ -186,7 +187,9 @@ def constant_radius(now: Moment) -> tuple[float, float]:
 
 
 def straight(now: Moment) -> tuple[float, float]:
-    """Drive straight at constant speed, which gives no information about the road."""
+    """Drive straight at constant speed. The tyres then use almost no grip, so the drive gives no
+    information about the road.
+    """
     return steer_to(now, now.x + preview(now), 0.0), hold(now)
 
 

@@ -110,8 +110,9 @@ COLUMNS: Final = int(Misaligned.TORQUELESS) + 1
 
 
 def memory_of(rows: FloatArray, rate_hz: float) -> int:
-    """Return the number of past samples that the sensor model must store: one more than the largest
-    clock delay in the rows (N, COLUMNS), in samples; 0 without a delay.
+    """Return the number of past samples that the sensor model must store for the largest clock
+    delay in the rows (N, COLUMNS): this delay in samples, rounded up, plus one. Return 0 without a
+    delay.
     """
     lag = float(rows[:, Misaligned.LAG : Misaligned.LAG + DEVICES].max())
     return math.ceil(lag * rate_hz) + 1 if lag > 0.0 else 0
@@ -134,8 +135,8 @@ def delayed_record(records: FloatArray, now: int, samples: float, record: FloatA
 
 @compiled
 def misalign(mounted: FloatArray, signals: FloatArray) -> None:
-    """Convert true readings (18,) to those of misaligned sensors, in place; `mounted` are the
-    vehicle's sensor errors.
+    """Convert the true readings (18,) in `signals` to those of misaligned sensors, in place.
+    `mounted` is the vehicle's row of sensor errors.
     """
     ax = signals[S.AX]
     ay = signals[S.AY]

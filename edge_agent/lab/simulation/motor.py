@@ -15,7 +15,7 @@ Legend, in the rotor's d-q axes
 
 The inverter's current control is proportional-integral with feed-forward of the motor's own terms.
 The target of i_d is zero, and the voltage is limited. The paper gives no constants; these are of an
-ordinary hub motor. The equation of mechanical motion is the wheel's own in `plant`, whose inertia
+ordinary hub motor. The mechanical motion is computed in `plant` with the wheel, whose inertia
 includes the rotor. Viscous friction is left out, because the filters use the torque at the wheel.
 """
 

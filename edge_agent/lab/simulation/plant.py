@@ -24,18 +24,19 @@ An accelerometer measures all forces except gravity: (dv_x/dt − r v_y − g_x)
 the vehicle stands. The load transfer follows the measured acceleration, and the sum of the loads is
 the part of the weight normal to the road.
 
-The slip stiffness K does not depend on μ, except for tyres with the option that it does: friction
-acts by similarity (Pacejka, Tyre and Vehicle Dynamics, 3rd ed., §4.2), and |F| ≤ μ F_z.
+By default the slip stiffness K does not depend on μ, because friction acts by similarity (Pacejka,
+Tyre and Vehicle Dynamics, 3rd ed., §4.2), and |F| ≤ μ F_z. With an option of the vehicle, K grows
+with μ.
 
 A vehicle may have tyres with a relaxation length (RELAXATION: four fifths of the slip build up over
 that length), and controllers that work in cycles and report their activity (ABS_HZ:
 `controllers.py`). Without them slip control is smooth.
 
 Integration: explicit Euler for the body, and linearly implicit Euler for the wheels, because their
-slip is stiff. With the secant slope of the tyre in the denominator a wheel step is stable at any
-speed. The tyre's force is that at the end of the step, when the speed of the ground under the wheel
-has changed too; without that term a wheel would seem to have twice its inertia. Wheel order fl, fr,
-rl, rr; ISO 8855 signs.
+slip is stiff. With the secant slope of the tyre in the denominator, the step of a wheel is stable
+at any speed. The tyre force is taken at the end of the step. Therefore it includes the change of
+the ground's speed under the wheel; without that term a wheel would seem to have twice its inertia.
+Wheel order fl, fr, rl, rr; ISO 8855 signs.
 """
 
 from __future__ import annotations
@@ -124,8 +125,8 @@ def wheel_torques(
 
 @compiled
 def relax_slip(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
-    """Advance the slip of the tyres in the vehicle's state `x` by `dt` [s] over their relaxation
-    length, after the wheel speeds have been updated.
+    """Advance the delayed part of the tyres' slip in the vehicle's state `x` by `dt` [s], after the
+    wheel speeds have been updated. It follows the slip of the wheels over the relaxation length.
     """
     for i in range(4):
         along, across = wheel_velocity(

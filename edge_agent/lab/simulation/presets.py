@@ -24,9 +24,9 @@ STIFFNESSES: Final = {"proportional-to-friction": 1.0}  # name -> TrueParameter.
 class TrueVehicle:
     """True parameters of a vehicle, including those that no vehicle file contains.
 
-    The tyre's shape c and curvature e give peaks between θ = 2.3 (c 1.6, e -.4) and 3.5 (c 1.4, e
-    .1) and a falling branch. An estimator that assumes the textbook shape has force errors of 5 to
-    15 % there.
+    With the tyre's shape c and curvature e, the force has its peak between the normalised slips θ =
+    2.3 (c 1.6, e -.4) and 3.5 (c 1.4, e .1) and decreases beyond. An estimator that assumes the
+    textbook shape has force errors of 5 to 15 % there.
     """
 
     vehicle: Vehicle

@@ -1,5 +1,5 @@
-"""Relief: the slope of the road as the gradient of a height over the plane, and the crossfall of
-its lanes.
+"""Relief of the road: its slope as the gradient of a height over the plane, and the crossfall
+(sideways slope) of its lanes.
 
 Legend
     h       height [m] over x (east) and y (north) [m]
@@ -83,8 +83,8 @@ class Relief:
 
 
 class WaveColumn(IntEnum):
-    """Index of a column in the relief table's row of a wave (slope that varies along a
-    direction).
+    """Index of a column in the rows of the relief table that describe waves. A wave is a slope that
+    varies along one direction.
     """
 
     PEAK = 0
@@ -149,8 +149,8 @@ def level_relief(_seed: int) -> Relief:
 
 
 def rolling_relief(seed: int) -> Relief:
-    """Return a relief (slopes of the road surface) of waves along the road, 300 and 120 m long,
-    with slopes of 3 %.
+    """Return a relief (slopes of the road surface) with two waves along the road, 300 and 120 m
+    long, whose slopes reach 3 %.
     """
     key = key_of(seed, RELIEF_STREAM)
     return Relief(
@@ -161,8 +161,8 @@ def rolling_relief(seed: int) -> Relief:
 
 
 def stepped_relief(seed: int) -> Relief:
-    """Return a relief (slopes of the road surface) of slopes of alternately +4 % and -4 %, 60 m
-    long each, with kinks between them.
+    """Return a relief (slopes of the road surface) whose slope alternates between +4 % and -4 %
+    every 60 m, with kinks between.
     """
     return Relief(
         (Wave(0.04, 120.0, 0.0, _random_turn(key_of(seed, RELIEF_STREAM), 0), stepped=True),)

@@ -3,7 +3,7 @@ connectors through junctions.
 
     lane       a directed polyline, points about a metre apart, with heading and curvature
     connector  a lane through a junction, from the end of one lane to the start of another road's
-    profile    v²/q at each point [m]: the squared speed v², over q, of a driver who accepts lateral
+    profile    v²/q at each point [m], where v is the speed of a driver who accepts lateral
                accelerations of q m/s^2 and braking of BRAKING·q and knows the next turns; because
                v² is proportional to q, one profile serves all drivers
 """
@@ -158,8 +158,8 @@ def round_corners(corners: list[tuple[float, float]], radius: float) -> FloatArr
 
 
 def resample_line(line: FloatArray, spacing: float = SPACING_M) -> FloatArray:
-    """Return the same line of points (x, y), shape (n, 2) [m], with equally spaced points, about
-    `spacing` [m] apart, and the same ends.
+    """Return a line of points (x, y), shape (n, 2) [m], with points at equal distances of about
+    `spacing` [m]; its course and its ends are unchanged.
     """
     run = _distance_along(line)
     even = np.linspace(0.0, run[-1], max(2, round(run[-1] / spacing) + 1))

@@ -1,5 +1,5 @@
-"""Scenarios as a table: each has a road network, its friction over time, and its position
-on earth.
+"""Table of the scenarios (simulated areas). Each has a road network, its friction over time, and
+its position on earth.
 """
 
 from __future__ import annotations

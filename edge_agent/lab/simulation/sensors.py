@@ -243,8 +243,9 @@ def read_late(
 
 @compiled
 def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int) -> None:
-    """Advance the slow errors `wander` (3,) of the position receiver to the next fix. At the first
-    fix, the errors are drawn with the standard deviation that they keep afterwards.
+    """Advance the slow errors `wander` (3,) of the position receiver to the next fix (determined
+    position). At the first fix, the errors are drawn with the standard deviation that they keep
+    afterwards.
     """
     keep = 0.0 if sample == 0 else math.exp(-FIX_S / WANDER_S)
     for i in range(3):

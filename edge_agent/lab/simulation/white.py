@@ -23,8 +23,8 @@ def scheduled_variance(t: FloatArray) -> FloatArray:
 
 
 def on_ay(t: FloatArray, others: float) -> FloatArray:
-    """Return noise variances (T, 3) of a_x, a_y and yaw rate [SI units squared]: SCHEDULE for a_y,
-    and the constant `others` for the other two.
+    """Return noise variances (T, 3) of a_x, a_y and yaw rate [SI units squared] at the times t
+    (T,): according to SCHEDULE for a_y, and the constant `others` for the other two.
     """
     variance = np.full((len(t), 3), others)
     variance[:, 1] = scheduled_variance(t)

@@ -1,4 +1,4 @@
-"""Columns of the papers' tables: results of the same drive under the paper's conditions
+"""Columns of the papers' tables: results for the same manoeuvre under the paper's conditions
 ("matched"), with the simulator's own vehicle model ("own plant"), and with realistic sensors.
 """
 
@@ -22,8 +22,8 @@ BankMaker: TypeAlias = Callable[[Sequence[Vehicle]], EstimatorBank]
 
 
 def means(batch: DriveSet, reported: Estimates) -> Values:
-    """Return all measures (such as errors) of an estimator's results by name, averaged over the
-    drives.
+    """Return all measures of an estimator's results by name (errors, coverage and others), averaged
+    over the drives.
     """
     return {name: float(np.mean(value)) for name, value in measures(batch, reported).items()}
 
@@ -37,8 +37,8 @@ def without_noise(spec: DriveSpec, make: BankMaker) -> tuple[DriveSet, Estimates
 
 
 def with_sensors(name: str, estimator: str, seeds: Sequence[int]) -> tuple[Values, Values]:
-    """Return the measures (such as errors) of the paper's estimator and of the default estimator,
-    on drives with ordinary sensors.
+    """Simulate the scenario `name` with ordinary sensors; return the measures (such as errors) of
+    the paper's estimator and of the default estimator.
     """
     batch = realistic(PAPERS[name], seeds)
     found = [

@@ -1,4 +1,5 @@
-"""The papers' conditions: vehicle models with the papers' tyres and without drag, and their drives.
+"""The papers' conditions: vehicle models with the papers' tyres and without drag, and the
+manoeuvres that they drive.
 
 A "matched" vehicle is a simulated vehicle ("plant") that has exactly the equations of the filter in
 the paper. Only drives at constant speed have drag and rolling resistance, which the filter knows.
@@ -34,8 +35,9 @@ def with_losses(vehicle: TrueVehicle) -> TrueVehicle:
 
 
 def _in_wheel() -> tuple[TrueVehicle, TyreOption]:
-    """Return the vehicle of paper 002 with the cornering stiffnesses C_f, C_r and wheel inertia J
-    of its table 1, and the tyre option that its filter needs for this vehicle.
+    """Return the vehicle of paper 002 (in-wheel motors) with the cornering stiffnesses C_f, C_r and
+    the wheel inertia J of the paper's table 1, and the tyre option that tells the filter the ratio
+    of the two stiffnesses.
     """
     row = parameter_row(SMALL.vehicle)
     base = row[Parameter.TO_FRONT] + row[Parameter.TO_REAR]

@@ -26,7 +26,7 @@ FILTERS: Final = {"FCKF": "comparator", "ACOFCKF": "improved"}
 def plots(
     constant: NoisyRun, variable: NoisyRun, tuned: Memberships, tuning: PaperTuning
 ) -> list[PaperPlot]:
-    """Return all plots. Curves over time show the drive with the first noise seed."""
+    """Return all plots for paper 004. Curves over time show the drive with the first noise seed."""
     return [
         _path_plot(constant),
         _torque_plot(constant),
@@ -166,8 +166,9 @@ def _search_plot(tuning: PaperTuning) -> PaperPlot:
 
 
 def pheromone_plot(tuning: PaperTuning) -> PaperPlot:
-    """Return the plot of the pheromone as a colour map: one axis shows the vertices (variables of
-    the fuzzy sets), the other their positions (possible values)."""
+    """Return the plot of the pheromone as a colour map. One axis shows the vertices (corners of the
+    fuzzy sets), the other their positions (possible values).
+    """
     count = len(tuning.pheromone)
     ticks = tuple(f"{'e' if k < count // 2 else 'n'} {k % (count // 2) + 1}" for k in range(count))
     label = "position of the vertex: " + ", ".join(f"{value:g}" for value in POSITIONS)

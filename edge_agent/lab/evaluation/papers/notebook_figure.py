@@ -1,4 +1,4 @@
-"""Figure that a notebook shows as a picture when it is the value of a cell."""
+"""Matplotlib figure that a notebook shows as a picture if the figure is the result of a cell."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ DPI: Final = 80
 
 
 class NotebookFigure(Figure):
-    """Matplotlib figure with a picture for notebooks. Figures made without `pyplot` have none."""
+    """Matplotlib figure that notebooks can show as a picture. Plain figures that are made without
+    `pyplot` lack the method for it.
+    """
 
     def _repr_png_(self) -> bytes:
         """Return the figure as PNG; IPython calls this method."""

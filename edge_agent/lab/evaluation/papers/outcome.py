@@ -17,7 +17,7 @@ Table = dict[str, Values]  # column -> measures
 
 
 class PaperRow(NamedTuple):
-    """One number of a paper's table, with our numbers for comparison.
+    """One number of a paper's table, and our corresponding numbers for comparison.
 
     Attributes:
         name: name of the figure, below `papers.NUMBER.`.
@@ -65,8 +65,8 @@ class PaperRow(NamedTuple):
         return self.limit is None or self.figure("papers").holds
 
     def figure(self, prefix: str) -> Figure:
-        """Return the number under the paper's conditions (`matched`) as a figure with its
-        target.
+        """Return the number under the paper's conditions (`matched`), with its target, as a
+        `Figure` named `prefix` plus the row's name.
         """
         return Figure(f"{prefix}.{self.name}", self.matched, self.unit, self.limit, self.better)
 

@@ -79,7 +79,9 @@ def markdown_tables(tables: Sequence[PaperTable]) -> str:
 
 
 def markdown_elements(elements: Sequence[Element]) -> str:
-    """Return the list of a paper's elements (equations, tables, figures) as a Markdown table."""
+    """Return a Markdown table of a paper's elements (equations, tables, figures): whether each is
+    implemented, why, and where.
+    """
     lines = ["| paper | element | verdict | why | where |", "|---|---|---|---|---|"]
     for element in elements:
         where = f"`{element.where}`" if element.where else ""
@@ -103,7 +105,7 @@ def report_markdown(done: Reproduction) -> str:
 
 def report_html(done: Reproduction, seconds: float) -> str:
     """Return the report as one HTML page that shows the SVG files in the same folder. `seconds` is
-    the computing time to state.
+    the computing time that the page states.
     """
     counts = ", ".join(
         f"{sum(element.verdict == verdict for element in done.elements)} {verdict}"

@@ -1,5 +1,5 @@
-"""Reproduction of paper 000: joint federated filters on two lane changes with friction .5, then .3;
-the friction filter is as printed.
+"""Reproduction of paper 000: federated filters for motion and friction, on two lane changes during
+which friction changes from .5 to .3. The friction filter is implemented as printed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ NEAR: Final = 0.1
 
 def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
     """Return two durations [s] until the estimated mean friction `mu` (T,) is within NEAR of the
-    true value: one from the start, and one from the change of friction.
+    true value: the first from the start of the drive, the second from the change of friction.
     """
     t = batch.t[:, 0]
     truth = batch.mu[:, 0]
@@ -50,8 +50,8 @@ def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
 
 
 def _run_friction(spec: DriveSpec, setting: FederatedSetting) -> tuple[DriveSet, FloatArray]:
-    """Return a simulated drive, and the friction of the wheels (T, 4) that the printed filter
-    estimates from it; the filter gets the true motion.
+    """Simulate a drive, and run the printed friction filter on it with the true motion as input.
+    Return the drive and the estimated friction of the wheels (T, 4).
     """
     batch = ideal(spec)
     return batch, estimate(given_motion(batch, spec.vehicle), setting).mu

@@ -1,5 +1,5 @@
-"""Reproduction of paper 001: the adaptive fuzzy federated filter, and the filter FKF that the paper
-compares it with, on the paper's five drives.
+"""Reproduction of paper 001 on its five drives: the adaptive fuzzy federated filter, and the filter
+FKF with which the paper compares it.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Reproduction of paper 002: filter WCKF-A, tyre-force compensation (TFC) and filter WCKF-B, on the
-sine and the J-turn.
+"""Reproduction of paper 002 on a sine manoeuvre and a J-turn: the wheel filter WCKF-A, the
+tyre-force compensation (TFC) and the vehicle filter WCKF-B.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ REAL_KEYS: Final = {"v_x": "rmse_vx", "v_y": "rmse_vy", "β": "rmse_beta"}
 
 @dataclass(frozen=True)
 class ForceRun:
-    """One drive of paper 002: true values, and the results of its two filters, by quantity, (T,)
-    each.
+    """One drive of paper 002: the true values, and the results of the paper's two filters, by
+    quantity, (T,) each.
     """
 
     batch: DriveSet

@@ -1,5 +1,5 @@
-"""Reproduction of paper 003: four-wheel friction by the square-root filter and by the UKF that the
-paper compares it with, under the paper's conditions.
+"""Reproduction of paper 003 under its conditions: friction of the four wheels, estimated by the
+square-root filter and by the UKF with which the paper compares it.
 """
 
 from __future__ import annotations
@@ -90,14 +90,14 @@ class CaseRuns:
     runs: dict[str, FrictionRun]
 
     def error(self, name: str) -> float:
-        """Return the mean absolute error of the estimated friction over all wheels and samples,
-        including the time before convergence.
+        """Return the mean absolute error of the friction estimated by the filter `name`, over all
+        wheels and samples, including the time before convergence.
         """
         return float(np.abs(self.runs[name].mu - self.batch.mu_wheel[:, 0]).mean())
 
     def arrival(self, name: str) -> float:
-        """Return the time [s] from the start, or from the change of friction, until all wheels are
-        within NEAR of the true value.
+        """Return the time [s] until the filter `name` is within NEAR of the true friction at all
+        wheels. The time counts from the start, or from the change of friction if there is one.
         """
         truth = self.batch.mu_wheel[:, 0]
         changes = np.flatnonzero(np.abs(np.diff(truth, axis=0)).max(axis=1) > NEAR)
@@ -314,7 +314,9 @@ def _sensor_errors() -> tuple[PaperRow, ...]:
 
 
 def _add_noise(signals: FloatArray) -> FloatArray:
-    """Return the signals (T, 18) with white noise added to the wheel speeds."""
+    """Return the signals (T, 18) with white noise added to the wheel speeds, to test the filters
+    with a sensor error.
+    """
     changed = signals.copy()
     shape = changed[:, S.OMEGA : S.OMEGA + 4].shape
     changed[:, S.OMEGA : S.OMEGA + 4] += WHEEL_SPEED_NOISE * np.random.default_rng(3).normal(
@@ -324,8 +326,8 @@ def _add_noise(signals: FloatArray) -> FloatArray:
 
 
 def _scale_radius(signals: FloatArray) -> FloatArray:
-    """Return the signals (T, 18) of a car whose wheel radius is larger than the filter assumes, by
-    the share WHEEL_RADIUS_ERROR.
+    """Return the signals (T, 18) as a car would measure them whose wheel radius is larger than the
+    filter assumes, by the share WHEEL_RADIUS_ERROR.
     """
     changed = signals.copy()
     changed[:, S.OMEGA : S.OMEGA + 4] /= 1.0 + WHEEL_RADIUS_ERROR

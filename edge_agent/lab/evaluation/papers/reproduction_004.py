@@ -1,5 +1,5 @@
-"""Reproduction of paper 004: the fuzzy cubature filter before and after tuning by ant colony
-optimisation, with constant and variable noise.
+"""Reproduction of paper 004 with constant and with variable noise: the fuzzy cubature filter before
+and after tuning by ant colony optimisation.
 """
 
 from __future__ import annotations
@@ -54,8 +54,7 @@ ITERATIONS: Final = 12
 
 @dataclass(frozen=True)
 class NoisyRun:
-    """One experiment of paper 004: the drives with all noise seeds, and the results of each
-    filter.
+    """One experiment of paper 004: the drives with all noise seeds, and the results of each filter.
     """
 
     batch: DriveSet
@@ -81,7 +80,9 @@ class NoisyRun:
 
 
 def noise_of(t: FloatArray, noise: str) -> FloatArray:
-    """Return the noise variances (T, 3) of a_x, a_y and yaw rate [SI units squared]."""
+    """Return the noise variances (T, 3) of a_x, a_y and yaw rate [SI units squared] at the times t,
+    for the experiment with "constant" or "variable" noise.
+    """
     return np.full((len(t), 3), VARIANCE) if noise == "constant" else on_ay(t, VARIANCE)
 
 

@@ -1,5 +1,6 @@
-"""The functions that reproduce the papers, by paper, and the writer of the files of `edge-agent
-evaluate --paper`."""
+"""Table of the functions that reproduce the papers, and the function that writes the files of
+`edge-agent evaluate --paper`.
+"""
 
 from __future__ import annotations
 
@@ -34,8 +35,8 @@ LONGEST_S: Final = 90.0  # of one paper on two cores
 def write_paper(
     paper: str, seeds: Sequence[int], folder: Path, *, plots: bool = True
 ) -> Reproduction:
-    """Reproduce the results of a paper; write figures.json, report.md, and index.html with its
-    plots; return the results.
+    """Reproduce the results of a paper and return them. Write figures.json and report.md into the
+    folder; with `plots`, also the plots and index.html, which shows them.
     """
     began = time.monotonic()
     done = REPRODUCTIONS[paper](seeds)
