@@ -94,9 +94,9 @@ class LowerVertices:
         return float(weight @ outputs.mean(axis=1)) / total if total > 0.0 else 0.0
 
     def knot_table(self, knots: int) -> tuple[FloatArray, FloatArray]:
-        """Return a table for linear interpolation of `step`, two arrays (knots,): mismatches
-        (actual over theoretical variance of the innovations, minus 1) [1] and the steps of ln R
-        [nat] for them. R is the measurement noise.
+        """Return a table of `step` at `knots` mismatches for linear interpolation, two arrays
+        (knots,): the mismatches (actual over theoretical variance of the innovations, minus 1) [1],
+        and the steps of ln R [nat] for them. R is the measurement noise.
         """
         inputs, _ = self.triangle_sets()
         corners = np.unique(np.clip(inputs.ravel(), self.peaks[0], self.peaks[-1]))

@@ -8,10 +8,10 @@ share of the evidence on friction that it uses, and the rate at which it forgets
 | steering is WIDE | R of the axle that is steered is larger | Sugeno |
 | slide, demand, new forces, strain are in a set each | ln of the evidence share | Takagi–Sugeno |
 
-Sugeno: the result is the consequent of a rule times its membership. The first line is implemented
-in `fuzzy.py`. Sets are ramps from a foot (membership 0) to a peak (membership 1); feet, peaks and
-consequents are `Memberships`. Inputs come from the block (0.05 s of samples) that has just ended,
-so that no rule uses its own effect as input.
+Sugeno: the result is the consequent (output) of a rule times its membership (degree, 0 to 1). The
+first row is implemented in `fuzzy.py`. The other sets are ramps from a foot (membership 0) to a
+peak (membership 1); feet, peaks and consequents are `Memberships`. Inputs come from the block (0.05
+s of samples) that has just ended, so no rule has its own effect as input.
 
 `plain_rules` has no fuzzy set: the share of evidence is a product of two ramps, and nothing else
 changes. It is the baseline for the evaluation of the rules (`fuzzy.worth`).

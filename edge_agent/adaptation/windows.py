@@ -1,7 +1,8 @@
 """Measurement noise from a moving window of innovations in which larger innovations have more
 weight (paper 002, equations 24 and 25).
 
-Legend: e_j innovations of the last N samples of one row; c_j = |e_j| their weights, normalised (the
+Legend: e_j innovations (measurement minus prediction) of one measurement in the last N samples; c_j
+= |e_j| their weights, normalised (the
 paper's are not); P variance of the predicted measurement; R = sum(c_j*e_j^2)/sum(c_j)/2 - P. The
 factor one half is not in the paper; it makes R correct, because for a normal variable E|e|^3 / E|e|
 = 2 var(e).
@@ -27,9 +28,9 @@ def push_innovation(window: FloatArray, innovation: float) -> None:
 def weighted_noise(
     window: FloatArray, predicted: float, nominal: float, least: float, largest: float
 ) -> float:
-    """Return the noise variance R of one measurement row from its last innovations (measurement
-    minus prediction), `window` (N,), limited to [least, largest]*nominal. While the window is not
-    full, return `nominal`.
+    """Return the noise variance R of one measurement from its last innovations (measurement minus
+    prediction), `window` (N,), limited to [least, largest]*nominal. While the window is not full,
+    return `nominal`.
 
     `predicted` is the variance of the predicted measurement, without noise.
     """

@@ -45,8 +45,8 @@ class Prediction(NamedTuple):
 
 
 class HeldOut(NamedTuple):
-    """Result of a validated calibration: the calibration to write, the groups left out of it, and
-    the mean predictions without (`before`) and with it (`after`).
+    """Result of a validated calibration: the calibration to write, the groups of quantities left
+    out of it, and the mean predictions of held-out drives without (`before`) and with it (`after`).
     """
 
     calibration: Calibration
@@ -61,8 +61,8 @@ Judge: TypeAlias = Callable[[Vehicle, Drive], Prediction]
 
 
 def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> HeldOut:
-    """Learn a calibration from all drives, and keep only the groups that also improve the
-    prediction of held-out drives.
+    """Learn a calibration from all drives. Keep only those groups of quantities with which an
+    estimator predicts held-out drives at least as well as without.
 
     Raises:
         InputError: no drive has enough excitation, or there is only one drive and it is too short
@@ -143,7 +143,8 @@ def restrict_groups(calibration: Calibration, groups: Sequence[str]) -> Calibrat
 
 def is_worse(tried: Sequence[Prediction], best: Sequence[Prediction]) -> bool:
     """Return True if the predictions `tried` are worse than `best`: their mean log-likelihood is
-    lower, or one drive has the flag CONTRADICTION (measurements contradict the model) for longer.
+    lower by more than WORSE, or on some drive the flag CONTRADICTION (measurements contradict the
+    model) is set for longer, by more than LONGER.
     """
     lost = _mean_prediction(best).log_likelihood - _mean_prediction(tried).log_likelihood
     longer = max(new.contradicted - old.contradicted for new, old in zip(tried, best, strict=True))

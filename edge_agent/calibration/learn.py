@@ -152,8 +152,8 @@ def weigh_estimates(drives: Sequence[DriveEstimates], vehicle: Vehicle) -> Calib
 
 
 def surer_values(one: Calibration | None, other: Calibration | None) -> Calibration | None:
-    """Return a calibration (sensor errors) that combines two of the same car: for each quantity,
-    the value with the smaller standard deviation.
+    """Combine two calibrations (sensor errors) of one car: for each quantity, return the value with
+    the smaller standard deviation.
     """
     if one is None or other is None:
         return one or other

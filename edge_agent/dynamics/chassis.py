@@ -1,4 +1,4 @@
-"""Model of the vehicle body with four tyres: computes the accelerations for a given state,
+"""Model of the vehicle body on four tyres. It computes the accelerations for a given motion,
 steering, wheel speeds and friction.
 """
 

@@ -59,9 +59,9 @@ def drive_wheel(
 
 @compiled
 def slip_share(radius: float, omega: float, along: float) -> float:
-    """Return the weight, 1/2 + 2^(-1/|s|), that the tyre model's force has in the compensated force
-    (`blend_forces`). Source: equation (33) of paper 002, with the slip s of equation (15). The
-    weight is about one half at all ordinary slips.
+    """Return the weight, 1/2 + 2^(-1/|s|), of the tyre model's force in the compensated force
+    (`blend_forces`), by equation (33) of paper 002 with the slip s of equation (15). At ordinary
+    slips it is about one half.
     """
     turning = radius * omega
     most = max(abs(turning), abs(along), 1e-3)

@@ -103,7 +103,7 @@ class Body(NamedTuple):
 
 @inlined
 def body_of(row: FloatArray) -> Body:
-    """Return the parameters that body and tyres use, from a parameter row (15,)."""
+    """Return those parameters of a parameter row (15,) that the equations of body and tyres use."""
     p = Parameter
     return Body(
         row[p.MASS],

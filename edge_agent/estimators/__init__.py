@@ -1,5 +1,5 @@
-"""Estimators by name, through one interface: `create(name, vehicles)` and
-`EstimatorBank.advance`.
+"""Estimators of vehicle motion and tyre-road friction. They are selected by name and have one
+interface: `create(name, vehicles)` and `EstimatorBank.advance`.
 """
 
 from edge_agent.estimators.bank import EstimatorBank

@@ -1,12 +1,13 @@
-"""`adaptive-federated-ckf`: paper 001, a federated cubature filter with fuzzy R and adaptive
-information shares.
+"""`adaptive-federated-ckf`: the filter of paper 001, a federated cubature filter with fuzzy
+measurement noise R and adaptive information shares. Numbers in brackets are the paper's equations.
 
 "Driving state estimation of distributed drive electric vehicles by an adaptive fuzzy federated
 Kalman filter", Sustainability 2023, 15, 13446 (paper 001). Motion and sub-filters: see
 `gaussian/federated_motion`. A fuzzy rule base of 7 x 5 rules scales the measurement noise R of each
 sub-filter (section 3.1, table 1, see `rules`). Its inputs are the mismatch between actual and
-expected innovation variance over a window, and the rate of that mismatch. The information shares
-follow from the predicted residuals, (30) to (33): beta_i = min(1, c/gamma_i), normalised.
+expected innovation variance over a window, and the rate of that mismatch. The share beta_i of
+sub-filter i in the master's information follows from the size gamma_i of its predicted residuals,
+(30) to (33): beta_i = min(1, c/gamma_i) with a constant c, normalised.
 
 Friction is not a state of the filter. It is set by hand (section 4.1), here to DRY (a dry road).
 The estimator's output for friction is the prior distribution.
@@ -60,8 +61,8 @@ class AdaptiveMemory(FederatedMemory):
 
 
 class AdaptiveDesign:
-    """Parameters that are set by hand: friction of the four wheels [1], and output values (levels)
-    of the fuzzy rules.
+    """Parameters that are set by hand: friction of the four wheels [1], True if R and shares are
+    adapted, and output values (levels) of the fuzzy rules.
     """
 
     friction: Annotated[FloatArray, 4]
@@ -132,8 +133,11 @@ def _step_filter(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> b
 
 @compiled
 def _adapt_noise_and_shares(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> None:
-    """Compute the factors on the measurement noise R of both sub-filters, and the shares of the
-    master's information that they get, for the next sample, `dt` [s] after the last one.
+    """Adapt the federated filter after a sample, for use at the next sample: compute the factors on
+    the measurement noise R of both sub-filters, and the shares of the master's information that
+    they get.
+
+    `dt` [s] is the time since the last sample.
     """
     motion = memory.motion
     keep = 0.5 ** (dt / WINDOW_S)

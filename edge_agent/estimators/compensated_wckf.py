@@ -1,5 +1,6 @@
-"""`compensated-wckf`: paper 002, weighted square-root cubature filters on the electric drive wheel,
-with force compensation.
+"""`compensated-wckf`: the filters of paper 002, weighted square-root cubature filters on the
+electric drive wheel, with compensation of the tyre force. Numbers in brackets are the paper's
+equations.
 
 Chen, Cai, Chen, Xu, Jiang, Sun, "Design of vehicle running states-fused estimation strategy using
 Kalman filters and tire force compensation method", IEEE Access 2019, doi
@@ -15,8 +16,8 @@ Friction is not a state of the filters. It is set by hand, here to DRY (a dry ro
 output for friction is the prior distribution.
 
 `EstimatorBank.memory("mean")` returns the states of WCKF-A, and `memory("compensated")` the
-compensated forces; the paper's figures compare A with B. ELEMENTS lists each element of the paper
-and every departure with its reason.
+compensated forces, because the paper's figures compare A with B. ELEMENTS lists each element of the
+paper and every departure with its reason.
 """
 
 from __future__ import annotations
@@ -102,8 +103,8 @@ class CompensatedMemory(PaperMemory):
 
 
 class FrictionSet:
-    """Friction that is set by hand, and scratch arrays of a filter step; each step writes them
-    before it reads them.
+    """Friction that is set by hand, and scratch arrays. A step of the filter writes each scratch
+    array before it reads it.
     """
 
     friction: Annotated[FloatArray, 4]
@@ -116,7 +117,8 @@ def make_bank(
 ) -> EstimatorBank:
     """Return a bank of filters, one per vehicle, on a road with the given friction [1].
 
-    The tyre option corresponds to the cornering stiffnesses in the paper's table 1.
+    `tyre` selects the tyre model; the paper's vehicle needs its `rear_slope`, the ratio of the
+    cornering stiffnesses in table 1.
     """
     context = records(FrictionSet, 1)
     context["friction"] = friction

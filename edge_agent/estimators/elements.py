@@ -32,8 +32,8 @@ class Element(NamedTuple):
 
 
 def elements_without_reason(elements: tuple[Element, ...]) -> list[str]:
-    """Return the `place` (number in the paper) of each equation, table or figure whose entry lacks
-    a required reason or a required code location.
+    """Return the `place` (number in the paper) of each element, such as an equation or figure,
+    whose entry lacks a required reason or a required code location.
     """
     found = []
     for element in elements:

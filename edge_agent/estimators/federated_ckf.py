@@ -1,12 +1,13 @@
-"""`federated-ckf`: paper 000, joint federated cubature filters for motion and for the friction of
-four wheels.
+"""`federated-ckf`: the filters of paper 000, joint federated cubature filters for motion and for
+the friction of four wheels. Numbers in brackets are the paper's equations.
 
 Wu, Li, Fan, "Joint estimation of driving state and road adhesion coefficient for distributed drive
 electric vehicle", IEEE Access 2021, doi 10.1109/ACCESS.2021.3081443. Motion filter: see
 `gaussian/federated_motion`. Friction filter: state [mu_fl, mu_fr, mu_rl, mu_rr], random walk (28).
-It also has two sub-filters, with measurements [a_x, a_y, r] and [a_y, r] (40) to (48), fused by
-(51), (52). The friction filter uses the estimated motion, and the tyres of the motion filter use
-the estimated friction (figure 3). The information shares of the sub-filters follow from (54).
+Like the motion filter it has two sub-filters, with measurements [a_x, a_y, r] and [a_y, r] (40) to
+(48), fused by (51), (52). The friction filter uses the estimated motion, and the tyres of the
+motion filter use the estimated friction (figure 3). The information shares of the sub-filters
+follow from (54).
 
 The printed Q = I and R = 10 000 (57) are a sensible tuning where slip stiffness is proportional to
 friction; `literal.federated_friction` contains the friction filter as printed. On a real tyre
@@ -125,7 +126,8 @@ def share_by_information(first: float, second: float) -> float:
     """Return the information share of sub-filter 1 [1] from the traces of the covariances of both
     sub-filters.
 
-    The sub-filter with the smaller trace gets the larger share: (54) with the ratio inverted.
+    The sub-filter with the smaller trace gets the larger share. This is equation (54) of paper 000
+    with its ratio inverted.
     """
     return min(max(second / (first + second), LEAST_BETA), 1.0 - LEAST_BETA)
 

@@ -1,4 +1,6 @@
-"""Health flags as plain integers, because compiled kernels cannot combine enumeration members."""
+"""Health flags as plain integers, because compiled functions cannot combine members of an
+enumeration.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """`paper-aco-fckf`: the fuzzy cubature Kalman filter of paper 004 as printed, with errata
-corrected.
+corrected. Numbers in brackets are the paper's equations.
 
 Xiong, Liu, Zhang, Zhu, Liu, "An accurate vehicle and road condition estimation algorithm for
 vehicle networking applications", IEEE Access 2019, doi 10.1109/ACCESS.2019.2895413.

@@ -1,12 +1,12 @@
 """The estimators by name, and `create`, which makes a bank of them.
 
-`aco-fckf`, `fckf` and `ckf` are one filter: a Rao-Blackwellised mixture over friction with
-cubature filters as its nodes. They differ in the fuzzy adaptation of the measurement
-noise: tuned by ant colony optimisation, untuned, or none. The filter is based on paper 004 and
+`aco-fckf`, `fckf` and `ckf` are one filter, a Rao-Blackwellised mixture: a grid of friction values
+(nodes), each with a cubature filter. They differ in the fuzzy adaptation of the measurement noise:
+it is tuned by ant colony optimisation, untuned, or absent. The filter is based on paper 004 and
 departs from it in these points: kinematic prediction; wheel speed as a measurement; force from
 torque; residuals by total least squares; friction as a mixture instead of a state; stiffness, leaks
-(gravity in tilted accelerometers) and offsets as states; bounded adaptation in the direction of the
-errata.
+(gravity in tilted accelerometers) and offsets as states; bounded adaptation of R, with its
+direction corrected (errata).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Code that runs before the kernel of every bank: it checks the samples, and divides the vehicles
-equally among threads.
+"""Code that runs before the compiled function ("kernel") of every estimator bank: it checks the
+samples, and divides the vehicles equally among threads.
 
-Kernels release the interpreter's lock and share no state.
+Threads run in parallel because kernels release the interpreter's lock and share no state.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""The cubature filter with its points in adjacent columns, for compiled functions that run millions
-of steps per second.
+"""Cubature Kalman filter whose points lie in adjacent columns, for compiled functions that run
+millions of steps per second.
 
 Legend
     m, L     state's mean (n,), and lower-triangular square root of its covariance, P = L*L' (n, n)
@@ -38,8 +38,8 @@ def gather_points(
     points: FloatArray, noise_std: FloatArray, pace: float, mean: FloatArray, sqrt_cov: FloatArray
 ) -> None:
     """Compute mean (n,) and sqrt_cov (n, n), the root of the covariance, from propagated points (n,
-    2n). Process noise with standard deviations pace*q is added. Afterwards `points` contains the
-    deviations from the mean.
+    2n), and add process noise with the standard deviations pace*noise_std. Afterwards `points`
+    contains the deviations from the mean.
 
     The mean is the first point plus the mean deviation from it, so that large offsets lose no
     digits. The covariance is summed and factorised, at half the cost of an orthogonal

@@ -1,5 +1,5 @@
-"""Rank-one downdate of a covariance factor. It is refused if the result would not be a
-covariance.
+"""Rank-one downdate (subtraction of column*column') of a covariance factor. The downdate is refused
+if the result would not be a covariance.
 """
 
 from __future__ import annotations

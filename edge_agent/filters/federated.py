@@ -13,8 +13,9 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def share_information(sqrt_cov: FloatArray, beta: float, out: FloatArray) -> None:
-    """Compute out (n, n): the square root of the covariance of a sub-filter that gets the share
-    beta, 0 < beta <= 1, of the master's information.
+    """Compute `out` (n, n), the square root of a sub-filter's covariance, if the sub-filter gets
+    the share `beta` of the master's information, 0 < beta <= 1. `sqrt_cov` is the root of the
+    master's covariance.
     """
     gain = 1.0 / math.sqrt(beta)
     for i in range(sqrt_cov.shape[0]):

@@ -1,5 +1,5 @@
-"""Square-root prediction and update by orthogonal transformations, for use inside larger compiled
-functions.
+"""Square-root prediction and update of a sigma-point filter by orthogonal transformations, for use
+inside larger compiled functions.
 
 Legend
     x, m        state, its mean                                            (n,)

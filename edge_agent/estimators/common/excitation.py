@@ -1,5 +1,5 @@
-"""Largest grip used (force over load) within the last second, stored in a ring of short time
-intervals (slots).
+"""Record of the largest grip used (force over load) within the last second, kept in a ring of short
+time intervals (slots).
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ def note_excitation(ring: Excitation, time: float, used: float) -> None:
 
 @compiled
 def _find_largest(ring: Excitation, time: float) -> None:
-    """Search all time slots of the last second for the largest grip used, and store it in
-    `ring.largest`. This is needed because the slot of the previous maximum has expired.
+    """Search all time slots (short intervals) of the last second for the largest grip used, and
+    store it in `ring.largest`. This is needed when the slot of the previous maximum has expired.
     """
     ring.largest = 0.0
     for k in range(SLOTS):

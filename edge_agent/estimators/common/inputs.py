@@ -93,7 +93,7 @@ def _reset_track(track: InputTrack) -> None:
 
 @compiled
 def _store_inputs(track: InputTrack) -> None:
-    """Store the input signals of this sample; the next sample uses them as the previous inputs."""
+    """Keep the input signals of this sample as the previous inputs for the next sample."""
     for k in range(INPUTS):
         track.inputs_before[k] = track.inputs[k]
     for wheel in range(4):
@@ -104,7 +104,8 @@ def _store_inputs(track: InputTrack) -> None:
 @compiled
 def _fill_inputs(track: InputTrack, row: FloatArray, anew: bool) -> None:
     """Fill the inputs of the vehicle model, `track.inputs`, from the readings, and replace missing
-    values. If the last argument is True, values of earlier samples are not used as replacements.
+    values. If the last argument is True, the filter begins at this sample, and values of earlier
+    samples are not used as replacements.
     """
     now = track.now
     use = track.inputs
@@ -131,8 +132,8 @@ def _fill_inputs(track: InputTrack, row: FloatArray, anew: bool) -> None:
 def _grip_used(track: InputTrack, row: FloatArray) -> float:
     """Return the largest grip used now by any wheel, as force over load [1].
 
-    It is the hypotenuse of the longitudinal part (torque over radius and load, largest of the four
-    wheels) and of the lateral acceleration in g.
+    It is the root of the sum of two squares: the longitudinal force over load (torque over radius
+    and load, largest of the four wheels), and the lateral acceleration in g.
     """
     use = track.inputs
     loads = wheel_loads(body_of(row), use[S.AX], use[S.AY])

@@ -1,9 +1,9 @@
-"""Writers of the output columns that every estimator fills.
+"""Functions that write the output columns that every estimator fills.
 
 The papers' filters report friction as the median and the 5 % and 95 % quantiles of a Gaussian,
 clipped to the range of the friction grid. These filters cannot separate the evidence of one visit
 (the passage of one map cell) from their prior. Therefore they give no evidence, and the agent
-publishes friction with its interval.
+publishes the friction interval instead.
 """
 
 from __future__ import annotations

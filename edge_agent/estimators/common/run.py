@@ -1,8 +1,9 @@
-"""Sample loop of all filters from papers: check the sample, begin or step the filter, report.
+"""Sample loop of all filters from papers. For each sample it checks the readings, begins or steps
+the filter, and writes the estimates.
 
-The module of a paper contains the record of its filter (`PaperMemory` with fields of its own),
-three compiled functions and the citation. `kernel_of` builds the bank's kernel from these
-functions.
+The module of each paper defines a record for its filter (`PaperMemory` with further fields) and
+three compiled functions: begin, step and report. From these functions, `kernel_of` builds the
+function ("kernel") that an estimator bank calls.
 """
 
 from __future__ import annotations

@@ -75,8 +75,8 @@ class MotionSetting(NamedTuple):
 
 
 class FederatedMotion:
-    """Setting, master state, information shares and latest innovations (measurement minus
-    prediction) of the motion filter of one vehicle.
+    """Data of the motion filter of one vehicle: setting, state of the master, information shares of
+    the sub-filters, and latest innovations (measurement minus prediction).
     """
 
     process: Annotated[FloatArray, STATES]  # standard deviations per STEP_S
@@ -254,8 +254,8 @@ def widened_speed_std(std: float, innovation: float) -> float:
     """Return the standard deviation [m/s] of the measured wheel speed, increased for a large
     innovation (measurement minus prediction).
 
-    The innovation is then at most FARTHEST standard deviations, so spinning or locked wheels have
-    little effect.
+    The increase limits the innovation to FARTHEST standard deviations, so that spinning or locked
+    wheels have little effect.
     """
     return std if math.isnan(innovation) else max(std, abs(innovation) / FARTHEST)
 

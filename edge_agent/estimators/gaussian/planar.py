@@ -1,4 +1,5 @@
-"""Process model of the papers with three degrees of freedom, integrated by Heun's rule.
+"""Process model with three degrees of freedom (v_x, v_y, yaw rate) that the papers share,
+integrated by Heun's rule.
 
 State [v_x, v_y, a_x, a_y, r, z]. Papers 000 (1) to (14), 001, 004 (1) to (12): v_x' = a_x + r*v_y,
 v_y' = a_y - r*v_x (004 prints the wrong sign), I_z*r' = moment of the tyres' forces; a_x and a_y
@@ -82,14 +83,15 @@ def propagate_points(
     track: InputTrack,
     step: PlanarStep,
 ) -> None:
-    """Advance the states in the columns (6, POINTS) by one step, in place.
+    """Advance the states in the columns (6, POINTS), one per cubature point, by one step, in place.
 
-    Inputs change linearly from the previous sample to this one. With `by_torque`, longitudinal
-    forces come from the wheels' torque, z is the yaw acceleration, and friction (4,) is given. The
-    velocity is then integrated from the states a_x and a_y alone; the measurements correct these
-    states for drag and slopes. Without `by_torque`, forces come from slip and z is the friction of
-    all wheels. With `by_motor`, longitudinal forces come from the torque of each axle's motor, half
-    to each wheel; z is still friction.
+    Inputs change linearly from the previous sample to this one. `step` selects the source of the
+    longitudinal forces. With `by_torque`, longitudinal forces come from the wheels' torque, z is
+    the yaw acceleration, and friction (4,) is given. The velocity is then integrated from the
+    states a_x and a_y alone; the measurements correct these states for drag and slopes. Without
+    `by_torque`, forces come from slip and z is the friction of all wheels. With `by_motor`,
+    longitudinal forces come from the torque of each axle's motor, half to each wheel; z is still
+    friction.
     """
     slowest = abs(columns[0, 0])
     for p in range(1, POINTS):

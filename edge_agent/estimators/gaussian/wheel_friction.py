@@ -1,5 +1,5 @@
-"""The friction of four wheels as states of a Gaussian filter: return to the prior over distance,
-and the mean of the wheels.
+"""The friction of four wheels as states of a Gaussian filter: its return to the prior over the
+distance driven, and the mean over the wheels.
 
 Legend: mu_i friction of a wheel, m_0 and s_0 its prior mean and standard deviation (moments of the
 uniform prior), lambda distance constant of forgetting [m], rho correlation between the wheels'
@@ -69,20 +69,21 @@ def return_to_prior(mean: FloatArray, root: FloatArray, metres: float, work: Flo
 
 @compiled
 def dependence_factor(demand: float, dt: float) -> float:
-    """Return the factor on the measurement's standard deviation for a sample `dt` [s] after the
-    previous sample, at a force of `demand` [g].
+    """Return the factor by which a filter increases the standard deviation of a measurement, for a
+    sample `dt` [s] after the previous one, at a force of `demand` [g].
 
-    The factor has two reasons. Errors of the model last, so the samples within that time count as
-    one measurement. Without force, only slip noise is left, which carries no information on
-    friction.
+    The factor has two reasons. Errors of the model last for INDEPENDENT_S, so all samples within
+    this time count as one measurement. Without force, only slip noise is left, which carries no
+    information on friction.
     """
     return math.sqrt(max(INDEPENDENT_S / dt, 1.0) * (1.0 + (DEMAND_HALF / max(demand, 1e-2)) ** 4))
 
 
 @compiled
 def visible_share(demand: float) -> float:
-    """Return the share of the friction's standard deviation that a measurement update may reduce,
-    at a force of `demand` [g]: near 0 at low demand, near 1 at high demand.
+    """Return the share of the standard deviation of friction that a measurement may reduce, at a
+    force of `demand` [g]. It is near 0 at low demand, because the measurement then hardly depends
+    on friction, and near 1 at high demand.
     """
     used = (demand / DEMAND_HALF) ** 4
     return used / (1.0 + used)

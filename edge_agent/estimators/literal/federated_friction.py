@@ -1,5 +1,5 @@
 """The friction filter of paper 000 as printed: two cubature sub-filters and a master, with given
-motion.
+motion. Numbers in brackets are the paper's equations.
 
 State mu_fl, mu_fr, mu_rl, mu_rr, a random walk (28); measurements [a_x, a_y, r] and [a_y, r] (53);
 F_x from wheel torque (10). The information shares follow from (54), which gives more information to

@@ -1,4 +1,5 @@
-"""The friction filter of paper 003 as printed, and the filter that the paper compares it with.
+"""The friction filter of paper 003 as printed, and the filter (UKF) with which the paper compares
+it.
 
 The filter has four states, given motion and unscented points. State mu_fl, mu_fr, mu_rl, mu_rr, a
 random walk. Measurement [a_x, a_y, r] (section 3.1). The filter measures the yaw rate r over one
@@ -10,13 +11,13 @@ Legend: X_i, Z_i points of state and measurement, side weight w = 1/(2*alpha^2*n
 d = sum of w*e_i.
 
 Square-root form (section 3.2): roots by singular values. With the printed alpha = .001 the central
-point has a weight of -10^6, which has no root. But sum(W_i*(Z_i - z)*(Z_i - z)') = sum(w*e_i*e_i')
-+ (beta - alpha^2)*d*d' exactly, and in the right-hand form all weights are positive. That form is
-used here, in both precisions.
+point has a weight of -10^6, which has no real root. However, sum(W_i*(Z_i - z)*(Z_i - z)') =
+sum(w*e_i*e_i') + (beta - alpha^2)*d*d' exactly, and in the right-hand form all weights are
+positive. That form is used here, in both precisions.
 
-Covariance form (section 3.1, "UKF", the comparator): the textbook sums with weights of 10^6, whose
-digits cancel. In single precision the covariance then has no Cholesky factor at some steps, and the
-last valid factor is used instead.
+Covariance form (section 3.1, "UKF", for comparison): the textbook sums with weights of 10^6, in
+which digits cancel. In single precision the covariance then has no Cholesky factor at some steps,
+and the last valid factor is used instead.
 """
 
 from __future__ import annotations
