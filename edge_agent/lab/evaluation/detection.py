@@ -84,12 +84,16 @@ class DetectionTally:
     seconds: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, name: str, values: NDArray[np.generic]) -> None:
-        """Add an array of values to the measure `name`, whose mean is computed from sum and count."""
+        """Add an array of values to the measure `name`, whose mean is computed from sum and
+        count.
+        """
         self.total[name] = self.total.get(name, 0.0) + float(np.sum(values, dtype=np.float64))
         self.count[name] = self.count.get(name, 0) + int(np.size(values))
 
     def add_case(self, name: str, *, holds: bool) -> None:
-        """Count one case in the share called `name`, the share of cases in which `holds` is True."""
+        """Count one case in the share called `name`, the share of cases in which `holds` is
+        True.
+        """
         self.add(name, np.array([holds]))
 
     def merge(self, other: DetectionTally) -> None:

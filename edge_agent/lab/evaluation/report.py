@@ -192,7 +192,9 @@ def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
 
 
 def world(values: dict[str, float]) -> str:
-    """Return a Markdown table of the results in towns with inaccurate cars, one row per estimator."""
+    """Return a Markdown table of the results in towns with inaccurate cars, one row per
+    estimator.
+    """
     shown = {
         "coverage90": "coverage",
         "coverage90.ice": "on ice",

@@ -54,7 +54,9 @@ ITERATIONS: Final = 12
 
 @dataclass(frozen=True)
 class NoisyRun:
-    """One experiment of paper 004: the drives with all noise seeds, and the results of each filter."""
+    """One experiment of paper 004: the drives with all noise seeds, and the results of each
+    filter.
+    """
 
     batch: DriveSet
     reported: dict[str, Estimates]
