@@ -123,7 +123,9 @@ class QueryEngine:
         return self._read("map", paths, "snapshot_time", "snapshot", _MAP_COLUMNS)
 
     def rows(self) -> int:
-        """Return the number of observations in the selected files, read from their footers."""
+        """Return the number of observations in the selected files. Only the footers of the Parquet
+        files are read, not their rows.
+        """
         return sum(int(pq.read_metadata(path).num_rows) for path in self.files("observations"))
 
     def answer(self, expression: Table) -> pa.Table:
@@ -134,9 +136,9 @@ class QueryEngine:
     def _read(
         self, name: str, paths: Sequence[Path], moment: str, seconds: str, columns: str = "*"
     ) -> Table:
-        """Return a table of the given files, with an additional column named `seconds`: the time
-        column `moment` in whole seconds since 1970. Queries use this column instead of `moment`,
-        because DuckDB and Spark convert times differently.
+        """Return a table of the given files with one additional column, whose name is the argument
+        `seconds`. It contains the time column `moment` in whole seconds since 1970. Queries use
+        this column instead of `moment`, because DuckDB and Spark convert times differently.
         """
         texts = [str(path) for path in paths]
         if self._spark is None:
@@ -160,10 +162,11 @@ class QueryEngine:
 
 def has_value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
     """Return a condition that is true for rows with a value of mu, and false for rows with only a
-    lower bound. A row has a value if the vehicle used at least the share EXCITED_SHARE of mu (the
-    rule is in `schemas/README.md`).
+    lower bound. A row has a value if the vehicle used at least the share EXCITED_SHARE of the
+    friction mu that it reports (the rule is in `schemas/README.md`).
 
-    NaN is larger than any number in both engines, so it is checked explicitly.
+    Rows with NaN are excluded explicitly, because both engines treat NaN as larger than any number,
+    so that a comparison alone would accept it.
     """
     share = ibis.literal(EXCITED_SHARE - _NEARLY, "float64")
     enough = t.mu_utilised.cast("float64") >= share * t.mu.cast("float64")

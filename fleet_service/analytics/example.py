@@ -59,7 +59,9 @@ def draw_figures(root: Path, folder: Path) -> dict[str, pa.Table]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the example; return the exit code."""
+    """Draw the example's plots for the archive named in `argv`, or for a synthetic archive; return
+    the exit code.
+    """
     parser = argparse.ArgumentParser(prog="python -m fleet_service.analytics.example")
     parser.add_argument("--archive", type=Path, help="compacted archive (default: a synthetic one)")
     parser.add_argument("--out", type=Path, required=True, help="output folder for the figures")

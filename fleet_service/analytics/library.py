@@ -31,9 +31,9 @@ def ask_archive(
     options: Options | None = None,
     engine: str = "duckdb",
 ) -> pa.Table:
-    """Return the answer to one of the predefined questions about the compacted files
-    (`fleet-service compact`). `period` is begin and end of the observations, ISO 8601, UTC; None
-    for an open end.
+    """Return the answer to one of the predefined questions about an archive. Only compacted files
+    are read, that is, rows that `fleet-service compact` has sorted by cell. `period` is the begin
+    and end of the observations, ISO 8601, UTC; None for an open end.
 
     Raises:
         InputError: there is no such question or archive, no data in the selected part, or an option

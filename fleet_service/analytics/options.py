@@ -14,9 +14,11 @@ class Options:
     Attributes:
         at: time of a road treatment, or of a replayed map [ns].
         stations: path of a table of weather station readings, CSV or Parquet.
-        least_vehicles: minimum number of vehicles that report a slippery stretch or spell.
+        least_vehicles: minimum number of vehicles that must have measured a slippery stretch, a
+            slippery period, or a road link, for it to be listed or judged.
         step_s: time between the frames of an animated replay [s]; None for one map.
-        lateness_s: allowed lateness of the service whose map is replayed [s].
+        lateness_s: setting of the service whose map is replayed: how late a report may arrive and
+            still be used in order of time [s].
         roads: table made by `fleet-service roads`.
         level: minimum friction that a maintenance contract requires.
         within_s: time within which this friction must be restored [s].

@@ -181,7 +181,7 @@ def add_geometry(table: pa.Table, question: Question) -> pa.Table:
 
 
 def _row_cells(table: pa.Table) -> list[list[int]]:
-    """Return, for each row of an answer, the list of the map cells that it describes."""
+    """Return, for each row of an answer, the map cells that it describes."""
     found: list[Any] = table[PARTS].to_pylist()
     return found
 

@@ -52,9 +52,9 @@ class DrawnCells:
     Attributes:
         boxes: west, south, east, north [deg] of each square.
         part: row number of each square; None if every row has one square.
-        sector: heading sector of each row, 0 east to 3 south.
+        sector: heading sector of each row: 0 east, 1 north, 2 west, 3 south.
         panels: for each panel (map), its name and one value per row; None means 'not measured'.
-        names, rows: names of the texts shown for a row, and the texts.
+        names, rows: labels of the texts that are shown for each row, and these texts.
         frames, frame: names of the frames, and the frame number of each row.
         lasting: for each row, True if its value will still grow, such as the duration of a spell
             that has not ended.

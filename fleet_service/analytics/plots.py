@@ -49,8 +49,9 @@ def draw(table: pa.Table, name: str, about: str, path: Path) -> None:
 
 
 def cell_shapes(cell: IntArray, sector: IntArray | None = None) -> FloatArray:
-    """Return the corners of cells as squares, (n, 4, 2) [m], or with sectors as triangles (quarters
-    of the cells), (n, 3, 2). The origin is the south-west corner of all cells.
+    """Return the corners of map cells [m], with the south-west corner of all cells as the origin.
+    Without `sector`, the shapes are squares, (n, 4, 2). With `sector`, they are triangles, (n, 3,
+    2): the quarter of the cell that belongs to this heading sector.
     """
     west, south, *_ = grid.bounds(cell)
     scale = METRES_PER_DEGREE * np.cos(np.radians(south.mean())) if len(cell) else 1.0
@@ -302,7 +303,7 @@ def _draw_replay(figure: Figure, table: pa.Table) -> None:
 
 def _first_two(figure: Figure, table: pa.Table) -> None:
     """Plot the first two numeric columns of an answer against each other; used for questions of
-    plug-ins.
+    plug-ins, which have no plot of their own.
     """
     numbers = [
         f.name for f in table.schema if pa.types.is_floating(f.type) or pa.types.is_integer(f.type)

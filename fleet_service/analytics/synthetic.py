@@ -180,8 +180,8 @@ def _draw_positions(
 
 
 def night_factor(seconds: FloatArray) -> FloatArray:
-    """Return how much each time of day `seconds` (n,) belongs to the night: a factor from 0 by day
-    to 1 at four in the morning.
+    """Return a factor for each time `seconds` (n,): 1 at four in the morning, falling to 0 at ten
+    in the evening and at ten in the morning, and 0 by day.
     """
     return np.clip(np.cos(2 * np.pi * (seconds / DAY_S - 4 / 24)), 0.0, 1.0)
 
@@ -200,8 +200,8 @@ def _make_likelihoods(
     rng: np.random.Generator, mu: FloatArray, used: FloatArray, excited: BoolArray
 ) -> ByteArray:
     """Return the log-likelihoods of the reports, (n, 32), in steps of 1/16 nat. The likelihood of a
-    reported value of mu falls both below and above this value. The likelihood of a lower bound
-    falls only below the grip that was used.
+    reported value of mu decreases on both sides of this value. The likelihood of a lower bound
+    decreases only below the grip that was used.
     """
     distance = (mugrid.CENTRES - np.where(excited, mu, used)[:, None]).astype(np.float32)
     flank = rng.uniform(0.02, 0.08, (2, len(mu), 1)).astype(np.float32)

@@ -32,10 +32,10 @@ class TimeNow(NamedTuple):
 
     Attributes:
         now: the time.
-        slack: how far the time of a report may lie beyond `now`, because the archive already
+        slack: how much later than `now` the time of a report may be, because the archive already
             contains reports with such times.
-        doubt: how much further beyond `now` it may lie so that the report is only ignored for now
-            (its sender repeats it), and not rejected for good.
+        doubt: how much later than `now` + `slack` it may be without rejection. Such a report is
+            ignored for now; its sender repeats it.
         least: lower bound of the true time.
         sure: True if active alerts may end only because time has passed; False while the clock may
             be wrong.

@@ -73,8 +73,8 @@ class Endpoints:
                 queryable.undeclare()
 
     def _hand_over(self, query: zenoh.Query, session: zenoh.Session) -> None:
-        """Answer a hand-over request: shut the service down regularly, so that the named standby (a
-        waiting service) takes over.
+        """Answer a hand-over request: shut the service down regularly, so that the standby (waiting
+        service) that the request names takes over.
         """
         self._engine.holding.to = (
             handover.answer_request(query, session, self._config.regions) or self._engine.holding.to

@@ -69,7 +69,8 @@ def handle_requests(
 
 def _erase_in_copy(copy: BucketReplica) -> str | None:
     """Remove the erased data from the archive's copy in a bucket (object store) too. Return None,
-    or the reason why the erasure there is incomplete; a background job then completes it later.
+    or the reason why the copy still contains some of the data; a background job then removes them
+    later.
     """
     try:
         copy.sync()

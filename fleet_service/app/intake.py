@@ -48,8 +48,8 @@ class Intake:
         acks: acknowledgements to send.
         batches: admission of batches; replaced by `reset`.
         now: time of the last `ingest` [ns].
-        report_lag_s: time [s] between the end of the newest visit of a cell and the arrival of its
-            report.
+        report_lag_s: shortest time [s], among the rows of the last `ingest`, from the end of a
+            visit (a vehicle's passage through a cell) to the arrival of its report.
         weather: queue of weather messages.
     """
 

@@ -165,8 +165,9 @@ class Service:
 
     def _has_lost_archive(self, came: Callable[[], bool]) -> bool:
         """Return True if another service has taken over the archive. The lease in the bucket, which
-        names the owner, shows this. While the bucket does not answer, the Zenoh liveliness tokens
-        of another service for the same regions show it.
+        names the owner, shows this. While the bucket does not answer, `came` shows it: a function
+        that returns True if Zenoh liveliness tokens of another service for the same regions have
+        appeared.
         """
         holding = self.engine.holding
         if not holding.may_acknowledge and came():
@@ -174,9 +175,9 @@ class Service:
         return holding.is_lost
 
     def _hanging(self) -> str | None:
-        """Return a description of a part of the service outside the worker (the thread that
-        processes messages) that has died or hangs, so that only a restart helps; None if there is
-        none.
+        """Return a description of a part of the service that hangs or has died, so that only a
+        restart helps; None if there is none. The worker (the thread that processes messages) calls
+        this and is not checked itself.
         """
         if self.engine.settlement.hangs_s >= HANGS_S:
             return (

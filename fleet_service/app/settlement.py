@@ -84,9 +84,9 @@ class Settlement:
         return self._log.hangs_s
 
     def until_early_s(self, now_s: float) -> float:
-        """Return the time [s] until the waiting rows should be written, without waiting for the end
-        of the period; `now_s` is the monotonic time [s]. Infinite if no rows wait, if a write is
-        running, or if the last write failed.
+        """Return the time [s] until the waiting rows should be written early, that is, before the
+        regular period ends; `now_s` is the monotonic time [s]. Infinite if no rows wait, if a write
+        is running, or if the last write failed.
         """
         if self.failing or not self._log.can_begin:
             return math.inf

@@ -70,8 +70,8 @@ COSTS: Final = Costs(
 
 
 class MemoryContent(NamedTuple):
-    """Content of a service's memory: numbers of vehicles, of cells (with sector), of pairs of a
-    vehicle and a cell that it visited lately, and of observations in the lateness window.
+    """Content of a service's memory: numbers of vehicles, of cells (with heading sector), of pairs
+    of a vehicle and a cell that it visited lately, and of observations in the lateness window.
     """
 
     vehicles: float
@@ -86,7 +86,7 @@ class PlannedFleet(NamedTuple):
     Attributes:
         vehicles: number of vehicles on the road at the same time.
         rate_hz: observations per second of each vehicle; one per visited cell.
-        cells: number of cells (with sector) of all roads.
+        cells: number of cells (with heading sector) of all roads.
         message_rows: observations per message.
         lateness_s: setting `lateness_s` of the service [s].
     """
@@ -99,9 +99,9 @@ class PlannedFleet(NamedTuple):
 
 
 class DeploymentSize(NamedTuple):
-    """Size of a deployment. `services` is the number of services such that each uses at most 60 %
-    of a core; `memory_bytes` is the memory of all of them, of which `parts_bytes` says what it is
-    used for.
+    """Size of a deployment. `services` is the number of services for which each uses at most 60 %
+    of a core. `memory_bytes` is the memory of all services together, and `parts_bytes` divides it
+    by use.
     """
 
     observations_per_s: float
@@ -143,14 +143,15 @@ def remembered_pairs(rate: float, values: float) -> float:
 
     Args:
         rate: observations per second.
-        values: share of them that give a value of friction.
+        values: share of these observations that give a value of friction and not only a lower
+            bound.
     """
     bounds = 1.0 - values
     return rate * (values * FORGOTTEN_S + bounds * VOTE_RENEWAL_S + FORGOTTEN_EVERY_S / 2)
 
 
 def cells_of_roads(road_km: float, latitude: float) -> float:
-    """Return the number of cells (with sector, both directions) of roads of a total length
+    """Return the number of cells (with heading sector, both directions) of roads of a total length
     [km] at a latitude [deg].
     """
     edge_m = _CELL_M * math.cos(math.radians(latitude))

@@ -34,12 +34,12 @@ class StandingAlerts:
 
     @property
     def count(self) -> int:
-        """Return the number of slots (cell and sector) with an active alert."""
+        """Return the number of slots (cell and heading sector) with an active alert."""
         return len(self._shared.state.alerts.slots)
 
     @property
     def slots(self) -> IntArray:
-        """Return the slots (cell and sector) with an active alert, (k,)."""
+        """Return the slots (cell and heading sector) with an active alert, (k,)."""
         return np.array(sorted(self._shared.state.alerts.slots), np.int64)
 
     @property

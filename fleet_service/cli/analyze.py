@@ -151,8 +151,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _report_covered_box(arguments: argparse.Namespace, bbox: tuple[float, ...]) -> None:
-    """If a query found no observation in its box, print the box that contains all observations. It
-    helps a user after latitude and longitude were swapped.
+    """If a query found no observation in its box, print the box that contains all observations.
+    This helps a user who has swapped latitude and longitude.
     """
     from fleet_service.analytics import engines
     from fleet_service.archive.export.extract import Extract

@@ -93,8 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _say_what_is_covered(arguments: argparse.Namespace) -> None:
-    """If a query found no cell in its box, print the box of the whole map. It helps a user after
-    latitude and longitude were swapped.
+    """If a query found no cell in its box, print the box of the whole map. This helps a user who
+    has swapped latitude and longitude.
     """
     from fleet_service.client import map_client
 

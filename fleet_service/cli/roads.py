@@ -1,5 +1,5 @@
-"""`fleet-service roads`: assign each cell and sector to a link of a road network. `analyze
-contract` uses the result.
+"""`fleet-service roads`: assign each map cell and heading sector to a link of a road network.
+`analyze contract` uses the result.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
-"""Slippery stretches as a DATEX II publication (version 3) for a National Access Point. Pure.
+"""Slippery stretches as a DATEX II publication (version 3) for a National Access Point. Pure (no
+I/O).
 
-A stretch is published as a situation of category a of safety-related traffic information
-(Regulation (EU) 886/2013, temporary slippery road). Its condition is `slippery`, never `ice`,
-because the map knows the friction but not its cause. A situation keeps its id; the version of its
-record increases with every change. When the alert is over, the record is published with its end
-time for another KEPT_S.
+A stretch is published as a situation "temporary slippery road", which is category (a) of the
+safety-related traffic information in Regulation (EU) 886/2013. Its condition is `slippery`, never
+`ice`, because the map knows the friction but not its cause. A situation keeps its id; the version
+of its record increases with every change. When the alert is over, the record is published with its
+end time for another KEPT_S.
 
 Each publication is made from the previous one and the active alerts; no other state must be stored.
 """
@@ -264,8 +265,8 @@ def _has_ended(record: ET.Element) -> bool:
 
 def _same_place(alert: StretchAlert, old: dict[str, ET.Element], written: set[str]) -> str | None:
     """Return the id of a situation in the previous publication that shares a cell with the stretch
-    of road; None if there is none. Cells are compared and not names, because a client that was
-    restarted gives the same stretch another name.
+    of road; None if there is none. Cells are compared instead of names, because a client gives the
+    same stretch another name after a restart.
     """
     cells = {
         f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points

@@ -64,8 +64,8 @@ class DatexFile:
                 longitude).
 
         Raises:
-            InputError: the file cannot be written; the attribute `document` is the new version all
-                the same.
+            InputError: the file cannot be written; the attribute `document` is then already the new
+                version.
         """
         before = self.document
         new = make_publication(self._supplier, standing, time.time_ns(), before, is_heard)

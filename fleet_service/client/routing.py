@@ -1,5 +1,5 @@
 """Low friction along road links as costs for route planners: cost factors for Valhalla, a custom
-model for GraphHopper. Pure.
+model for GraphHopper. Pure (no I/O).
 
 The factor is computed from the lower bound of friction. Only cells that were measured, or estimated
 from neighbours ("borrowed"), count. In other cells the lower bound is low because no vehicle has

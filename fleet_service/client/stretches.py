@@ -1,8 +1,9 @@
-"""Alerts of road stretches, made from alerts of single cells and headings. Pure.
+"""Alerts of road stretches, made from alerts of single cells and headings. Pure (no I/O).
 
 Cells with an active alert that are at most LINK_CELLS apart form one stretch; both driving
-directions belong to the same stretch. A stretch keeps its id from the first cell to the last. When
-two stretches merge, the older id stays. When a stretch splits, the larger part keeps the id.
+directions belong to the same stretch. A stretch keeps its id from its first alert until the alerts
+of all its cells are over. When two stretches merge, the older id stays. When a stretch splits, the
+larger part keeps the id.
 """
 
 from __future__ import annotations
@@ -254,8 +255,8 @@ def _new_name(first: Alert) -> str:
 
 
 def _centre_line(cell: IntArray) -> tuple[tuple[float, float], ...]:
-    """Return the centres [deg] of distinct cells along the longest path between neighbouring
-    cells.
+    """Return the centres [deg] of distinct cells along a road, in order: the longest path through
+    the tree that connects neighbouring cells.
     """
     places = np.stack(grid.deinterleave(cell), axis=1).astype(np.float64)
     tree = _span_tree(places)

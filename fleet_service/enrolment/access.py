@@ -1,5 +1,5 @@
 """Configuration of a Zenoh router: mutual TLS, and an access list that denies everything not listed
-here. Pure.
+here. Pure (no I/O).
 
 | role    | may publish                                       | may read and query            |
 |---------|---------------------------------------------------|-------------------------------|

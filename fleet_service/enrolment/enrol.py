@@ -124,7 +124,7 @@ class Registry:
         return signer
 
     def _switch(self) -> None:
-        """Make the next certificate authority the one that signs certificates. An interrupted call
+        """Let the next certificate authority sign all certificates from now on. An interrupted call
         can be repeated.
         """
         following = ca.read_pair(self._authority / "next")

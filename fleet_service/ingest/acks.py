@@ -38,15 +38,15 @@ class Acks:
             durable[stream].append(seq)
 
     def record_late(self, batches: Iterable[BatchId]) -> None:
-        """Record that batches arrived too late for the map to use them in order of time. The sender
-        learns this with the acknowledgement that the batches are durable.
+        """Record that batches arrived too late for the map to use them in order of time. The
+        acknowledgement that the batches are durable tells their sender about this.
         """
         for stream, seq in batches:
             self._late[stream].add(seq)
 
     def record_rejected(self, vehicle: str, batch: Head, row: int, reason: str) -> None:
-        """Record that a batch was rejected because of the row `row`, with the reason for the
-        sender.
+        """Record that a batch was rejected because of the row `row`, and the reason that is sent to
+        its sender.
         """
         self._rejected[vehicle][batch.boot, batch.kind, batch.region].append(
             (batch.seq, row, reason)

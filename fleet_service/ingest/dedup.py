@@ -1,6 +1,7 @@
 """Record of accepted batches, which detects duplicates. Each stream (batches of one vehicle, start,
 kind and region) has a watermark and a set of numbers. No batch with a sequence number up to the
-watermark is expected any more. The set contains the accepted sequence numbers above it. Pure.
+watermark is expected any more. The set contains the accepted sequence numbers above it. Pure (no
+I/O).
 
 The record's size is bounded by accepted data. Every number above a watermark is a batch in the
 archive, a stream has at most MAX_GAPS such numbers, and a stream is dropped when its newest record

@@ -1,5 +1,5 @@
 """Check of each vehicle's path for plausibility: the vehicle must be able to have been at all the
-places that it reports. Pure.
+places that it reports. Pure (no I/O).
 
 A vehicle's path is a list of at most ANCHORS "anchors" (time and place), over all its batches,
 starts and regions. A report is plausible if the vehicle could drive from the previous anchor to it,

@@ -1,4 +1,5 @@
-"""Simulated vehicle: draws the reports of an honest but imperfect agent about a road. Pure.
+"""Simulated vehicle: draws the reports of an honest but imperfect agent about a road. Pure (no
+I/O).
 
 Legend
     μ      friction of the road                                                      (n,)

@@ -1,5 +1,5 @@
 """Ice that forms and melts on one road of a town. The module measures how many passes with enough
-grip used the map needs to show the change. Pure.
+grip used the map needs to show the change. Pure (no I/O).
 """
 
 from __future__ import annotations

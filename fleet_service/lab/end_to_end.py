@@ -220,9 +220,9 @@ def observations_in(columns: dict[str, Any]) -> Observations:
 
 
 def slots_with_truth(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatArray]:
-    """Return the slots (cell and sector) that a vehicle truly visited, and the true friction of
-    each. It is the mean over the last half minute of the drive, or over all visits if there were
-    none in that time.
+    """Return the slots (cell and heading sector) that a vehicle truly visited, and the true
+    friction of each. It is the mean over the last half minute of the drive, or over all visits if
+    there were none in that time.
     """
     cell = visits["cell"].to_numpy()
     sector = visits["sector"].to_numpy()
@@ -240,8 +240,8 @@ def slots_with_truth(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatA
 
 
 def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Return a mask of slots (cell and sector), (slots,): True if all visits to the slot truly had
-    the same friction.
+    """Return a mask of slots (cell and heading sector), (slots,): True if all visits to the slot
+    truly had the same friction.
     """
     slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))
     mu = visits["mu"].to_numpy()
@@ -254,8 +254,8 @@ def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np
 
 
 def excited_vehicles(fusion: Fusion, visits: pa.Table) -> IntArray:
-    """Return, for each slot (cell and sector), the number of distinct vehicles that used at least
-    the share EXCITED_SHARE of the grip there, (slots,).
+    """Return, for each slot (cell and heading sector), the number of distinct vehicles that used at
+    least the share EXCITED_SHARE of the grip there, (slots,).
     """
     rows = visits["utilisation"].to_numpy() >= EXCITED_SHARE
     slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))

@@ -1,5 +1,5 @@
 """Fading of knowledge about a dry road: measures the lower end of the map's interval at some times
-after the last pass. Pure.
+after the last pass. Pure (no I/O).
 """
 
 from __future__ import annotations

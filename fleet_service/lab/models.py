@@ -1,5 +1,5 @@
 """Fleets whose errors differ from the assumptions of the fusion (the map's computation), and one
-fleet that follows them. Pure.
+fleet that follows them. Pure (no I/O).
 
 Each fleet first drives half of the roads, so that the service gets to know its vehicles. It is
 judged on the other half, which no vehicle visited before. So the map there rests only on the

@@ -1,5 +1,5 @@
 """Errors of the real estimator: its reports on simulated drives, resampled for the visits of a
-town. Pure.
+town. Pure (no I/O).
 
 The simulated vehicle of `agent` has the errors that the service assumes, which makes its map look
 too good. Here each vehicle of a town takes its errors from one vehicle of the drives, with all

@@ -1,5 +1,5 @@
 """Scores of map answers against the true friction: coverage, error, interval score and calibration.
-Pure.
+Pure (no I/O).
 """
 
 from __future__ import annotations

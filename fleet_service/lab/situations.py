@@ -1,7 +1,7 @@
 """Short situations in which a fused map could become wrong: many lower bounds, an outage, careful
 drivers on ice, a wet curve.
 
-The true friction is known by construction. Pure.
+The true friction is known by construction. Pure (no I/O).
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Fleets of another maker: vehicles that follow only the public contract (`schemas/README.md`) and
-have an error model of their own. Pure.
+have an error model of their own. Pure (no I/O).
 
 Each vehicle has a gain error that affects both its value of μ and the grip that it reports as used.
 If a fusion learned a correction from both, it would see a relation between them that is not a

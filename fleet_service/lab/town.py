@@ -1,5 +1,5 @@
 """A simulated town: roads as rows of cells, their friction over time, and the drives of a fleet.
-Pure.
+Pure (no I/O).
 
 Every road has stretches of one surface each. Most passes use little grip. Where drivers brake or
 steer depends on the place: a few cells get many excited visits (with much grip used), most get

@@ -1,5 +1,5 @@
 """Documents of OGC API Features, Part 1: Core (OGC 17-069r4), with one collection `grip`: the map's
-cells. Pure.
+cells. Pure (no I/O).
 
 A feature is one heading sector in one cell. Its geometry is the quarter of the cell on the side of
 the heading. A feature with only a lower bound has no `mu`, and unknown values are null or absent.

@@ -79,8 +79,8 @@ class Moments:
         return b"" if cells is None else map_mirror.block_at(level, tile, cells, 1, float(moment))
 
     def history(self, cell: int, sector: int) -> list[dict[str, Any]]:
-        """Return the belief (mu with its interval and P(slippery)) about a cell and sector at each
-        stored moment at which readers could see the cell, oldest first.
+        """Return the belief (mu with its interval and P(slippery)) about a cell and heading sector
+        at each stored moment at which readers could see the cell, oldest first.
         """
         found = []
         files = self._files()
@@ -101,8 +101,8 @@ class Moments:
         return found
 
     def _recent_history(self, moment: int, cell: int, sector: int) -> list[dict[str, Any]]:
-        """Return the belief (mu with its interval and P(slippery)) about a cell and sector at a
-        recent moment, as a list with one item; empty if the cell was unknown.
+        """Return the belief (mu with its interval and P(slippery)) about a cell and heading sector
+        at a recent moment, as a list with one item; empty if the cell was unknown.
         """
         tile = int(grid.tile_of(cell))
         place = (cell & 0x3FFF) * grid.SECTORS + sector

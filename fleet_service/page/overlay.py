@@ -16,8 +16,8 @@ from schemas.errors import InputError
 
 
 def read_overlay(path: Path | None) -> dict[str, list[Any]] | None:
-    """Return cell (as text), sector and mean mu of each cell and sector; None if the file does not
-    exist yet.
+    """Return cell (as text), sector and mean mu of each cell and heading sector; None if the file
+    does not exist yet.
 
     Raises:
         InputError: the file has other columns.

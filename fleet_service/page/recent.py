@@ -1,5 +1,5 @@
 """Recent moments of the live map in memory. In the first hour, before a service has stored a
-snapshot, they are the only past that the page can show. Pure.
+snapshot, they are the only past that the page can show. Pure (no I/O).
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Map cells as 13-byte records for the page, one block per tile. At small zoom levels, cells are
-aggregated to the worst value. Pure.
+aggregated to the worst value. Pure (no I/O).
 
 A block is a head of 32 bytes followed by its columns, little-endian, so that a browser can use them
 without copying: `last` (4 bytes per cell), `place` (2), and `mu`, `lower`, `upper`, `slippery`,

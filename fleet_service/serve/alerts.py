@@ -1,6 +1,6 @@
 """Low-friction alerts. An alert is raised when at least two vehicles reported ice and the cell is
 slippery with high probability. It is cleared only when the probability has clearly fallen
-(hysteresis), and the end message states a reason. Pure.
+(hysteresis), and the end message states a reason. Pure (no I/O).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Alerts:
 
     @property
     def slots(self) -> set[int]:
-        """Return the slots (cell and sector) that have an active alert."""
+        """Return the slots (cell and heading sector) that have an active alert."""
         return set(self._standing)
 
     @property
@@ -82,15 +82,15 @@ class Alerts:
         }
 
     def renumber(self, place: IntArray) -> None:
-        """Update the slot numbers of active alerts after the slots (storage of cells and sectors)
-        were renumbered; `place` contains the new number of each slot. No slot must have been
-        removed that has an active alert.
+        """Update the slot numbers of active alerts after the slots (storage of cells with heading
+        sectors) were renumbered; `place` contains the new number of each slot. No slot must have
+        been removed that has an active alert.
         """
         self._standing = {int(place[slot]): alert for slot, alert in self._standing.items()}
 
     def update(self, slots: IntArray) -> list[Alert]:
-        """Return the alerts that are raised or cleared because the given slots (cells and sectors),
-        (k,), were updated.
+        """Return the alerts that are raised or cleared because the given slots (cells with heading
+        sectors), (k,), were updated.
         """
         time = self._fusion.live.time[slots]
         slippery = self._fusion.slippery(slots)
@@ -127,7 +127,7 @@ class Alerts:
         )
 
     def _suspects(self, slots: IntArray) -> IntArray:
-        """Return the slots (cells and sectors) in which enough vehicles support an alert.
+        """Return the slots (cells with heading sectors) in which enough vehicles support an alert.
         Candidates are the updated slots (k,) and the other slots on their slippery stretches. A
         "source" is a vehicle whose report supports an alert.
 
@@ -153,15 +153,15 @@ class Alerts:
 
     def _own_sources(self, slots: IntArray, side: int) -> IntArray:
         """Return the report times [ns] of the vehicles that support one `side` (ice or grip) in
-        each slot (cell and sector), (k, SOURCES). Only reports within the hour before the slot's
-        last report count.
+        each slot (cell and heading sector), (k, SOURCES). Only reports within the hour before the
+        slot's last report count.
         """
         return self._fusion.sources(slots, side, self._fusion.live.time[slots] - SOURCE_NS)
 
     def _can_clear(self, slots: IntArray) -> BoolArray:
-        """Return a mask of slots (cells and sectors), (k,): True if the alert may be cleared.
-        Within the hour, two more vehicles must have reported grip than ice, or as many vehicles
-        grip as the map remembers per cell.
+        """Return a mask of slots (cells with heading sectors), (k,): True if the alert may be
+        cleared. Within the hour, two more vehicles must have reported grip than ice, or as many
+        vehicles grip as the map remembers per cell.
         """
         grip = (self._own_sources(slots, GRIP) > 0).sum(axis=1)
         ice = (self._own_sources(slots, ICE) > 0).sum(axis=1)

@@ -1,4 +1,4 @@
-"""Limit on alerts that two vehicles raise alone, on roads without other vehicles. Pure.
+"""Limit on alerts that two vehicles raise alone, on roads without other vehicles. Pure (no I/O).
 
 Two enrolled vehicles that collude could report ice anywhere along plausible paths. On a road with
 other traffic, other vehicles contradict them; on an idle road, which no third vehicle has reported,

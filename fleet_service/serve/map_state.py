@@ -1,4 +1,4 @@
-"""The map: which cells belong to each tile, and which tiles have changed. Pure."""
+"""The map: which cells belong to each tile, and which tiles have changed. Pure (no I/O)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class MapState:
         self.change = 0  # how often anything changed
 
     def mark_changed(self, slots: IntArray) -> None:
-        """Record that slots (cells and sectors) were updated, so that their tiles count as
+        """Record that slots (cells with heading sectors) were updated, so that their tiles count as
         changed.
         """
         self._index()
@@ -60,8 +60,8 @@ class MapState:
         return sorted(self._slots)
 
     def slots(self, tile: int) -> IntArray:
-        """Return the slots (row numbers of cells and sectors), (n,), of a tile, in the order of
-        their first visit.
+        """Return the slots (row numbers of cells with heading sectors), (n,), of a tile, in the
+        order of their first visit.
         """
         self._index()
         if tile not in self._slots:
@@ -71,12 +71,12 @@ class MapState:
         return parts[0].astype(np.int64)
 
     def count(self, tile: int) -> int:
-        """Return the number of slots (cells and sectors) of a tile."""
+        """Return the number of slots (cells with heading sectors) of a tile."""
         return sum(map(len, self._slots.get(tile, ())))
 
     def rebuild(self) -> None:
         """Discard the index from tiles to cells, so that it is built again. Call this after the
-        slots (storage of cells and sectors) were renumbered.
+        slots (storage of cells with heading sectors) were renumbered.
         """
         self._slots.clear()
         self._indexed = 0
@@ -99,5 +99,7 @@ class MapState:
 
 
 def tile_of(fusion: Fusion, slots: IntArray) -> IntArray:
-    """Return the tile number (n,) of each slot (cell and sector), given by row numbers (n,)."""
+    """Return the tile number (n,) of each slot (cell and heading sector), given by row numbers
+    (n,).
+    """
     return grid.tile_of(fusion.live.key[slots] // grid.SECTORS)

@@ -1,5 +1,5 @@
 """Estimates for unvisited cells from visited neighbours ("borrowed" values): wider, and marked as
-such. Pure.
+such. Pure (no I/O).
 
 A neighbour may be another kind of road (a bridge, the other side of a shadow), so half of the
 estimated belief is the prior. Along a route the order of cells is known. There a cell borrows from
@@ -87,8 +87,8 @@ def _route_gaps(
     source: Readable, route: IntArray, tile: int, known: IntArray
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Return three arrays (k,) for the unvisited parts of a route in a tile: the keys (cell and
-    sector), the slots of the nearest visited keys before or behind each, and the share of that
-    neighbour in the estimate, [0, 1].
+    heading sector), the slots of the nearest visited keys before or behind each, and the share of
+    that neighbour in the estimate, [0, 1].
 
     A key appears once for each side on which a visited key is within REACH. Directly adjacent keys
     are excluded, because they are handled as neighbours.

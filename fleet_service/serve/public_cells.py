@@ -1,5 +1,5 @@
 """Cells that readers may see if persons are kept private: the passage of a single vehicle changes
-nothing that is visible. Pure.
+nothing that is visible. Pure (no I/O).
 
 Readers see a copy of the map. Copies are made only at fixed times (every PERIOD_NS). A cell is
 copied if at least LEAST vehicles have visited it since its last copy, and as many have been in its
@@ -92,15 +92,15 @@ class PublicCells:
         return cells_of(self._rows)
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
-        """Return the belief about the road (32 probabilities of μ) for each slot (cell and sector),
-        (k, 32), as readers may see it at `now` [ns].
+        """Return the belief about the road (32 probabilities of μ) for each slot (cell and heading
+        sector), (k, 32), as readers may see it at `now` [ns].
         """
         self._add_slots()
         return self._fusion.beliefs(slots, now, self._rows)
 
     def slots_of(self, cell: IntArray, sector: IntArray) -> IntArray:
-        """Return the slot (row number) (n,) of each cell and sector; -1 if no vehicle has reported
-        it.
+        """Return the slot (row number) (n,) of each cell and heading sector; -1 if no vehicle has
+        reported it.
         """
         return self._fusion.slots_of(cell, sector)
 
@@ -128,23 +128,23 @@ class PublicCells:
         self._copy_more_slippery(voted[voted >= 0], now)
 
     def select(self, slots: IntArray, now: int) -> IntArray:
-        """Return those of the slots (row numbers of cells and sectors) that are public at `now`
-        [ns].
+        """Return those of the slots (row numbers of cells with heading sectors) that are public at
+        `now` [ns].
         """
         self.publish(now)
         return slots[self._shown[slots]]
 
     def take_published(self) -> IntArray:
-        """Return the slots (row numbers of cells and sectors) that were published since the last
-        call.
+        """Return the slots (row numbers of cells with heading sectors) that were published since
+        the last call.
         """
         found = np.concatenate([np.zeros(0, np.int64), *self._published])
         self._published.clear()
         return found
 
     def renumber(self, place: IntArray) -> None:
-        """Update the slot numbers after the slots (storage of cells and sectors) were renumbered;
-        `place` contains the new numbers, -1 for removed slots.
+        """Update the slot numbers after the slots (storage of cells with heading sectors) were
+        renumbered; `place` contains the new numbers, -1 for removed slots.
         """
         self.visitors.renumber(place)
         stay = np.flatnonzero(place[: self._size] >= 0)
@@ -220,8 +220,8 @@ class PublicCells:
         self._period = int(present["period"].max(initial=0))
 
     def _copy_more_slippery(self, slots: IntArray, now: int) -> None:
-        """Publish (copy for readers) those of the slots (cells and sectors) that have become
-        clearly more slippery than readers see.
+        """Publish (copy for readers) those of the slots (cells with heading sectors) that have
+        become clearly more slippery than readers see.
         """
         current = self._fusion.beliefs(slots, now)
         shown = self.beliefs(slots, now)
@@ -232,16 +232,16 @@ class PublicCells:
         self._pending[slots[self._shown[slots]]] = 0
 
     def _copy(self, slots: IntArray) -> None:
-        """Copy the current state of the slots (cells and sectors) to the public copy, which readers
-        see.
+        """Copy the current state of the slots (cells with heading sectors) to the public copy,
+        which readers see.
         """
         live = self._fusion.store.state.live
         self._rows.belief[slots] = live.belief[slots]
         self._rows.cells[slots] = live.cells[slots]
 
     def _add_slots(self) -> None:
-        """Add new slots (cells and sectors) to the public copy, in the state of an unvisited cell.
-        The memory is doubled when it is full, so that this is rare.
+        """Add new slots (cells with heading sectors) to the public copy, in the state of an
+        unvisited cell. The memory is doubled when it is full, so that this is rare.
         """
         if self._size == self._fusion.size:
             return

@@ -1,5 +1,5 @@
 """Answers to map queries, one tile at a time: select cells, compute beliefs, estimate unvisited
-cells, encode. Pure.
+cells, encode. Pure (no I/O).
 """
 
 from __future__ import annotations

@@ -115,7 +115,9 @@ class TileCache:
         return made
 
     def seen(self, slots: IntArray, now: int) -> CellView:
-        """Return the cells of public slots (cells and sectors) in the form that readers see."""
+        """Return the cells of public slots (cells with heading sectors) in the form that readers
+        see.
+        """
         return self.coarse(view_cells(self.source, slots, now))
 
     @property
@@ -132,8 +134,8 @@ class TileCache:
         return cells if self._public is None else coarsen_cells(cells)
 
     def public(self, slots: IntArray, now: int) -> IntArray:
-        """Return those of the slots (row numbers of cells and sectors) that are public at `now`
-        [ns].
+        """Return those of the slots (row numbers of cells with heading sectors) that are public at
+        `now` [ns].
         """
         slots = slots[self.state.fusion.live.vehicles[slots] >= self._least]
         return slots if self._public is None else self._public.select(slots, now)

@@ -1,4 +1,6 @@
-"""View of cells: a copy of their state at one moment, as columns that no longer change. Pure."""
+"""View of cells: a copy of their state at one moment, as columns that no longer change. Pure (no
+I/O).
+"""
 
 from __future__ import annotations
 
@@ -58,20 +60,22 @@ class Readable(Protocol):
 
     @property
     def live(self) -> Cells:
-        """Return the present state of all cells as columns, one row per slot (cell and sector)."""
+        """Return the present state of all cells as columns, one row per slot (cell and heading
+        sector).
+        """
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
-        """Return the belief about the road (32 probabilities of μ) for each slot (cell and sector),
-        (k, 32), predicted to `now` [ns].
+        """Return the belief about the road (32 probabilities of μ) for each slot (cell and heading
+        sector), (k, 32), predicted to `now` [ns].
         """
 
     def slots_of(self, cell: IntArray, sector: IntArray) -> IntArray:
-        """Return the slot (row number) (n,) of each cell and sector; -1 if there is none."""
+        """Return the slot (row number) (n,) of each cell and heading sector; -1 if there is none."""
 
 
 def view_cells(source: Readable, slots: IntArray, now: int) -> CellView:
-    """Return a copy of the state of `slots` (cells and sectors), with beliefs for the time `now`
-    [ns]. The map may be updated afterwards without changing the copy.
+    """Return a copy of the state of `slots` (cells with heading sectors), with beliefs for the time
+    `now` [ns]. The map may be updated afterwards without changing the copy.
     """
     live = source.live
     key = live.key[slots]

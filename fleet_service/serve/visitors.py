@@ -1,5 +1,5 @@
 """Number of distinct vehicles that were recently in a cell: a lower bound, in sixteen bytes per
-cell. Pure.
+cell. Pure (no I/O).
 
 The data of k vehicles hide each single vehicle only while there are k of them. If a cell stayed
 public for ever, a single car at night would be visible in it.
@@ -27,8 +27,8 @@ _SHIFT: Final = np.uint64(58)
 
 
 class Visitors:
-    """Recent vehicles of each slot (cell and sector) of a fusion (beliefs about all cells). The
-    time window is divided into parts; in each part, a vehicle that visited is one bit of 64.
+    """Recent vehicles of each slot (cell and heading sector) of a fusion (beliefs about all cells).
+    The time window is divided into parts; in each part, a vehicle that visited is one bit of 64.
 
     Args:
         fusion: owner of the slots; it must process observations before they are passed to `add`.
@@ -57,8 +57,8 @@ class Visitors:
         return self._part * PART_NS
 
     def count(self, slots: IntArray, now: int) -> IntArray:
-        """Return the number of distinct vehicles in each slot (cell and sector), (k,), within the
-        time window that ends at `now` [ns].
+        """Return the number of distinct vehicles in each slot (cell and heading sector), (k,),
+        within the time window that ends at `now` [ns].
         """
         self._grow()
         ago = max(now // PART_NS - self._part, 0)
@@ -66,8 +66,8 @@ class Visitors:
         return np.asarray(np.bitwise_count(np.bitwise_or.reduce(within, axis=1)), np.int64)
 
     def renumber(self, place: IntArray) -> None:
-        """Update the slot numbers after the slots (storage of cells and sectors) were renumbered;
-        `place` contains the new numbers, -1 for removed slots.
+        """Update the slot numbers after the slots (storage of cells with heading sectors) were
+        renumbered; `place` contains the new numbers, -1 for removed slots.
         """
         stay = np.flatnonzero(place >= 0)
         longer = np.zeros((len(place), PARTS), np.uint64)
@@ -97,8 +97,8 @@ class Visitors:
         return made
 
     def _grow(self) -> None:
-        """Enlarge the memory for new slots (cells and sectors). The memory is doubled when it is
-        full, so that this is rare.
+        """Enlarge the memory for new slots (cells with heading sectors). The memory is doubled when
+        it is full, so that this is rare.
         """
         if len(self._bits) < self._fusion.size:
             longer = np.zeros((2 * self._fusion.size, PARTS), np.uint64)

@@ -1,4 +1,6 @@
-"""Table of the predefined questions: name, description, and the possible forms of the answer."""
+"""Table of the predefined questions: for each its name, help text, sort order, and the column that
+gives the colours of a map.
+"""
 
 from __future__ import annotations
 

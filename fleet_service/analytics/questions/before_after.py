@@ -2,12 +2,14 @@
 accounts for biased vehicles.
 
 Legend
-    y    a value of mu in cell c, period p (before, after), by vehicle v
-    w    weight of a cell, n_b·n_a / (n_b + n_a), zero where a period has no value
-    D    difference Σ w·(mean after - mean before) / Σ w
-    u_v  influence of a vehicle: Σ over its values of ±w/(n·Σw)·(y - mean of cell and period)
-    sd   sqrt(V/(V-1)·Σ u_v²): values of a vehicle count as one (Liang and Zeger 1986, cluster-
-         robust variance)
+    y         a value of mu in cell c, period p (before, after), by vehicle v
+    n_b, n_a  number of values of a cell before and after the given time
+    w         weight of a cell, n_b·n_a / (n_b + n_a), zero where a period has no value
+    D         difference Σ w·(mean after - mean before) / Σ w
+    u_v       influence of a vehicle: Σ over its values of ±w/(n·Σw)·(y - mean of cell and period),
+              with + and n = n_a after the given time, - and n = n_b before
+    sd        standard deviation of D, sqrt(V/(V-1)·Σ u_v²) for V vehicles. All values of one
+              vehicle count as one (cluster-robust variance, Liang and Zeger 1986).
 """
 
 from __future__ import annotations

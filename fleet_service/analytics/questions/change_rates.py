@@ -1,14 +1,14 @@
 """`change-rates`: how fast roads become slippery or recover, by temperature and by hour, from the
 archive's values.
 
-Two successive values of a cell, from different vehicles, show whether the road was slippery at both
-times. The probability that they differ in this after a time Δ is
+Two successive values of a cell, from different vehicles, are compared. They are unlike if one is
+slippery and the other is not. The probability of this after a time Δ is
 
     P(unlike | Δ) = e + (m − e) (1 − exp(−λ Δ)),   m = 2 π (1 − π)
 
     λ   rate of change of the road, as in the fusion (CHANGE_S is 1/λ)                      [1/s]
-    e   probability that two readings of the same road differ because of errors
-    m   probability that readings of two roads differ; π is the share of slippery values in the
+    e   probability that two values of the same road are unlike because of errors
+    m   probability that values of two roads are unlike; π is the share of slippery values in the
         class (a temperature band, or a part of the day)
 
 This is the fusion's own model of change (`fleet_service/fusion/README.md`). λ and e are

@@ -142,8 +142,8 @@ def longest_breach(
         slot: (n,) numbers of time slots, ascending.
         lower, mu, upper: (n,) interval and mean of each slot.
         level: friction that the maintenance contract requires.
-        span: begin and end [s] of all measurements. Nothing is known outside it, so slots are cut
-            to it.
+        span: begin and end [s] of all measurements. Nothing is known outside this time, so the
+            parts of slots outside it are not counted.
     """
     begins = np.maximum(slot * SLOT_S, span[0])
     closes = np.minimum((slot + 1) * SLOT_S, span[1])
@@ -161,8 +161,8 @@ def longest_breach(
 
 def _find_runs(is_below: BoolArray, far: BoolArray | None = None) -> tuple[IntArray, IntArray]:
     """Return two arrays for the runs of successive True values in `is_below`: the first position of
-    each run, and the position after its last value. If `far` is given, a run also ends before each
-    time slot for which `far` (a gap lies before it) is True.
+    each run, and the position after its last value. `far` is True for each position that follows a
+    gap in time; if it is given, no run extends across such a gap.
     """
     number = np.cumsum(~is_below if far is None else ~is_below | far)
     at = np.flatnonzero(is_below)
@@ -174,9 +174,10 @@ class _Measured(NamedTuple):
     """Measurements of one road link.
 
     Attributes:
-        pieces: row numbers of each piece of the link.
+        pieces: for each piece (part of the link, PIECE_M long), the indices of its time slots in
+            the result of `slot_intervals`.
         vehicles: vehicles that measured the link.
-        values: number of values in each row.
+        values: numbers of friction values, one item per piece, time slot and vehicle.
     """
 
     pieces: dict[int, list[int]]

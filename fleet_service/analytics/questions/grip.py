@@ -1,5 +1,5 @@
-"""`grip`: percentiles of mu per cell and day. Also coverage: the shares of cells with values, with
-only lower bounds, and without visits.
+"""`grip`: percentiles of mu per cell and day. It also reports the daily coverage: the shares of
+cells with values, with only lower bounds, and without visits.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ PERCENTILES: Final = {"mu_p10": 0.1, "mu_p50": 0.5, "mu_p90": 0.9}
 
 
 def expression(t: Table) -> Table:
-    """Return a table with one row per day, cell and sector. A row without a value of mu has no
-    percentiles. Then it is only known that mu is at least `utilised_max`, the largest grip used.
+    """Return a table with one row per day, map cell and heading sector. A row without a value of mu
+    has no percentiles. Then it is only known that mu is at least `utilised_max`, the largest grip
+    used.
     """
     reported = ibis.ifelse(has_value(t), t.mu.cast("float64"), ibis.null("float64"))
     t = t.select(
@@ -42,9 +43,9 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return a table of percentiles of mu per day, cell and sector; `expression` describes the
-    rows. Also report the daily coverage of the network, which is the set of all cells and sectors
-    visited in the selected time.
+    """Return a table of percentiles of mu per day, map cell and heading sector; `expression`
+    describes the rows. Also report the daily coverage of the network, which is the set of all cells
+    and heading sectors visited in the selected time.
     """
     found = engine.answer(expression(engine.observations()))
     for line in coverage_lines(found):

@@ -27,8 +27,9 @@ REPORT_ROWS: Final = 1_000_000  # between two lines of progress
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return a table of the map's cells at the time `at`; with `step_s`, the cells of each frame
-    during the selected period. `frame` is the time of the frame.
+    """Return a table of the map's cells at the time `options.at`. If `options.step_s` is given,
+    return instead the cells of each frame (the map at one moment) during the selected period; the
+    column `frame` contains the time of the frame.
 
     Raises:
         InputError: the step is not valid, or makes too many frames.
@@ -71,8 +72,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def _frames_begin(engine: QueryEngine, first: int, step: int) -> int:
-    """Return the time of the first frame [ns]: the begin of the selected part, or the time just
-    before the first row if that is later.
+    """Return the time of the first frame [ns]: the begin of the selected part, or the last full
+    step before the first row (`first` [ns]) if that is later.
 
     Raises:
         InputError: there would be too many frames.

@@ -1,10 +1,10 @@
 """`spells`: begin and duration of slippery spells, and the time until a second vehicle reported
 each spell.
 
-A spell is a sequence of values below SLIPPERY_MU in one cell and sector, in order of time. It ends
-with the first value that is not slippery. Only spells that at least `least_vehicles` vehicles
-reported are listed. The alert time is that of the first value of a second vehicle, as in the
-service.
+A spell is a sequence of values below SLIPPERY_MU in one cell and heading sector, in order of time.
+It ends with the first value that is not slippery. Only spells that at least `least_vehicles`
+vehicles reported are listed. The alert time is that of the first value of a second vehicle, as in
+the service.
 """
 
 from __future__ import annotations

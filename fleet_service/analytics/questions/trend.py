@@ -32,8 +32,8 @@ TYPES: Final[dict[str, pa.DataType]] = {
 
 
 def expression(t: Table) -> Table:
-    """Return a table with one row per month that has values of mu: number of values and of
-    vehicles, median, and share of slippery values.
+    """Return a table with one row per month that has values of mu: number of values, number of
+    vehicles, median of mu, and share of slippery values.
     """
     t = t.filter(has_value(t)).select(
         "cell", "sector", "vehicle", month=t.day.truncate("M"), y=t.mu.cast("float64")

@@ -23,8 +23,8 @@ SHARE: Final = 0.1
 
 
 def expression(t: Table, least_vehicles: int) -> Table:
-    """Return a table of the cells and sectors in which at least the share SHARE of the values is
-    slippery, reported by at least `least_vehicles` vehicles.
+    """Return a table of those cells and heading sectors in which at least the share SHARE of the
+    values is slippery, if at least `least_vehicles` vehicles reported them.
     """
     reported = has_value(t)
     cells = t.group_by(["cell", "sector"]).aggregate(
@@ -53,7 +53,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 def join_stretches(cells: pa.Table) -> pa.Table:
     """Return a table with one row per slippery stretch: a stretch is a group of touching cells of
-    one sector. `members` are its cells, and the box encloses them.
+    the same heading sector. `members` are its cells, and the box encloses them.
     """
     column = {name: cells[name].to_numpy() for name in cells.schema.names}
     label = _label_components(column["cell"], column["sector"].astype(np.int64))
@@ -93,8 +93,9 @@ def join_stretches(cells: pa.Table) -> pa.Table:
 
 
 def wilson_lower(hits: FloatArray, of: FloatArray) -> FloatArray:
-    """Return the lower 95 % confidence bound (Wilson 1927) of a share: of `of` observations (n,),
-    `hits` (n,) had a property.
+    """Return the lower 95 % confidence bound (Wilson 1927) of a share. The share is `hits` / `of`,
+    (n,) each: `of` is the number of observations, and `hits` the number of them that have a
+    property.
     """
     n = np.maximum(of, 1.0)
     p = hits / n
@@ -104,7 +105,7 @@ def wilson_lower(hits: FloatArray, of: FloatArray) -> FloatArray:
 
 def _label_components(cell: IntArray, sector: IntArray) -> IntArray:
     """Return the number of the group to which each cell belongs, (n,). Cells belong to the same
-    group if a chain of touching cells of the same sector connects them.
+    group if a chain of touching cells of the same heading sector connects them.
     """
     key = cell * grid.SECTORS + sector
     order = np.argsort(key)

@@ -1,5 +1,6 @@
-"""Assignment of cells and sectors to road links. It is computed once per network, so trips need not
-be matched to roads.
+"""Assignment of map cells to road links, separately for each heading sector of a cell. It is
+computed once per network. Observations can then be looked up by cell and sector, so no trip must be
+matched to roads.
 
 A cell and sector belong to the link that is nearest in distance and heading. A cell in which one
 link ends and the next begins belongs to both links, because its observations cannot be separated.
@@ -67,7 +68,15 @@ class _Marks(NamedTuple):
 
 
 class _Joined(NamedTuple):
-    """Cells and sectors that are assigned to road links, in columns (n,)."""
+    """Assignment of map cells and heading sectors to road links, in columns (n,).
+
+    Attributes:
+        cell, sector: map cell and heading sector.
+        mark: index of the nearest mark (point on a road link), which also gives the link.
+        distance: distance from the cell's centre to this mark [m].
+        ambiguous: by how much the next best link fits worse [m]; NaN if there is no other link.
+        second: True if the cell also belongs to a link that fits better and adjoins this link.
+    """
 
     cell: IntArray
     sector: IntArray
@@ -78,8 +87,8 @@ class _Joined(NamedTuple):
 
 
 def join_roads(network: RoadNetwork) -> pa.Table:
-    """Return a table with one row per cell and sector on a link. The documentation page "Columns of
-    the questions" explains the columns.
+    """Return a table with one row for each cell and heading sector on a link. The documentation
+    page "Columns of the questions" explains the columns.
     """
     lengths, marks = _link_marks(network.links)
     scale = np.cos(np.radians(marks.latitude))
@@ -223,9 +232,9 @@ def _nearby_cells(marks: _Marks, side: float) -> IntArray:
 
 
 def _first_of(order: IntArray, *groups: IntArray) -> IntArray:
-    """Return the first index of each group in `order`, one item per group. Elements with equal
-    numbers in all arrays `groups` form a group; `order` contains the indices of the elements,
-    sorted by group.
+    """Return, for each group of elements, the index of its first element in `order`. `order`
+    contains the indices of all elements, sorted by group. Two elements belong to the same group if
+    they have equal numbers in all arrays `groups`.
     """
     new = np.zeros(len(order), np.bool_)
     new[:1] = True

@@ -1,7 +1,8 @@
 """Records of the data that were erased from an archive: a month, or one vehicle's rows of a month.
 Their measurements are not accepted again.
 
-    keys/2026-01.UNTIL.erased             empty; measurements of that month before UNTIL [ns]
+    keys/2026-01.UNTIL.erased             empty file: measurements of that month before UNTIL [ns]
+                                          are refused
     keys/2026-01.PSEUDONYM.UNTIL.erased   the same for the vehicle with this pseudonym; removed with
                                           the month's key
 

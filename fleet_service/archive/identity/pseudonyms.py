@@ -1,9 +1,9 @@
 """Pseudonyms: keyed hashes of vehicle names, and of the identifiers of vehicle starts, with one key
 per month.
 
-Destroying a month's key makes its rows anonymous. The hash of a start differs per month too;
-otherwise a start that lasts over midnight would link the pseudonyms of two months. The key is that
-of the month of a batch's first record, so that a repeated batch has the same pseudonym.
+Destroying a month's key makes its rows anonymous. The hash of a vehicle start differs per month
+too; otherwise a drive over the end of a month would link the pseudonyms of two months. The key is
+that of the month of a batch's first record, so that a repeated batch has the same pseudonym.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
 """Compaction: rows of the inbox are sorted by cell and time and moved to one file per date and zone
 (map square of zoom 7).
 
-A round takes the oldest segments. It adds files before it deletes segments:
+A round takes the oldest segments (files of new rows). It adds files before it deletes segments:
 
     1. all files of the round are written and synced as drafts; the footer of each names its sources
     2. they are renamed into place, and their folders synced
     3. the segments are deleted
 
 A crash between any two of these steps needs no repair. A row of a segment counts as compacted if a
-file of its partition names the segment. So `reading` sees each row once, and the next round takes
-the remaining rows.
+compacted file of the row's partition (date and zone) names the segment as a source. So the module
+`reading` reads each row once, and the next round takes the remaining rows.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Roll-up: additive statistics per cell, sector and hour. They stay when the rows from which they
-were computed are removed.
+"""Roll-up: additive statistics per cell, heading sector and hour. They stay when the rows from
+which they were computed are removed.
 
     rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet
 
@@ -94,8 +94,8 @@ def compute_part(path: Path, damaged: Damaged) -> pa.Table | None:
 
 
 def roll_up(table: pa.Table) -> pa.Table:
-    """Return additive statistics of observations (sums, counts, extremes) per cell, sector and
-    hour, sorted in this order.
+    """Return additive statistics of observations (sums, counts, extremes) per cell, heading sector
+    and hour, sorted in this order.
     """
     rows = segments.rows_of(table)
     hour = rows["leave_time"] // HOUR_NS

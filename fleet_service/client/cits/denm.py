@@ -1,5 +1,5 @@
 """DENM (hazard message of cooperative ITS) about low adhesion (ETSI EN 302 637-3, cause code 6): a
-record, and its encoding as bytes in unaligned PER. Pure.
+record, and its encoding as bytes in unaligned PER. Pure (no I/O).
 """
 
 from __future__ import annotations

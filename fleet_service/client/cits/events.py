@@ -1,9 +1,9 @@
 """Events (hazards in the sense of DENM) of one originating station: the event number of each
-stretch of road with an active alert, and the messages that must be sent. Pure.
+stretch of road with an active alert, and the messages that must be sent. Pure (no I/O).
 
-A stretch is one event from its first to its last cell, even over restarts, because the events are
-saved to a file. An event is sent when it begins, when it changes, before its validity ends, and
-once more when it is over.
+A stretch is one event from its first alert until the alerts of all its cells are over. The events
+are saved to a file, so a restart does not change this. An event is sent when it begins, when it
+changes, before its validity ends, and once more when it is over.
 """
 
 from __future__ import annotations

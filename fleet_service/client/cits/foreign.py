@@ -1,6 +1,6 @@
 """Conversion of DENM (hazard messages) from other stations to reports of one vehicle name. The
 fusion (the computation of the map from all reports) weighs and trusts this name like a vehicle.
-Pure.
+Pure (no I/O).
 
 All DENM of one interchange get the same name. An alert needs two independent sources, so DENM alone
 cannot raise an alert.

@@ -1,4 +1,4 @@
-"""Application properties of a DENM at an AMQP interchange of C-ROADS and NordicWay. Pure."""
+"""Application properties of a DENM at an AMQP interchange of C-ROADS and NordicWay. Pure (no I/O)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """Bit writer for unaligned PER (an ASN.1 encoding): each number takes only as many bits as its
-range needs, most significant bit first. Pure.
+range needs, most significant bit first. Pure (no I/O).
 """
 
 from __future__ import annotations
