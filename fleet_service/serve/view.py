@@ -70,7 +70,9 @@ class Readable(Protocol):
         """
 
     def slots_of(self, cell: IntArray, sector: IntArray) -> IntArray:
-        """Return the slot (row number) (n,) of each cell and heading sector; -1 if there is none."""
+        """Return the slot (row number), (n,), of each cell and heading sector; -1 if a cell has
+        none.
+        """
 
 
 def view_cells(source: Readable, slots: IntArray, now: int) -> CellView:

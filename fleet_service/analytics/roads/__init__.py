@@ -1,1 +1,1 @@
-"""Road networks: their links, and the assignment of the map's cells and heading sectors to links."""
+"""Road networks: links, and the assignment of the map's cells and heading sectors to links."""

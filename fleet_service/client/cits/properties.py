@@ -1,4 +1,6 @@
-"""Application properties of a DENM at an AMQP interchange of C-ROADS and NordicWay. Pure (no I/O)."""
+"""Application properties of a DENM (hazard message) at an AMQP interchange of C-ROADS and
+NordicWay. Pure (no I/O).
+"""
 
 from __future__ import annotations
 
