@@ -6,5 +6,7 @@ from edge_agent.publish.outbox import Outbox, StoredBatch
 
 
 def read_batches(outbox: Outbox) -> list[StoredBatch]:
-    """Return all batches (messages with records) in the outbox file, oldest first."""
+    """Return all batches (messages with records) in the outbox file (store of unacknowledged
+    messages), oldest first.
+    """
     return [batch for key in list(outbox.held) if (batch := outbox.read_batch(key)) is not None]

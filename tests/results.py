@@ -215,7 +215,9 @@ TABLES: Final = (
 
 
 class Line(NamedTuple):
-    """Row of the results block of the root README: text, and the figure that it shows."""
+    """Row of the results block (generated part) of the root README: text, and the figure that it
+    shows.
+    """
 
     text: str
     campaign: str
@@ -398,7 +400,9 @@ def _is_in_table(row: Row, tables: list[Table]) -> bool:
 
 
 def readme_block() -> str:
-    """Return the results block of the root README as Markdown, missed targets first."""
+    """Return the results block (generated part) of the root README as Markdown, missed targets
+    first.
+    """
     rows = []
     for line in LINES:
         row = read_kept(line.campaign).get(line.name)
@@ -444,7 +448,9 @@ def escape_unit(unit: str) -> str:
 
 
 def with_block(page: str) -> str:
-    """Return a page's text with its results block replaced by the current block."""
+    """Return a page's text in which the results block (its generated part) is replaced by the
+    current block.
+    """
     before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
     return f"{before}{readme_block()}{after}" if begin and end else page

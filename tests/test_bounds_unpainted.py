@@ -43,8 +43,8 @@ END: Final = "2026-01-28"
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return an archive with measurements of friction and with lower bounds of friction. As in
-    files before version 1.2, its map snapshot gives a cell that has only a lower bound a value of
-    mu.
+    files before version 1.2, its stored map (snapshot) states a value of mu even for a cell that
+    has only a lower bound.
     """
     root = tmp_path_factory.mktemp("bounds") / "archive"
     synthetic.write_archive(root, WORLD, 2000)

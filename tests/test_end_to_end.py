@@ -176,7 +176,9 @@ def _most_slippery_first(cell: dict[str, object]) -> float:
 
 
 def list_archived(folder: Path) -> list[tuple[object, ...]]:
-    """Return (vehicle, boot, region, seq, row) of each archived observation."""
+    """Return the identity of each archived observation: vehicle, boot (start of the agent), region,
+    seq (number of the batch), and row in the batch.
+    """
     columns = ("vehicle", "boot", "region", "seq", "row")
     tables = reading.read_tables(folder / "archive", Kind.OBSERVATION, columns)
     return [

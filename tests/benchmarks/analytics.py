@@ -2,7 +2,8 @@
 figures of this area in one file.
 
 Writes `.analytics/figures.json` and prints the table; `--rows` sets a smaller number. Durations are
-wall times on two threads, medians of ROUNDS. Rows per second of the compaction are per CPU second.
+wall times on two threads, medians of ROUNDS. The figure of the compaction (sorting of rows into
+files by cell) counts rows per CPU second.
 """
 
 from __future__ import annotations
@@ -151,7 +152,7 @@ def measure_questions(root: Path, readings: Path) -> list[Figure]:
 
 
 def write_small_archive(root: Path) -> dict[int, pa.Table]:
-    """Write a small archive, and return its map snapshots by time."""
+    """Write a small archive, and return the maps that it contains (snapshots), by time."""
     synthetic.write_archive(root, SMALL, 4000)
     compact(root)
     rollup.complete_parts(root)

@@ -17,7 +17,7 @@ from tests.benchmarks.peak import count_operations, measure_peak
 
 def estimators() -> list[Figure]:
     """Measure the time [µs] per vehicle and sample of the default estimator, for one vehicle and
-    for a bank.
+    for an estimator bank (many vehicles computed together).
     """
     log, vehicle = simulate_manoeuvre("double-lane-change", seed=SEED)
     signals = np.stack([log[name].to_numpy(zero_copy_only=False) for name in CHANNELS], axis=-1)[

@@ -42,8 +42,8 @@ resident()
 def make_visits(
     rng: np.random.Generator, rows: int, cells: int, begin_s: float, seconds: float
 ) -> Observations:
-    """Return `rows` visits to random cells of a square of `cells` cells, at random times within
-    `seconds`, in order of time.
+    """Return `rows` visits (passes of a vehicle through a cell) to random cells of a square of
+    `cells` cells, at random times within `seconds`, in order of time.
     """
     side = int(np.ceil(np.sqrt(cells)))
     x, y = grid.deinterleave(grid.cell_of(57.7, 11.97))
@@ -156,8 +156,8 @@ def _look_up(known: Any, keys: IntArray) -> IntArray:  # noqa: ANN401 numba's ow
 
 
 def resident() -> None:
-    """Print the resident memory [MB] of a service's process with 10⁶ cells that each had three
-    visits in a day.
+    """Print the resident memory [MB] of a service's process with 10⁶ cells each of which vehicles
+    visited three times in a day.
     """
     import fleet_service.app.service  # noqa: F401 what a service has loaded
     from fleet_service.serve.map_state import MapState

@@ -127,8 +127,8 @@ def corner_of_region(east: int) -> tuple[int, int]:
 def make_messages(
     count: int, records: int, now: int, vehicles: int = VEHICLES, begin: int = 0, east: int = 0
 ) -> list[Message]:
-    """Return `count` messages with `records` visits, the last of which end at `now` [ns], in one
-    region or in a region `east` regions further east.
+    """Return `count` messages with `records` visits (passes through map cells) each, the last of
+    which end at `now` [ns], in one region or in a region `east` regions further east.
 
     The first `begin` messages were made before: vehicles and sequence numbers continue after them.
     Each vehicle drives to and fro on a straight road, so that the service accepts its path.

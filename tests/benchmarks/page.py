@@ -136,8 +136,8 @@ def open_window(address: str) -> Iterator[Opened]:
 
 
 def measure_drawing(on: Stage) -> dict[str, float]:
-    """Measure in a browser the time of the first picture and the frame rate, of our page and of
-    MapLibre in turn. Also count the page's errors and its requests to other hosts. Return the
+    """Measure in a browser the time of the first picture and the frame rate, alternately of our
+    page and of MapLibre. Also count the page's errors and its requests to other hosts. Return the
     figures by name.
     """
     ours: list[tuple[float, float]] = []

@@ -236,7 +236,7 @@ def cells_of(document: bytes) -> set[int]:
 
 
 def measured_cells(table: pa.Table) -> set[int]:
-    """Return the cells of a map table whose basis is `measured`."""
+    """Return the cells of a map table whose basis (kind of evidence) is `measured`."""
     is_measured = np.array(table["basis"].to_pylist()) == "measured"
     return set(table["cell"].to_numpy()[is_measured].tolist())
 

@@ -1,5 +1,5 @@
-"""Benchmark of a running service under load: queries compared with a bare Zenoh queryable, and the
-time of alerts from publication to a subscriber.
+"""Benchmark of a running service under load: queries compared with a bare Zenoh queryable (program
+that only answers queries), and the time of alerts from publication to a subscriber.
 
 Router, service, load, bare queryable and client run in separate processes.
 """
@@ -51,8 +51,8 @@ _X, _Y = (
 
 
 def make_batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice: bool) -> Batch:
-    """Return a batch of visits (passes through map cells) of the test tile, dated now. They report
-    ice if `ice` is True, otherwise only how much friction the tyres used.
+    """Return a batch (message) of visits (passes through map cells) of the test tile, dated now.
+    They report ice if `ice` is True, otherwise only how much friction the tyres used.
     """
     cell = grid.interleave(_X + column.astype(np.int64), _Y + row.astype(np.int64))
     latitude, longitude = grid.centre(cell)
@@ -245,7 +245,7 @@ def ack_delays_s(
 
 def service() -> list[Figure]:
     """Measure queries, alerts and acknowledgements under 20 000 observations/s, and compare queries
-    with those of a bare queryable.
+    with those of a bare Zenoh queryable (program that only answers queries).
     """
     tile = keys.map_key(_TILE)
     # The first cell. The box goes from it over all columns and half of the lines. It is a little

@@ -1,5 +1,5 @@
-"""Check of `fleet-service size`: memory of an engine with 10⁴ and 10⁵ vehicles, compared with the
-calculator's estimate. Each engine runs in a separate process.
+"""Check of `fleet-service size`: memory of an engine (service without network) with 10⁴ and 10⁵
+vehicles, compared with the calculator's estimate. Each engine runs in a separate process.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def sizing() -> list[Figure]:
 
 
 def main(vehicles: int, messages: int) -> None:
-    """Ingest a number of messages of each vehicle. Print the content of the engine's memory, and
-    the memory that it takes [bytes], as one line of JSON.
+    """Let an engine (service without network) ingest `messages` messages of each vehicle. Print the
+    content of the engine's memory, and the memory that it takes [bytes], as one line of JSON.
     """
     with (
         tempfile.TemporaryDirectory() as folder,

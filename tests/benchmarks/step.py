@@ -76,8 +76,8 @@ Kind = TypeVar("Kind", Limit, VectorLimit)
 
 
 def make_limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> Kind:
-    """Return a bank of filters in C for N vehicles, each in the state of the drive's
-    first sample.
+    """Return a bank of filters (one per vehicle, computed together) in C, each in the state of the
+    drive's first sample.
     """
     rows = parameter_table([drive.vehicle] * vehicles)
     return kind(

@@ -249,8 +249,8 @@ class Cluster:
 
     @contextmanager
     def run_pods(self, bucket: BucketServer | None = None) -> Iterator[Cluster]:
-        """Start every pod for the block. Each probe succeeds before the block begins, and each pod
-        ends cleanly after it.
+        """Start every pod for the `with` block. Each probe succeeds before the block begins, and
+        each pod must end cleanly after it.
         """
         kept = cache_root()
         image = self.root / "image-cache"

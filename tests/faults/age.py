@@ -3,9 +3,9 @@ cost of a query about the past.
 
 20 million observations and 40 million states of six days are generated once and stored in
 `age-archive` next to the campaigns' folders. A service starts from Parquet files only, writes a
-checkpoint, and starts again from this checkpoint and the few later rows. Each start runs in a
-separate process, whose peak memory is measured. Finally a service starts twice more: from an
-archive of one day, and from this day plus the other days moved back by months. Both starts must
+checkpoint (saved state), and starts again from this checkpoint and the few later rows. Each start
+runs in a separate process, whose peak memory is measured. Finally a service starts twice more: from
+an archive of one day, and from this day plus the other days moved back by months. Both starts must
 cost the same, because expired days are not read.
 """
 

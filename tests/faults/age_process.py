@@ -1,8 +1,8 @@
 """`python -m tests.faults.age_process WHAT ARCHIVE`: one operation of a service in a separate
 process that measures itself.
 
-`ready` starts a service from the archive, `checkpoint` also writes a checkpoint, and `past` answers
-the query on stdin. The process prints its time [s] and its peak memory [MB].
+`ready` starts a service from the archive, `checkpoint` also writes a checkpoint (saved state), and
+`past` answers the query on stdin. The process prints its time [s] and its peak memory [MB].
 """
 
 from __future__ import annotations

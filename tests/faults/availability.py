@@ -183,8 +183,8 @@ def _loop_service_past(target: Target) -> Attack:
 
 @contextmanager
 def _loop_service(target: Target, query: str) -> Iterator[None]:
-    """Send a query to the service again and again during the `with` block, in LOOPS threads that
-    share one session.
+    """Send a query to the service again and again, in LOOPS threads that share one session, for the
+    duration of the `with` block.
     """
     session = open_session(ZenohSettings(connect=[target.endpoint]))
     assert session is not None
@@ -195,7 +195,7 @@ def _loop_service(target: Target, query: str) -> Iterator[None]:
 @contextmanager
 def _hold_connections(target: Target, *parts: bytes) -> Iterator[None]:
     """Open CONNECTIONS connections, and on each send the given parts and read a little of the
-    answer after each part. The connections stay open during the block.
+    answer after each part. The connections stay open during the `with` block.
     """
     with ExitStack() as stack:
         for _ in range(CONNECTIONS):
@@ -226,7 +226,7 @@ def _hold_unread_answers(target: Target) -> Attack:
 
 @contextmanager
 def _hold_streams(target: Target) -> Iterator[None]:
-    """Open event streams without reading them, and keep them open during the block."""
+    """Open event streams without reading them, and keep them open during the `with` block."""
     with ExitStack() as stack:
         for _ in range(STREAMS):
             one = HTTPConnection(target.host, target.port, PATIENCE_S, (ATTACKER, 0))

@@ -1,12 +1,12 @@
 """Campaign on an outage of an hour: the service is down while routers run and cars drive on; then
 the service returns with a limited rate.
 
-The cars' outboxes and the service's engine are real. Network and time are simulated, so that an
-hour takes a minute. The simulated service puts messages into a queue and drops those that do not
-fit. It acknowledges rows on disk twice a second. Its capacity is that of a service for a thousand
-cars, scaled to the number of cars: 20 batches a second and 20 places in the queue per car. Every
-second each car enters a cell that no car visited before. At the end all these cells must be on the
-map, the old ones as late reports.
+The cars' outboxes (stores of unacknowledged messages) and the service's engine (the service without
+its network) are real. Network and time are simulated, so that an hour takes a minute. The simulated
+service puts messages into a queue and drops those that do not fit. It acknowledges rows on disk
+twice a second. Its capacity is that of a service for a thousand cars, scaled to the number of cars:
+20 batches a second and 20 places in the queue per car. Every second each car enters a cell that no
+car visited before. At the end all these cells must be on the map, the old ones as late reports.
 """
 
 from __future__ import annotations
@@ -180,6 +180,6 @@ def _run_outage(site: Site, engine: Engine) -> list[Figure]:
 
 
 def _list_shown_cells(engine: Engine) -> set[int]:
-    """Return the cells on the map with at least one counted visit of a vehicle."""
+    """Return the map's cells with at least one counted visit (pass of a vehicle)."""
     fusion = engine.state.fusion
     return set(fusion.cell[fusion.live.visits[: fusion.size] > 0].tolist())

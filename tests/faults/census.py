@@ -1,4 +1,6 @@
-"""Comparison of the load generators' journals with the archive."""
+"""Comparison of the load generators' journals (lists of stored and acknowledged batches) with the
+archive.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,9 @@ class Census:
     """Counts of batches and rows after all load has ended.
 
     Attributes:
-        stored: batches that were committed to an outbox.
-        settled: number of these batches that an acknowledgement settled.
+        stored: number of batches that were committed to an outbox (store of unacknowledged
+            messages).
+        settled: number of these batches that an acknowledgement settled (made final).
         acknowledged_lost: settled batches of which a row is missing in the archive.
         lost: stored batches of which a row is missing, settled or not.
         doubled: rows that the archive contains more than once.
@@ -69,7 +72,9 @@ class Told(NamedTuple):
 
 
 def read_journals(journals: Iterable[Path]) -> Told:
-    """Return the content of the journals of all load generators."""
+    """Return the content of the journals (lists of stored and acknowledged batches) of all load
+    generators.
+    """
     out = Told({}, {})
     for journal in journals:
         for line in journal.read_text().splitlines():
@@ -85,7 +90,9 @@ def read_journals(journals: Iterable[Path]) -> Told:
 
 
 def compare_with_archive(journals: Iterable[Path], archive: Path) -> Census:
-    """Compare the load generators' journals with all rows of the archive, and return the counts."""
+    """Compare the load generators' journals (lists of stored and acknowledged batches) with all
+    rows of the archive, and return the counts.
+    """
     stored, settled = read_journals(journals)
     held, doubled, rows = _count_archived(archive, {name[:2] for name in stored})
     doubled = max(doubled, _doubled_outside(archive))
@@ -120,7 +127,8 @@ def _count_archived(
 
     Args:
         archive: folder of the archive.
-        starts: (vehicle, boot) of the batches to count.
+        starts: (vehicle, boot) of the batches to count; the boot identifies a start of the
+            vehicle's agent.
     """
     tables = list(reading.read_tables(archive, Kind.OBSERVATION, ROW))
     if not tables:

@@ -2,8 +2,9 @@
 or at its start. Meanwhile vehicles drive on, some of them on ice.
 
 The clock is the service's own, but it reads simulated clocks of the machine. Messages, engine,
-archive, checkpoint, retention and restart are real. In each case vehicles report ice, the clock
-jumps, the vehicles go on and send some batches again, and the service is restarted.
+archive, checkpoint (saved state), retention and restart are those of a real service. In each case
+vehicles report ice, the clock jumps, the vehicles go on and send some batches again, and the
+service is restarted.
 """
 
 from __future__ import annotations
@@ -184,8 +185,8 @@ def _make_message(vehicle: int, seq: int, at: int) -> Message:
 
 
 def _count_rows(root: Path) -> Counter[tuple[int, int]]:
-    """Return the number of archived rows per (boot, seq). The vehicle is not used, because its
-    pseudonym differs from month to month.
+    """Return the number of archived rows per boot (start of the vehicle's agent) and seq (number of
+    the batch). The vehicle is not used, because its pseudonym differs from month to month.
     """
     tables = list(reading.read_tables(root, Kind.OBSERVATION, ["boot", "seq"]))
     table = pa.concat_tables(tables)

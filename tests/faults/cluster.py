@@ -1,9 +1,10 @@
 """`python -m tests.faults.cluster [--failovers 100] [--out DIR] [--seed N]`: repeated failovers
 between services under load.
 
-The active service is killed, frozen or cut off, at random times, during a compaction, or during an
-upload. Some failovers have two standbys, and some services resume after a freeze. At the end each
-machine, and one that starts with an empty disk, must have all acknowledged rows exactly once.
+The active service is killed, frozen or cut off, at random times, during a compaction (sorting of
+new rows), or during an upload. Some failovers have two standbys (waiting services), and some
+services resume after a freeze. At the end each machine, and one that starts with an empty disk,
+must have all acknowledged rows exactly once.
 """
 
 from __future__ import annotations

@@ -272,7 +272,9 @@ class Failover(NamedTuple):
 
 
 class Machines:
-    """Machines of one region: one is active, some are standbys, the others are spare."""
+    """Machines of one region: one is active, some are standbys (they wait to take over), the others
+    are spare.
+    """
 
     def __init__(
         self,

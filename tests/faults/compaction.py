@@ -1,5 +1,5 @@
-"""Campaign of kill -9 during compaction, repeated while one thread writes to the log and another
-reads the archive.
+"""Campaign of kill -9 during compaction (sorting of the archive's new rows), repeated while one
+thread writes to the log and another reads the archive.
 
 `python -m tests.faults.compaction ARCHIVE` compacts in an endless loop of small rounds; the
 campaign kills this process at random moments.

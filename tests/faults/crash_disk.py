@@ -90,7 +90,9 @@ class CrashDisk:
 
     @contextmanager
     def intercept_calls(self) -> Iterator[None]:
-        """Redirect all file operations on the folder to the simulated disk inside the block."""
+        """Redirect all file operations on the folder to the simulated disk, for the duration of the
+        `with` block.
+        """
         calls: dict[str, Callable[..., Callable[..., object]]] = {
             "fsync": self._wrap_fsync,
             "rename": self._wrap_rename,

@@ -1,14 +1,16 @@
 """Campaign of histories on a disk with power loss: power lost at any operation, partly written
 data, a full disk.
 
-This module has thousands of histories of the log and its compaction. `crash_spool` has histories of
-the agent's outbox. `crash_service` has histories of a whole service with its keys, checkpoints,
-weather, retention and erasure.
+This module has thousands of histories of the segment log (writer of new rows) and its compaction
+(sorting). `crash_spool` has histories of the agent's outbox (store of unacknowledged messages).
+`crash_service` has histories of a whole service with its keys, checkpoints, weather, retention and
+erasure.
 
-A history of the log is a few lives of one archive. In each life batches are admitted, and segments
-are written and compacted. Then the power fails at a random operation, and the next life starts from
-the surviving files. Every acknowledged row must be present exactly once, and a batch may count as
-received only if it is present. In the last life every unacknowledged batch is sent again.
+A history of the log is a few lives of one archive. In each life (run of the program) batches are
+admitted, and segments (files of new rows) are written and compacted. Then the power fails at a
+random operation, and the next life starts from the surviving files. Every acknowledged row must be
+present exactly once, and a batch may count as received only if it is present. In the last life
+every unacknowledged batch is sent again.
 """
 
 from __future__ import annotations

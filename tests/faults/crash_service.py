@@ -1,12 +1,14 @@
-"""Histories of a whole service on a disk with power loss: keys, log, compaction, roll-ups,
-checkpoints, snapshots, weather, retention and erasure.
+"""Histories of a whole service on a disk with power loss. They include keys, log, compaction
+(sorting of rows), roll-ups (hourly statistics), checkpoints (saved states), map snapshots, weather,
+retention and erasure.
 
-A history is a few lives of one archive, days apart. In each life the engine receives batches and
-weather, and its maintenance jobs run in any order. Between two lives an operator may erase one
-vehicle's month or the whole month. The power fails at a random operation. The next life must find
-every acknowledged row exactly once, and all weather that was used. It must recognise a repeated
-batch if and only if the archive contains it. The map from a checkpoint and the log must equal the
-map from the log alone, no compacted file may be damaged, and erased rows must not come back.
+A history is a few lives (runs of the service) of one archive, days apart. In each life the engine
+receives batches and weather, and its maintenance jobs run in any order. Between two lives an
+operator may erase one vehicle's month or the whole month. The power fails at a random operation.
+The next life must find every acknowledged row exactly once, and all weather that was used. It must
+recognise a repeated batch if and only if the archive contains it. The map from a checkpoint and the
+log must equal the map from the log alone, no compacted file may be damaged, and erased rows must
+not come back.
 """
 
 from __future__ import annotations

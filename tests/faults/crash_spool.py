@@ -1,4 +1,5 @@
-"""Histories of the agent's outbox: power lost at any byte that SQLite had not yet synced.
+"""Histories of the agent's outbox (store of unacknowledged messages): power lost at any byte that
+SQLite had not yet synced.
 
 SQLite writes its files itself, so the files are read before and after each commit. When a commit
 has returned, its bytes are synced. Power loss during the next commit leaves the old files with a

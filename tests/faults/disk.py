@@ -5,8 +5,8 @@ If this process may mount, the file system is a real tmpfs of some megabytes. Ot
 call by which log, maintenance jobs and outbox create or rename a file fails with ENOSPC. While the
 disk is full, only stored rows may be acknowledged, and jobs must still be tried. When there is
 space again, everything must be acknowledged and nothing may hang. Finally the disk is full with
-days that retention would remove, but whose roll-ups must be computed first: the reserved space must
-be enough for them.
+days that retention would remove, but whose roll-ups (hourly statistics) must be computed first: the
+reserved space must be enough for them.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ STUCK_S: Final = 60.0
 
 @contextmanager
 def small_disk(folder: Path) -> Iterator[bool]:
-    """Mount a small file system at a folder during the block. Yield False if this process may not
-    mount.
+    """Mount a small file system at a folder during the `with` block. Yield False if this process
+    may not mount.
     """
     folder.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", f"size={SIZE_MB}m", "tmpfs", str(folder)]
@@ -71,8 +71,8 @@ def small_disk(folder: Path) -> Iterator[bool]:
 
 @contextmanager
 def fill_disk(folder: Path, mounted: bool) -> Iterator[None]:
-    """Fill the disk for the duration of the block. If no small disk is mounted, let all system
-    calls that write fail as on a full disk.
+    """Fill the disk for the duration of the `with` block. If no small disk is mounted, let all
+    system calls that write fail as on a full disk.
     """
     if mounted:
         ballast = folder / "ballast"
@@ -91,7 +91,9 @@ def fill_disk(folder: Path, mounted: bool) -> Iterator[None]:
 
 @contextmanager
 def _refuse_writes(*names: str) -> Iterator[None]:
-    """Let the named functions of `os` fail as on a full disk, for the duration of the block."""
+    """Let the named functions of `os` fail as on a full disk, for the duration of the `with` block.
+    The functions work again afterwards.
+    """
 
     def refuse(*_: object, **__: object) -> object:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -2,8 +2,9 @@
 the others and on the map.
 
 Its reports are true, so the flooding vehicle should count like a vehicle that sends once a second.
-The resulting map is compared with a reference map. An engine without a network makes the reference
-from the same batches of the honest vehicles and one report per second of the flooding vehicle.
+The resulting map is compared with a reference map. An engine (service without network) makes the
+reference from the same batches of the honest vehicles and one report per second of the flooding
+vehicle.
 """
 
 from __future__ import annotations
@@ -52,8 +53,8 @@ def list_places() -> list[tuple[int, float, float]]:
 
 
 def make_visit(name: str, seq: int, now: int) -> Batch:
-    """Return a batch with one visit to a cell. Over successive sequence numbers, the vehicle drives
-    along the road repeatedly.
+    """Return a batch with one visit (pass through a cell). Over successive sequence numbers, the
+    vehicle drives along the road repeatedly.
     """
     cell, latitude, longitude = list_places()[(seq + hash_of(name)) % CELLS]
     mu = FLOODED_MU if name == FLOODER else 0.75 + 0.01 * (hash_of(name) % 10)

@@ -1,5 +1,5 @@
-"""Campaign of malformed messages and queries among honest ones, through the whole engine:
-admission, fusion, archive, answers.
+"""Campaign of malformed messages and queries among honest ones, through the whole engine (service
+without network): admission, fusion, archive, answers.
 
 The check is independent of the service's own rules. It reads the archive: every value must be
 finite or absent and within the physical limits of its unit, and every honest row must be present
@@ -78,8 +78,8 @@ NEEDED: Final = {"latitude", "longitude"}
 
 
 def run(site: Site) -> list[Figure]:
-    """Let the engine process a million malformed messages (in a quick run, some thousands), and
-    return the figures.
+    """Let the engine (service without network) process a million malformed messages (in a quick
+    run, some thousands), and return the figures.
     """
     count = site.choose_amount(1_000_000, 10_000)
     began = time.time_ns()

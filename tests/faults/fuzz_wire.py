@@ -1,10 +1,11 @@
 """Campaign of malformed messages, weather, queries and acknowledgements through a real router, to a
 service and vehicles.
 
-Campaign `fuzz` passes its inputs directly to the engine. Here the inputs pass through the whole
-system: Zenoh's threads, the bounded queue, rate limits of vehicles, queryables, and the worker.
-Meanwhile vehicles report through the agent's publisher and outbox. The acknowledgements sent here
-are all undecodable; certificates protect against forged ones (campaign `security`).
+Campaign `fuzz` passes its inputs directly to the engine (service without network). Here the inputs
+pass through the whole system: Zenoh's threads, the bounded queue, rate limits of vehicles, handlers
+of queries, and the worker (thread that processes messages). Meanwhile vehicles report through the
+agent's publisher and outbox. The acknowledgements sent here are all undecodable; certificates
+protect against forged ones (campaign `security`).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ once, under load.
 The kills run in rounds, each with its own archive, so that a restarted service has to read back
 minutes and not hours. The archive also has old rows, which a retention process removes meanwhile;
 this process is killed too. At the end of a round everything runs until all batches are settled.
-Then the archive is compared with the journals.
+Then the archive is compared with the agents' journals (lists of stored and acknowledged batches).
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ RETIRING_KILLED: Final = 0.5
 
 
 class Load(NamedTuple):
-    """Load during the kills: number of observations, duration [s], and whether retention removed a
-    day meanwhile.
+    """Load during the kills: number of observations, duration [s], and True if retention (deletion
+    of old rows) removed a day meanwhile.
     """
 
     observations: int
@@ -147,7 +147,8 @@ def old_days(archive: Path) -> list[Path]:
 
 def _find_finished_jobs(archive: Path) -> frozenset[str]:
     """Return the names of the background jobs that have left results, which shows that they ran
-    during the kills. The old rows were compacted before.
+    during the kills. Compaction (sorting) of the old rows does not count, because it happened
+    before.
     """
     old = old_days(archive)
     compacted = (file.parents[1] not in old for file in archive.glob("observations/*/*/*.parquet"))
@@ -184,7 +185,8 @@ def _run_round(
     """Run one round of kills. Return the counts of batches and rows (census), and the load from the
     start of all processes until the end.
 
-    The kills go on, up to three times as many, until compaction and checkpoints have left results.
+    The kills go on, up to three times as many, until the service has compacted (sorted) rows and
+    written a checkpoint (saved state).
     """
     for number in range(agents):
         there.make_load([f"sim-{number:03}"], RATE, seed=number).start()

@@ -17,8 +17,8 @@ from tests.faults.lease_histories import ServiceHistory, judge_history
 
 
 class Judged(NamedTuple):
-    """Sums over all simulated lease histories: violations (broken promises), failovers,
-    acknowledgements, and refused starts.
+    """Sums over all simulated histories of a lease (exclusive ownership of an archive): violations
+    (broken promises), failovers, acknowledgements, and refused starts.
     """
 
     acknowledged_by_two: int
@@ -29,8 +29,8 @@ class Judged(NamedTuple):
 
 
 def judge_seeds(seeds: Iterable[int]) -> Judged:
-    """Simulate services that compete for a lease, once per seed; check each run, and return the
-    sums of the results.
+    """Simulate services that compete for a lease (exclusive ownership of an archive), once per
+    seed; check each run, and return the sums of the results.
     """
     counts = [0] * len(Judged._fields)
     for seed in seeds:
@@ -50,16 +50,16 @@ def judge_seeds(seeds: Iterable[int]) -> Judged:
 
 
 def judge_without_comparison(seeds: Iterable[int]) -> Judged:
-    """Check simulated histories of a broken lease protocol: services do not compare their lease
-    times.
+    """Check simulated histories of a deliberately broken lease protocol, in which services do not
+    compare their lease times.
     """
     with patch.object(lease_module, "_check_settings", lambda *_: None):
         return judge_seeds(seeds)
 
 
 def judge_without_expiry(seeds: Iterable[int]) -> Judged:
-    """Check simulated histories of a broken lease protocol: a holder acknowledges until it notices
-    its successor.
+    """Check simulated histories of a deliberately broken lease protocol, in which a holder
+    acknowledges until it notices its successor.
     """
     fresh = property(lambda lease: not lease.lost)
     with patch.object(Lease, "may_acknowledge", fresh):
@@ -67,8 +67,8 @@ def judge_without_expiry(seeds: Iterable[int]) -> Judged:
 
 
 def run(site: Site) -> list[Figure]:
-    """Check simulated histories of the real lease protocol, and of two broken protocols in which
-    violations must be found; return the figures.
+    """Check simulated histories of the real lease protocol (exclusive ownership of an archive), and
+    of two broken protocols in which violations must be found; return the figures.
     """
     first = 1000 * site.seed
     judged = judge_seeds(range(first, first + site.choose_amount(200, 12)))

@@ -1,10 +1,10 @@
 """Simulated histories (sequences of events) of services that share an archive, in virtual time, and
 a checker of these histories.
 
-The product's `Lease` runs unchanged on a bucket in memory. Every process has its own clock rate,
-wall clock and lease time. Processes are killed, frozen, cut off from the bucket, and lose their
-token. Requests are slow, and some take effect after the client gave up. All events follow from a
-seed.
+The product's `Lease` (exclusive ownership of the archive) runs unchanged on a bucket in memory.
+Every process has its own clock rate, wall clock and lease time. Processes are killed, frozen, cut
+off from the bucket, and lose their token. Requests are slow, and some take effect after the client
+gave up. All events follow from a seed.
 
 A history records the life of every batch: uploaded by a service, acknowledged, known to each later
 owner when it begins to serve, and counted by a reader at the end.
@@ -50,8 +50,8 @@ class Event(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """Result of the check of a simulated history: acknowledgements by two lease holders for one
-    archive, and violations of the promises to agents.
+    """Result of the check of a simulated history: number of acknowledgements by an earlier holder
+    of the lease after its successor began to serve, and violations of the promises to agents.
     """
 
     acknowledged_by_two: int

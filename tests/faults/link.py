@@ -219,7 +219,7 @@ def write_line(process: subprocess.Popen[str], line: str) -> None:
 
 @contextmanager
 def open_namespaces(folder: Path) -> Iterator[Namespaces]:
-    """Yield network namespaces, which are removed after the block."""
+    """Yield network namespaces, which are removed after the `with` block."""
     folder.mkdir(parents=True)
     with ExitStack() as stack:
         yield Namespaces(folder, stack)

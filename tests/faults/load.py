@@ -1,5 +1,6 @@
-"""Load generator: observations of synthetic visits through the agent's real publisher and outbox,
-with a journal of stored and settled batches.
+"""Load generator. It sends observations of synthetic visits (passes through map cells) through the
+agent's real publisher and outbox, and writes a journal of stored and settled (finally answered)
+batches.
 
 `python -m tests.faults.load FILE` reads the fields of `Plan` from a JSON file. The journal is the
 standard output: one line per batch that was committed to the outbox, and one per batch that an
@@ -52,8 +53,8 @@ class Plan:
 
 
 def print_events(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
-    """Print a line for each batch: `sign vehicle boot kind region seq records time`. The sign is
-    `+` for a batch on disk and `-` for a settled (finally answered) batch.
+    """Print a line for each batch to the journal: `sign vehicle boot kind region seq records time`.
+    The sign is `+` for a batch on disk and `-` for a settled (finally answered) batch.
     """
     at = f"{time.time():.3f}"
     for stream, seq, records in events:
@@ -84,7 +85,9 @@ class WatchedOutbox(Outbox):
 def make_visits(
     rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: int
 ) -> RecordBlock:
-    """Return one synthetic visit per element of `vehicle` (n,), all ending at `now` [ns]."""
+    """Return one synthetic visit (pass through a map cell) per element of `vehicle` (n,), all
+    ending at `now` [ns].
+    """
     n = len(vehicle)
     columns: Columns = {}
     for name, dtype in column_types(Kind.OBSERVATION).items():
@@ -137,7 +140,7 @@ def _set_events(*events: threading.Event) -> None:
 
 
 def main(path: str) -> int:
-    """Run one load generator until it is told to end."""
+    """Run one load generator until a signal ends it."""
     plan = Plan(**json.loads(Path(path).read_text()))
     quiet = threading.Event()
     leave = threading.Event()

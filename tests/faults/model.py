@@ -1,10 +1,11 @@
-"""Campaign that checks the model of acknowledgement, lease, takeover, hand-over and erasure
-(`protocol_model.py`) exhaustively: the model checker visits every reachable state within a bound on
-the numbers of leases and renewals.
+"""Campaign that checks the protocol model in `protocol_model.py`: acknowledgement, lease (exclusive
+ownership of the archive), takeover, hand-over and erasure. The model checker visits every reachable
+state up to a maximum number of leases and renewals.
 
 The whole protocol must break no invariant. Then one rule at a time is switched off (the protocols
-in BROKEN), for example the fence, or the limit of half a lease for acknowledgements. Each of these
-protocols must break an invariant, which shows that the checker can find errors.
+in BROKEN), for example the fence (list of the former owner's valid files), or the limit of half a
+lease for acknowledgements. Each of these protocols must break an invariant, which shows that the
+checker can find errors.
 """
 
 from __future__ import annotations

@@ -21,8 +21,8 @@ DRAIN_S: Final = 60.0
 
 
 def router_down(site: Site) -> list[Figure]:
-    """Kill the router for a minute. Every report of that minute must be settled soon after the
-    router's return.
+    """Kill the router for a minute. Every report of that minute must be settled (finally answered)
+    soon after the router's return.
     """
     down_s = site.choose_amount(60, 4)
     with open_stage(site.folder) as there:

@@ -2,10 +2,10 @@
 vehicles that report ice on roads where nobody else drives.
 
 Teleports: cars that drive honestly also report one distant place. It is in the same batch or in
-another batch, boot or region, before or after their other reports, or reached in short leaps.
-Whether a report is impossible follows from its distance to the car's own path. Two cars: they
-report ice at 210 places along 400 km, either in leaps, or later as a backlog, or live at a
-plausible 65 m/s.
+another batch, under another boot (start of the agent) or region, before or after their other
+reports, or reached in short leaps. Whether a report is impossible follows from its distance to the
+car's own path. Two cars: they report ice at 210 places along 400 km, either in leaps, or later as a
+backlog, or live at a plausible 65 m/s.
 """
 
 from __future__ import annotations

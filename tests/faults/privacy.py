@@ -8,8 +8,8 @@ counts changed most, as the place of the car. From the first such places it take
 as the car's street. A reader that sees no change guesses at random; such a guess counts by its
 probability of being right.
 
-As a control, a map that shows every visit at once is also tested. There the reader must find the
-car.
+As a control, a map that shows every visit (pass through a cell) at once is also tested. There the
+reader must find the car.
 """
 
 from __future__ import annotations

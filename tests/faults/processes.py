@@ -168,7 +168,7 @@ class Stage:
 
     @property
     def journals(self) -> list[Path]:
-        """Return the paths of the load generators' journals of stored and settled (finally
+        """Return the paths of the load generators' journals, which list stored and settled (finally
         answered) batches.
         """
         return [part.log for part in self.loads]
@@ -178,7 +178,7 @@ class Stage:
         (finally answered).
 
         The wait ends early if no batch is settled for `patience_s`. Batches left in an outbox are
-        then missing in the archive, and the census counts them.
+        then missing in the archive; the comparison with the archive counts them.
         """
         for part in self.loads:
             part.line_with("ready: ")  # before, the signal would end it
@@ -203,7 +203,7 @@ class Stage:
 @contextmanager
 def open_stage(folder: Path, **service: object) -> Iterator[Stage]:
     """Yield a running router and service (`Stage`) when the service is ready. Every process is
-    ended after the block.
+    ended after the `with` block.
     """
     there = Stage(folder, **service)
     try:

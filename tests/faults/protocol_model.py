@@ -1,5 +1,5 @@
-"""Explicit-state model of acknowledgement, lease, takeover, hand-over and erasure; `explore_states`
-visits every reachable state.
+"""Explicit-state model of acknowledgement, lease (exclusive ownership of an archive), takeover,
+hand-over and erasure; `explore_states` visits every reachable state.
 
 Two services share a bucket; a vehicle has BATCHES. Time passes in ticks. In each tick a service's
 clock advances by one, but the clock of a lease holder may stand still in every second tick. No step
@@ -101,9 +101,11 @@ class World(NamedTuple):
 
     Attributes:
         services: states of both services.
-        number, holder, turn, released: the newest lease object.
+        number, holder, turn, released: content of the newest lease object in the bucket; turn
+            counts its renewals.
         objects: (batch, number) of each object in the bucket.
-        fence: (number, older objects that count).
+        fence: lease number of the owner that wrote the fence, and the older objects that count for
+            it.
         acked: batches that were acknowledged to the vehicle as durable.
         erased: batches that were erased.
     """

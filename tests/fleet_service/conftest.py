@@ -55,7 +55,7 @@ def session(router: ZenohSettings) -> Iterator[zenoh.Session]:
 
 @contextmanager
 def running(router: ZenohSettings, root: Path, **changed: object) -> Iterator[Running]:
-    """Yield a running service on an archive, and stop it after the block."""
+    """Yield a running service on an archive, and stop it after the `with` block."""
     config = ServiceConfig(
         zenoh=router,
         put_s=PUT_S,

@@ -28,8 +28,8 @@ Numbers: TypeAlias = Sequence[float] | NDArray[np.floating[Any]] | NDArray[np.in
 
 
 def value(mu: Numbers, std: float = STD) -> FloatArray:
-    """Return log-likelihoods (n, 32) of visits that measured the friction `mu` (n,) with standard
-    deviation `std`.
+    """Return log-likelihoods (n, 32) of visits (passages of a cell) that measured the friction `mu`
+    (n,) with standard deviation `std`.
     """
     return np.asarray(-0.5 * np.square((mugrid.CENTRES - np.asarray(mu, float)[:, None]) / std))
 

@@ -67,10 +67,11 @@ class KnownIce:
 
     Args:
         folder: folder for the archive and the outputs.
-        is_older: True for a map in the form of older versions, in which `unvalued` are bounds.
+        is_older: True for a map in the form of older versions, in which the places `unvalued` have
+            only a lower bound of friction.
 
     Attributes:
-        archive: folder of the archive, with a snapshot of the map.
+        archive: folder of the archive, with a stored map (snapshot).
         table: the map, in the schema of an answer.
         places: cells and headings with P(slippery) above KNOWN, computed from the beliefs.
         unvalued: those of `places` for which no vehicle reported a value of its own.
@@ -139,7 +140,7 @@ def _key(row: dict[str, Any]) -> tuple[int, int]:
 
 def _hidden_rows(ice: KnownIce, rows: list[dict[str, Any]]) -> Places:
     """Return the known slippery places that the rows of an output hide: they have no row, no μ, or
-    the basis `bound`.
+    the basis (kind of evidence) `bound`.
     """
     shown = {
         _key(row)

@@ -10,8 +10,8 @@ An approach starts on road that is not slippery; a car that drives from snow ont
 slippery road. A warning is in time if the car could stop before the stretch from the place of the
 warning, and if the warning is still active on arrival. Stopping takes 1.5 s of reaction, then
 braking with the true friction of the road before the stretch, at most with 3 m/s². A warning is
-false if nothing within a lane's width of the path that the car then drove is slippery, because no
-map cell is finer.
+false if nothing slippery lies within a lane's width of the path that the car then drove. The limit
+is not narrower, because the map's cells are not finer than a lane.
 """
 
 from __future__ import annotations

@@ -39,7 +39,9 @@ CENTRE: Final = Pose(57.70, 11.97, 0.0, SPEED, 1_800_000_000 * NS)
 
 
 def street_places() -> IntArray:
-    """Return the keys (cell·4 + sector) of all places on the city's streets, (n,), sorted."""
+    """Return the sorted keys (cell·4 + heading sector), (n,), of all map places on the city's
+    streets.
+    """
     side = np.arange(0.0, BLOCK_M * BLOCKS, 4.0)
     line = np.arange(0.0, BLOCK_M * (BLOCKS + 1), BLOCK_M)
     found = []

@@ -58,7 +58,7 @@ class FilterTrace:
 def entry_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
     """Return the figures over all towns: the error when a vehicle enters a cell and the delay
     caused by a wrong map, each as the value with the map divided by the value without it; and the
-    largest change of a published value.
+    largest change of a published likelihood that the map causes.
     """
     errors: list[FloatArray] = []
     delays: dict[str, list[tuple[float, float]]] = {"dry": [], "ice": []}
@@ -171,7 +171,7 @@ def arrival_times(
 
 def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) -> float:
     """Return the largest change [nat] of a published likelihood of friction that a completely wrong
-    map causes. The expected value is 0.
+    map causes. It must be 0, because the map never enters a published report.
     """
     seed = int(fleet.scenario.name.split("-")[1])
     again = SimulatedFleet(fleet.scenario, len(fleet.vehicles), seed, RATE_HZ, rough=0.5)

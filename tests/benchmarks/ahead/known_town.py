@@ -20,8 +20,8 @@ SPREAD = 0.06  # standard deviation of what the map says of a cell, and of how f
 
 
 class KnownPlaces(NamedTuple):
-    """Map places (cells with heading sector) that lanes lead through, each once, (n,): key (cell·4
-    + sector), and smallest true friction.
+    """Map places (cells with heading sector) through which the lanes of a scenario lead, each once,
+    (n,): key (cell·4 + sector), and smallest true friction.
     """
 
     key: IntArray

@@ -1,11 +1,12 @@
 """Country made of copies of one town: positions of its vehicles, and the reports of each over time.
 
-    regions    17, 17 and 16 in three zones side by side, one service per zone
+    regions    17, 17 and 16 in three zones (map squares of zoom 7) side by side, one service per
+               zone
     towns      four in a region; regions have different sizes, proportional to 1/sqrt(rank)
     vehicles   each repeats a part of the drive of one vehicle of the city, shifted by whole tiles;
                vehicles of one town with the same drive are spread evenly over it
-    reports    each vehicle sends ROWS visits every PERIOD_S, and these visits last PERIOD_S, as in
-               slow traffic
+    reports    each vehicle sends ROWS visits (passes through map cells) every PERIOD_S, and these
+               visits last PERIOD_S, as in slow traffic
 
 The sender and the observer compute the same country independently, from the seed and the city's
 observations.
@@ -96,12 +97,16 @@ class Country:
                 self.begin[same] = np.arange(len(same)) * len(self.drives[one]) // len(same)
 
     def _locate_region(self, zone: int, k: int) -> tuple[int, int]:
-        """Return column and row, in the world's grid of regions, of region k of a zone."""
+        """Return column and row, in the world's grid of regions, of region k of a zone (map square
+        that one service serves).
+        """
         zone_x, zone_y = (int(side[0]) for side in self._home)
         return (zone_x + zone - 1) * _REGIONS + k % _REGIONS, zone_y * _REGIONS + 2 + k // _REGIONS
 
     def list_expressions(self) -> list[str]:
-        """Return the regions of each service as key expressions of zones."""
+        """Return, for each service, the Zenoh key expression of the regions that it serves: those
+        of one zone.
+        """
         first = [sum(ZONES[:zone]) for zone in range(len(ZONES))]
         parts = [keys.chunks(int(self.region_id(k)), grid.REGION_ZOOM).split("/") for k in first]
         return ["/".join((*part[:2], "*")) for part in parts]

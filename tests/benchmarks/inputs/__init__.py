@@ -1,1 +1,3 @@
-"""Evaluation of the inputs: readers, signal doctor, calibration, and live sources."""
+"""Evaluation of the inputs: readers of files, signal doctor (a check of recorded signals),
+calibration, and live sources.
+"""

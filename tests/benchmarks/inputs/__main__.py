@@ -1,5 +1,5 @@
-"""`python -m tests.benchmarks.inputs [--out DIR] [--recorded LOG] [--quick]`: evaluate readers,
-signal doctor, calibration and live sources.
+"""`python -m tests.benchmarks.inputs [--out DIR] [--recorded LOG] [--quick]`: evaluate readers of
+files, signal doctor (a check of recorded signals), calibration and live sources.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Test of the signal doctor: recording faults are added to simulated drives, and the doctor must
-find and name them.
+"""Test of the signal doctor, a check of recorded signals: recording faults are added to simulated
+drives, and the doctor must find and name them.
 
 The sizes of the faults are those seen in imported third-party logs: units, signs, offsets, a clock
 0.4 s off, status bits in a wheel speed, exchanged columns, and a vehicle file with another tyre
@@ -203,8 +203,8 @@ def drives(
 
 
 def doctor_verdict(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
-    """Return two booleans: whether the signal doctor names the fault, and whether it finds the
-    drive free of faults.
+    """Return two booleans: True if the signal doctor (a check of recorded signals) names the fault,
+    and True if it finds the drive free of faults.
     """
     diagnosis = diagnose(*planted.spoil(drive))
     found = {(finding.channel, finding.kind) for finding in diagnosis.findings}
@@ -216,7 +216,8 @@ def figures(count: int, seed: int) -> list[Figure]:
     """Return two shares for accurate and inaccurate cars: added faults that the signal doctor
     finds, and drives that it declares free of faults.
 
-    Drives without a fault show the false alarms. The same shares are measured in a winter town.
+    The second share, on drives without a fault, shows the false alarms. The same shares are
+    measured in a winter town.
     """
     cars = [*drives(count, seed, rough=False), *drives(count, seed + 1, rough=True)]
     cold = [

@@ -119,7 +119,9 @@ def _alerted(
 def _own_report(
     name: str, seq: int, now: int, place: tuple[float, float], friction: dict[str, float]
 ) -> tuple[str, bytes]:
-    """Return key and JSON of a vehicle's six visits at one place, heading north."""
+    """Return key and JSON of a vehicle's six visits to one place (passes through its map cell),
+    heading north.
+    """
     visits = 6
     region = int(grid.region_of(int(grid.cell_of(*place))))
     values = {"latitude": place[0], "longitude": place[1], "yaw": np.pi / 2, **friction}

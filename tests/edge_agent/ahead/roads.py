@@ -34,8 +34,8 @@ def line(
 
 
 def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) -> IntArray:
-    """Return the keys (cell · 4 + sector) along the road that `line` returns, (n,), in order, each
-    once.
+    """Return the keys (cell · 4 + heading sector), (n,), along the road that `line` returns, each
+    once and in driving order.
     """
     key = grid.cell_of(*line(length, yaw, start)) * grid.SECTORS + int(grid.sector_of(yaw))
     return key[np.sort(np.unique(key, return_index=True)[1])]
@@ -71,7 +71,7 @@ def make_local_map(parts: list[ReceivedCells]) -> LocalMap:
 
 
 def alert(key: int, *, raised: bool = True, time: int = NOW) -> Alert:
-    """Return an ice alert for a key (cell · 4 + sector)."""
+    """Return an alert of ice for a map place, given as key (cell · 4 + heading sector)."""
     cell, sector = divmod(int(key), grid.SECTORS)
     latitude, longitude = grid.centre(cell)
     return Alert(

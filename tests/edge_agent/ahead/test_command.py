@@ -23,7 +23,7 @@ WORDS = ["run", "--scenario", "test", "--estimator", "ckf", "--name", "car-one",
 
 
 def everywhere_slippery(now: int) -> list[Alert]:
-    """Return active ice alerts for every cell on the triangular course of the simulated car."""
+    """Return active ice alerts for every map cell on the triangular course of the simulated car."""
     scenario = scenario_named("test")
     x, y = np.meshgrid(np.arange(-15.0, 130.0, 5.0), np.arange(-15.0, 105.0, 5.0))
     cells = np.unique(grid.cell_of(*scenario.to_latlon(x.ravel(), y.ravel())))

@@ -116,7 +116,7 @@ def test_one_vehicle_alone_warns_nobody() -> None:
 
 def test_alert_over_a_mere_bound_is_exported_with_its_own_grip() -> None:
     """The map's knowledge of ice may fade until only a lower bound of friction is left, while the
-    alert is still active. The warning must then have the friction stated by the alert.
+    alert is still active. The warning must then state the friction of the alert.
     """
     cache = make_local_map([cells(icy(), 0.1, basis=BOUND)])
     for key in icy():

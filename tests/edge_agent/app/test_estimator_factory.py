@@ -1,5 +1,5 @@
-"""Tests of the function that creates an estimator bank by name, and of the memberships (parameters
-of fuzzy sets) that it uses.
+"""Tests of the function that creates an estimator bank (filters of N vehicles) by name, and of the
+memberships (parameters of fuzzy sets) that it uses.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the agent's shared library of compiled kernels, and tests of which modules an agent
-loads.
+"""Tests of the agent's shared library of kernels (compiled functions), and tests of which modules
+an agent loads.
 """
 
 from __future__ import annotations

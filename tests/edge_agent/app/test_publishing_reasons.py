@@ -23,7 +23,7 @@ REFUSED = Counts(rejected={Kind.OBSERVATION: 3})
 
 @dataclass
 class State:
-    """Status of a publisher that the test sets."""
+    """Simulated publisher status; the test sets its fields."""
 
     links: int = 1
     cut_off: bool = False

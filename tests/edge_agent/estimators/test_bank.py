@@ -1,4 +1,4 @@
-"""Tests of properties that every estimator of the bank must have: outputs depend on past samples
+"""Tests of properties that every available estimator must have: outputs depend on past samples
 only, are bit-equal for any division of the samples into calls, have wide intervals without
 excitation, and contain no NaN.
 """

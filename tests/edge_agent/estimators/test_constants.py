@@ -296,8 +296,8 @@ def summarize_reports(estimates: Estimates) -> dict[str, float]:
 
 def inside(filters: np.ndarray) -> dict[str, float]:
     """Return figures of the filter's internal states over one drive, by name. They include
-    probabilities of the friction nodes, penalties of the nodes, means and standard deviations of
-    the states, and strain (misfit of the vehicle model).
+    probabilities and penalties of the nodes (filters of one friction hypothesis each), means and
+    standard deviations of the states, and strain (misfit of the vehicle model).
     """
     weight = filters["weight"]
     split = filters["split"]

@@ -1,5 +1,5 @@
-"""Tests of novelty: whether the force or the lateral slip in a block of samples differs from its
-usual value.
+"""Tests of novelty: the degree to which the force or the lateral slip in a block (some samples)
+differs from its usual value.
 """
 
 from __future__ import annotations

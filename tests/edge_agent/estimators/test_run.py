@@ -1,4 +1,6 @@
-"""Test of the shared loop of the papers' filters: it is compiled once for all processes."""
+"""Test of the shared loop of the papers' filters: a process must reuse the machine code that an
+earlier process compiled.
+"""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def find_told_interval(
     """Return lower end, median and upper end of the interval reported for a belief.
 
     Args:
-        weight: probabilities of the friction nodes.
+        weight: probabilities of the nodes (friction hypotheses).
         patch: probability of an ice patch.
         likeness: degree (0 to 1) to which the car agrees with its vehicle file.
     """

@@ -73,8 +73,8 @@ def test_any_split_of_the_samples_gives_the_same_records(seed: int) -> None:
 
 
 def test_an_observation_tells_its_visit() -> None:
-    """The observation of a visit must have its times, pose and speed, and the friction at its end.
-    A car drives east through three cells at 10 m/s.
+    """A car drives east through three cells at 10 m/s. The observation of each visit (pass through
+    a cell) must have the times, pose and speed of the visit, and the friction estimated at its end.
     """
     samples = 25
     east = np.arange(samples)[:, None] * 1.0
@@ -300,8 +300,9 @@ def test_without_position_there_is_no_state() -> None:
 
 
 def test_observation_contains_controller_flags_and_context_of_its_visit() -> None:
-    """The observation of a visit must contain the ABS flag and the context read during this visit,
-    and "unknown" where there was hardly any reading. A car drives east through cells at 10 m/s.
+    """A car drives east through cells at 10 m/s. The observation of each visit (pass through a
+    cell) must contain the ABS flag and the context (controllers, temperature, wipers) read during
+    the visit, and "unknown" where there was hardly any reading.
     """
     samples = 40
     east = np.arange(samples)[:, None] * 1.0

@@ -1,5 +1,6 @@
-"""Tests of the outbox: consecutive numbers, storage on disk first, settlement (removal after an
-answer) by ranges, retries at growing intervals, a size limit, and use by one agent only.
+"""Tests of the outbox, the agent's store of unacknowledged messages: consecutive numbers, storage
+on disk first, settlement (removal after an answer) by ranges, retries at growing intervals, a size
+limit, and use by one agent only.
 """
 
 from __future__ import annotations
@@ -148,8 +149,8 @@ def test_unsettled_batches_are_resent_oldest_first_at_growing_intervals(path: Pa
 
 
 def silence_route(outbox: Outbox, now: float = 0.0) -> float:
-    """Store batches (messages) that no service answers, until the outbox regards the route as
-    silent; return the simulated time [s] at that moment.
+    """Store batches (messages) that no service answers, until the outbox (store of unacknowledged
+    messages) regards the route as silent. Return the simulated time [s] at that moment.
     """
     outbox.store([draft()], now)
     while outbox.store([draft()], now)[0].fresh:

@@ -1,5 +1,5 @@
 """Tests of the publisher on real sessions: every record arrives once under its vehicle's name and
-is settled by an answer.
+is settled (removed from the outbox) by an answer.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of a damaged outbox file: it is renamed and counted, its readable batches are recovered,
-and the agent continues.
+"""Tests of a damaged outbox file (the agent's store of unacknowledged messages): it is renamed and
+counted, its readable batches are recovered, and the agent continues.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ BATCHES = 120
 
 
 def store_batches(path: Path) -> dict[int, bytes]:
-    """Store some hundred batches in an outbox on disk, and return their payloads by sequence
-    number.
+    """Store some hundred batches in an outbox (store of unacknowledged messages) on disk, and
+    return their payloads by sequence number.
     """
     random_ = random.Random(7)
     payloads = [random_.randbytes(random_.choice((60, 190, 900))) for _ in range(BATCHES)]

@@ -45,7 +45,7 @@ def find_visited(fusion: Fusion) -> IntArray:
 
 @pytest.fixture(scope="session")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return an archive with compacted (sorted) rows and a snapshot of the map every twelve
+    """Return an archive with compacted (sorted) rows and a stored map (snapshot) every twelve
     hours.
     """
     root = tmp_path_factory.mktemp("analytics") / "archive"

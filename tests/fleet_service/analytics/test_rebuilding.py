@@ -1,5 +1,5 @@
 """Tests that a map rebuilt zone by zone (in squares of zoom 7) equals a replay of the whole
-archive, and that its roll-ups equal the stored ones.
+archive, and that its roll-ups (hourly statistics) equal the stored ones.
 """
 
 from __future__ import annotations

@@ -171,7 +171,7 @@ def service(
     router: ZenohSettings, folder: Path, bucket: BucketServer
 ) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
     """Yield a service process with a bucket copy that is ready, and the address of its health page.
-    The process is ended after the block.
+    The process is ended after the `with` block.
     """
     config = folder / "service.json"
     archive = {"path": str(folder / "archive"), **bucket.settings}
@@ -206,7 +206,7 @@ def health(address: str) -> str:
 
 def drive(fleet: Fleet, sent: list[Batch]) -> bool:
     """Send those of the batches `sent` again that are not acknowledged yet, as a vehicle's outbox
-    does. Return True if all batches are acknowledged.
+    (store of unacknowledged messages) does. Return True if all batches are acknowledged.
     """
     for one in fleet.list_unsettled(sent)[:20]:
         fleet.publish(one)

@@ -46,8 +46,8 @@ MONTH = f"{datetime.now(UTC):%Y-%m}"
 
 
 def sent_by(vehicle: str, seq: int) -> Batch:
-    """Return a batch with two visits: one where all vehicles drive, and one where only the vehicle
-    to erase drives.
+    """Return a batch with two visits (passes through cells): one where all vehicles drive, and one
+    where only the vehicle that the test erases drives.
     """
     now = time.time_ns() - SECOND
     latitude = np.array([LATITUDE, ALONE if vehicle == GONE else LATITUDE])

@@ -32,7 +32,7 @@ KILLS = 3
 
 @contextmanager
 def service(router: ZenohSettings, folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """Yield a service process that is ready, and end it after the block."""
+    """Yield a service process that is ready, and end it after the `with` block."""
     config = folder / "service.json"
     config.write_text(json.dumps({"zenoh": {"connect": router.connect}, "segment_s": 0.05}))
     words = ["run", "--config", str(config), "--archive", str(folder / "archive")]
@@ -81,8 +81,8 @@ def test_killed_service_keeps_acknowledged_reports_and_doubles_none(
 
 
 def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
-    """Return the identity (boot in its archived form, seq of the batch, row in it) of every
-    acknowledged row.
+    """Return the identity of every acknowledged row: boot (start of the agent) in its archived
+    form, seq (number of the batch), and row in the batch.
     """
     pseudonyms = Pseudonyms(folder / "archive" / "keys")
     now = time.time_ns()
@@ -98,7 +98,9 @@ def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
 
 
 def list_archived(folder: Path) -> list[tuple[int, int, int]]:
-    """Return the identity (boot, seq, row) of every row in the archive."""
+    """Return the identity of every row in the archive: boot (start of the agent), seq (number of
+    the batch), and row in the batch.
+    """
     table = pa.concat_tables(
         reading.read_tables(folder / "archive", Kind.OBSERVATION, ["boot", "seq", "row"])
     )

@@ -7,9 +7,10 @@ that it gave when it was written.
 Commit 1f90692 wrote `data/v1.0` in this way, before files had a version. A stored archive is never
 written again, because later code must still be able to read it.
 
-The archive has eight vehicles in two zones, around midnight. It contains compacted rows with
-roll-ups and a snapshot, a checkpoint, and later segments. The rows are of dry road and ice:
-measurements, lower bounds, and rows that came too late. There are also states and a weather report.
+The archive has eight vehicles in two zones (map squares of zoom 7), around midnight. It contains
+compacted (sorted) rows with hourly statistics and a map snapshot, a checkpoint (saved state), and
+later segments (files of new rows). The rows are of dry road and ice: measurements, lower bounds,
+and rows that came too late. There are also states and a weather report.
 """
 
 from __future__ import annotations

@@ -65,7 +65,9 @@ def fill(root: Path, segments: int, count: int, seed: int = 0) -> Writer:
 
 
 def identities(root: Path, kind: Kind) -> list[tuple[int, int]]:
-    """Return (boot, seq) of all rows in an archive, sorted."""
+    """Return the sorted identities of all rows in an archive: boot (start of the agent) and seq
+    (number of the batch).
+    """
     return sorted(
         (row["boot"], row["seq"])
         for table in reading.read_tables(root, kind, ["boot", "seq"])

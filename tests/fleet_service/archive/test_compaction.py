@@ -1,5 +1,5 @@
-"""Tests that compaction loses and doubles no row, wherever it is interrupted and whichever program
-reads the archive.
+"""Tests of compaction (sorting of new rows into files by cell): it loses and doubles no row,
+wherever it is interrupted and whichever program reads the archive.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class DiedError(BaseException):
 
 
 def public(root: Path, kind: Kind) -> list[tuple[int, int]]:
-    """Return (boot, seq) of the rows that a foreign program, which reads only the compacted
-    (sorted) files, finds.
+    """Return the identities (boot, seq) of the rows that are visible to a foreign program, which
+    reads only the compacted (sorted) files.
     """
     paths = list((root / layout.TABLES[kind]).rglob("*.parquet"))
     found = [pq.read_table(path, columns=["boot", "seq"], partitioning=None) for path in paths]

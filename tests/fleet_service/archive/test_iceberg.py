@@ -1,5 +1,5 @@
-"""Tests of Iceberg tables over the archive: pyiceberg and DuckDB find every compacted row once,
-also after rows were removed.
+"""Tests of Iceberg tables over the archive: pyiceberg and DuckDB find every compacted (sorted) row
+once, also after rows were removed.
 """
 
 from __future__ import annotations

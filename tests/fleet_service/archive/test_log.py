@@ -1,5 +1,5 @@
-"""Tests of the segment log: no batch is acknowledged before it is durable, and a failed write loses
-no row.
+"""Tests of the segment log (writer of new rows): no batch is acknowledged before it is durable, and
+a failed write loses no row.
 """
 
 from __future__ import annotations

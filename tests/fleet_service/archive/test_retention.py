@@ -180,7 +180,7 @@ def rows_kept(root: Path) -> int:
 
 def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: Path) -> None:
     """A batch of an erased month must be refused, also after restarts. The archive no longer has
-    the batch, but an outbox may still send it if its acknowledgement was lost.
+    the batch, but a vehicle's outbox may still send it if its acknowledgement was lost.
     """
     old = batch("car-001", 1, NOON, [0.8])
     away = batch("car-002", 1, NOON - DAY, [0.8])

@@ -25,7 +25,8 @@ def flags(o: Observations, limited: BoolArray, used: FloatArray) -> Observations
 
 
 def make_acquainted(claims_on_dry: bool) -> Fusion:
-    """Return a fusion (beliefs about all cells) after 30 minutes of visits to dry cells.
+    """Return a fusion (beliefs about all cells) after 30 minutes in which vehicles visited dry
+    cells.
 
     The vehicle FLAGGED brakes gently every second time, with its flag on if `claims_on_dry`. In its
     other visits it reports friction values, so that it becomes trusted.
@@ -41,8 +42,9 @@ def make_acquainted(claims_on_dry: bool) -> Fusion:
 
 
 def ice_with(fusion: Fusion, *, flag: bool) -> bool:
-    """Return True if two visits raise an alert: one vehicle reports the friction of ice, and the
-    vehicle FLAGGED uses little grip, with the flag of its slip controller as given by `flag`.
+    """Return True if two visits (passages of a cell) raise an alert: one vehicle reports the
+    friction of ice, and the vehicle FLAGGED uses little grip, with the flag of its slip controller
+    as given by `flag`.
     """
     who = np.array([3, FLAGGED])
     likelihood = np.concatenate([value(np.array([ICY]), 0.02), at_least(np.array([0.1]))])

@@ -38,7 +38,7 @@ def east(steps: int, north: int = 0) -> int:
 
 
 def road(found: dict[int, FloatArray], sector: int = 0) -> Fusion:
-    """Return a fusion (beliefs about all cells) after visits to cells east of CELL.
+    """Return a fusion (beliefs about all cells) after vehicles visited cells east of CELL.
 
     Args:
         found: log-likelihoods (n, 32) of the visits to a cell, by the number of steps east of CELL;

@@ -21,9 +21,9 @@ UNKNOWN = float(SLIPPERY_SHARE @ mugrid.PRIOR)
 
 
 def visited(noticed: FloatArray, *, limited: bool = False) -> Fusion:
-    """Return a fusion (beliefs about friction) with visits to one cell. First, vehicles report the
-    friction values `noticed`, a minute apart; then QUIET other vehicles pass and use a grip of
-    0.05, which is too little to measure friction.
+    """Return a fusion (beliefs about friction) after visits (passages) of one cell. First, vehicles
+    report the friction values `noticed`, a minute apart; then QUIET other vehicles pass and use a
+    grip of 0.05, which is too little to measure friction.
     """
     fusion = Fusion(120.0)
     n = len(noticed)

@@ -16,8 +16,9 @@ LIARS = np.arange(100, 108)
 
 
 def drive_liars(private: int = 0, *, enrolled: bool = False) -> Fusion:
-    """Return a fusion (beliefs about all cells) after reports of twenty honest vehicles and eight
-    liars, which report 0.25 in four cells. Only the liars visit `private` further cells.
+    """Return a fusion (beliefs about all cells) after half an hour of reports about four cells.
+    Twenty honest vehicles report a friction near 0.8, eight liars 0.25. Each liar also sends
+    `private` reports a minute about other cells, which only liars visit.
     """
     rng = np.random.default_rng(4)
     fusion = Fusion(120.0, enrolled=enrolled)

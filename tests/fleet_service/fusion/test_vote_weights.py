@@ -25,8 +25,8 @@ def make_acquainted(
 ) -> Fusion:
     """Return a fusion (beliefs about all cells) that has received forty minutes of reports about
     ten cells, from a fleet whose vehicles have constant relative errors of standard deviation
-    `gain_std`. Each value is too low by `slope` times the unused part of μ. `gain_in_use` is True
-    if the error also affects the used grip.
+    `gain_std`. Each reported friction value is too low by `slope` times the unused part of μ.
+    `gain_in_use` is True if the error also affects the used grip.
     """
     rng = np.random.default_rng(5)
     fusion = Fusion(120.0)
@@ -142,9 +142,9 @@ def test_gentle_value_a_little_below_grip_may_be_a_soft_tyre(used: float, witnes
 
 
 def count_witnesses(mu: float, used: float, tail: float) -> int:
-    """Process one vehicle's value `mu` of friction, and return the number of vehicles (0 or 1)
-    whose report then supports an alert of ice. `tail` is the value's log-likelihood of dry road
-    [nat].
+    """Process one vehicle's friction value `mu`, measured with the grip `used`. Return the number
+    of vehicles (0 or 1) whose report then supports an alert of ice. `tail` is the log-likelihood
+    [nat] that the report gives to dry road.
     """
     fusion = Fusion(120.0)
     tailed = np.maximum(value([mu], 0.03), np.where(mugrid.CENTRES > 0.5, tail, -12.0))

@@ -186,7 +186,7 @@ def test_who_a_vehicle_is_is_durable_before_it_is_acknowledged(
 
 
 def everywhere(seq: int, count: int, now: int) -> Batch:
-    """Return a batch with visits to `count` new adjacent cells, one after the other at 12 m/s."""
+    """Return a batch that reports `count` new adjacent cells, one after the other at 12 m/s."""
     at = np.arange(count) + seq * count
     latitude = 57.60 + 2e-4 * (at // 400)
     longitude = 11.75 + 2e-4 * (at % 400)

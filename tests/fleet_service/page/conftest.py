@@ -32,7 +32,7 @@ class RunningPage:
 @contextmanager
 def page_of(connection: ZenohSettings, **changed: object) -> Iterator[str]:
     """Yield the address of a page that runs in a thread of this process, and stop the page after
-    the block.
+    the `with` block.
     """
     stop = threading.Event()
     lines = list[str]()
@@ -57,7 +57,7 @@ def bare(router: ZenohSettings) -> Iterator[str]:
 
 @pytest.fixture
 def page(router: ZenohSettings, tmp_path: Path) -> Iterator[RunningPage]:
-    """Yield a page with a service that writes a snapshot each second."""
+    """Yield a page with a service that stores the map (a snapshot) each second."""
     archive = tmp_path / "archive"
     with (
         running(router, archive, snapshot_s=1.0) as service,

@@ -322,7 +322,7 @@ def test_slider_shows_a_past_cell_and_two_moments_side_by_side(
 
 
 def list_snapshots(archive: Path) -> list[int]:
-    """Return the times [s since 1970] of those map snapshots of the archive that the page
+    """Return the times [s since 1970] of those stored maps (snapshots) of the archive that the page
     offers.
     """
     return sorted(

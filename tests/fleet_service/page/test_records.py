@@ -1,5 +1,5 @@
-"""Tests of the page's map records: their values equal the map's and never show more grip, and a
-larger square of the overview has the worst value of its cells.
+"""Tests of the records in which the page receives map cells: their values equal the map's and never
+show more grip, and a larger square of the overview has the worst value of its cells.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of checkpoints: a restart from a checkpoint equals a restart from the whole log, and reads
-only later rows.
+"""Tests of checkpoints (saved states of a service): a restart from a checkpoint equals a restart
+from the whole log, and reads only later rows.
 """
 
 from __future__ import annotations

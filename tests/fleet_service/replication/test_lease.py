@@ -1,5 +1,5 @@
-"""Tests of the lease: a service that ended, froze or was cut off is followed by another service,
-which has every acknowledged row exactly once.
+"""Tests of the lease (exclusive ownership of an archive): a service that ended, froze or was cut
+off is followed by another service, which has every acknowledged row exactly once.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the lease object: it states the lease time, other versions are read, and a damaged
-object delays but never ends a service.
+"""Tests of the lease object, which records in the bucket which service owns the archive: it states
+the lease time, other versions are read, and a damaged object delays but never ends a service.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def lease_on(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
 
 
 def standby_of(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
-    """Let a standby service take over the lease (ownership of an archive), and return its
+    """Let a standby (waiting service) take over the lease (ownership of an archive), and return its
     `Lease`.
     """
     standby = Standby(

@@ -57,8 +57,8 @@ def there(bucket: BucketServer) -> dict[str, bytes]:
 
 
 def fill_log(root: Path, copy: BucketReplica | None, seeds: range = range(3)) -> SegmentLog[int]:
-    """Return a segment log that has written segments (files of new rows) of both kinds,
-    observations and states, to disk, and to the bucket if the bucket copy `copy` is given.
+    """Return a segment log (writer of new rows) that has written files of observations and states
+    to disk. With `copy`, it has also uploaded them to the bucket.
     """
     log: SegmentLog[int] = SegmentLog(root, NAME, None if copy is None else copy.upload_segments)
     Pseudonyms(root / "keys").of("sim-001", 0)

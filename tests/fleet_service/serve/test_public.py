@@ -158,9 +158,9 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
 
 
 def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Start) -> None:
-    """A vehicle that passes alone at night must not be visible in answers, routes, snapshots and
-    tiles, although many vehicles passed by day: only vehicles of the last hours may make a cell
-    public.
+    """A vehicle that passes alone at night must not be visible in answers, routes, stored maps
+    (snapshots) and tiles, although many vehicles passed by day: only vehicles of the last hours may
+    make a cell public.
     """
     engine = start(3)
     day = (time.time_ns() // (2 * PART_NS) - 2) * 2 * PART_NS + 8 * 3600 * SECOND

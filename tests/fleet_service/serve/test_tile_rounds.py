@@ -1,5 +1,6 @@
-"""Tests of the rounds in which tiles are published: they begin at regular times, each tile has its
-turn, and they never take more than a fixed share of a pass of the service's main loop.
+"""Tests of the rounds in which tiles are published: they begin at regular times, each changed tile
+is published in some round, and they never take more than a fixed share of a pass of the service's
+main loop.
 """
 
 from __future__ import annotations

@@ -151,8 +151,8 @@ def test_steering_left_turns_left_and_loads_the_right_wheels() -> None:
 
 @pytest.mark.parametrize("share", [-0.4, 0.3])
 def test_rear_wheels_that_steer_keep_the_circle_and_swing_the_tail(share: float) -> None:
-    """At walking pace the yaw rate must be the one that follows geometrically from the directions
-    of the wheels, for every ratio of rear to front steering.
+    """At walking pace the yaw rate must equal the rate given by the geometry of the wheel
+    directions, for every ratio of rear to front steering.
     """
     circles = []
     for rear in (0.0, share):

@@ -106,8 +106,8 @@ def test_interval_score_is_least_at_the_true_quantiles() -> None:
 
 def test_inflated_noise_does_not_win_the_innovation_likelihood(drives: TuningSet) -> None:
     """The likelihood of the innovations (measurement minus prediction) must be lower with a
-    measurement noise of 4.5 R than with the right R, although fewer innovations exceed their bound
-    with 4.5 R.
+    measurement noise of 4.5 R than with the right R, although fewer innovations exceed their
+    expected bound with 4.5 R.
     """
     usual, inflated = (
         scores_of(Memberships(ln_scales=(s, s)), drives, ESTIMATOR) for s in (0.0, 1.5)
