@@ -1,12 +1,13 @@
-"""GripMap under one name: the public faces of `edge_agent` and `fleet_service`.
+"""GripMap under one name: the public names of `edge_agent` and `fleet_service`.
 
     import gripmap
     log, vehicle = gripmap.simulate_manoeuvre("slalom", mu=0.5)
     bank = gripmap.make_bank("fckf", [vehicle])
 
-The distribution brings four top-level packages with plain names. Another package of such a name, a
-folder `schemas` of one's own for instance, may come first on the path and hide one of them:
-importing this module tells which and where.
+The distribution contains four top-level packages with plain names. If another package or folder
+with one of these names, for example your own folder `schemas`, comes first on Python's search path,
+it hides GripMap's package. Importing this module then raises an error that names the package and
+the place of the other one.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ FACES = ("edge_agent", "fleet_service")
 
 
 def _check_packages() -> None:
-    """ImportError where another package hides one of ours."""
+    """Raise ImportError if another package hides one of GripMap's packages."""
     here = Path(__file__).resolve().parent
     for name in PACKAGES:
         spec = find_spec(name)
@@ -40,7 +41,7 @@ _check_packages()
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401 whatever a face holds
-    """A name of a face, loaded when it is first asked for."""
+    """Return a public name of `edge_agent` or `fleet_service`, imported when it is first used."""
     for face in FACES:
         package = importlib.import_module(face)
         if name in package.__all__:
@@ -49,12 +50,12 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 whatever a face holds
 
 
 def __dir__() -> list[str]:
-    """Every name of the faces."""
+    """Return all public names of `edge_agent` and `fleet_service`, sorted."""
     return sorted({name for face in FACES for name in importlib.import_module(face).__all__})
 
 
 def gripmap_main() -> NoReturn:
-    """Run `gripmap`."""
+    """Run the command line `gripmap`, and exit with its exit code."""
     from deploy.cli import main
     from schemas.runtime.process import force_exit
 
@@ -62,7 +63,7 @@ def gripmap_main() -> NoReturn:
 
 
 def edge_agent_main() -> NoReturn:
-    """Run `edge-agent`."""
+    """Run the command line `edge-agent`, and exit with its exit code."""
     from edge_agent.cli import main
     from schemas.runtime.process import exit_fast
 
@@ -70,7 +71,7 @@ def edge_agent_main() -> NoReturn:
 
 
 def fleet_service_main() -> NoReturn:
-    """Run `fleet-service`."""
+    """Run the command line `fleet-service`, and exit with its exit code."""
     from fleet_service.cli import main
     from schemas.runtime.process import exit_fast
 

@@ -4,8 +4,9 @@
     hills-SEED]
 
 No network is used. Every second the cars' observations are fused, as in a service. Alerts and, at
-intervals, tiles are passed to the listening cars as bytes. Each seed is driven twice from the same
-start: once all cars listen, once no car does. The figures are written to DIR/figures.json.
+intervals, tiles are passed to the listening cars as bytes. The drive of each random seed is
+simulated twice from the same start: once with all cars receiving the map and alerts, once with
+none. The figures are written to DIR/figures.json.
 """
 
 from __future__ import annotations
@@ -171,8 +172,8 @@ class ListeningTown:
             self.heard.store_alert(decode_alert_message(key, wire.encode_alert(alert), now), now)
 
     def _hear(self, second: int) -> None:
-        """At the given second, pass the active alerts, and at intervals the tiles of the map, to
-        the cars that receive the map.
+        """Pass the active alerts to the cars that receive the map and, every ASKED_S seconds, all
+        map tiles too. `second` is the time since the start of the drive [s].
         """
         now = self._now()
         for alert in self.alerts.standing_alerts:
@@ -283,8 +284,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def measure(with_: list[Drive], without: list[Drive]) -> list[Figure]:
-    """Return the figures that compare drives with and without cars that receive the map and its
-    alerts.
+    """Return the figures that compare drives in which the cars receive the map and its alerts with
+    drives in which they do not.
     """
     slid, before = (
         sum(len({k for k, _ in drive.slid}) for drive in drives) for drives in (with_, without)

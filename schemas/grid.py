@@ -1,9 +1,9 @@
 """Places on earth: cells, tiles, regions and zones of the Web-Mercator grid, and heading sectors.
 All functions are vectorised.
 
-A *quadint* at zoom z interleaves the bits of the Web-Mercator tile column x and row y (x in the
-even bits), so that its base-4 digits are the quadkey. The cell's ancestor at zoom z is a shift:
-`parent = cell >> 2·(21 - z)`.
+A *quadint* is the number of a grid square. At zoom z it interleaves the bits of the Web-Mercator
+tile column x and row y (x in the even bits), so that its base-4 digits are the quadkey. The square
+at zoom z that contains a cell is found by a shift: `parent = cell >> 2·(21 - z)`.
 
     cell     zoom 21   10 m (60° north) to 19 m (equator)   the canonical cell, int64
     tile     zoom 14   area of one map message

@@ -25,7 +25,7 @@ _CHUNKS: Final = (4, 3, 3, 4)
 
 
 class Topic(NamedTuple):
-    """Kind of key, with its message and quality of service.
+    """Kind of Zenoh key, with its message and quality of service.
 
     Attributes:
         name: first chunk of the key after the root.
@@ -141,8 +141,8 @@ def shard_key(service: str) -> str:
 
 
 class ServiceToken(NamedTuple):
-    """Announcement that a service serves a region: a Zenoh liveliness token, which exists as long
-    as the service runs.
+    """Announcement that a service serves a region. It is a Zenoh liveliness token, which exists as
+    long as the service runs.
 
     Attributes:
         region: key expression, chunks of 4, 3 and 3 digits or `*`.

@@ -1,6 +1,7 @@
-"""Columns of the messages: name, type, unit and meaning. `schemas.tables` makes the tables of them.
+"""Columns of the messages: name, type, unit and meaning. `schemas.tables` builds its tables from
+them.
 
-The module does without Arrow, because an agent that only sends messages does not need it.
+The module does not import Arrow, because an agent that only sends messages does not need it.
 """
 
 from __future__ import annotations

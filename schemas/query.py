@@ -36,7 +36,7 @@ class Format(StrEnum):
 
     @property
     def encoding(self) -> str:
-        """Name of the Zenoh encoding of a reply in this format."""
+        """Return the name of the Zenoh encoding of a reply in this format."""
         return {"arrow": wire.ARROW, "geojson": wire.GEOJSON, "json": wire.JSON}[self.value]
 
 

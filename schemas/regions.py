@@ -1,5 +1,5 @@
-"""Key expressions of regions, the regions along a route, and the areas that no service serves.
-Pure.
+"""Key expressions of regions, the regions along a route, and the areas that no service serves. The
+module is pure (no I/O).
 
 A region expression has three chunks, of 4, 3 and 3 quadkey digits; `*` matches any chunk.
 """
@@ -44,7 +44,8 @@ def region_of(tile: int) -> str:
 
 def unserved_expressions(asked: MapQuery, served: Collection[str]) -> list[str]:
     """Return as few region expressions as possible that cover the part of a query for which no
-    service answers. For a query without a place, this is the area outside every service's regions.
+    service answers. If the query names no place, it covers the whole earth, so that the result is
+    the area outside every service's regions.
 
     Raises:
         InputError: the route is too long.
@@ -75,7 +76,9 @@ def _regions_without(
 
 
 class Rank:
-    """Sort order of cells and sectors along a route; cells that are not on the route come last."""
+    """Sort order of places (cells with heading sector) along a route; places that are not on the
+    route come last.
+    """
 
     def __init__(self, route: Sequence[tuple[float, float]]) -> None:
         self._place = {key: place for place, key in enumerate(keys_along(route).tolist())}
@@ -98,8 +101,8 @@ class Rank:
 
 
 def keys_along(route: Sequence[tuple[float, float]]) -> IntArray:
-    """Return the keys (cell · 4 + sector) that a route of (longitude, latitude) [deg] passes, in
-    order and without repetitions.
+    """Return the keys (cell · 4 + sector) of the places on a route, in order and without
+    repetitions. The points of the route are (longitude, latitude) [deg].
 
     Raises:
         InputError: the route is longer than ROUTE_MOST_M.

@@ -1,4 +1,6 @@
-"""The highest speed at which a vehicle can stop within its sight distance. Pure."""
+"""Highest speed at which a vehicle can stop within its sight distance. The module is pure
+(no I/O).
+"""
 
 from __future__ import annotations
 

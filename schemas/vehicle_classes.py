@@ -1,11 +1,11 @@
 """Vehicle files of common classes, for a car whose own parameters are unknown.
 
-The values are typical of production cars with one or two persons. Stiffness is per wheel, at static
-load, relative to the angle of the rim. It includes the compliance of steering and bushes, and roll.
-Therefore the front axle is softer than the rear axle and every car understeers, by 20 to 35 mrad
-per g. Measured stiffnesses of six cars (Volvo S90, VW Golf, Ferrari 250LM and others) are 10 to 17
-times the load per radian at the front axle and 15 to 25 times at the rear axle. Sizes follow the
-makers' data sheets of each class.
+The values are typical of production cars with one or two persons. Cornering stiffness is per wheel,
+at static load, relative to the angle of the rim. It includes the compliance of the steering, the
+compliance of the suspension bushes, and the effect of roll. Therefore the front axle is softer than
+the rear axle and every car understeers, by 20 to 35 mrad per g. Measured stiffnesses of six cars
+(Volvo S90, VW Golf, Ferrari 250LM and others) are 10 to 17 times the load per radian at the front
+axle and 15 to 25 times at the rear axle. Sizes follow the makers' data sheets of each class.
 """
 
 from __future__ import annotations

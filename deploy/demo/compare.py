@@ -1,8 +1,8 @@
 """Figures of the demo: the map compared with the true friction.
 
-True values come from the simulator's record of each visit of a vehicle to a cell: mean friction
-under its wheels, and the largest share of the grip that it used. A visit with a share of at least
-0.6 is called *excited*, because it allows the friction to be measured.
+The true values come from the simulator. For each visit of a vehicle to a cell it records the mean
+friction under the wheels, and the largest share of that friction that the vehicle used. A visit
+with a share of at least 0.6 is called *excited*, because only then can the friction be measured.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 def demo_works(found: Sequence[Figure]) -> bool:
     """Return True if every figure of the demo with a mandatory target meets its target.
 
-    A late alert, wide intervals, few passes or a busy machine do not count as a failure.
+    Late alerts, wide intervals, few passes or a long run time are reported, but are not failures.
     """
 
     def breaks_promise(figure: Figure) -> bool:
@@ -54,8 +54,8 @@ def demo_works(found: Sequence[Figure]) -> bool:
 
 @dataclass(frozen=True)
 class MapComparison:
-    """Table of the map's cells (with heading sector) for which the true friction is known, one per
-    row. `truth` is the true friction at the end of the demo; the other columns are those of the
+    """Table of the map's cells for which the true friction is known, one row per cell and heading
+    sector. `truth` is the true friction at the end of the demo; the other columns are those of the
     map.
     """
 
@@ -75,8 +75,8 @@ class MapComparison:
 
     @property
     def is_measured(self) -> BoolArray:
-        """Return a mask of rows, (n,): True if vehicles measured friction in the cell, and did not
-        only report lower bounds.
+        """Return a mask of rows, (n,): True if at least one vehicle measured the friction in the
+        cell; False if vehicles reported only lower bounds.
         """
         return np.asarray(self.cells["basis"].to_numpy(zero_copy_only=False) == "measured")
 
@@ -90,8 +90,9 @@ class MapComparison:
 
 
 def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], float]:
-    """Return the true friction of each visited (cell, sector) at the end of the demo: the mean over
-    visits since the change of the road, or over all visits if there were none since.
+    """Return the true friction of each visited (cell, sector) at the end of the demo. It is the
+    mean over the visits since the road changed at `changed_ns`, or over all visits if there were
+    none since.
     """
     keys = _cell_keys(visits)
     after = visits["enter_time"].cast(pa.int64()).to_numpy() >= changed_ns
@@ -136,8 +137,8 @@ def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison
 def delay_passes(
     visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
 ) -> float:
-    """Return the number of excited passes (with enough grip used to measure the friction) over a
-    new patch of ice until its first alert. It is the median over all patches.
+    """Return how many excited passes (with enough grip used to measure the friction) drove over a
+    new patch of ice before its first alert: the median over all patches.
 
     A patch without an alert counts as infinite. Cells at most LINK_CELLS apart belong to one patch.
 
@@ -160,8 +161,8 @@ def delay_passes(
 def known_patches(
     visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
 ) -> list[tuple[IntArray, int]]:
-    """Return, for each patch of ice, its cells (numbers) and the time of the first alert on the map
-    [ns]; the time is NEVER if there was no alert.
+    """Return a pair for each patch of ice: the numbers of its cells, and the time of the first
+    alert for the patch [ns]. The time is NEVER if there was no alert.
     """
     cells = np.unique(visits["cell"].to_numpy()[patch])
     label = link_cells(cells)
@@ -282,7 +283,7 @@ def lost_grip(
     visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int, share: float
 ) -> LostGrip:
     """Return the passes of cars over new ice after the first alert of its patch. `share` is the
-    share of drivers that are warned.
+    share of drivers that receive warnings.
     """
     on = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
     since = np.full(visits.num_rows, NEVER)
@@ -317,10 +318,10 @@ def _vehicle_number(vehicle: str) -> int:
 
 
 def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
-    """Return a mask of visits, (visits,): True for visits after the change that found clearly less
-    grip than all earlier visits in the cell.
+    """Return a mask of visits, (visits,): True for visits after the change of the road that found
+    clearly less grip than all visits to the same cell before the change.
 
-    Old snow that is reached late, or its border, does not count as new ice.
+    Visits to cells that were slippery before the change, such as old snow, do not count.
     """
     enter = visits["enter_time"].cast(pa.int64()).to_numpy()
     cell = visits["cell"].to_numpy()

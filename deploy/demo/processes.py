@@ -94,8 +94,8 @@ class ManagedProcess:
 
 @contextmanager
 def run_system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
-    """Run a router and a fleet service on a free port of loopback while the block runs; yield the
-    endpoint and the service.
+    """Run a router and a fleet service on a free port of the loopback interface, until the `with`
+    block ends. Yield the endpoint of the router and the process of the service.
 
     The configuration for the agents is written to `folder/agent.json`.
     """
@@ -129,8 +129,8 @@ def run_system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
 
 @contextmanager
 def run_page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Iterator[str]:
-    """Run the live page with the streets of the simulated town; yield its address. The page can
-    draw the true friction over the map.
+    """Run the live page with the streets of the simulated town until the `with` block ends; yield
+    its address. The page can draw the true friction over the map.
     """
     metrics = service.line_with("ready").rpartition(", ")[2]
     tiles, roads = town.write_files(scenario_named(SCENARIO), folder)
@@ -157,7 +157,7 @@ def start_fleet(
     folder: Path, vehicles: int, duration_s: float, seed: int, warned: float
 ) -> ManagedProcess:
     """Start the process of the simulated vehicles and return it. Each vehicle has its own network
-    session and name. A share `warned` of the drivers is warned of ice.
+    session and name. The share `warned` of the drivers receives warnings of ice.
     """
     scripts = Path(sys.executable).parent
     options = {

@@ -1,4 +1,5 @@
-"""Example: read an archive with pandas, DuckDB and GeoPandas, and with GripMap's own question.
+"""Example: read an archive with pandas, DuckDB and GeoPandas, and with GripMap's built-in
+evaluations ("questions").
 
 python deploy/examples/archive_questions.py ARCHIVE FOLDER
 """
@@ -16,8 +17,8 @@ import fleet_service
 
 
 def main(archive: Path, folder: Path) -> None:
-    """Compute the median friction per cell with DuckDB and pandas, find the worst stretches with
-    GripMap, and write a map for a GIS.
+    """Compute the median friction per cell with DuckDB and with pandas. Find the stretches with the
+    lowest friction with GripMap, and write a map of them for a geographic information system.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = f"{archive}/observations/*/*/*.parquet"

@@ -1,5 +1,5 @@
-"""Horizon: knowledge of the map about each metre ahead, and the safe speed there. The module is
-pure.
+"""Horizon: the map's values for each metre of the road ahead, and the safe speed there. The module
+is pure (no I/O, no clock).
 
 A metre that the map does not know limits no speed and causes no warning.
 """
@@ -45,12 +45,12 @@ class Horizon(NamedTuple):
         mu_lower, mu_upper: 5 % and 95 % quantiles.
         p_slippery: P(mu < 0.4).
         age_s: time since the last observation [s].
-        basis: origin of the values: UNKNOWN, BOUND (only a lower bound), MEASURED or BORROWED (from
-            neighbouring places), of local_map.
+        basis: origin of the values, a constant of `local_map`: UNKNOWN, BOUND (only a lower bound),
+            MEASURED or BORROWED (from neighbouring places).
         slippery: True if the metre justifies a warning.
         alerted: True if an alert is active there.
-        safe_speed: [m/s]; NaN where unknown, because nothing is known about the safe speed of an
-            unknown road.
+        safe_speed: speed from which the car can take the bends and stop in time [m/s]; NaN where
+            the map knows nothing about the friction.
     """
 
     path: Path
@@ -133,9 +133,10 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
     """Return the safe speed [m/s] at each metre (M,). At this speed a car can take the bends and
     stop within SIGHT_M, with friction at the lower end of its interval.
 
-    Before a slower place the speed decreases with a comfortable deceleration, or with the grip that
-    cornering leaves. Where nothing is measured (NaN in `mu_lower`) the result is NaN, except before
-    a slower place; there the braking is at most that of an unknown road.
+    Before a place with a lower safe speed, the speed falls towards it with a comfortable
+    deceleration, or with a smaller one if cornering leaves less grip for braking. Where nothing is
+    measured (NaN in `mu_lower`) the result is NaN, except before a slower place; there the braking
+    is at most that of an unknown road.
     """
     measured = np.isfinite(mu_lower)
     bend = np.abs(np.nan_to_num(curvature))

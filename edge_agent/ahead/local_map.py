@@ -1,9 +1,10 @@
-"""Local copy of the map around one car, limited in size; old knowledge fades to unknown. The module
-is pure; time is an argument.
+"""Local copy of the fleet's map around one car, limited in size; old values fade to unknown. The
+module is pure: no I/O, and time is an argument.
 
-The belief about a cell (probabilities of friction) is reconstructed from the values in a tile:
-lower end, median and upper end of μ, and P(slippery). It then fades as in the fleet's map: with
-time, the probability grows that the road has changed, and a changed road is unknown.
+A map tile contains four values per cell: lower end, median and upper end of μ, and P(slippery).
+From them this module reconstructs the belief, a probability distribution of the friction. The
+belief then fades as in the fleet's map: with time, the probability grows that the road has changed,
+and the friction of a changed road is unknown.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ SLIPPERY_BINS: Final[FloatArray] = np.clip(
 
 
 class ReceivedCells(NamedTuple):
-    """Cells (n,) received from the fleet service; `belief` (n, 32) are probabilities on the
-    friction grid.
+    """Map cells (n,) received from the fleet service. `belief` (n, 32) is the probability
+    distribution of each cell's friction on the friction grid.
     """
 
     key: IntArray
@@ -49,8 +50,8 @@ class ReceivedCells(NamedTuple):
 
 
 class PlaceBelief(NamedTuple):
-    """Knowledge about places (a place is a map cell with a sector of heading), (n,) each; NaN and
-    UNKNOWN where nothing is known.
+    """Map's values for n places (a place is a map cell with a sector of heading), (n,) each; NaN
+    and UNKNOWN where the map knows nothing.
     """
 
     key: IntArray
@@ -67,8 +68,8 @@ class PlaceBelief(NamedTuple):
 def belief_of(
     lower: FloatArray, mu: FloatArray, upper: FloatArray, slippery: FloatArray
 ) -> FloatArray:
-    """Return the belief about n cells, probabilities on the friction grid (n, 32), computed from
-    the values in a map tile; `mu` may be NaN.
+    """Return the beliefs about n cells (probabilities of friction on the friction grid, (n, 32)),
+    computed from the values in a map tile; `mu` may be NaN.
 
     `lower`, `mu` and `upper` are the 5 %, 50 % and 95 % quantiles, `slippery` is P(slippery). The
     distribution function is linear between these values.
@@ -175,11 +176,11 @@ class LocalMap:
             del self._alerts[key]
 
     def look_up(self, key: IntArray, now: int) -> PlaceBelief:
-        """Return the current knowledge about n places, given by their keys (cell·4 + sector), `key`
-        (n,).
+        """Return the current values of n places, given by their keys (cell·4 + sector), `key` (n,).
 
-        Ice and water are not limited to a lane. Therefore an alert for the opposite direction also
-        counts for this direction, unless a better friction was measured here afterwards.
+        Ice and water usually cover the lanes of both directions. Therefore an alert for the
+        opposite direction also counts for this direction, unless a vehicle has measured better
+        friction here afterwards.
         """
         belief, basis, last, at, vehicles = self._look_up(key)
         alerted = np.zeros(len(key), np.bool_)
@@ -254,9 +255,10 @@ class LocalMap:
         return self._all
 
     def _look_up(self, key: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]:
-        """Return, for n places (map cells with heading sector): belief (n, 32) and, each (n,),
-        basis (origin of the values), time of the last observation, time of receipt and number of
-        observing vehicles.
+        """Return arrays for n places (map cells with heading sector), given by their keys `key`
+        (n,). They are the belief (probabilities of friction, (n, 32)) and, each (n,), the basis
+        (origin of the values), the time of the last observation, the time of receipt and the number
+        of observing vehicles.
         """
         whole = self._all_cells()
         if not len(whole.key):

@@ -1,7 +1,7 @@
-"""Lookout: computes the map's values for the road ahead of each vehicle. It does so once a second
-on a separate thread, and immediately when alerts change.
+"""Lookout: a thread that looks up the map's values for the road ahead of each vehicle. It does so
+once a second, and immediately when alerts change.
 
-The estimation loop only passes positions to it, by `see`, which never waits.
+The estimation loop only passes positions to the thread, by `see`, which never waits.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class _Watcher:
 
 @dataclass
 class LookoutCounts:
-    """Counters of the lookout (thread that looks ahead in the map): looks ahead, warnings, failures
-    and processor time.
+    """Counters of the lookout (thread that looks up the map ahead): number of look-ups, warnings
+    and failures, and processor time.
     """
 
     looks: int = 0
@@ -84,7 +84,7 @@ class LookoutCounts:
 
 
 class Lookout:
-    """Thread that looks ahead for several vehicles, which are identified by name.
+    """Thread that looks up the map ahead of several vehicles, which are identified by name.
 
     Args:
         names: the vehicles; row k of the poses belongs to vehicle k.
@@ -92,7 +92,8 @@ class Lookout:
         route_of: returns the route that the user gave for vehicle k, or None to follow the roads
             visible in the map.
         listening: returns True for a vehicle that looks ahead; by default all vehicles do.
-        on_horizons: called with the vehicle's name, its horizons and its pose after each look.
+        on_horizons: called after each look-up with the vehicle's name, its horizons (map values
+            along each possible path) and its pose.
     """
 
     def __init__(
@@ -117,7 +118,7 @@ class Lookout:
         self.counts = LookoutCounts()
 
     def start(self) -> None:
-        """Start the thread that looks ahead."""
+        """Start the lookout's thread, which looks up the map ahead of the vehicles."""
         self._thread.start()
 
     def attach(self, name: str, session: zenoh.Session) -> None:
@@ -137,12 +138,12 @@ class Lookout:
         self._poses = poses
 
     def believe(self, places: IntArray, beliefs: tuple[FloatArray, FloatArray] | None) -> None:
-        """Combine the friction beliefs of the vehicles' filters with the map as a prior, and store
-        the quantiles of the result.
+        """Combine the friction beliefs (probabilities) of the vehicles' filters with the map as a
+        prior, and store the quantiles of the result.
 
         Args:
             places: (N,) current place (cell·4 + sector) of each vehicle, -1 where unknown.
-            beliefs: result of `EstimatorBank.beliefs`.
+            beliefs: beliefs of the filters, as `EstimatorBank.beliefs` returns them.
         """
         if beliefs is None:
             return
@@ -162,13 +163,13 @@ class Lookout:
         self._here = np.column_stack([mugrid.quantiles(informed, q) for q in (0.5, 0.05, 0.95)])
 
     def outlook(self, name: str) -> Outlook | None:
-        """Return the last result of looking ahead for the vehicle `name`, with its warnings and the
-        road ahead; None before the first one.
+        """Return the latest result of the lookout for the vehicle `name`: its warnings and the road
+        ahead. Return None before the first result.
         """
         return self._watchers[self._number[name]].outlook
 
     def close(self, within_s: float = 1.0) -> None:
-        """Stop the thread that looks ahead; the vehicles' sessions stay open."""
+        """Stop the lookout's thread; the vehicles' sessions stay open."""
         self._stop.set()
         self._wake.set()
         if self._thread.ident is not None:
@@ -273,8 +274,8 @@ def paths_ahead(
 
 
 def runs_of_places(horizon: Horizon) -> Runs:
-    """Return the parts of a horizon (values of the map for each metre ahead) that lie in the same
-    place (cell and sector), as runs of consecutive metres.
+    """Divide a horizon (values of the map for each metre ahead) into runs: consecutive metres that
+    lie in the same place (cell and heading sector). Return the runs.
     """
     key = horizon.key
     starts = np.append(

@@ -91,11 +91,11 @@ class MapSubscriber:
         return bool(self._routers)
 
     def follow_paths(self, paths: list[Path], pose: Pose, within: float) -> None:
-        """Subscribe and send queries along the possible paths, the most likely first. The call does
-        not wait for an answer.
+        """Subscribe to alerts and send map queries along the possible paths, the most likely path
+        first. The call does not wait for an answer.
 
-        The subscription to alerts covers the first `within` metres of the paths. Map cells are also
-        requested beyond that, see `RequestLog.missing_boxes`.
+        The subscriptions cover the first `within` metres of the paths. The queries also cover cells
+        beyond that, see `RequestLog.missing_boxes`.
         """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
         back = bool(routers - self._routers)

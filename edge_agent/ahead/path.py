@@ -6,9 +6,9 @@ Legend
     key      cell·4 + sector: a place of the map, int64
     places   (M, C) keys that a metre may lie in, the likeliest first; NONE fills unused columns
 
-A car of the fleet may have driven one lane away from the path, with a position error of 1.5 m.
-Therefore each metre also covers places a little to the left and right, and both sectors near the
-border of a sector.
+The reports about this road come from cars that may have driven in the next lane, with a position
+error of 1.5 m. Therefore each metre also covers places a little to the left and right. If the
+heading is near the border of two sectors, the metre covers both sectors.
 """
 
 from __future__ import annotations
@@ -108,8 +108,8 @@ def path_along(
 ) -> Path:
     """Return the path along a line (n, 2) [m] that begins at the car, at most `length` [m] long.
 
-    `first` (n,) are the keys of map places (cell·4 + sector) at the line's points, as far as known.
-    They take precedence over the keys computed from the positions.
+    `first` (n,) are the keys of map places (cell·4 + sector) at the line's points, if the caller
+    knows them. They take precedence over the keys computed from the positions.
     """
     run = _distance_along(line)
     count = max(int(min(run[-1], length)), 1)
@@ -167,7 +167,7 @@ class GivenRoute:
 
     def _match_position(self, line: FloatArray, run: FloatArray, pose: Pose) -> float | None:
         """Return the car's distance along the route [m], at the point that best fits its position
-        and heading. Points shortly after the point matched last are preferred.
+        and heading. Points shortly after the previously matched point are preferred.
 
         Return None if no point matches.
         """

@@ -1,9 +1,10 @@
-"""Speed limit for a motion planner from the lower bound of friction ahead, as Autoware's message
-VelocityLimit.
+"""Speed limit for a motion planner, computed from the lower bound of friction ahead, and sent as
+Autoware's message VelocityLimit.
 
-The limit is the speed from which the vehicle can brake comfortably to the safe speed of each place
-ahead. It decreases immediately. It increases only after the computed limit has been higher for
-HOLD_S, so that it does not fluctuate. An unmeasured road gives no limit.
+The limit is the highest speed from which the vehicle can brake comfortably to the safe speed of
+each place ahead. When the computed limit falls, the sent limit follows immediately. When it rises,
+the sent limit follows only after HOLD_S, so that it does not fluctuate. A road without measurements
+gives no limit.
 
 Autoware subscribes to `/planning/scenario_planning/max_velocity_candidates`
 (tier4_planning_msgs/msg/VelocityLimit). The message is published in the form of rmw_zenoh: CDR,
@@ -42,8 +43,8 @@ _GID_BYTES: Final = 16
 
 
 def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
-    """Return the highest present speed [m/s] from which each safe speed ahead is reached by braking
-    with COMFORT after LATE_S.
+    """Return the highest speed [m/s] at which the vehicle may drive now. From this speed, braking
+    with the deceleration COMFORT after a delay of LATE_S reaches each safe speed ahead in time.
 
     Return inf if no safe speed is known.
 
@@ -63,9 +64,9 @@ def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
 
 
 def cautious_bound(mu: FloatArray, mu_lower: FloatArray) -> FloatArray:
-    """Return the friction that the road exceeds with a probability of 99.5 %; NaN if unknown;
-    arrays of any shape. It is extrapolated from the median `mu` and the 5 % quantile `mu_lower` of
-    its friction.
+    """Return the friction that the road exceeds with a probability of 99.5 %; NaN if unknown. It is
+    extrapolated from the median `mu` and the 5 % quantile `mu_lower` of the friction; the arrays
+    may have any shape.
     """
     below = np.nan_to_num(mu - mu_lower)
     return np.asarray(np.maximum(mu_lower - CAUTION * below, LEAST_GRIP))
@@ -94,8 +95,8 @@ class SteadyLimit:
         self._higher_since: int | None = None
 
     def update(self, limit: float, now: int) -> bool:
-        """Process a computed speed limit [m/s] at the time `now` [ns]. Return True if the output of
-        the hysteresis, the limit that is sent to the planner, has changed.
+        """Process a computed speed limit [m/s] at the time `now` [ns]. Return True if the limit
+        that is sent to the planner has changed.
         """
         if limit < self.value:
             self._higher_since = None

@@ -1,5 +1,5 @@
-"""Zenoh session to the motion planner of a vehicle: publishes the speed limit at each change, and
-repeats it every REPEAT_S.
+"""Zenoh session to the motion planner of a vehicle. It publishes the speed limit whenever the limit
+changes, and repeats it every REPEAT_S.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""The map as prior knowledge about the friction in the vehicle's current cell. It never affects
-published records. The module is pure.
+"""The map as prior knowledge about the friction in the vehicle's current cell. The result never
+affects published records. The module is pure (no I/O).
 
-The estimator runs without the map: its recursion, and the published evidence of a visit (passage of
-one cell), are bit-equal with and without a map. In addition, this module computes the belief of an
-estimator that had started the visit with the map's belief:
+The estimator itself does not use the map: its recursion, and the published evidence of a visit
+(passage of one cell), are bit-equal with and without a map. This module computes a second belief,
+the one that the estimator would have if it had started the visit with the map's belief:
 
     q(μ)  ∝  [(1 - h)·w⁻(μ) + h·u(μ)] · m(μ)/u(μ)     at the border of a cell
     p_M   ∝  q · L            p  =  (1 - β')·p_M + β'·w            inside the cell
@@ -21,9 +21,9 @@ Legend
             β·Z_W/(β·Z_W + (1 - β)·Z_M) with Z_M = Σ q·L and Z_W = Σ w⁻·L. It begins at SHARE,
             its lowest value; a share KEPT of its excess over SHARE passes to the next visit
 
-Only the filter's own belief passes a border, never the mixture p, so that no cell of the map is
-counted twice. Averaging of hypotheses by their predictions: Hoeting et al., Bayesian model
-averaging, Stat. Sci. 14 (1999).
+At a border, only the filter's own belief is carried to the next cell, never the mixture p.
+Otherwise the map's belief about one cell would be counted again in the next. Averaging of
+hypotheses by their predictions: Hoeting et al., Bayesian model averaging, Stat. Sci. 14 (1999).
 """
 
 from __future__ import annotations

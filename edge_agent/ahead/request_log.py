@@ -1,7 +1,7 @@
-"""Choice of map requests: narrow boxes along the path ahead, so that a day needs megabytes and not
-gigabytes. The module is pure.
+"""Choice of the map areas to request: narrow boxes along the path ahead, so that a day of driving
+needs megabytes and not gigabytes. The module is pure (no I/O).
 
-The fleet service publishes every changed map tile completely, each second: about 50 kB in a busy
+Each second, the fleet service publishes every changed map tile completely: about 50 kB in a busy
 town. A car needs only the part along its path, and not every second, but it must hear of ice
 immediately. Therefore it requests narrow boxes along its path, and subscribes to the alerts of the
 tiles there.
@@ -80,8 +80,8 @@ class RequestLog:
 
 
 class Tiles:
-    """Tiles whose alerts are subscribed to: the tiles ahead, and for LEAVE_S those that were ahead
-    before.
+    """Set of map tiles to whose alerts the vehicle subscribes: the tiles ahead, and for LEAVE_S
+    those that were ahead before.
     """
 
     def __init__(self) -> None:
@@ -119,7 +119,9 @@ class Tiles:
 
 
 def keys_of(box: Box) -> list[int]:
-    """Return the regions (z10 quadints) that a box (rectangle of the map) touches, each once."""
+    """Return the regions (zoom-10 grid squares, by number) that a box (rectangle of the map)
+    touches, each once.
+    """
     corners = grid.cell_of(
         np.array([box.south, box.south, box.north, box.north]),
         np.array([box.west, box.east, box.west, box.east]),

@@ -1,11 +1,11 @@
 """Roads visible in the map: sequences of places (cell and sector) that vehicles visited one after
 the other.
 
-One place follows another if it lies within about two cells in front of it, and its sector is a
-possible heading for a vehicle that comes from there. At a fork all roads are followed, the
-straightest first. After its last known place, the straightest road is continued straight on over
-the length of a corridor. This extension lets the known road grow, because the car requests the map
-only along its path.
+Place B follows place A if B lies within about two cells in front of A, and the sector of B is a
+possible heading for a vehicle that comes from A. At a fork all roads are followed, the straightest
+first. The straightest road is extended straight on beyond its last known place. Without this
+extension the car would never request the map there, because it requests the map only along its
+path.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ STEP_M: Final = 10.0  # a cell
 
 
 def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
-    """Return the possible paths ahead along the places (map cells with heading sector) that the map
-    knows, `keys` (n,), at most `length` [m] long.
+    """Return the possible paths ahead along the places in the map (cells with heading sector),
+    given by their keys `keys` (n,). Each path is at most `length` [m] long.
 
     The list is empty if the map shows no road at the car.
     """

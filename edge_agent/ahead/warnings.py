@@ -1,5 +1,6 @@
-"""Warnings about slippery stretches of road: issued when a stretch comes within reach, updated when
-it changes, ended when it is over. The module is pure.
+"""Warnings about slippery stretches of road. A warning is issued when a stretch comes within reach,
+updated when the stretch changes, and ended when the stretch is no longer ahead or no longer
+slippery. The module is pure (no I/O).
 
 The reach is the distance that the car needs to stop before the stretch. It consists of the distance
 during the driver's reaction, a margin, and braking with the lower end of the friction interval.
@@ -56,8 +57,8 @@ class _Stretch:
 def update_warnings(
     active: tuple[Active, ...], horizons: list[Horizon], pose: Pose, known: LocalMap
 ) -> tuple[tuple[Active, ...], list[GripWarning]]:
-    """Update the active warnings from new horizons (values of the map for each metre ahead); return
-    them, and the warnings to report now.
+    """Update the active warnings from new horizons (values of the map for each metre ahead). Return
+    the active warnings after the update, and the warnings to report now.
 
     Args:
         active: active warnings before the update.
@@ -141,8 +142,9 @@ def _find_runs(mask: BoolArray) -> list[tuple[int, int]]:
 
 
 def _by_place(stretches: list[_Stretch]) -> list[tuple[frozenset[int], list[_Stretch]]]:
-    """Group slippery stretches of several paths that have places (map cells with heading sector) in
-    common. Return one pair per group: all its places, and all its stretches.
+    """Group slippery stretches of several possible paths: stretches that share a place (map cell
+    with heading sector) belong to one group. Return a pair per group: all its places, and all its
+    stretches.
     """
     groups: list[tuple[frozenset[int], list[_Stretch]]] = []
     for stretch in stretches:

@@ -1,8 +1,9 @@
-"""The agent: connects the estimator bank, the pipeline that makes records from estimates, and the
-publisher in the live loop.
+"""The agent: connects three components in the live loop. They are the estimator bank (estimators of
+all vehicles, advanced together), the pipeline that makes records from estimates, and the publisher.
 
-It corresponds to `fleet_service.app.service`. Signals come from an `AgentSource`. Additional parts
-that use the vehicles' Zenoh sessions, such as warnings of the road ahead, are `AgentPart`s.
+It is the counterpart of `fleet_service.app.service`. Signals come from an `AgentSource`. Additional
+components that use the vehicles' Zenoh sessions, such as warnings of the road ahead, are
+`AgentPart`s.
 """
 
 from __future__ import annotations
@@ -84,22 +85,23 @@ class AgentSource(NamedTuple):
 
 
 class AgentPart(Protocol):
-    """Interface of an additional part that uses the vehicles' Zenoh sessions."""
+    """Interface of an additional component of the agent that uses the vehicles' Zenoh sessions."""
 
     def attach_session(self, name: str, session: zenoh.Session) -> None:
-        """Give this part of the agent the opened Zenoh session of the vehicle `name`."""
+        """Give this component of the agent the opened Zenoh session of the vehicle `name`."""
 
     def start_part(self) -> None:
-        """Start this part of the agent, before the agent processes the first samples."""
+        """Start this component of the agent, before the agent processes the first samples."""
 
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:
-        """Update this part of the agent from the pipeline after a block of samples; `admitted` is
-        True if the records of the block are published.
+        """Update this component of the agent from the pipeline after a block of samples. `admitted`
+        is True if the records of the block are published.
         """
 
     def close_part(self) -> Mapping[str, float]:
-        """Stop this part of the agent, and return its counts for the agent's last line of
-        output."""
+        """Stop this component of the agent; return its counts for the agent's last line of
+        output.
+        """
 
 
 class Agent:

@@ -116,8 +116,8 @@ def curve_of(
 
 
 def thin_parts(count: int) -> list[slice]:
-    """Return at most MOST_POINTS slices that divide the `count` samples of a curve. Each slice
-    becomes one point of the plot.
+    """Divide the `count` samples of a curve into at most MOST_POINTS slices; return the slices.
+    Each slice becomes one point of the plot.
     """
     step = max(1, math.ceil(count / MOST_POINTS))
     return [slice(k, min(k + step, count)) for k in range(0, count, step)]

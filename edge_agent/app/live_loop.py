@@ -1,5 +1,5 @@
-"""Live loop: passes blocks of samples in real time through the pipeline (estimation and records) to
-the publisher, until the loop is stopped.
+"""Live loop: passes blocks (consecutive samples) in real time through the pipeline, which estimates
+and makes records, to the publisher, until the loop is stopped.
 
 The loop waits so that no block is processed before its time. A block counts as late if its
 processing ends more than the block's own duration behind real time. No block is skipped: a loop
@@ -32,7 +32,8 @@ log = logging.getLogger(__name__)
 @dataclass
 class Progress:
     """Progress of the live loop (estimation in real time): duration of the signals [s], number of
-    blocks (of samples), number of late blocks, the longest and the last delay [s].
+    blocks of samples, number of late blocks (delayed by more than their own duration), the longest
+    and the last delay [s].
 
     `held` counts records that were not published, because their signals were not verified.
     """
@@ -134,8 +135,8 @@ def _offer_if_admitted(
 
 
 def final_counts(progress: Progress, publisher: Publisher) -> dict[str, float]:
-    """Return the agent's final counts: all records, the observations among them, and the number of
-    blocks of samples with the delays of the loop.
+    """Return the counts that the agent prints at its end, by name: records by result, observations
+    (a subset of the records) by result, and blocks of samples; and the largest delay of the loop.
     """
     counts = publisher.counts
     seen = Kind.OBSERVATION

@@ -9,7 +9,7 @@ from schemas.errors import InputError
 
 
 def prepare_path(field: str, path: Path) -> Path:
-    """Create the folder in which the file `path` will lie, and return the path.
+    """Create the folder that will contain the file `path`, if it does not exist; return the path.
 
     Raises:
         InputError: the path is a folder, or its folder cannot be written.

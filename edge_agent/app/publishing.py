@@ -1,4 +1,6 @@
-"""Opening of a command's publisher as configured, and closing with a report of the final counts."""
+"""Functions that open a command's publisher as configured, and close it with a report of the final
+counts.
+"""
 
 from __future__ import annotations
 

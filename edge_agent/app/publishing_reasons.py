@@ -48,7 +48,7 @@ class PublisherState(Protocol):
 
 class SignalWatch:
     """Observer of a source of signals: it records when the source last delivered a position, a
-    wheel speed and a turning wheel.
+    wheel speed, and a wheel speed above standstill.
 
     Args:
         clock: monotonic clock [s].
@@ -133,8 +133,8 @@ def reasons_not_publishing(
 
 
 class ReasonReporter:
-    """Printer of the reasons why an agent publishes nothing. It checks first after FIRST_S, then
-    every EVERY_S, and prints reasons that differ from the last ones.
+    """Printer of the reasons why an agent publishes nothing. It checks the reasons first after
+    FIRST_S and then every EVERY_S, and prints them only if they have changed.
 
     Args:
         find: returns the present reasons.

@@ -1,11 +1,12 @@
-"""Live trip: the signal doctor verifies the signals, and a calibration is learned from them. The
-result is stored next to the outbox.
+"""Live trip of a car: the signal doctor (automatic check of the signals) verifies the signals, and
+a calibration is learned from them. The result is stored next to the outbox (file of unsent
+records).
 
-Nothing is published before the doctor has found the signals free of faults. This may have been in
-an earlier trip with the same vehicle file and profile. A trip is examined in parts of PART_S
-seconds. The calibration is learned from each part that passes; a part with a fault ends the
-publishing until a later part passes. Learned values are used from the next trip on, because an
-estimator's vehicle does not change during a trip.
+Nothing is published until the doctor has found the signals free of faults, in this trip or in an
+earlier trip with the same vehicle file and profile. A trip is examined in sections of PART_S
+seconds. The calibration is learned from each section without a fault. A section with a fault stops
+the publishing until a later section has no fault. Learned values are used from the next trip on,
+because an estimator's vehicle does not change during a trip.
 """
 
 from __future__ import annotations
@@ -41,8 +42,9 @@ log = logging.getLogger(__name__)
 
 
 class Known(BaseModel):
-    """Stored knowledge about a car: `passed` is True if the signal doctor found no fault in its
-    signals; `drives` are the sensor errors estimated from each part of its trips.
+    """Stored knowledge about a car. `passed` is True if the signal doctor (automatic check) found
+    no fault in the car's signals. `drives` are the sensor errors estimated from each section of the
+    car's trips.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -121,8 +123,9 @@ class Trip:
                 yield replace(block, signals=mended[:, None])
 
     def learn_rest(self) -> None:
-        """Start the examination of the last part of the trip, so that the calibration is also
-        learned from it."""
+        """Start the examination of the last section of the trip, so that the calibration is also
+        learned from this section.
+        """
         self._start_examination(final=True)
 
     def close(self) -> None:
@@ -146,8 +149,8 @@ class Trip:
             self._start_examination(final=False)
 
     def _start_examination(self, *, final: bool) -> None:
-        """Start an examination of the signals of the current part of the trip on another thread.
-        With `final`, the part ends and the next one begins.
+        """Start an examination of the signals in the current section of the trip, on another
+        thread. With `final`, this section ends and the next one begins.
         """
         if not self._blocks:
             return
@@ -200,8 +203,8 @@ def _car_identity(vehicle: Vehicle, profile: Profile) -> str:
 
 
 def _read_state(path: Path, identity: str) -> Known:
-    """Return the stored knowledge of the car; an empty one if the file is missing, broken, or
-    belongs to another car.
+    """Return the stored knowledge of the car. Return an empty one if the file is missing, is
+    broken, or belongs to another car.
     """
     try:
         known = Known.model_validate_json(path.read_bytes())

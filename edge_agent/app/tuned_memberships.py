@@ -170,8 +170,8 @@ def shipped_memberships(estimator: str) -> Memberships:
 
 
 def search_results(estimator: str) -> dict[str, list[Memberships]]:
-    """Return the results of all searches that led to the file of memberships (fuzzy sets) in this
-    package, by kind of search; empty if the file does not contain them.
+    """Return the memberships (fuzzy sets) that each search found, by kind of search, from the file
+    of memberships in this package. Return an empty dictionary if the file does not contain them.
     """
     document = load_tuned(FOLDER / f"{estimator}.json").document
     return {

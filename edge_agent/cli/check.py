@@ -36,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check the signals of a log; return 0 if the log passes, 1 if a channel is faulty or
-    unknown.
+    """Check the signals of a log. Return 0 if the log passes, 1 if a channel is faulty or unknown
+    (neither confirmed nor faulty).
     """
     from edge_agent.app.backfill import vehicle_file_of
     from edge_agent.app.output_path import prepare_path

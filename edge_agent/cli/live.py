@@ -1,4 +1,4 @@
-"""Optional parts of the agent, for the commands `run` and `fleet`: warnings of the road ahead,
+"""Optional components of the agent, for the commands `run` and `fleet`: warnings of the road ahead,
 friction as VSS signals, and warm-up of the simulation.
 """
 
@@ -32,8 +32,8 @@ def warm_up_simulation(scenario: str, rate_hz: float, rough: float = 0.0) -> Non
 
 
 class LookoutPart:
-    """Agent part that looks ahead: it receives the map over the vehicles' sessions and gives
-    warnings.
+    """Component of the agent for the road ahead: it receives the map over the vehicles' sessions
+    and gives warnings.
     """
 
     def __init__(self, lookout: Lookout) -> None:
@@ -64,8 +64,8 @@ class LookoutPart:
 
 
 class VssPart:
-    """Agent part that reports the friction at the vehicles as VSS signals (vehicle signal
-    specification). It does so only while records of the vehicles may be published.
+    """Component of the agent that reports the friction at the vehicles as VSS signals (vehicle
+    signal specification). It does so only while records of the vehicles may be published.
     """
 
     def __init__(self, output: RoadFrictionOutput) -> None:

@@ -1,5 +1,5 @@
-"""Options that several commands share. The module imports little, because every help text
-needs it.
+"""Options that several commands share. The module imports little, because it is loaded for every
+help text, and help must appear fast.
 """
 
 from __future__ import annotations

@@ -279,7 +279,7 @@ def _publish_log(
 
 def _start_time(given: str | None, log: SignalLog) -> int:
     """Return the time [ns UTC] of t = 0 in a recorded log: the given time, else the time stated in
-    the log, else a time by which the log ends now.
+    the log, else a time such that the log ends now.
     """
     from schemas.config import moment
 

@@ -214,10 +214,10 @@ def _tuning_drives(
 
 
 def _search_worth(score: Score, objective: str) -> float:
-    """Return the value by which search results are compared; larger is better.
+    """Return the value by which the results of searches are compared; larger is better.
 
-    If the true friction is known, the value is minus the cost of false and missed ice; otherwise it
-    is the objective of the search.
+    If the true friction is known, the value is minus the cost of false and missed ice. Otherwise it
+    is the value of the objective that the search maximised.
     """
     known = {name: value for name, value in score.model_dump().items() if value is not None}
     unknown = {"interval_score": math.nan, "coverage": math.nan}
@@ -312,7 +312,7 @@ def progress_printer(
     """Return a function that prints one line per iteration of a search: best and mean value of the
     objective, elapsed time and expected remaining time.
 
-    `clock` returns the time [s].
+    `way` is the name of the search in the line, and `clock` returns the time [s].
     """
     began = clock()
 

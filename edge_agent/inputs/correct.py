@@ -1,11 +1,11 @@
 """Correction of signals by a vehicle's calibration: sensor offsets, wheel radii, steering angle and
 delays between devices.
 
-A quantity that was not learned is assumed to be free of error. A learned quantity is the mean of a
-posterior whose prior assumes no error. Therefore the correction is smaller than the measured error.
-The rear steering angle is not corrected. The lateral acceleration a_y is not corrected either: its
-measured offset on a straight is partly a sensor error and partly the crossfall of the road. The
-tyres provide a real force for the crossfall, and drives cannot separate the two.
+A quantity that was not learned is assumed to be free of error. A learned error is a posterior mean,
+and its prior assumes no error. Therefore the correction is smaller than the measured error. The
+rear steering angle is not corrected. The lateral acceleration a_y is not corrected either. Its
+measured offset on a straight is partly a sensor error and partly due to the crossfall of the road,
+which causes a real tyre force. Drives cannot separate the two.
 """
 
 from __future__ import annotations
@@ -26,10 +26,9 @@ class Corrector:
     """Correction of one vehicle's signals by its calibration; the samples may be passed in blocks
     of any length.
 
-    Devices have different delays. The signals of faster devices are delayed to match the slowest
-    device: a row gets their reading nearest to the moment that the slowest device's reading
-    describes, without interpolation. This moment is up to a tenth of a second before the row's time
-    stamp.
+    Devices have different delays. All readings of a corrected row (sample) describe one moment,
+    that of the slowest device's reading, which is up to 0.1 s before the row's time stamp. For each
+    faster device the reading nearest to this moment is used, without interpolation.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -135,8 +134,8 @@ def _correct_signals(signals: FloatArray, known: Calibration) -> FloatArray:
 
 
 def _device_waits(known: Calibration | None) -> dict[tuple[int, int], float]:
-    """Return, by device, the delay [s] that must be added to its channels so that all devices match
-    the slowest one. The slowest device itself is left out.
+    """Return the delay [s] that must be added to the signals of each device so that they match the
+    slowest device. A key is the device's range of channels. The slowest device itself is left out.
     """
     if known is None or (known.wheel_lag is None and known.steer_lag is None):
         return {}

@@ -165,7 +165,7 @@ def _align_clocks(
     recordings: Sequence[Recording], reference: int, shifts: Mapping[str, float], notes: list[str]
 ) -> tuple[list[float], int | None]:
     """Return the seconds to add to the times of each recording, and the [ns UTC] of time 0 (None
-    without a date).
+    without a date). `reference` is the index of the recording whose clock is used for the log.
     """
     spans = [_time_span(recording) for recording in recordings]
     base = recordings[reference].start_ns
@@ -364,8 +364,8 @@ def _build_rows(
 
 
 def _row_rate(dense: Mapping[str, Series]) -> float:
-    """Return the rate [Hz] at which the merged log gets rows (samples): that of the fastest
-    channel, rounded up to a usual rate.
+    """Return the number of rows (samples) per second [Hz] of the merged log: the rate of the
+    fastest channel, rounded up to a usual rate.
     """
     fastest = max(1.0 / max(float(np.median(np.diff(one.t))), 1e-3) for one in dense.values())
     return next((rate for rate in RATES if rate >= 0.95 * fastest), RATES[-1])

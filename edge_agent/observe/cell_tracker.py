@@ -1,12 +1,13 @@
-"""Begin and end of visits: computes the cell and heading sector of a vehicle from position fixes
-and yaw, sample by sample.
+"""Begin and end of visits (passages of one map cell): computes the cell and heading sector of a
+vehicle from position fixes and yaw, sample by sample.
 
-A visit (passage of one map cell) begins with a position fix in a new cell or heading sector. Fixes
-are noisy, and a road may run along a border. Therefore a visit ends only when a fix lies clearly
-outside: CELL_MARGIN beyond the cell, or SECTOR_KEEP beyond the sector. After FIX_HELD_S without a
-fix the vehicle is in no cell (cell -1). Without yaw the course over ground is used. The module is
-pure: the state between blocks of samples is a `CellTrack` per vehicle. Any division of the samples
-into blocks gives the same result.
+A visit begins with a position fix in a new cell or heading sector. Fixes are noisy, and a road may
+run along a border. Therefore a visit ends only when a fix lies clearly outside: CELL_MARGIN beyond
+the cell, or SECTOR_KEEP beyond the sector. After FIX_HELD_S without a fix the vehicle is in no cell
+(cell -1). Without yaw the course over ground is used.
+
+The module is pure: the state between blocks of samples is a `CellTrack` per vehicle. Any division
+of the samples into blocks gives the same result.
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ NOWHERE: Final = -1  # cell of a vehicle without position
 
 
 class CellTrack:
-    """State of the tracking of one vehicle that is kept between blocks of samples, as a record; NaN
-    where nothing has been received yet."""
+    """State of the cell tracking of one vehicle, as a record that is kept between blocks of
+    samples; NaN where nothing has been received yet.
+    """
 
     fix_time: float  # of the last fix [s]
     latitude: float  # of it [deg]
@@ -70,10 +72,10 @@ class ReceiverSample:
 class Located(NamedTuple):
     """Cells visited by N vehicles at T samples, shape (T, N).
 
-    closes: True at the first sample of a new visit (passage of a cell), or of being in no cell.
-    inside, outside: True where a position fix of this sample lies inside or outside the visited
-    cell. cell, sector: quadint z21 and heading sector, -1 when in no cell. latitude, longitude
-    [deg], yaw [rad]: as last received, NaN when too old.
+    closes: True where the previous visit (passage of a cell) has ended: at the first sample in a
+    new cell or sector, or in no cell. inside, outside: True where a position fix of this sample
+    lies inside or outside the visited cell. cell, sector: quadint z21 and heading sector, -1 when
+    in no cell. latitude, longitude [deg], yaw [rad]: as last received, NaN when too old.
     """
 
     closes: BoolArray

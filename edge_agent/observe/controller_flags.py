@@ -47,8 +47,9 @@ REASONS: Final = {
 
 
 class FlagRecord:
-    """Memory about one controller flag (ABS, ESC or traction control) of one vehicle, from which
-    the conditions above are decided. It is updated with each sample in which the flag is known.
+    """State of one controller flag (ABS, ESC or traction control) of one vehicle, from which the
+    filter decides whether the flag is implausible. It is updated with each sample in which the flag
+    is known.
     """
 
     time: float  # time of the flag's last known sample [s]
@@ -61,7 +62,9 @@ class FlagRecord:
 
 
 def new_flag_records(vehicles: int) -> RecordArray:
-    """Return the memory, (N, len(FLAGS)) records, for N vehicles whose flags have not been read."""
+    """Return the initial state of the controller flags of N vehicles, (N, len(FLAGS)) records; no
+    flag has been read yet.
+    """
     made = records(FlagRecord, vehicles, len(FLAGS))
     made["time"] = np.nan
     return made
@@ -70,16 +73,17 @@ def new_flag_records(vehicles: int) -> RecordArray:
 def trusted_context(
     before: RecordArray, t: FloatArray, signals: FloatArray, context: FloatArray
 ) -> tuple[RecordArray, FloatArray]:
-    """Replace implausible flags in the context by NaN (unknown).
+    """Replace implausible controller flags (ABS, ESC, traction control) in the context signals by
+    NaN (unknown).
 
     Args:
-        before: (N, len(FLAGS)) records after the previous block.
+        before: (N, len(FLAGS)) states of the flags after the previous block.
         t: (T, N) [s].
         signals: (T, N, channels); the wheel speeds show whether the vehicle stands.
         context: (T, N, len(CONTEXT)).
 
     Returns:
-        the records for the next block, and the context with NaN for implausible flags.
+        the states for the next block, and the context signals with NaN for implausible flags.
     """
     after = before.copy()
     checked = context.copy()
@@ -114,8 +118,8 @@ def doubted_flags(record: RecordArray) -> list[tuple[int, str, str]]:
 def _check_flags(
     flags: Records[FlagRecord], t: FloatArray, standing: FloatArray, context: FloatArray
 ) -> None:
-    """Update the memory of all controller flags sample by sample, and set implausible flags in the
-    context to NaN; this is the compiled part of `trusted_context`.
+    """Update the states of all controller flags sample by sample, and set implausible flags in the
+    context signals to NaN; this is the compiled part of `trusted_context`.
     """
     for k in range(t.shape[0]):
         for n in range(t.shape[1]):
@@ -137,11 +141,11 @@ def _check_flags(
 
 @compiled
 def _count_sample(record: FlagRecord, dt: float, on: bool, stands: bool) -> None:
-    """Update the memory of one controller flag with a new sample, and decide whether the flag is
+    """Update the state of one controller flag with a new sample, and decide whether the flag is
     implausible (`record.doubt`).
 
     Args:
-        record: memory of the flag.
+        record: state of the flag.
         dt: time since the flag's previous known sample [s].
         on: True if the flag is on in this sample.
         stands: True if the vehicle stands in this sample.

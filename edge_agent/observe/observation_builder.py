@@ -1,10 +1,10 @@
-"""Construction of the records for publication from estimates: one observation per visit (passage)
-of a map cell, and states of the vehicle at a given rate.
+"""Construction of the records for publication from estimates: one observation per visit (passage of
+a map cell), and states of the vehicle at a given rate.
 
-For each block of samples: `located` marks the samples at which visits (passages of a map cell) end
-(`cell_tracker`), the estimator bank is advanced with these `closes`, and `build_records` constructs
-the records. The state between blocks is an `OpenVisits`. Any division of the samples into blocks
-gives the same records in the same order. The module is pure.
+Each block of samples is processed in three steps. `cell_tracker` marks the samples at which visits
+end. The estimator bank (estimators of all vehicles) processes the block and these marks. Then
+`build_records` constructs the records. The state between blocks is an `OpenVisits`. Any division of
+the samples into blocks gives the same records in the same order. The module is pure (no I/O).
 """
 
 from __future__ import annotations
@@ -280,7 +280,7 @@ def _begin_visit(visit: Visit, time: int, cell: int, sector: int) -> None:
 
 @compiled
 def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
-    """Begin a new part of a visit (passage of a map cell) after a change of friction within the
+    """Begin a new part of a visit (passage of a map cell), because the friction changed within the
     cell.
 
     The recorded grip used in the visit is limited to the largest friction that `told`, the
@@ -332,9 +332,9 @@ def _add_context(visit: Visit, context: FloatArray) -> None:
 
 @compiled
 def _update_felt_grip(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
-    """Update the grip of a visit (passage of a map cell) that the accelerometers show, `dt` [s]
-    after the previous sample. Without accelerometer readings the grip of a new visit stays
-    infinite, and then does not limit the grip used.
+    """Update the grip that the accelerometers show in a visit (passage of a map cell), `dt` [s]
+    after the previous sample. Without accelerometer readings this grip stays infinite in a new
+    visit, so that it does not limit the grip used.
     """
     if np.isfinite(sample.ax + sample.ay):
         share = 1.0 - np.exp(-dt / FELT_S)
@@ -379,9 +379,10 @@ def _grip_directions(ended: RecordArray) -> dict[str, FloatArray]:
 def _grip_used(ended: RecordArray) -> FloatArray:
     """Return the grip used (force over load) in n visits (passages of a map cell), (n,) [1].
 
-    It is limited by the accelerometers in this cell, because the time window of `mu_utilised` may
-    reach into the previous cell. If friction changed within the visit, the result is the smallest
-    value of its parts (before and after each change).
+    It is the largest grip used in the last second (`mu_utilised`), limited to the grip that the
+    accelerometers show in this cell. The limit is needed because that second may include part of
+    the previous cell. If friction changed within the visit, the result is the smallest value of its
+    parts (before and after each change).
     """
     last = np.minimum(ended["mu_utilised"], ended["felt"])
     return np.asarray(np.minimum(last, ended["earlier_used"]))

@@ -1,5 +1,5 @@
-"""One step of the estimation loop: computes cells of the vehicles, estimates, and records for
-publication from a block of samples.
+"""One step of the estimation loop. From a block of samples it computes the cells in which the
+vehicles are, the estimates, and the records for publication.
 
 The step is the same for one car and for a fleet, live and in a replay.
 """
@@ -124,7 +124,7 @@ class Pipeline:
 
     def doubted_flags(self) -> list[tuple[int, str, str]]:
         """Return (index of the vehicle, name of the flag, reason) for each controller flag that is
-        ignored now as implausible.
+        implausible and therefore ignored now.
         """
         return doubted_flags(self._flags)
 

@@ -1,10 +1,11 @@
 """Privacy of trip ends: observations near the beginning and the end of a trip are not published.
 
-A parking place identifies its owner. Therefore a record waits until the vehicle has driven on: it
-may be published if the beginning of the trip is at least `metres` and `seconds` before it, and the
-vehicle's present position at least as far after it. A trip lasts as long as the pipeline; records
-that still wait at its end are never published. The module is pure. If both limits are zero, every
-record is published immediately.
+A parking place identifies the vehicle's owner. Therefore each record waits until it is far enough
+from both ends. It may be published if the beginning of the trip is at least `metres` and `seconds`
+before it, and the vehicle's present position is at least as far after it. A trip lasts as long as
+the pipeline object (one run of the agent). Records that still wait at the end of the trip are never
+published. If both limits are zero, every record is published immediately. The module is pure (no
+I/O).
 """
 
 from __future__ import annotations
@@ -74,8 +75,8 @@ class TripEnds:
         return _select_rows(both, begun & passed)
 
     def _drop_old_track(self) -> None:
-        """Delete those stored distances and times of the vehicles that are older than the oldest
-        waiting record.
+        """Delete the stored times and distances of the vehicles that are no longer needed, because
+        they are older than the oldest waiting record.
         """
         waiting = [
             r.columns[_TIME[kind]].min() for kind, r in self._waiting.items() if len(r.vehicle)

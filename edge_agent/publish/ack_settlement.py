@@ -1,5 +1,5 @@
-"""Processing of acknowledgements from fleet services: they settle batches (end their storage in the
-outbox, the store on disk), and show how far the vehicle's clock is behind.
+"""Processing of acknowledgements from fleet services. An acknowledgement settles batches: they are
+removed from the outbox (store on disk). It also shows how far the vehicle's clock is behind.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class Counts:
 
 
 class AckSettlement:
-    """Queue of received acknowledgements; the sending thread applies them to the outbox (store of
-    unsent and unanswered batches).
+    """Queue of received acknowledgements. The sending thread takes them from it and applies them to
+    the outbox (store of unsent and unanswered batches).
 
     Attributes:
         clock_behind_s: delay of the vehicle's clock relative to the last service that answered [s].

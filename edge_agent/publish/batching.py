@@ -1,5 +1,5 @@
-"""Batching: records are collected per (vehicle, kind, region) until a batch is due. The module is
-pure; time is an argument.
+"""Batching: records are collected per (vehicle, kind, region) until a batch (one message) is due.
+The module is pure: no I/O, and time is an argument.
 
 A batch is due when it is full, when its oldest record has waited long enough, or immediately when a
 record is urgent.

@@ -1,5 +1,5 @@
-"""Batches that an outbox holds, in memory and without their payloads: by key, by stream and in
-order of age. The module is pure.
+"""In-memory index of the batches in an outbox (store on disk), without their payloads: by key, by
+stream and in order of age. The module is pure (no I/O).
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ LEAST_OLDEST: Final = 1000  # keys that may be gone before they are looked throu
 
 
 class Stream(NamedTuple):
-    """Stream of batches with its own sequence numbers, which count from 1: the batches of one
-    vehicle, one start, one kind of record and one region (z10 quadint).
+    """Stream of batches with its own sequence numbers, which count from 1. A stream has all batches
+    of one vehicle, one start of the agent (`boot`), one kind of record and one region (z10
+    quadint).
     """
 
     vehicle: str
@@ -55,10 +56,10 @@ class _Sequence:
     held: dict[int, int] = field(default_factory=dict)
 
     def first_held(self) -> int:
-        """Return the lowest seq that is still in the outbox, or the next free seq if the outbox has
-        no batch of the stream.
+        """Return the lowest sequence number of a batch that is still in the outbox, or the next
+        free number if the outbox has no batch of the stream.
 
-        The search continues where the last one ended, so each settled seq is skipped only once.
+        The search continues where the last one ended, so that each number is skipped only once.
         """
         while self.first < self.next and self.first not in self.held:
             self.first += 1
@@ -66,7 +67,7 @@ class _Sequence:
 
 
 class HeldBatches:
-    """Batches in an outbox by their key, the row number in the file.
+    """Index of the batches in an outbox (store on disk) by their key, the row number in the file.
 
     Attributes:
         bytes: total size of the payloads [bytes].
@@ -93,7 +94,7 @@ class HeldBatches:
         return iter(self._entries)
 
     def add_batch(self, key: int, batch: HeldBatch) -> None:
-        """Add a batch (message with records) that the outbox's file already contains."""
+        """Add a batch (message with records) of the outbox's file to the index."""
         self._entries[key] = batch
         oldest = self._oldest[batch.stream.kind]
         oldest.append(key)
@@ -108,7 +109,7 @@ class HeldBatches:
         self.bytes += batch.size
 
     def remove_batch(self, key: int) -> HeldBatch:
-        """Remove the batch with this key from the held batches and return it."""
+        """Remove the batch with this key from the index and return it."""
         batch = self._entries.pop(key)
         sequence = self._streams[batch.stream]
         del sequence.held[batch.seq]
@@ -118,8 +119,8 @@ class HeldBatches:
         return batch
 
     def remove_all(self) -> None:
-        """Remove all held batches (messages not yet answered). The sequence numbers of the streams
-        (vehicle, kind, region) continue.
+        """Remove all batches (messages not yet answered) from the index. The sequence numbers of
+        this start's streams (vehicle, kind, region) continue.
         """
         own = {
             stream: sequence
@@ -134,21 +135,21 @@ class HeldBatches:
         self.bytes = 0
 
     def has_stream(self, stream: Stream) -> bool:
-        """Return True if the stream (vehicle, start, kind, region) belongs to this start, or has
-        batches in the outbox.
+        """Return True if the index knows the stream (vehicle, start, kind, region): it has had
+        batches since this start, or it has batches of an earlier start in the outbox.
         """
         return stream in self._streams
 
     def next_numbers(self, stream: Stream) -> tuple[int, int]:
-        """Return the next free sequence number of a stream (vehicle, start, kind, region), and the
-        lowest one that is held.
+        """Return two sequence numbers of a stream (vehicle, start, kind, region): the next free
+        one, and the lowest one of a batch in the outbox.
         """
         known = self._streams.get(stream) or _Sequence(stream)
         return known.next, known.first_held()
 
     def keys_within(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> set[int]:
-        """Return the keys of the held batches of a stream (vehicle, start, kind, region) in
-        inclusive ranges of sequence numbers.
+        """Return the keys of the batches in the outbox that belong to a stream (vehicle, start,
+        kind, region) and whose sequence numbers lie in one of the inclusive `ranges`.
         """
         sequence = self._streams.get(stream)
         if sequence is None:
@@ -157,8 +158,8 @@ class HeldBatches:
         return {key for first, last in ranges for key in _keys_within(held, first, last)}
 
     def pop_oldest(self, kind: Kind) -> int | None:
-        """Return the key of the oldest batch of a kind, or None if there is none; the next call
-        returns the next oldest.
+        """Return the key of the oldest batch of a kind, or None if there is none. Each call removes
+        the returned key from the order of age, so that the next call returns the next oldest.
         """
         oldest = self._oldest[kind]
         while oldest:
@@ -179,8 +180,8 @@ class HeldBatches:
     def count_records(
         self, vehicles: Collection[str] | None = None, kind: Kind | None = None
     ) -> int:
-        """Return the number of records that belong to the given vehicles or to all, of one kind or
-        of all kinds. May be called on any thread.
+        """Return the number of records that belong to the given vehicles, or to all vehicles, of
+        one kind or of all kinds. The method may be called on any thread.
         """
         return sum(
             one.records
@@ -190,8 +191,8 @@ class HeldBatches:
         )
 
     def count_stranded(self, vehicles: Collection[str]) -> int:
-        """Return the number of records that are not sent because they belong to other vehicles than
-        these, for example after a change of name. May be called on any thread.
+        """Return the number of records that are not sent because their vehicle is not one of
+        `vehicles`, for example after a change of name. The method may be called on any thread.
         """
         return sum(
             one.records

@@ -66,7 +66,7 @@ class Outbox:
 
     Attributes:
         held: the batches, without payloads; its counts may be read on any thread.
-        schedule: which batches are in flight, and which are sent again when.
+        schedule: which batches are in flight (sent and not answered), and when they are sent again.
         counts: numbers of records by what happened to them.
 
     Raises:
@@ -214,7 +214,7 @@ class Outbox:
         """Return at most `limit` batches to send now, oldest first, of the given vehicles or of all
         vehicles.
 
-        The module `pacing` decides how many batches of a vehicle and region are sent.
+        The module `pacing` limits how many batches of a vehicle and region are sent at once.
 
         Raises:
             sqlite3.Error: the disk cannot be read.

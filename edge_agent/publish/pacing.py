@@ -158,8 +158,8 @@ class Pacer:
         return out
 
     def _take_probe(self, now: float, jitter: float, held: Container[int]) -> list[int]:
-        """Return the key of one batch as a probe, alternately the oldest and the newest, so that an
-        unreadable batch does not block the route.
+        """Return the key of one batch to send as a probe, alternately the oldest and the newest
+        batch, so that a batch that the service cannot read does not block all others.
 
         The list is empty if no probe is due.
         """

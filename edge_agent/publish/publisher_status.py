@@ -49,7 +49,7 @@ class PublisherStatus:
 
     @property
     def clock_behind_s(self) -> float:
-        """Return the delay of the vehicle's clock relative to the service's [s]."""
+        """Return how far the vehicle's clock is behind the clock of the fleet service [s]."""
         return self._settlement.clock_behind_s
 
     @property
@@ -67,8 +67,8 @@ class PublisherStatus:
 
     @property
     def fill_share(self) -> float:
-        """Return the used share of the capacity of the outbox, the file of unsettled batches
-        [1].
+        """Return the used share of the outbox's capacity [1]; the outbox is the file of unsettled
+        batches.
         """
         return self._outbox.held.bytes / self._outbox.capacity_bytes
 

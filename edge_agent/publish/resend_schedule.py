@@ -21,7 +21,9 @@ JITTER: Final = 0.25
 
 
 class ResendSchedule:
-    """Schedule of the batches in `held`: which are in flight, and which are sent again when."""
+    """Schedule of the batches in `held`: which are in flight (sent and not answered), and when
+    batches are sent again.
+    """
 
     def __init__(self, held: HeldBatches, first_resend_s: float, seed: int) -> None:
         self.first_resend_s = first_resend_s
@@ -62,8 +64,8 @@ class ResendSchedule:
         self._pacer_of(batch).record_sent(now)
 
     def send_or_queue(self, key: int, now: float) -> bool:
-        """Mark a new batch as in flight and return True. If the service of its region is silent,
-        queue it and return False.
+        """Mark a new batch as in flight (sent and not answered) and return True. If the service of
+        the batch's region is silent, queue the batch and return False.
         """
         if self._pacer_of(self._held[key]).silent:
             self.queue_batch(key)
@@ -80,7 +82,9 @@ class ResendSchedule:
             pacer.record_answer()
 
     def record_removal(self, batch: HeldBatch) -> None:
-        """Record that a batch (message with records) was removed from the outbox file."""
+        """Update the schedule after the removal of a batch (message with records) from the
+        outbox.
+        """
         if batch.due is not None:
             self._pacer_of(batch).record_settled()
 
@@ -101,8 +105,9 @@ class ResendSchedule:
                 self.queue_batch(key)
 
     def expire_batches(self, now: float) -> Iterator[int]:
-        """Queue the batches that were not answered in time. Yield the key of each that was passed
-        over (see `HeldBatches.is_passed_over`) instead; the caller removes it before it goes on.
+        """Queue the batches that were not answered in time, so that they are sent again. A batch
+        that the service has passed over (see `HeldBatches.is_passed_over`) is not queued. Its key
+        is yielded instead, and the caller must remove the batch before it continues.
         """
         while self._later and self._later[0][0] <= now:
             at, key = heapq.heappop(self._later)

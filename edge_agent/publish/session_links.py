@@ -75,7 +75,8 @@ class SessionLinks:
         return self._links[batch.stream.vehicle].put(batch)
 
     def update_connections(self) -> list[str]:
-        """Update the connection states, and return the names whose link was replaced by a new one.
+        """Update the connection states, and return the names of the vehicles whose link to a router
+        was replaced by a new one.
 
         Batches in flight on the former link are lost, so the caller must send them again.
         """

@@ -1,5 +1,5 @@
-"""SQLite file of an outbox: opened exclusively. A damaged file is renamed, and its readable batches
-are copied to a new file.
+"""SQLite file of an outbox (store of unsettled batches), opened exclusively by one process. If the
+file is damaged, it is renamed, and its readable batches are copied to a new file.
 
 Each batch has a checksum of its identifier and payload, because SQLite itself does not detect
 changed bits in its data.
@@ -225,8 +225,8 @@ def _is_outbox(path: Path) -> bool:
 
 
 def _readable_batches(path: Path) -> list[Row]:
-    """Return the batches of a damaged file, oldest first, each once. A batch must have a correct
-    checksum, or none because it was written by an old version.
+    """Return the batches of a damaged file, oldest first, each once. A batch counts as readable if
+    its checksum is correct, or if an old version wrote it without a checksum.
     """
     log_file = path.with_name(f"{path.name}-wal")
     found: dict[int, Row] = {}

@@ -53,7 +53,7 @@ class SignalProvider(Protocol):
     """Interface of a receiver for the signals of a vehicle."""
 
     def write(self, signals: Mapping[str, float], time_ns: int) -> None:
-        """Accept signals [%] and their time [ns UTC] for sending, without waiting."""
+        """Accept signals [%] and their time [ns UTC] for sending. The call must not wait."""
 
     def close(self) -> None:
         """Deliver the signals that still wait, and stop the provider."""

@@ -67,8 +67,8 @@ def parser_of(
 
 
 def join_negative_numbers(argv: Sequence[str]) -> list[str]:
-    """Rewrite `--bbox -0.5,51,…` as `--bbox=-0.5,51,…`, because argparse takes a leading minus
-    for an option.
+    """Rewrite `--bbox -0.5,51,…` as `--bbox=-0.5,51,…`. Without this, argparse would take the value
+    with its leading minus for an option.
     """
     out: list[str] = []
     for word in argv:

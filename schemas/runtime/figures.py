@@ -1,5 +1,5 @@
-"""Figures measured by a campaign, each with its target: the file `figures.json` and a Markdown
-table.
+"""Figures measured by a campaign (one run of an evaluation), each with its target: the file
+`figures.json` and a Markdown table.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Figure:
 
     @property
     def holds(self) -> bool:
-        """True if the figure's value meets its target; False for NaN (not measured)."""
+        """Return True if the figure's value meets its target; False for NaN (not measured)."""
         if self.bar is None:
             return not math.isnan(self.value)
         if isinstance(self.bar, tuple):
@@ -87,7 +87,9 @@ def commit(source: Path) -> str:
 
 
 def write(path: Path, campaign: str, seeds: Sequence[int], figures: Sequence[Figure]) -> None:
-    """Write the header of a campaign and its figures to a file as one JSON list."""
+    """Write the header and the figures of a campaign (one run of an evaluation) to a file as one
+    JSON list.
+    """
     rows = [{**asdict(figure), "holds": figure.holds} for figure in figures]
     for row in rows:
         row["value"] = row["value"] if math.isfinite(row["value"]) else None

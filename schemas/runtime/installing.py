@@ -1,5 +1,5 @@
-"""Commands that install optional parts ("extras") of this distribution. The command uses the source
-from which the distribution was installed, because no package index offers it.
+"""Commands that install optional dependencies ("extras") of this distribution. They refer to the
+source from which the distribution was installed, because no package index offers it.
 """
 
 from __future__ import annotations

@@ -29,14 +29,16 @@ R = TypeVar("R")
 
 
 class _Native:
-    """Library whose kernels this process uses; None: all kernels are compiled by Numba."""
+    """Shared library whose kernels (compiled numerical functions) this process uses. If it is None,
+    Numba compiles all kernels.
+    """
 
     library: Library | None = None
 
 
 def use_native_kernels(library: Library) -> None:
-    """Take the kernels of all modules that are imported from now on from a shared library. A kernel
-    that it lacks is compiled by Numba at its first call.
+    """Take the kernels (compiled numerical functions) of all modules that are imported from now on
+    from a shared library. If the library lacks a kernel, Numba compiles it at its first call.
     """
     _Native.library = library
 
@@ -45,9 +47,9 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Compile `function` with numba: cached on disk, no fast-math, IEEE division (x/0 is inf, not
     an exception).
 
-    Without fast-math and threads, the result for a row does not depend on the number of rows.
-    Therefore a vehicle gets bit-equal results alone and among thousands. If the cache cannot be
-    written, the function is compiled again at each start.
+    Without fast-math and threads, the result for one row of an array does not depend on the number
+    of rows. Therefore a vehicle gets bit-equal results whether it is processed alone or among
+    thousands. If the cache cannot be written, the function is compiled again at each start.
     """
     return _compile(function)
 
@@ -81,7 +83,7 @@ def refcount_free(function: Callable[P, R]) -> Callable[P, R]:
 
 def refcount_free_inlined(function: Callable[P, R]) -> Callable[P, R]:
     """Compile like `refcount_free`, and copy the code into each caller as `inlined` does. An array
-    argument is passed as seven machine words.
+    costs more as an argument than a number, because it is passed as seven machine words.
     """
     return _compile(function, nogil=True, forceinline=True, references=False)
 
@@ -142,9 +144,9 @@ def _cache_of(package: str) -> str | None:
 
 
 def native_library_path(package: str) -> Path | None:
-    """Return the path of the shared library of a package's kernels, in the same cache; the name
-    contains digests of all source files and of the processor's features. Return None if the cache
-    cannot be written.
+    """Return the path of the shared library with a package's kernels (compiled functions), in the
+    package's cache folder. The name contains digests of all source files and of the processor's
+    features. Return None if the cache cannot be written.
     """
     given = os.environ.get("NUMBA_CACHE_DIR")
     folder = Path(given) if given else cache_root()
@@ -166,9 +168,9 @@ def kernel_cache(package: str) -> str:
     """Return the folder for a package's compiled functions, in the user's cache; a digest of all
     source files is part of its name.
 
-    Numba's own cache checks only the source file of a function, not the files of the functions and
-    constants that it uses. After a change there it would use outdated code. Old folders may be
-    deleted at any time.
+    The digest is needed because Numba's own cache checks only the source file of a function. After
+    a change in another file, whose functions or constants the function uses, Numba would use
+    outdated code. Old folders may be deleted at any time.
     """
     root = Path(__file__).parents[2]
     digest = hashlib.blake2b(digest_size=8)

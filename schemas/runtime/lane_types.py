@@ -1,5 +1,5 @@
-"""Numba types of vectors ("lanes") and of their masks, and the machine code of their operators.
-`lanes.py` explains them and is the module to import.
+"""Numba types of vectors of numbers ("lanes") and of their masks, and the machine code of their
+operators. Other modules import `lanes.py`, which also explains lanes.
 """
 
 # ruff: noqa: ANN401, ARG001, ARG002 the interfaces of numba and llvmlite have no types
@@ -34,28 +34,34 @@ FUSED: Final = ("contract",)  # a*b + c may be rounded once
 
 
 class LanesType(types.Type):
-    """Numba type of LANES float64 numbers in one vector."""
+    """Numba type of one vector register with LANES float64 numbers ("lanes")."""
 
     def __init__(self) -> None:
         super().__init__(name="Lanes")
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Conversion | None:
-        """Return that a single number can be spread over the lanes."""
+        """Return `Conversion.safe` if `other` is the type of a single number, because a number can
+        be copied into all lanes of the vector; else None.
+        """
         return Conversion.safe if isinstance(other, types.Float | types.Integer) else None
 
     def unify(self, typingctx: Any, other: Any) -> LanesType | None:
-        """Return the type of a variable that holds a number first and lanes later."""
+        """Return this vector type for a variable that holds a single number at one place of the
+        code and a vector at another; None if `other` is not the type of a number.
+        """
         return self if isinstance(other, types.Float | types.Integer) else None
 
 
 class MaskType(types.Type):
-    """Numba type of LANES truth values, the result of a comparison of lanes."""
+    """Numba type of a mask: LANES truth values, the result of a comparison of two vectors."""
 
     def __init__(self) -> None:
         super().__init__(name="LanesMask")
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Conversion | None:
-        """Return that a single truth value can be spread over the lanes."""
+        """Return `Conversion.safe` if `other` is the type of a single truth value, because it can
+        be copied into all lanes of the mask; else None.
+        """
         return Conversion.safe if isinstance(other, types.Boolean) else None
 
 
@@ -65,7 +71,7 @@ MASK_TYPE: Final = MaskType()
 
 @register_model(LanesType)
 class LanesModel(models.PrimitiveModel):
-    """Storage of lanes: an LLVM vector."""
+    """Storage of Numba values of the type LanesType: an LLVM vector of numbers."""
 
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, VECTOR)
@@ -73,14 +79,16 @@ class LanesModel(models.PrimitiveModel):
 
 @register_model(MaskType)
 class MaskModel(models.PrimitiveModel):
-    """Storage of a mask: an LLVM vector of bits."""
+    """Storage of Numba values of the type MaskType: an LLVM vector of bits."""
 
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, BIT_VECTOR)
 
 
 def spread_value(builder: Any, value: Any, vector: Any) -> Any:
-    """Return a vector with `value` in all lanes."""
+    """Generate code that copies `value` into all lanes of a new vector of the LLVM type `vector`;
+    return this vector.
+    """
     empty = ir.Constant(vector, ir.Undefined)
     first = builder.insert_element(empty, value, INDEX(0))
     places = ir.Constant(ir.VectorType(INDEX, LANES), [INDEX(0)] * LANES)
@@ -90,18 +98,24 @@ def spread_value(builder: Any, value: Any, vector: Any) -> Any:
 @lower_cast(types.Float, LanesType)
 @lower_cast(types.Integer, LanesType)
 def cast_number(context: Any, builder: Any, given: Any, wanted: Any, value: Any) -> Any:
-    """Return lanes that all hold a number."""
+    """Generate code that copies a single number into all lanes of a new vector; return this
+    vector.
+    """
     return spread_value(builder, context.cast(builder, value, given, types.float64), VECTOR)
 
 
 @lower_cast(types.Boolean, MaskType)
 def cast_truth(context: Any, builder: Any, given: Any, wanted: Any, value: Any) -> Any:
-    """Return a mask that holds a truth value in all lanes."""
+    """Generate code that copies a single truth value into all lanes of a new mask; return this
+    mask.
+    """
     return spread_value(builder, cgutils.as_bool_bit(builder, value), BIT_VECTOR)
 
 
 def call_llvm(builder: Any, name: str, *args: Any) -> Any:
-    """Call the LLVM intrinsic `name`, for example "sqrt", for numbers or vectors."""
+    """Generate a call of the LLVM intrinsic `name`, for example "sqrt", for single numbers or for
+    vectors; return its result.
+    """
     kind = args[0].type
     function = cgutils.get_or_insert_function(
         builder.module,
@@ -112,7 +126,9 @@ def call_llvm(builder: Any, name: str, *args: Any) -> Any:
 
 
 def choose_lanes(builder: Any, sign: str, a: Any, b: Any) -> Any:
-    """Return a where `a sign b` holds, and b elsewhere, also where one of them is NaN."""
+    """Generate code that compares two vectors lane by lane; return a vector with the number of `a`
+    where `a sign b` holds, else that of `b`. NaN in either vector selects `b`.
+    """
     return builder.select(builder.fcmp_ordered(sign, a, b), a, b)
 
 
@@ -125,8 +141,9 @@ def _is_truth(kind: Any) -> bool:
 
 
 def _register(function: Any, arguments: int, given: Any, result: Any, lower: Any) -> None:
-    """Register `lower`, which builds the code of `function` for lanes or masks (type `given`), of
-    which other arguments may be single numbers or truth values.
+    """Make Numba use `lower` to generate the code of `function` (an operator, for example) if at
+    least one argument has the vector or mask type `given`. The other arguments may be single
+    numbers or truth values.
     """
     fits: Callable[[Any], bool] = _is_number if given is LANES_TYPE else _is_truth
 
@@ -191,8 +208,9 @@ _register_comparisons()
 
 
 def find_vector(target: Any, builder: Any, sig: Any, values: Any) -> Any:
-    """Return a pointer to the vector of an array at a place: the first two arguments of an
-    intrinsic with the signature `sig`. The place is an index, or one per axis before the lanes.
+    """Generate code that returns a pointer to one vector (LANES numbers) in an array. The array and
+    the place are the first two arguments of an intrinsic with the signature `sig`. The place is an
+    index, or a tuple with one index per axis before the last axis (the lanes).
     """
     kind = sig.args[0]
     held = target.make_array(kind)(target, builder, values[0])
@@ -209,7 +227,9 @@ def find_vector(target: Any, builder: Any, sig: Any, values: Any) -> Any:
 
 
 def type_load(context: Any, array: Any, place: Any) -> Any:
-    """Return signature and code generator of `lanes_at`."""
+    """Return the signature and the code generator of the intrinsic `lanes_at`, which loads a vector
+    from an array.
+    """
 
     def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
         return builder.load(find_vector(target, builder, sig, values), align=ANY_BYTE)
@@ -218,7 +238,9 @@ def type_load(context: Any, array: Any, place: Any) -> Any:
 
 
 def type_store(context: Any, array: Any, place: Any, value: Any) -> Any:
-    """Return signature and code generator of `put_lanes`."""
+    """Return the signature and the code generator of the intrinsic `put_lanes`, which stores a
+    vector into an array.
+    """
 
     def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
         builder.store(values[2], find_vector(target, builder, sig, values), align=ANY_BYTE)
@@ -228,7 +250,9 @@ def type_store(context: Any, array: Any, place: Any, value: Any) -> Any:
 
 
 def type_select(context: Any, where: Any, first: Any, other: Any) -> Any:
-    """Return signature and code generator of `select`."""
+    """Return the signature and the code generator of the intrinsic `select`, which takes each
+    number from one of two vectors, as a mask says.
+    """
     wide = any(isinstance(kind, LanesType | MaskType) for kind in (where, first, other))
     number = LANES_TYPE if wide else types.float64
     truth = MASK_TYPE if isinstance(where, MaskType) else types.boolean
@@ -241,8 +265,8 @@ def type_select(context: Any, where: Any, first: Any, other: Any) -> Any:
 
 
 def _reduce(combine: Callable[[Any, Any, Any], Any]) -> Any:
-    """Return a code generator that combines the lower with the upper half of the lanes until one
-    number is left, so that the order is fixed.
+    """Return a code generator that reduces a vector to one number: `combine` joins its lower and
+    upper half, until one number is left. Thus the order of the operations is fixed.
     """
 
     def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
@@ -262,19 +286,25 @@ def _reduce(combine: Callable[[Any, Any, Any], Any]) -> Any:
 
 
 def type_sum(context: Any, value: Any) -> Any:
-    """Return signature and code generator of `sum_lanes`."""
+    """Return the signature and the code generator of the intrinsic `sum_lanes`, which adds the
+    numbers of a vector.
+    """
     return types.float64(LANES_TYPE), _reduce(lambda builder, a, b: builder.fadd(a, b))
 
 
 def type_largest(context: Any, value: Any) -> Any:
-    """Return signature and code generator of `largest_lane`."""
+    """Return the signature and the code generator of the intrinsic `largest_lane`, which returns
+    the largest number of a vector.
+    """
     return types.float64(LANES_TYPE), _reduce(
         lambda builder, a, b: choose_lanes(builder, ">", a, b)
     )
 
 
 def type_any(context: Any, mask: Any) -> Any:
-    """Return signature and code generator of `any_lane`."""
+    """Return the signature and the code generator of the intrinsic `any_lane`, which returns True
+    if any truth value of a mask is True.
+    """
 
     def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
         if isinstance(mask, types.Boolean):
@@ -287,7 +317,9 @@ def type_any(context: Any, mask: Any) -> Any:
 
 
 def type_gather(context: Any, table: Any, cell: Any) -> Any:
-    """Return signature and code generator of `gather`."""
+    """Return the signature and the code generator of the intrinsic `gather`, which reads a table at
+    one index per lane.
+    """
     number = LANES_TYPE if isinstance(cell, LanesType) else types.float64
 
     def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
@@ -313,8 +345,9 @@ def _constant(long: Any, value: int) -> Any:
 
 
 def _type_function(value: Any, build: Callable[[Any, Any, Any, Any], Any]) -> Any:
-    """Return signature and code generator of a function of a number or lanes; `build` gets the
-    builder, the value, and the LLVM types of the value and of as many integers.
+    """Return the signature and the code generator of an intrinsic with one argument, a single
+    number or a vector. `build` generates the code from the LLVM builder, the argument, its LLVM
+    type, and the LLVM type of as many integers.
     """
     wide = isinstance(value, LanesType)
     number = LANES_TYPE if wide else types.float64
@@ -327,13 +360,16 @@ def _type_function(value: Any, build: Callable[[Any, Any, Any, Any], Any]) -> An
 
 
 def type_floor(context: Any, value: Any) -> Any:
-    """Return signature and code generator of `floor`."""
+    """Return the signature and the code generator of the intrinsic `floor` (largest whole number
+    that is not above the argument).
+    """
     return _type_function(value, lambda builder, x, *_: call_llvm(builder, "floor", x))
 
 
 def type_guess(context: Any, value: Any) -> Any:
-    """Return signature and code generator of `guess_inverse`: the bits of the result are a constant
-    minus the bits of the argument, which inverts the exponent.
+    """Return the signature and the code generator of the intrinsic `guess_inverse`, a first
+    approximation of 1/x. The bits of the result are a constant minus the bits of x, which changes
+    the sign of the exponent.
     """
 
     def build_code(builder: Any, x: Any, double: Any, long: Any) -> Any:
@@ -344,7 +380,10 @@ def type_guess(context: Any, value: Any) -> Any:
 
 
 def type_root_guess(context: Any, value: Any) -> Any:
-    """Return signature and code generator of `guess_inverse_root`; it also halves the exponent."""
+    """Return the signature and the code generator of the intrinsic `guess_inverse_root`, a first
+    approximation of 1/sqrt(x). Like `guess_inverse` it changes the bits of x; it also halves the
+    exponent.
+    """
 
     def build_code(builder: Any, x: Any, double: Any, long: Any) -> Any:
         half = builder.lshr(builder.bitcast(x, long), _constant(long, 1))
@@ -354,7 +393,9 @@ def type_root_guess(context: Any, value: Any) -> Any:
 
 
 def type_power_of_two(context: Any, value: Any) -> Any:
-    """Return signature and code generator of `power_of_two`, which writes the exponent's bits."""
+    """Return the signature and the code generator of the intrinsic `power_of_two`, which computes
+    2^k by writing the exponent's bits.
+    """
 
     def build_code(builder: Any, x: Any, double: Any, long: Any) -> Any:
         biased = builder.add(builder.fptosi(x, long), _constant(long, 1023))
@@ -364,7 +405,9 @@ def type_power_of_two(context: Any, value: Any) -> Any:
 
 
 def type_exponent(context: Any, value: Any) -> Any:
-    """Return signature and code generator of `exponent_of`, which reads the exponent's bits."""
+    """Return the signature and the code generator of the intrinsic `exponent_of`, which reads the
+    binary exponent from the bits of a number.
+    """
 
     def build_code(builder: Any, x: Any, double: Any, long: Any) -> Any:
         biased = builder.lshr(builder.bitcast(x, long), _constant(long, 52))

@@ -1,14 +1,14 @@
-"""Numbers side by side in one vector register ("lanes") for compiled functions.
+"""Vectors of numbers in one processor register ("lanes") for compiled functions.
 
-A filter bank runs the same arithmetic for many hypotheses. A vector of LANES numbers, one per
-hypothesis, lets one machine instruction serve all of them (structure of arrays). In compiled code
-such a vector comes from `lanes_at` and behaves like a float: operators, `abs`, `min`, `max` and
-`math.sqrt` work lane by lane, and a float is spread over all lanes. One source thus serves single
-numbers and lanes, and for type checkers lanes are floats. A comparison gives a mask, for which
-`select` replaces a branch.
+A filter bank runs the same arithmetic for many hypotheses. In a vector of LANES numbers, one per
+hypothesis, one machine instruction serves all of them (structure of arrays). In compiled code such
+a vector comes from `lanes_at` and behaves like a float: operators, `abs`, `min`, `max` and
+`math.sqrt` work on each lane separately, and a float is copied into all lanes. Therefore one source
+text works for single numbers and for vectors, and type checkers treat vectors as floats. A
+comparison gives a mask; `select` replaces a branch.
 
-Multiplication and addition of lanes are fused where the processor can. Nothing else of fast-math is
-allowed: NaN and infinity keep their meaning, and sums keep their order
+Multiplication and addition of vectors are fused where the processor can do so. No other part of
+fast-math is allowed: NaN and infinity keep their meaning, and sums keep their order
 (`deploy/docs/decisions/0011-no-fast-math.md`).
 """
 
@@ -25,7 +25,9 @@ Function: TypeAlias = Callable[[float], float]
 
 
 def intrinsic_of(name: str) -> object:
-    """Return the intrinsic whose type and machine code `lane_types` defines under `name`."""
+    """Return the Numba intrinsic (function made of given machine code) that `lane_types` defines
+    under `name`.
+    """
     return load_intrinsic("schemas.runtime.lane_types", name)
 
 
@@ -63,8 +65,9 @@ LOG_TERMS: Final = tuple(2.0 / k for k in range(21, 0, -2))
 def inverse_of(x: float) -> float:
     """Return 1/x of a positive normal x with a relative error below 3e-16.
 
-    A division occupies the processor as long as thirty multiply-adds. Newton's method of third
-    order, y <- y*(1 + e + e^2) with e = 1 - x*y, needs nine and reduces the error to its cube.
+    A division occupies the processor as long as thirty multiply-adds. The third-order Newton method
+    used here, y <- y*(1 + e + e^2) with e = 1 - x*y, needs nine in its three steps. Each step
+    raises the relative error to the third power.
     """
     y = guess_inverse(x)
     for _ in range(3):
@@ -92,7 +95,8 @@ def exp_lanes(x: float) -> float:
     """Return e^x for -700 <= x <= 700, with a relative error below 3e-16; a larger or smaller x
     counts as the nearest limit.
 
-    e^x is 2^k*e^r with a whole k and |r| <= ln(2)/2, and e^r its Taylor polynomial.
+    e^x is computed as 2^k*e^r with a whole number k and |r| <= ln(2)/2, where e^r is its Taylor
+    polynomial.
     """
     x = min(max(x, -MOST_EXPONENT), MOST_EXPONENT)
     k = floor(x * LOG2_E + 0.5)
@@ -105,7 +109,8 @@ def log_lanes(x: float) -> float:
     """Return ln(x) of a positive x that is not subnormal; the error is below 3e-16 times the larger
     of 1 and the result.
 
-    With x = 2^k*m and m around 1, ln(m) is 2*artanh(s) for s = (m - 1)/(m + 1), a series in s^2.
+    x is split into 2^k*m with m around 1. ln(m) is 2*artanh(s) with s = (m - 1)/(m + 1), computed
+    as a series in s^2.
     """
     k = exponent_of(x)
     m = x * power_of_two(-k)

@@ -1,7 +1,8 @@
 """Connections of a Zenoh session: the connected router, the transport, and the number of changes.
 
-Zenoh reports each transport and link that opens or closes. A watch keeps the current state and
-counts, so that its owner learns of a lost connection at once and not from missing answers.
+Zenoh reports each transport and link that opens or closes. A `LinkWatch` stores the current state
+and the counts. Therefore a program learns of a lost connection at once, and not only from missing
+answers.
 """
 
 from __future__ import annotations
@@ -55,12 +56,14 @@ class LinkWatch:
 
     @property
     def is_connected(self) -> bool:
-        """True if the watched session is connected to a router."""
+        """Return True if the watched session is connected to a router."""
         return bool(self._routers)
 
     @property
     def protocols(self) -> list[str]:
-        """Transport protocols of the watched session's current links: quic, tls or tcp."""
+        """Return the transport protocols of the watched session's current links: quic, tls
+        or tcp.
+        """
         with self._lock:
             return sorted(self._links.values())
 

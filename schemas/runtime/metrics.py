@@ -1,7 +1,8 @@
-"""Metrics and health over HTTP: OpenMetrics at `/metrics`, health at `/healthz`, on loopback by
-default.
+"""Metrics and health over HTTP: OpenMetrics at `/metrics`, health at `/healthz`, on the loopback
+interface by default.
 
-Values are read when they are requested; no counter exists only for the metrics.
+All values are read from the program's state when they are requested; no counter exists only for the
+metrics.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ Troubles = Callable[[], Sequence[str]]
 def serve_metrics(
     host: str, port: int | None, read: Read, troubles: Troubles
 ) -> Iterator[str | None]:
-    """Serve metrics and health while the block runs; yield the address, or None if `port` is None.
-    Port 0 selects a free port.
+    """Serve metrics and health until the `with` block ends; yield the address, or None if `port` is
+    None. Port 0 selects a free port.
 
     Args:
         host, port: address to listen on.

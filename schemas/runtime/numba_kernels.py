@@ -1,4 +1,6 @@
-"""Compilation of kernels by Numba, with its cache of compiled functions on disk."""
+"""Compilation of kernels (numerical functions) by Numba, with its cache of compiled functions on
+disk.
+"""
 
 from __future__ import annotations
 
@@ -39,14 +41,18 @@ event.register("numba:compile", _Told())  # type: ignore[no-untyped-call]
 
 @typeof_impl.register(NativeKernel)
 def _typeof_native_kernel(kernel: NativeKernel, _: object) -> types.Dispatcher:
-    """Let compiled code call the Numba version of a native kernel."""
+    """Let functions that Numba compiles call a native kernel (function from a shared library): they
+    get Numba's own version of this kernel.
+    """
     dispatcher: Any = kernel.numba_kernel
     return types.Dispatcher(dispatcher)
 
 
 @typeof_impl.register(NativeIntrinsic)
 def _typeof_native_intrinsic(made: NativeIntrinsic, _: object) -> types.Type:
-    """Let compiled code call Numba's version of an intrinsic, which may be loaded only now."""
+    """Let functions that Numba compiles call an intrinsic (function made of given machine code):
+    they get Numba's own version, which may be loaded only at this moment.
+    """
     intrinsic = made.numba_intrinsic
     for context in (cpu_target.typing_context, cpu_target.target_context):
         context.refresh()

@@ -1,4 +1,4 @@
-"""Prefetch of array elements in compiled code."""
+"""Prefetch of array elements into the processor's caches, for compiled code."""
 
 from __future__ import annotations
 

@@ -66,12 +66,12 @@ class PresenceTracker:
             return set(self._fell)
 
     def refresh(self, session: zenoh.Session) -> set[ServiceToken]:
-        """Query the active liveliness tokens (signs that a service is alive), and return them
-        together with the tracked ones.
+        """Query the liveliness tokens (signs that a service is alive) that are active now. Return
+        them together with the tracked ones.
 
-        A router's answer may lack a token that the router is just sending to the same session's
-        subscription (1 of 60 answers). The subscription then delivers the token before the answer
-        ends.
+        Both are needed: a router's answer may lack a token that the router is just sending to the
+        subscription of the same session (1 of 60 answers). The subscription then delivers this
+        token before the answer ends.
         """
         return active_tokens(session) | self.active
 
@@ -87,7 +87,7 @@ class PresenceTracker:
 @contextmanager
 def track_tokens(session: zenoh.Session) -> Iterator[PresenceTracker]:
     """Yield a tracker of the services' liveliness tokens (signs that a service is alive). It
-    contains the tokens that are active now, and follows changes until the block ends.
+    contains the tokens that are active now, and follows changes until the `with` block ends.
     """
     tokens = PresenceTracker()
 

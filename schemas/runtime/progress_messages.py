@@ -52,7 +52,7 @@ def report(line: str) -> None:
 
 
 def report_once(line: str) -> None:
-    """Print a progress message unless this process has printed it before."""
+    """Print a progress message, unless this process has already printed the same message."""
     if line not in _voice.said_once:
         _voice.said_once.add(line)
         report(line)
@@ -68,7 +68,9 @@ def set_status(words: str) -> None:
 
 @contextmanager
 def show_status(words: str) -> Iterator[None]:
-    """Show a spinner while the block runs: only on a terminal, and only after PATIENCE_S."""
+    """Show a spinner with the text `words` until the `with` block ends. It appears only on a
+    terminal, and only after PATIENCE_S.
+    """
     if not (_voice.on and sys.stderr.isatty()) or _voice.shown is not None:
         yield
         return

@@ -1,12 +1,13 @@
 """Records of named fields as a NumPy structured array: the state of each vehicle in compiled code.
 
-The annotations of a class define the fields: float, int, bool, a NumPy number, another such class,
-or Annotated[FloatArray, size, ...] and its counterparts for other numbers. `record_type` returns
-the type and `records` the array. Compiled code sees a row as an object with these names.
+A record is defined by a class whose annotations are the fields. A field is a float, int, bool, a
+NumPy number, another record class, or Annotated[FloatArray, size, ...] and its counterparts for
+other numbers. `record_type` returns the structured NumPy type of a class, and `records` an array of
+this type. Compiled code sees a row of the array as an object with the names of the fields.
 
-A tuple of arrays would be slower: each array in it costs 0.1 to 0.3 µs per call, and a record array
-costs as much as one array. The data of one vehicle are contiguous, and sizes are constants, so
-short loops are unrolled.
+A tuple with one array per field would be slower: each array in it costs 0.1 to 0.3 µs per call,
+whereas a whole record array costs as much as one array. The data of one vehicle are contiguous.
+Field sizes are constants, so that the compiler unrolls short loops.
 
 Annotated[LaneArray, size, ...] adds a last axis of LANES numbers, which compiled code reads as one
 vector (`lanes.py`). Such fields begin at a cache line, because a vector that crosses two lines is
@@ -111,7 +112,9 @@ def _number_type(held: Any) -> Any:  # noqa: ANN401 the annotation of a field
 
 @cache
 def _alignment(held: Any) -> int:  # noqa: ANN401 the annotation of a field
-    """Return the number of bytes at a multiple of which a field must begin."""
+    """Return the alignment of a record's field: its offset must be a multiple of this number of
+    bytes.
+    """
     if held is LaneArray:
         return LINE
     if held in KINDS:

@@ -1,8 +1,8 @@
 """Spark session, and distribution of tasks over a cluster.
 
-Tasks run independently, and a task is repeated if its machine fails. A task therefore writes each
-file under a name that depends on the task alone. It writes a draft of its own and renames the
-draft.
+Tasks run independently, and a task is repeated if its machine fails. Therefore a task writes each
+file under a name that depends on the task alone. It writes the file under a temporary name first,
+and then renames it.
 """
 
 from __future__ import annotations

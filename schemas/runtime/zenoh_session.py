@@ -1,9 +1,12 @@
 """Zenoh session for GripMap: a client of routers, without scouting, gossip and shared memory.
 
-Reasons: scouting finds foreign routers and costs half a second at start. Shared memory drops
-samples silently when a receiver stalls. The lease of a Zenoh link states how long the link to a
-silent peer stays open. An endpoint that does not answer is abandoned after `open_timeout`. So,
-where UDP is blocked, TLS (listed after QUIC) is tried soon.
+Reasons for the settings:
+
+- Scouting finds foreign routers and costs half a second at start.
+- Shared memory drops samples silently when a receiver stalls.
+- The lease is the time for which the link to a silent peer stays open; here it is 3 s.
+- An endpoint that does not answer is abandoned after `open_timeout`. Therefore, where UDP is
+  blocked, TLS (listed after QUIC) is tried soon.
 """
 
 from __future__ import annotations
@@ -44,8 +47,8 @@ log = logging.getLogger(__name__)
 
 
 def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
-    """Return the Zenoh configuration. Endpoints override the defaults of this module, and the
-    `config` section of the settings overrides both.
+    """Return the Zenoh configuration of a session. It consists of this module's defaults, the
+    endpoints of the settings, and their `config` section; a later one overrides the earlier ones.
 
     Args:
         settings: Zenoh section of the configuration file.

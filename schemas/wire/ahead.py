@@ -1,5 +1,5 @@
-"""Encoder and decoder of the message about the road ahead of a vehicle: warnings, and the horizon
-(the road ahead) as a sequence of road segments ("runs").
+"""Encoder and decoder of the message about the road ahead of a vehicle. The message contains
+warnings, and the map's values along the road ("horizon") as a sequence of road segments ("runs").
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class GripWarning:
 
 
 class Runs(NamedTuple):
-    """Horizon (the road ahead) as n runs. A run is a segment of the route within one cell and
-    sector. Fields as in the protobuf message `Ahead`.
+    """Horizon (the map's values for the road ahead) as n runs. A run is a segment of the route
+    within one cell and sector. Fields as in the protobuf message `Ahead`.
     """
 
     start_m: FloatArray

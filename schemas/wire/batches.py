@@ -1,5 +1,5 @@
-"""Decoder of one batch of records, and the parts that all decoders share: heads (fields of a batch
-other than its records), checks, and columns that a sender may leave out.
+"""Decoder of one batch (message with records), and functions that all decoders share. They handle
+heads (fields of a batch other than its records), checks, and columns that a sender may leave out.
 
 Missing columns are filled: floats with NaN, cell and sector from the pose (position and yaw), the
 leaving time with the entering time. The fleet service has its own decoder, which decodes many

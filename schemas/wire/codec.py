@@ -41,8 +41,8 @@ MAX_BYTES: Final = 64 * 1024  # fifty records take 8 kB as protobuf, 40 kB as JS
 
 
 class Kind(StrEnum):
-    """Kind of a batch: observations or states. The enum value is the chunk of the Zenoh key that
-    names the kind.
+    """Kind of the records in a batch: observations or states. The enum value is also the chunk
+    (part between slashes) of the Zenoh key that names the kind.
     """
 
     OBSERVATION = "obs"

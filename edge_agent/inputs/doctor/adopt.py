@@ -1,11 +1,12 @@
-"""Correction of a recorded drive by the measurements of the signal doctor: delayed devices and
-locked axles.
+"""Correction of a recorded drive by the measurements of the signal doctor (automatic check of the
+signals): delayed devices and locked axles.
 
 The doctor reports a delay between devices that is too large for the filter. If the drive shows the
 size of the delay, the log is corrected before the estimator reads it. A delay of unknown size
-remains a finding (reported fault), and the records of the log are not published. Smaller delays are
-estimated by the filter's own states, so that a log without faults is estimated causally, as in a
-car: no result depends on later samples.
+remains a finding (reported fault), and the records of the log are not published.
+
+Smaller delays are not corrected here, because the filter itself estimates them. Therefore a log
+without faults is estimated as in a car: no result depends on later samples.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ class Adopted(NamedTuple):
 
 
 def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
-    """Return the log for the estimator: corrected first by the calibration, then by the doctor's
-    measurements.
+    """Return the log for the estimator. It is corrected first by the vehicle's calibration, then by
+    the measurements of the signal doctor (automatic check of the signals).
     """
     return adopt_measured(replace(log, signals=correct_log(log.t, log.signals, vehicle)), vehicle)
 

@@ -49,9 +49,9 @@ def late_devices(diagnosis: Diagnosis) -> dict[str, float]:
     """Return the delay [s] of each device (wheel speeds, steering, inertial unit), from the lags
     measured in the turns of a drive.
 
-    If wheels and steering lead the yaw rate by about the same time, the inertial unit has the
-    delay; but if its accelerometer is not late compared with the wheels, only the gyroscope has the
-    delay.
+    If wheels and steering are both ahead of the yaw rate by about the same time, the delay is
+    attributed to the inertial unit. If the unit's accelerometer is not late compared with the
+    wheels, the delay is attributed to the gyroscope alone.
     """
     wheel, steer = (diagnosis.lags.get(name, 0.0) for name in ("wheel_lag", "steer_lag"))
     if not (abs(wheel) > LARGEST_LAG_S and abs(wheel - steer) < 0.5 * abs(wheel)):

@@ -193,7 +193,8 @@ def prepare_drive(
 
 def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
     """Return a mask (n,) that is True where a wheel spins or locks. The function compares the wheel
-    speeds (n, 4) with each other, so their unit does not matter.
+    speeds (n, 4) with each other, so their unit does not matter. `fast` is a high speed of the car
+    in this drive, in the same unit.
 
     The front and rear wheel of a side roll nearly alike, in turns too. A constant difference
     between them is attributed to different tyres. A wheel that differs all the time is not
@@ -219,8 +220,9 @@ def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
 
 
 def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
-    """Return a mask (n,) that is True where all wheels spin or lock together: there the ratio of
-    their speed to the speed over ground is unusual. The unit of the wheel speed does not matter.
+    """Return a mask (n,) that is True where all wheels spin or lock together, because the ratio of
+    their speed `v` to the speed over ground `v_ground` is unusual. The unit of `v` does not matter.
+    `fast` is a high speed of the car in this drive, in the same unit.
     """
     known = np.isfinite(v) & np.isfinite(v_ground) & (np.abs(v) > 0.3 * fast)
     if known.sum() < 5 * RATE_HZ:

@@ -310,8 +310,8 @@ def _holds_throughout(
 
 def _turns_as_steered(verdict: Verdict, found: dict[str, Fit]) -> bool:
     """Return True if the car turns as its steering or its course over ground predicts. Otherwise
-    the car slides, and v·r (speed times yaw rate) must not be compared with the lateral
-    acceleration.
+    the car slides, and its lateral acceleration is not v·r (speed times yaw rate), so that the two
+    must not be compared.
     """
     for name in ("steering", "turning"):
         gain = 1.0
@@ -330,12 +330,12 @@ def _turns_as_steered(verdict: Verdict, found: dict[str, Fit]) -> bool:
 
 
 def _find_radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Finding]:
-    """Return findings about wheels that turn faster or slower than the others while driving
+    """Return findings about wheels that turn faster or slower than the others while the car drives
     straight and calmly, and about exchanged axles.
 
     In a bend, wheels slip with the force of the tyres, so only moments with hardly any force count.
-    If the error of a wheel does not also appear while the car coasts, the wheel speeds are added to
-    `doubts`, the channels that remain unknown.
+    An error of a wheel must also appear while the car coasts. If it does not, it is not reported,
+    and the wheel speeds are added to `doubts`, the channels that are neither confirmed nor faulty.
     """
     findings = []
     tracks = (vehicle.track_front, vehicle.track_front, vehicle.track_rear, vehicle.track_rear)

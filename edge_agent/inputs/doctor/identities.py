@@ -254,9 +254,9 @@ def _bend_of(
     """Return (share of `bend` (the understeer term) in the right side, standard deviation of ln
     gain that follows from the uncertainty of this share).
 
-    The share is the posterior mean over BENDS. Its cost is the residual of the left side over
-    `count` independent moments plus the squared deviation of the share from its value on usual
-    cars.
+    The share is the posterior mean over the candidate values BENDS. The cost of a candidate (-2
+    times its log posterior) consists of the residual of the left side over `count` independent
+    moments and the squared deviation of the candidate from the share on usual cars.
     """
     costs = np.zeros(len(BENDS))
     gains = np.zeros(len(BENDS))

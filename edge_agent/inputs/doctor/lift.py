@@ -1,10 +1,10 @@
 """Test for a car on a lift or on rollers: wheels turn and change speed, but the body does not
 accelerate.
 
-On a road, an accelerometer measures wheels that gain .5 m/s² for a second, also in a slide on ice:
-driven wheels without any grip may spin, but then the other wheels show whether the car moves.
-Therefore the test requires that one axle stands while the other turns fast, or that all wheels
-change their speed while accelerometers and yaw rate show no motion.
+On a road, wheels that gain 0.5 m/s² for a second accelerate the body, and the accelerometer shows
+it. Wheels that spin on ice are an exception: the body hardly accelerates, but the other wheels show
+whether the car moves. Therefore the test requires that one axle stands while the other turns fast,
+or that all wheels change their speed while accelerometers and yaw rate show no motion.
 """
 
 from __future__ import annotations

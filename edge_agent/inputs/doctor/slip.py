@@ -72,11 +72,11 @@ def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float
 
 
 def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
-    """Return the axles with exchanged left and right wheels, if the other axle is correct: name and
-    wheel indices.
+    """Return the axles with exchanged left and right wheels, as (name, wheel indices). An axle is
+    found only if the wheels of the other axle are not exchanged.
 
-    If both axles are exchanged, they agree with each other, and the comparison of the wheels' yaw
-    rate with the gyroscope shows the fault.
+    If both axles are exchanged, they agree with each other, and this test finds nothing. The
+    comparison of the wheels' yaw rate with the gyroscope then shows the fault.
     """
 
     def yaw_likeness(yaw: FloatArray) -> float:
@@ -108,9 +108,9 @@ def find_locked_axles(drive: EvenDrive) -> list[str]:
     """Return the axles whose wheels turn at the same speed, "front" or "rear": a locked
     differential, or one sensor for both wheels.
 
-    The other axle must agree with the yaw rate. A wheel speed of a locked axle is the mean of both
-    wheels; a filter that interprets the missing difference as slip would see a slide in every tight
-    turn.
+    An axle is reported only if the other axle agrees with the yaw rate. The fault matters because
+    in a turn the wheels of a locked axle lack the usual difference in speed. A filter would
+    interpret this as slip, and see a slide in every tight turn.
     """
     locked = []
     for name, own, other in (
@@ -164,9 +164,9 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
 
 
 def spread_of_parts(beside: FloatArray) -> float:
-    """Return the standard deviation of a quantity (n,), one value per part of a drive. If it is
-    small, the quantity is a constant sensor error such as a tilt; a slide does not last over all
-    parts.
+    """Return how much a quantity (n,) differs between the parts of a drive: the standard deviation
+    of its medians in the parts. If it is small, the quantity is a constant sensor error such as a
+    tilt, because a slide does not last over all parts.
     """
     parts = [
         float(np.nanmedian(part))
@@ -177,8 +177,8 @@ def spread_of_parts(beside: FloatArray) -> float:
 
 
 def is_steady(fit: Fit) -> bool:
-    """Return True if the fitted gain of an identity (left over right side of a physical relation)
-    in most parts of the drive equals that over the complete drive.
+    """Return True if the fitted gain of an identity (ratio of two quantities that are equal by
+    physics) is about the same in most parts of the drive as over the complete drive.
     """
     return share_of_parts(fit, fit.gain) >= STEADY_SHARE
 
