@@ -57,7 +57,9 @@ class RuleBase(NamedTuple):
 
 
 def rule_base(memberships: Memberships) -> RuleBase:
-    """Return the fuzzy rules with the corners and consequents given in `memberships`."""
+    """Return the fuzzy rules with the corners of the sets and the consequents (outputs) given in
+    `memberships`.
+    """
     m = memberships
     ln_noise, pace = m.consequents
     return RuleBase(
@@ -102,7 +104,7 @@ def forgetting_rate(rules: RuleBase, wheels: float) -> float:
 @compiled
 def wide_noise(rules: RuleBase, angle: float) -> float:
     """Return the factor on the measurement noise R of an axle whose wheels are steered by `angle`
-    [rad].
+    [rad]; it is above 1 at wide angles.
     """
     return math.exp(rules.ln_noise * is_high(abs(angle), rules.wide))
 

@@ -131,8 +131,8 @@ def learn_calibration(
 
 
 def weigh_estimates(drives: Sequence[DriveEstimates], vehicle: Vehicle) -> Calibration | None:
-    """Return a calibration (sensor errors of a car) with means and standard deviations over several
-    drives; None if no drive has an estimate.
+    """Combine the estimates of several drives into one calibration (sensor errors of a car), with
+    mean and standard deviation for each quantity; None if no drive has an estimate.
     """
     estimates: dict[str, list[float]] = {}
     for drive in drives:
@@ -169,11 +169,12 @@ def surer_values(one: Calibration | None, other: Calibration | None) -> Calibrat
 def _posterior_of(
     kind: str, values: FloatArray, bias: float, unknown: float
 ) -> tuple[float, float]:
-    """Return the posterior (mean, standard deviation) of a quantity of the calibration from the
-    estimates of several drives (n,).
+    """Return the posterior (mean, standard deviation) of a quantity of the calibration, called
+    `kind`, from its estimates in several drives, `values` (n,).
 
-    `unknown` is the standard deviation stated by the best drive. If it is not 0, the estimates
-    already include the prior; their median is then not moved towards the prior mean again.
+    `bias` is the standard deviation of errors common to all drives, and `unknown` the smallest
+    standard deviation that a drive states. If `unknown` is not 0, the estimates already include the
+    prior; then their median is not moved towards the prior mean again.
     """
     sound = SOUND.get(kind, 0.0)
     centre = float(np.median(values))

@@ -1,5 +1,5 @@
-"""The two operations of a federated filter: the master shares its information with the sub-filters,
-and fuses their results.
+"""The two operations of a federated filter: the master (main filter) shares its information with
+the sub-filters, and fuses their results.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ SLOT_S = 0.02
 
 
 class Excitation:
-    """Largest grip used in the last second, stored in a ring of time slots. Each slot has the
-    largest force over load [1] that any wheel used during the slot.
+    """Largest grip used in the last second, kept in a ring of time slots (short intervals). Each
+    slot has the largest force over load [1] that any wheel used during the slot.
     """
 
     time: Annotated[FloatArray, SLOTS]  # at which a slot began [s]
@@ -30,7 +30,9 @@ class Excitation:
 
 @compiled
 def begin_excitation(ring: Excitation) -> None:
-    """Reset the record of the grip used, a ring of time slots: no grip has been used so far."""
+    """Reset the record of the grip used, a ring of time slots (short intervals): no grip has been
+    used so far.
+    """
     ring.largest_time = -math.inf
     for k in range(SLOTS):
         ring.time[k] = -math.inf
@@ -38,8 +40,8 @@ def begin_excitation(ring: Excitation) -> None:
 
 @compiled
 def note_excitation(ring: Excitation, time: float, used: float) -> None:
-    """Store the grip used at `time` [s] in a ring of time slots, and update `ring.largest`, the
-    largest value of the last second.
+    """Store the grip used at `time` [s] in a ring of time slots (short intervals), and update
+    `ring.largest`, the largest value of the last second.
     """
     place = ring.newest
     if not time - ring.time[place] < SLOT_S:

@@ -115,8 +115,8 @@ def close_visit(
 
 @compiled
 def write_estimates(memory: MixtureMemory, design: MixtureDesign, output: FloatArray) -> None:
-    """Write the current estimates of a vehicle's filter (`memory`) into `output`, the row of one
-    sample; the caller adds the health flags.
+    """Write the current estimates of a vehicle's filter (`memory`) into `output`, the estimated
+    quantities of one sample. The caller adds the health flags.
     """
     if not memory.started:
         report_prior(design, output)

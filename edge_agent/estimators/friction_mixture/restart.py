@@ -121,8 +121,8 @@ def reset_to_wheel_speed(
 
     If wheels have agreed for a long time, vehicle states and friction are reset together with the
     motion. If wheels have just begun to roll without force, after a slide, only the motion is
-    reset. Without a reset, nodes that assume these wheels slide would not recover, because the tyre
-    curve is flat there. The larger measurement noise during a slide does not cause a reset.
+    reset. Without a reset, nodes (friction hypotheses) that assume these wheels slide would not
+    recover: the tyre curve is flat there, so the measurements hardly change their velocity.
     """
     rolling = memory.rolling
     if not math.isnan(rolling.ahead):

@@ -113,8 +113,8 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
 
 @compiled
 def prepare_prediction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Compute the process variances of the states over the block (0.05 s), and the factors by which
-    vehicle and sensor states return to their prior.
+    """Prepare the prediction over the block (0.05 s): compute the process variances of the states,
+    and the factors by which vehicle and sensor states return to their prior.
     """
     block = memory.block
     constants = design.constants

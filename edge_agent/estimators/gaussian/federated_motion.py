@@ -1,5 +1,5 @@
-"""Federated filter of planar motion with two cubature sub-filters and a master, common to papers
-000 and 001.
+"""Federated filter of planar motion that papers 000 and 001 share. It has two cubature sub-filters
+and a master that fuses their results.
 
 State [v_x, v_y, a_x, a_y, r, r'] (the papers use the moment Gamma = I_z*r' instead of r').
 Sub-filter 1 measures [a_x, a_y, r], sub-filter 2 [a_y, r] (000, below equation 53). Equations of

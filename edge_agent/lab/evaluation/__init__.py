@@ -1,3 +1,3 @@
-"""Evaluation of estimators (`edge-agent evaluate`): the papers' manoeuvres for every estimator,
-with figures, a table and plots.
+"""Evaluation of estimators (`edge-agent evaluate`): every estimator runs on the papers' manoeuvres,
+and the results are reported as numbers, a table and plots.
 """

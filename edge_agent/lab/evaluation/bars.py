@@ -1,5 +1,5 @@
-"""List of the figures that the evaluation campaign reports: first those with a target ("bar"), then
-all other measures for context.
+"""List of the figures (named numbers) that the evaluation campaign reports: first those with a
+target ("bar"), then all other measures for context.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ PRIOR_WIDTH: Final = 0.9 * 1.15  # of the 90 % interval of the uniform prior
 
 
 class EstimatorBar(NamedTuple):
-    """A figure with a target: its name, the function that reads it from the results (NaN if not
-    measured), its unit and its target.
+    """A figure (named number) with a target: its name, the function that reads it from the results
+    (NaN if not measured), its unit and its target.
     """
 
     name: str
@@ -52,8 +52,9 @@ def noise_mean(experiment: str, measure: str) -> Callable[[Results], float]:
 
 
 def in_the_world(name: str) -> Callable[[Results], float]:
-    """Return a function that takes the campaign's results and returns the figure `name` of the
-    default estimator in `real_world`: towns with inaccurate cars, or cars that stand on a slope.
+    """Return a function that takes the campaign's results and returns the figure (number) called
+    `name` of the default estimator in `real_world`: towns with inaccurate cars, or cars that stand
+    on a slope.
     """
     return lambda results: results.world.get(DEFAULT, {}).get(name, math.nan)
 
@@ -215,9 +216,9 @@ def unit_of(measure: str) -> str:
 
 
 def figures(results: Results, *, quick: bool) -> list[Figure]:
-    """Return all figures of the evaluation. Figures with a target come first (with `quick`, only
-    the measured ones). The others are named `KIND.SCENARIO.ESTIMATOR.MEASURE` and come with a
-    standard deviation.
+    """Return all figures (named numbers) of the evaluation. Figures with a target come first (with
+    `quick`, only the measured ones). The others are named `KIND.SCENARIO.ESTIMATOR.MEASURE` and
+    come with a standard deviation.
     """
     barred = [Figure(bar.name, bar.read(results), bar.unit, bar.bar, bar.better) for bar in BARS]
     listed = [figure for figure in barred if not (quick and math.isnan(figure.value))]
@@ -244,9 +245,9 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
 
 
 def _consistency_figures(results: Results) -> list[Figure]:
-    """Return the figures on filter consistency: the bounds of NEES and NIS (normalised squared
-    errors and innovations), and for every estimator the share of true frictions below each stated
-    quantile.
+    """Return the figures (named numbers) on filter consistency: the bounds of NEES and NIS
+    (normalised squared errors and innovations), and for every estimator the share of true frictions
+    below each stated quantile.
     """
     listed = []
     for measure in COMPONENTS if results.seeds else ():

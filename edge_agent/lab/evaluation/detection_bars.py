@@ -1,5 +1,6 @@
-"""Figures of the detection evaluation: how each figure is computed from a tally (sums and counts),
-its unit, and its targets ("bars") for inaccurate ("rough") and accurate ("plain") cars.
+"""Figures (named numbers) of the detection evaluation: how each figure is computed from a tally
+(sums and counts), its unit, and its targets ("bars") for inaccurate ("rough") and accurate
+("plain") cars.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ SHARE: Final = "1"
 
 
 class DetectionBar(NamedTuple):
-    """A figure of the detection evaluation: the drives that it covers, the function that computes
-    it from a tally (sums and counts), its unit, and its targets for inaccurate and for accurate
-    cars (KINDS).
+    """A figure (named number) of the detection evaluation: the drives that it covers, the function
+    that computes it from a tally (sums and counts), its unit, and its targets for inaccurate and
+    for accurate cars (KINDS).
 
     `length`: one of LENGTHS, or "" for both together.
     """
@@ -216,9 +217,9 @@ DETECTION: Final = (
 
 
 def detection_figures(results: DetectionResults) -> list[Figure]:
-    """Return the figure `NAME.KIND` for every entry of DETECTION and both kinds of cars (rough:
-    inaccurate, plain: accurate), with its standard error over towns. Figures with a target come
-    first.
+    """Return the figures (named numbers) of the detection evaluation with their standard errors
+    over towns: `NAME.KIND` for every entry of DETECTION and both kinds of cars (rough: inaccurate,
+    plain: accurate). Figures with a target come first.
 
     `NAME.KIND.winter` and `NAME.KIND.other` are the same figure for the winter towns and the other
     towns, if there are both.

@@ -47,8 +47,8 @@ DEFAULT: Final = "aco-fckf"
 
 
 class DetectionTown(NamedTuple):
-    """A town to evaluate: its seed, "rough" or "plain" cars, duration of the drives [s], number of
-    cars, and True if it is winter there.
+    """A town to evaluate: its seed, its kind of cars ("rough": inaccurate, or "plain": accurate),
+    duration of the drives [s], number of cars, and True if it is winter there.
     """
 
     seed: int

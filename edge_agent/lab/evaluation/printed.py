@@ -1,5 +1,5 @@
-"""Numbers printed in the papers, names of the figures of this evaluation that are compared with
-them, and reasons why some printed numbers cannot be reproduced.
+"""Table of the numbers printed in the papers, with the names of this evaluation's results that are
+compared with them, and the reasons why some printed numbers cannot be reproduced.
 """
 
 from __future__ import annotations
@@ -8,8 +8,8 @@ from typing import Final, NamedTuple
 
 
 class Printed(NamedTuple):
-    """A number that a paper prints: paper, quantity, printed value, and the names of the
-    evaluation's figures that are compared with it.
+    """A number that a paper prints: paper, quantity, printed value, and the names of this
+    evaluation's results that are compared with it.
     """
 
     paper: str
@@ -39,7 +39,7 @@ PRINTED_002: Final = {"sine": (".1008", ".0779"), "jturn": (".0825", ".0117")}
 def printed_row(
     paper: str, scenario: str, estimator: str, measure: str, what: str, value: str
 ) -> Printed:
-    """Return a number printed in a paper together with the names of two figures of this evaluation:
+    """Return a number printed in a paper together with the names of two results of this evaluation:
     one with error-free sensors, one with ordinary sensors.
     """
     same = f"ideal.{scenario}.{estimator}.{measure}"
@@ -133,7 +133,7 @@ DEFAULT: Final = "aco-fckf"
 
 
 def names() -> list[str]:
-    """Return the names of the evaluation's figures that are compared with printed numbers, and the
+    """Return the names of the evaluation's results that are compared with printed numbers, and the
     names of their standard deviations.
     """
     found = [

@@ -69,8 +69,8 @@ HEAD: Final = (
 
 @dataclass(frozen=True)
 class LogFigures:
-    """Figures about the estimates of one log, as listed in the module's docstring; NaN where the
-    log does not determine a figure.
+    """Results for one log, as listed in the module's docstring; NaN where the log does not
+    determine a result.
     """
 
     name: str
@@ -114,7 +114,9 @@ def judge_folder(
 
 
 def judge_log(path: Path) -> LogFigures:
-    """Estimate one recorded log, and return the evaluation figures of the estimates."""
+    """Estimate motion and friction from one recorded log, and return the evaluation results for
+    it.
+    """
     adopted = prepare_log(read_log(path), load_vehicle(path.with_suffix(".json")))
     values, urgent = replay_log(adopted.log, adopted.vehicle)
     truth = read_truth(path, adopted.log.t)
@@ -173,7 +175,7 @@ def judge_estimates(
     known: float | None,
     urgent: int | None,
 ) -> LogFigures:
-    """Return the evaluation figures of one log, computed from its estimates `values` (T, columns)
+    """Return the evaluation results for one log, computed from its estimates `values` (T, columns)
     and the measured true values.
     """
     t = adopted.log.t
@@ -254,8 +256,9 @@ def root_mean_square(error: FloatArray, among: BoolArray) -> float:
 
 
 def summarise(found: Sequence[LogFigures]) -> list[Figure]:
-    """Return the evaluation figures over all logs. Most are means weighted by the duration of each
-    log. Figures for which one bad log is too many are the value of the worst log.
+    """Return the figures (named numbers) of the evaluation over all logs. Most are means weighted
+    by the duration of each log. Where one bad log is too many, the figure is the value of the worst
+    log.
     """
     seconds = np.array([log.seconds for log in found])
 
@@ -283,7 +286,7 @@ def summarise(found: Sequence[LogFigures]) -> list[Figure]:
 
 
 def table_row(log: LogFigures) -> str:
-    """Return the evaluation figures of one log as a row of a Markdown table."""
+    """Return the evaluation results for one log as a row of a Markdown table."""
     cells = [
         f"{value:.3g}" if math.isfinite(value) else "–"
         for value in (asdict(log)[name] for name in HEAD)
@@ -295,7 +298,7 @@ def table_row(log: LogFigures) -> str:
 
 
 def table(found: Sequence[LogFigures]) -> str:
-    """Return the evaluation figures of all logs as a Markdown table."""
+    """Return the evaluation results for all logs as a Markdown table."""
     head = ["log", "seconds", "doctor passed", *(name.replace("_", " ") for name in HEAD)]
     rows = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}", *(table_row(log) for log in found)]
     return "\n".join(rows)

@@ -246,8 +246,9 @@ def fastest(estimator: str, batches: Sequence[DriveSet]) -> float:
 
 @dataclass
 class RealWorldResults:
-    """Evaluation figures by estimator and name, and one drive to plot. One of the "estimators" is
-    "baseline": the wheels' mean speed as v_x, and the prior's interval as friction.
+    """Results of the evaluation (named numbers) by estimator and name, and one drive to plot. One
+    of the "estimators" is "baseline": the wheels' mean speed as v_x, and the prior's interval as
+    friction.
     """
 
     found: dict[str, dict[str, float]]

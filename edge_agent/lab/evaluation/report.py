@@ -1,4 +1,4 @@
-"""Markdown report of the evaluation, generated only from the figures."""
+"""Markdown report of the evaluation, generated only from its figures (named numbers)."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def report(figures: Sequence[Figure], *, seeds: int) -> str:
 
 
 def table(values: dict[str, float]) -> str:
-    """Return a Markdown table that compares the figures printed in the papers with the figures
+    """Return a Markdown table that compares the numbers printed in the papers with the numbers
     measured here.
     """
     rows = []
@@ -150,8 +150,8 @@ def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def number(values: dict[str, float], name: str, *, spread: bool = True) -> str:
-    """Return a figure's mean as text for the report, with ± standard deviation if `spread` is True
-    and it is known; a dash if it was not measured.
+    """Return the mean of the figure (named number) `name` as text for the report, with ± standard
+    deviation if `spread` is True and it is known; a dash if it was not measured.
     """
     value = values.get(name, math.nan)
     sd = values.get(f"{name}.sd")
@@ -163,7 +163,7 @@ def number(values: dict[str, float], name: str, *, spread: bool = True) -> str:
 
 
 def own_plants(barred: Sequence[Figure], values: dict[str, float]) -> str:
-    """Return a Markdown table of the figures of paper 004 that have a target: the value under the
+    """Return a Markdown table of the results for paper 004 that have a target: the value under the
     paper's conditions, and the values with the simulator's own vehicle models ("plants").
     """
     rows = []
@@ -180,7 +180,7 @@ def own_plants(barred: Sequence[Figure], values: dict[str, float]) -> str:
 
 
 def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
-    """Return a Markdown table of those figures with a target for which an oracle (an ideal
+    """Return a Markdown table of those results with a target for which an oracle (an ideal
     observer) was run: the target, the value of the default estimator, and that of the oracle.
     """
     rows = []
@@ -219,8 +219,8 @@ def world(values: dict[str, float]) -> str:
 
 
 def estimators(values: dict[str, float], prefix: str, suffix: str) -> list[str]:
-    """Return the names of the estimators that occur in the names of the figures between `prefix`
-    and `suffix`, each once and in order.
+    """Return the names of the estimators that occur in the keys of `values` between `prefix` and
+    `suffix`, each once and in order.
     """
     found = [
         name[len(prefix) : -len(suffix)]
@@ -344,8 +344,8 @@ def detection_report(figures: Sequence[Figure]) -> str:
 
 
 def detection_table(figures: Sequence[Figure]) -> str:
-    """Return a Markdown table with one row per figure of the detection evaluation: rough and plain
-    cars with standard errors, and the targets.
+    """Return a Markdown table of the detection evaluation with one row per result: its value for
+    rough (inaccurate) and plain (accurate) cars with standard errors, and the targets.
     """
     by_name = {figure.name: figure for figure in figures}
     names = dict.fromkeys(

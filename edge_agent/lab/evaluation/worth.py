@@ -4,7 +4,8 @@ that were not used for tuning.
 Legend of the filter variants (for all scores, less is better)
     fuzzy        the default estimator with all its rules and the shipped vertices
     sets_off     no fuzzy sets: a product of ramps decides the share of evidence, and R is not
-                 adapted; strain and the consistency test as in the default
+                 adapted; strain (deviation of states from their prior) and the consistency test as
+                 in the default
     none         without any rule, strain and consistency test (`ckf`)
     default      all rules with untuned vertices
     random       all rules with the vertices (corners of the fuzzy sets) found by random search,
@@ -179,9 +180,9 @@ def ratio(scores: Scores, name: str) -> float:
 
 
 def figures(scores: Scores) -> list[Figure]:
-    """Return the figures of the comparison of filter variants that have no target: standard
-    deviations of the ratios, paired differences of the scores, ratios per surface, and every
-    interval score.
+    """Return those figures (named numbers) of the comparison of filter variants that have no
+    target: standard deviations of the ratios, paired differences of the scores, ratios per surface,
+    and every interval score.
     """
     listed = []
     for name, (over, under) in RATIOS.items():
@@ -210,8 +211,8 @@ def figures(scores: Scores) -> list[Figure]:
 
 
 def barred_figures(scores: Scores) -> list[Figure]:
-    """Return the figures of the comparison of filter variants: first the ratios, which have
-    targets, then all others.
+    """Return all figures (named numbers) of the comparison of filter variants: first the ratios,
+    which have targets, then all others.
     """
     barred = [Figure(name, ratio(scores, name), "1", bar, "less") for name, bar in BARS.items()]
     plain = [
@@ -223,8 +224,8 @@ def barred_figures(scores: Scores) -> list[Figure]:
 
 
 def comparison_table(values: dict[str, float]) -> str:
-    """Return a Markdown table of the ratios of interval scores between filter variants, from the
-    values of the figures by name.
+    """Return a Markdown table of the ratios of interval scores between filter variants. `values`
+    are the results of the comparison by name.
     """
     lines = [
         (

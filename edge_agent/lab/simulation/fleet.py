@@ -299,8 +299,8 @@ def rough_ones(vehicles: int, share: float) -> BoolArray:
 def winter_ones(vehicles: int, share: float) -> BoolArray:
     """Return an array (N,) that is True for vehicles with winter equipment.
 
-    Pairs of successive vehicles have the same equipment. Therefore half of the winter vehicles are
-    rough if half of all vehicles are.
+    Pairs of successive vehicles have the same equipment. Therefore, if every second vehicle is
+    rough (inaccurate), half of the winter vehicles are rough.
     """
     return np.repeat(rough_ones((vehicles + 1) // 2, share), 2)[:vehicles]
 

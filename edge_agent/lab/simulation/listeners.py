@@ -1,5 +1,5 @@
-"""Simulated drivers who receive warnings and slow down: their routes, and the warnings passed to
-them.
+"""Simulated drivers who receive warnings and slow down. The module keeps their routes ahead, and
+passes warnings to them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ EVERY: Final = 10  # blocks between two looks at the route
 
 def warned_ones(vehicles: int, share: float) -> BoolArray:
     """Return an array (N,) that is True for drivers who receive warnings. They are evenly
-    distributed over accurate and rough vehicles.
+    distributed over accurate and rough (inaccurate) vehicles.
 
     Raises:
         InputError: the share is not between 0 and 1.

@@ -1,5 +1,5 @@
-"""Roads as lanes: centre lines of straights and arcs, one lane per direction on the right, and
-connectors through junctions.
+"""Roads as lanes (directed lines of points): centre lines of straights and arcs, one lane per
+direction on the right, and connectors through junctions.
 
     lane       a directed polyline, points about a metre apart, with heading and curvature
     connector  a lane through a junction, from the end of one lane to the start of another road's

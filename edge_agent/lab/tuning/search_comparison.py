@@ -88,8 +88,8 @@ def compare_searches(
     quick: bool = False,
     log_line: Callable[[str], None] = lambda _line: None,
 ) -> list[Figure]:
-    """Run every search method with every seed, score the results on held-out noise, and return
-    means with standard errors.
+    """Run every search method with every seed, and score the results on held-out noise. Return the
+    figures (named numbers): means with standard errors.
     """
     ants, iterations, duration = (3, 2, 1.0) if quick else (ANTS, ITERATIONS, study.DURATION_S)
     train = study.record(study.TRAIN, duration)
@@ -147,7 +147,9 @@ def _mean(name: str, values: Sequence[float]) -> list[Figure]:
 
 
 def comparison_markdown(figures: Sequence[Figure]) -> str:
-    """Return the report of the comparison of search methods as Markdown, from the figures only."""
+    """Return the report of the comparison of search methods as Markdown, computed only from its
+    figures (named numbers).
+    """
     return (
         "# Search methods with equal budgets on the filter of paper 004\n\n"
         "Mean log-likelihood of the innovations [nat/s] ± standard error over seeds; more is "
@@ -156,7 +158,9 @@ def comparison_markdown(figures: Sequence[Figure]) -> str:
 
 
 def comparison_tables(figures: Sequence[Figure]) -> str:
-    """Return the two Markdown tables of the report: means, and paired differences."""
+    """Return the two Markdown tables of the comparison of search methods: means, and differences
+    paired by seed.
+    """
     values = {figure.name: figure.value for figure in figures}
 
     def cell(name: str) -> str:

@@ -4,8 +4,8 @@ search and ant colony, for correct and wrong measurement noise R of the filter.
 The filter is `paper-aco-fckf` as in the paper's experiments: white noise only on a_x, a_y and r,
 exact inputs, start at the true state. R can therefore be exactly right, ten times too small or ten
 times too large. The objective is the mean log-likelihood of the innovations over all conditions
-[nat/s]. Inflating R does not improve it, in contrast to the paper's own objective (33). Held-out
-drives share neither seed nor manoeuvre with the drives of the search.
+[nat/s]. Inflating R does not improve it, in contrast to the paper's own objective (equation 33).
+Held-out drives share neither seed nor manoeuvre with the drives of the search.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Report of the tuning study as figures, a table, a plot and a file of tuned memberships
-(parameters of the fuzzy sets). Each kind of search runs several times, and all results are scored
-on held-out drives.
+"""Report of the tuning study as figures (named numbers), a table, a plot and a file of tuned
+memberships (parameters of the fuzzy sets). Each kind of search runs several times, and all results
+are scored on held-out drives.
 """
 
 from __future__ import annotations
@@ -86,7 +86,8 @@ def run(
     reporter: Callable[[str], Progress],
 ) -> Study:
     """Run every kind of search with every seed, and return the study with all results. `reporter`
-    is called with the name of a search and returns the function that reports its progress.
+    receives the name of a search and returns the function to which this search reports its
+    progress.
     """
     done = Study(study.record(study.TRAIN, duration_s), study.record(study.HELD_OUT, duration_s))
     problem = study.problem_on(done.train, positions)
@@ -105,9 +106,9 @@ def run(
 
 
 def figures(done: Study) -> list[Figure]:
-    """Return the figures of the study for each kind of search: the scores under each condition of
-    the measurement noise on held-out drives, the objective on both sets of drives, and the progress
-    of the searches.
+    """Return the figures (named numbers) of the study for each kind of search: the scores under
+    each condition of the measurement noise on held-out drives, the objective on both sets of
+    drives, and the progress of the searches.
     """
     listed = []
     overalls: dict[str, list[float]] = {}
@@ -154,8 +155,8 @@ def _mean_sd(name: str, values: Sequence[float], unit: str) -> list[Figure]:
 
 
 def markdown(listed: Sequence[Figure]) -> str:
-    """Return a Markdown table of the figures `listed`, with a row per condition and measure and a
-    column per kind of search.
+    """Return a Markdown table of the study's results `listed`, with a row per condition and measure
+    and a column per kind of search.
     """
     values = {figure.name: figure.value for figure in listed}
 
@@ -198,8 +199,8 @@ def scores(done: Study, way: str) -> dict[str, Score]:
 
 
 def draw(listed: Sequence[Figure], per_iteration: int, path: Path) -> None:
-    """Plot the best objective found so far over the number of evaluations: mean and one standard
-    deviation over the searches.
+    """Plot, for each kind of search, the best objective found so far over the number of
+    evaluations: mean and one standard deviation over the searches. The plot is written to `path`.
     """
     import matplotlib as mpl
 

@@ -136,8 +136,9 @@ def _steer_rate(memory: MixtureMemory, duration: float) -> float:
 def _compute_wheel_forces(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures
 ) -> int:
-    """Compute the longitudinal force over load of the four wheels, and the part of their noise
-    (`features.noise_std`) that comes from the forces; return the health flags.
+    """Compute the longitudinal force over load of the four wheels; return the health flags. The
+    noise of these forces is written to `features.noise_std`, to which `_compute_noise` later adds
+    the other noise.
     """
     health = 0
     loads = features.loads
@@ -258,8 +259,8 @@ def _compute_side_forces(memory: MixtureMemory, features: BlockFeatures) -> None
 
 @compiled
 def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
-    """Set the lateral force of an axle to NaN if its slip or the yaw moment was not measured;
-    return the health flags.
+    """Set the lateral force of an axle to NaN if it cannot be used, because the steering angle (for
+    the slip) or the yaw rate (for the force) was not measured. Return the health flags.
     """
     health = 0
     counts = memory.block.counts
@@ -342,11 +343,12 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
 def wheel_speed_jump(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures, wheel: int
 ) -> float:
-    """Return the difference [m/s] between a wheel's speed and its smoothed speed; 0 where unknown.
+    """Return the absolute difference [m/s] between the car's speed according to one wheel and the
+    smoothed value of this speed; 0 where unknown.
 
-    Before the comparison, the smoothed speed is advanced by the car's acceleration. The comparison
-    distinguishes a wheel that spins up or locks, whose difference lasts for several blocks (of 0.05
-    s), from a bump in the road, which lasts one or two.
+    Before the comparison, the smoothed value is advanced by the car's acceleration. If a wheel
+    spins up or locks, the difference lasts for several blocks (of 0.05 s). At a bump in the road it
+    lasts for one or two.
     """
     now = at_centre(memory.row, features, wheel)
     usual = memory.usual_rolling
@@ -427,8 +429,8 @@ def unexplained_slip_difference(
 
 @compiled
 def grip_demand(features: BlockFeatures) -> float:
-    """Return the larger force over load of the two axles [1]; the force is the longitudinal and
-    lateral one together. A missing lateral force counts as zero.
+    """Return the force over load [1] of the axle that uses more, from longitudinal and lateral
+    force together. A missing lateral force counts as zero.
 
     The forces of the two wheels of an axle are added, because force over load of an almost unloaded
     inner wheel would be unreliable.

@@ -1,10 +1,10 @@
 """Split of the longitudinal force between front and rear axle where torque is missing.
 
-Which axles are driven is learned from their slip. When a car accelerates, its driven axle turns
-faster than the other one, by the slip that its force needs. Brisk driving distinguishes front, rear
-and all-wheel drive within a second. When a car brakes, the front axle takes the larger share on all
-cars. On low friction a wheel slips more than its force requires. Therefore more slip than a kind of
-drive predicts is no evidence against this kind; less slip is.
+The filter learns from the slip of the axles which of them are driven. When a car accelerates, its
+driven axle turns faster than the other one, by the slip that its force needs. Brisk driving
+distinguishes front, rear and all-wheel drive within a second. When a car brakes, the front axle
+takes the larger share on all cars. On low friction a wheel slips more than its force requires.
+Therefore more slip than a kind of drive predicts is no evidence against this kind; less slip is.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ LEAST_ODDS = 1e-4  # a wrong certainty is left within seconds
 @compiled
 def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, float]:
     """Return the front axle's share of the longitudinal force at acceleration `ax` [m/s^2], and the
-    share's standard deviation.
+    standard deviation of the share. `odds` are the probabilities of front, rear and all-wheel
+    drive.
     """
     front = row[Parameter.DRIVE_FRONT]
     spread = SHARE_STD

@@ -1,5 +1,6 @@
-"""The grip in use (force over load) as a lower limit of friction: smaller frictions get a penalty,
-and the upper end of the reported interval is never below the grip in use.
+"""The grip in use (force over load) as a lower limit of friction: a tyre cannot transmit more than
+its friction. Friction hypotheses below it get a penalty, and the upper end of the reported interval
+is never below it.
 """
 
 from __future__ import annotations

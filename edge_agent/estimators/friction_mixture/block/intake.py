@@ -1,9 +1,9 @@
 """Intake of a sample: it rejects impossible readings, filters the yaw rate, and adds the sample to
 the sums of the block (the samples within 0.05 s).
 
-Missing readings are replaced: a_x by zero and a_y by r*v_x, both with the process noise of a random
-walk; the yaw rate by the speed difference of the rear wheels; steering by its last value. All other
-missing readings are left out of the sums.
+Missing readings are replaced: a_x by zero and a_y by r*v_x (yaw rate times speed), both with the
+process noise of a random walk; the yaw rate by the speed difference of the rear wheels; steering by
+its last value. All other missing readings are left out of the sums.
 """
 
 from __future__ import annotations
@@ -144,8 +144,8 @@ def _drop_outlier(value: float, used: float, read: float) -> float:
 def _integrate_motion(
     memory: MixtureMemory, constants: Constants, dt: float, ax: float, ay: float, turning: bool
 ) -> None:
-    """Integrate the velocity that the vehicle has gained since the block (0.05 s) began over a
-    further step of dt [s]. It is expressed in the current vehicle axes.
+    """Integrate, over a further step of `dt` [s], the velocity that the vehicle has gained since
+    the beginning of the block (0.05 s). It is expressed in the current vehicle axes.
 
     The solution is exact for inputs that are constant over dt. `ax` and `ay` [m/s^2] are NaN where
     missing; `turning` is True if the yaw rate is known.

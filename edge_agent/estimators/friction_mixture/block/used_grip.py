@@ -24,8 +24,8 @@ MOST_USED = 1.5  # [1] more is no tyre of a road car: a bump, or a load that the
 
 @compiled
 def used_grip(memory: MixtureMemory, features: BlockFeatures) -> float:
-    """Return the larger force over load of the two axles [1], smoothed over time, and update the
-    smoothed forces in the memory.
+    """Return the force over load [1], smoothed over time, of the axle that uses more. The smoothed
+    forces in `memory` are updated.
     """
     share = 1.0 - math.exp(-features.duration / SMOOTH_S)
     most = 0.0

@@ -3,7 +3,7 @@
 After a few metres without large tyre forces, the estimator lowers the lower end of the friction
 interval, because the road may be icy again. The median is unaffected. The mixture assumes that the
 road changes only once in hundreds of metres, so that learned friction lasts. With the mixture
-alone, the lower end would fall to ice only long after the car has passed a patch.
+alone, the lower end would fall to the friction of ice much too late for a patch of a few metres.
 
 Therefore this module stores, for each ice node (hypothesis of low friction), the probability that
 the car is now on a patch. Over the length of a patch this probability grows to the prior

@@ -143,9 +143,9 @@ def belief_strain(cost: float, learned: float, prior: float) -> float:
     """Return the strain (chi-square per degree of freedom) of the estimated vehicle and sensor
     states. `cost` [nat] is half of their chi-square against the prior.
 
-    `learned` is the number of degrees of freedom that measurements have determined. `prior` is a
-    number of imagined further ones with chi-square 1 each, so the result is 1 if nothing was
-    learned.
+    `learned` is the number of degrees of freedom that measurements have determined. `prior` is the
+    number of assumed further degrees of freedom, with chi-square 1 each, so that the result is 1 if
+    nothing was learned.
     """
     return (2.0 * cost + prior) / (learned + prior)
 

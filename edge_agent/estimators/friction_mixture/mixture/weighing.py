@@ -110,7 +110,9 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
 
 @compiled
 def mixture_likelihood(scratch: Scratch, groups: int) -> float:
-    """Return the log-likelihood [nat] of the block's measurements by the whole mixture."""
+    """Return the log-likelihood [nat] of the measurements of the block (0.05 s) under the whole
+    mixture of friction hypotheses.
+    """
     top = -math.inf
     for group in range(groups):
         awake = lanes_at(scratch.share, group) > 0.0
@@ -196,7 +198,7 @@ def update_novelty(
     """Compute two fuzzy truth values, 0 to 1: features.new ("forces or slips are new") and
     memory.slip.axle_ended ("the slide has ended"). Update the smoothed usual forces and slips.
 
-    (vx, vy) [m/s] is the mean velocity of the block.
+    (vx, vy) [m/s] is the mean velocity in the block (0.05 s).
     """
     constants = design.constants
     keep = math.exp(-features.duration / constants.steady_time)
@@ -242,8 +244,8 @@ def advance_usual(usual: FloatArray, i: int, now: float, keep: float) -> float:
 
 @compiled
 def axle_slip(row: FloatArray, features: BlockFeatures, vx: float, vy: float, axle: int) -> float:
-    """Return the lateral slip of an axle at the velocity (vx, vy) [m/s], as linear force over load;
-    NaN if its lateral force is unknown.
+    """Return the lateral slip of an axle at the velocity (vx, vy) [m/s], expressed as the force
+    over load [1] of a linear tyre; NaN if its lateral force is unknown.
     """
     if math.isnan(features.side[axle]):
         return math.nan

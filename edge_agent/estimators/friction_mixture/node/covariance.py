@@ -4,14 +4,14 @@ read and written; LANES is the number of nodes in a group.
 
 Legend
     m, P     means (n,) and covariances (n, n) of the states
-    h        covariance of the states with a measurement row, P*H'                 (n,)
+    h        covariance of the states with a measurement row, P*H' (n,)
     a, nu    variance of the innovation (measurement minus prediction), and innovation
     z        share of a node's state that is replaced by that of the whole mixture [1]
 
 The update is P <- P - h*h'/a. The difference loses digits: rounding is 1e-16, so ten digits remain
 if the measurements reduce a variance by a factor of 1e6. The measurements of one block (0.05 s)
-never reduce it more. Between blocks the process noise restores the rank, and a pivot of the factor
-is never below a limit.
+never reduce it more. Between blocks the process noise restores the rank, and a pivot (squared
+diagonal element) of the factor is never below a limit.
 """
 
 from __future__ import annotations
@@ -60,8 +60,9 @@ def factorize_first(covariance: FloatArray, root: FloatArray) -> None:
 def subtract_row(
     mean: FloatArray, covariance: FloatArray, h: FloatArray, per: float, step: float
 ) -> None:
-    """Apply one scalar measurement: m += h*step and P -= h*h'*per, with step nu/a, per 1/a and the
-    covariances h (n, LANES).
+    """Apply one scalar measurement to the filters of a group: m += h*step and P -= h*h'*per. Here
+    `h` (n, LANES) is the covariance of the states with the measurement, `step` is nu/a (innovation
+    over its variance) and `per` is 1/a.
     """
     for i in range(mean.shape[0]):
         own = lanes_at(h, i)
@@ -105,10 +106,14 @@ def predict_covariance(
     noise: FloatArray,
 ) -> None:
     """Replace the covariances by F*P*F' + diag(noise), where F is the matrix of the prediction over
-    a block (0.05 s): rotation by the yaw angle with cosine and sine `turn`, velocity `gain` from
-    the accelerations as offsets change it, and factors `keep` (n,) of the other states.
+    a block (0.05 s).
 
-    turned (2, n, LANES) is scratch: the covariance of the new velocity with the old states.
+    F consists of three parts: the rotation of the velocity by the yaw angle with cosine and sine
+    `turn`, the effect of accelerometer offsets on the velocity `gain`, and the factors `keep` (n,)
+    by which the other states decay.
+
+    `turned` (2, n, LANES) is scratch memory for the covariance of the new velocity with the old
+    states.
     """
     n = covariance.shape[0]
     for k in range(n):

@@ -1,5 +1,6 @@
-"""Linearisation of the six measurement equations (rows) of a group of nodes (friction hypotheses)
-at their means: noise of the rows, and derivatives by the states that enter linearly.
+"""Linearisation of the six measurement equations (rows: four wheels, two axles) of a group of nodes
+(friction hypotheses) at their means: noise of the rows, and derivatives by the states that enter
+linearly.
 """
 
 from __future__ import annotations
@@ -40,9 +41,10 @@ def linearize_nodes(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> float:
-    """Linearise the measurement rows of a group of nodes (friction hypotheses) at their `mean` (n,
-    LANES): compute tyre forces over load, residuals, noise, and node.derivative, the derivatives of
-    the rows by the linear states. Return the penalty [nat] of each node for sliding wheels.
+    """Linearise the measurement equations (rows) of a group of nodes (friction hypotheses) at their
+    `mean` (n, LANES). Compute tyre forces over load, residuals, noise, and node.derivative, the
+    derivatives of the rows by the linear states. Return the penalty [nat] of each node for sliding
+    wheels.
 
     The leak (gravity in a_y when the body rolls) and the offset of a_y change the same forces.
     Therefore the derivative by the leak is a multiple of the derivative by the offset.
@@ -100,8 +102,8 @@ def _differentiate_forces(
 
 @inlined
 def _divide_by_step(node: NodeWorkspace, out: FloatArray, step: float) -> None:
-    """Replace the residuals `out` (6, LANES), for which one state was changed by `step`, by their
-    derivatives.
+    """Turn the residuals `out` (6, LANES), computed with one state changed by `step`, into
+    derivatives by this state: their difference from node.residual, divided by `step`.
     """
     per_step = 1.0 / step
     for r in range(ROWS):
@@ -145,11 +147,11 @@ def _differentiate_speeds(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Compute the derivatives of the measurement rows by the four wheel radii, and by the time lag
-    of the wheel speed signals.
+    """Compute the derivatives of the measurement rows (residuals of wheels and axles) by the four
+    wheel radii, and by the time lag of the wheel speed signals.
 
-    Each wheel's measurement row depends on the speed of this wheel. One evaluation with all four
-    radii changed gives all derivatives, because the radii hardly change the rows of the axles.
+    The row of a wheel depends on the speed of this wheel only, and the rows of the axles hardly
+    depend on the radii. Therefore one evaluation with all four radii changed gives all derivatives.
     """
     step = design.nominal.std[NodeState.RADIUS]
     by_lag = node.derivative[NodeState.LAG_WHEEL]
@@ -180,11 +182,11 @@ def _differentiate_speeds(
 def weigh_slopes(
     curve: TyreCurve, features: BlockFeatures, flat: float, node: NodeWorkspace
 ) -> float:
-    """Compute node.noise, the noise variances of the six measurement rows at the slips node.slip;
-    return the penalty [nat] for sliding wheels.
+    """Compute node.noise, the noise variances of the six residuals (four wheels, two axles) at the
+    slips node.slip. Return a penalty [nat] per node for sliding wheels.
 
-    The penalty applies to wheels on the flat part of the curve: a sliding wheel may have any slip,
-    so its probability density is low.
+    The penalty is for wheels on the flat part of the tyre curve. There a wheel may have any slip,
+    so the probability density of the measured slip is low.
     """
     slip = node.slip
     density = 1.0 + 0.0 * lanes_at(slip.size, 0)

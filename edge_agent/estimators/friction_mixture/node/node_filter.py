@@ -6,15 +6,16 @@ Legend
     B           measurement deviations of the cubature points, in the axes of the first CURVED
                 columns of the factor of P                             (CURVED, 6)
     D           derivative of the rows by a state that they depend on linearly
-    h           covariance of the states with a row                     (n,)
-    S           covariance of the rows without noise                    (6, 6)
+    h           covariance of the states with a row (n,)
+    S           covariance of the rows without noise (6, 6)
 
-The measurement rows are nonlinear only in velocity and stiffness. Therefore the third-degree
-cubature rule is applied in these four dimensions. The rows are linear in the other states: leak
-(gravity that a tilted accelerometer measures), steering error, shape of the tyre curve and gain of
-torque. These enter exactly, by the derivative D (a Rao-Blackwellised rule). With L the first
-columns of the factor, h = L*B' + P*D' and S = B*(B + D*L)' + D*h. Rows are applied one after the
-other, so that the noise of each may differ from node to node.
+The six measurements (four wheels, two axles) are nonlinear only in velocity and stiffness.
+Therefore the third-degree cubature rule is applied in these four dimensions. The measurements are
+linear in the other states: leak (gravity that a tilted accelerometer measures), steering error,
+shape of the tyre curve and gain of torque. These enter exactly, by the derivative D (a
+Rao-Blackwellised rule). With L the first columns of the factor, h = L*B' + P*D' and S = B*(B +
+D*L)' + D*h. The measurements are applied one after the other, so that the noise of each may differ
+from node to node.
 """
 
 from __future__ import annotations
@@ -64,9 +65,8 @@ DOUBTED = 0.05  # of distrust_noise, at the brink of it
 
 
 class NodeUpdate(NamedTuple):
-    """Result of the measurement update of a group of nodes (friction hypotheses), per node: its
-    log-likelihood, and the terms from which the weights of all nodes and the penalties are
-    computed.
+    """Result of the measurement update of a group of nodes (friction hypotheses): for each node its
+    log-likelihood, and the terms from which node weights and penalties are computed.
     """
 
     log_likelihood: float  # with the inflated R and the price of sliding [nat]
@@ -131,14 +131,14 @@ def weigh_rows(
     share: float,
     inflation: float,
 ) -> float:
-    """Compute innovation, variance and inflated noise of each measurement row, and add them to the
-    sums of the block (0.05 s), weighted by the nodes' probabilities `share`. Return the
-    log-likelihood with the measurement noise R as it is before inflation.
+    """Compute innovation, variance and inflated noise of each of the six measurements (four wheels,
+    two axles), and add them to the sums of the block (0.05 s), weighted by the nodes' probabilities
+    `share`. Return the log-likelihood with the measurement noise R as it is before inflation.
 
-    The noise of the axles' rows is increased further if these rows contradict the model, and while
-    the inputs are steady. With steady inputs, errors of the tyre curve and of offsets repeat from
-    block to block; if they were treated as noise, the filter would average them into stiffness and
-    shape.
+    The noise of the axles is increased further if their measurements contradict the model, and
+    while the inputs are steady. With steady inputs, errors of the tyre curve and of offsets repeat
+    from block to block. With the smaller noise, the filter would adapt stiffness and shape to these
+    errors.
     """
     constants = design.constants
     features = scratch.features
@@ -188,11 +188,12 @@ def spread_points(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Compute the predicted measurements at the cubature points (sample states) of a group of nodes
-    (friction hypotheses).
+    """Evaluate the residuals at the cubature points (sample states) of a group of nodes (friction
+    hypotheses).
 
-    Fill node.curved (B), node.residual with the predicted rows, and node.nonlinearity with the
-    variance caused by nonlinearity. node.root holds the first columns of the covariances' factors.
+    Results: node.curved, the deviations of the residuals along each column of node.root (the first
+    columns of the covariances' factors); node.residual, their mean; and node.nonlinearity, the
+    variance caused by nonlinearity.
     """
     scale = math.sqrt(CURVED)
     slip = node.moved_slip
@@ -225,8 +226,8 @@ def spread_points(
 
 @compiled
 def find_covariances(covariance: FloatArray, node: NodeWorkspace) -> None:
-    """Compute node.cross, the covariance of the states with each measurement row (h), and
-    node.spread, the covariance of the rows with each other (S).
+    """Compute node.cross, the covariance of the states with each of the six measurements, and
+    node.spread, the covariance of the measurements with each other.
     """
     derivative = node.derivative
     for i in range(STATES):
@@ -267,9 +268,8 @@ def doubted_noise(trust: Trust, constants: Constants) -> float:
 
 @compiled
 def rear_noise(memory: MixtureMemory, constants: Constants) -> float:
-    """Return the factor on R (measurement noise) of the rear axle's measurement rows. It is above 1
-    while the front axle is already on another surface, because then no single friction explains
-    both axles.
+    """Return the factor on the measurement noise R of the rear axle. It is above 1 while the front
+    axle is already on another surface, because then no single friction explains both axles.
     """
     return constants.rear_unlike if memory.last.time < memory.slip.rear_unlike_until else 1.0
 
@@ -295,11 +295,13 @@ def take_rows(
     node: NodeWorkspace,
     axle_penalty: float,
 ) -> float:
-    """Update a group of nodes (friction hypotheses) with the innovations node.residual, one
-    measurement row after the other. node.spread is S with the noise on its diagonal.
+    """Update the filters of a group of nodes (friction hypotheses) with the innovations
+    node.residual, one measurement after the other. node.spread is the covariance of the
+    innovations.
 
     Return the negative log-likelihood [nat] without constants: half of the normalised squared
-    innovations, plus half of `axle_penalty`·ln(innovation variance) for each row of the axles.
+    innovations, plus half of `axle_penalty`·ln(innovation variance) for each measurement of an
+    axle.
     """
     squares = 0.0 * lanes_at(node.residual, 0)
     product = 1.0 + squares
@@ -324,8 +326,9 @@ def take_rows(
 
 @inlined
 def _condition_rows(node: NodeWorkspace, r: int, per: float) -> None:
-    """Condition the measurement rows after r on row r, whose variance is 1/per: update their
-    innovations, their covariances with each other, and their covariances with the states.
+    """Condition the measurements after number r on measurement r, whose innovation variance is
+    1/per: update their innovations, their covariances with each other, and their covariances with
+    the states.
     """
     for q in range(r + 1, ROWS):
         share = lanes_at(node.spread, (q, r)) * per
@@ -341,8 +344,8 @@ def _condition_rows(node: NodeWorkspace, r: int, per: float) -> None:
 
 @inlined
 def _subtract_rows(covariance: FloatArray, node: NodeWorkspace) -> None:
-    """Subtract from the state covariances the part that the measurement rows explain: h*h'*gain for
-    each row.
+    """Subtract from the state covariances the part that the measurements explain: h*h'*gain for
+    each measurement, with its covariance h with the states.
     """
     for i in range(STATES):
         for r in range(ROWS):

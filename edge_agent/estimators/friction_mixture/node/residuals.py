@@ -10,12 +10,12 @@ Legend
                 force over load [1]
     e           sign(e_b)*|e_a*e_b|/sqrt(e_a^2 + e_b^2): distance to the tyre curve [1]
 
-Rows: the longitudinal residuals of four wheels, then the lateral residuals of two axles. In the
-linear range e weights slip and force equally. On the flat part and beyond the peak only the force
-counts, so the row of a sliding wheel measures its friction (errata, section "what made the
-difference", item 1). An axle has one mean slip; its wheels share the lateral force in proportion to
-load. The states of a node (gravity leaking into a_y, gain of torque, shape of the tyre) correct the
-measured force.
+Measurements ("rows"): the longitudinal residuals of four wheels, then the lateral residuals of two
+axles. In the linear range e weights slip and force equally. On the flat part and beyond the peak
+only the force counts, so the row of a sliding wheel measures its friction (errata, section "what
+made the difference", item 1). An axle has one mean slip; its wheels share the lateral force in
+proportion to load. The states of a node (gravity leaking into a_y, gain of torque, shape of the
+tyre) correct the measured force.
 
 All functions compute a group of nodes at once (`schemas.runtime.lanes`).
 """
@@ -59,7 +59,7 @@ FLATTEST = 0.03  # a sliding wheel's slip is not quite arbitrary: its inertia ho
 
 @inlined
 def is_measured(features: BlockFeatures, r: int) -> bool:
-    """Return True if all readings of measurement row r (four wheels, two axles) are known."""
+    """Return True if all readings for residual r (0 to 3 wheels, 4 and 5 axles) are known."""
     reading = features.rolling[r] if r < 4 else features.side[r - 4]
     return not math.isnan(reading)
 
@@ -82,10 +82,10 @@ def gained_velocity(
     gain: VelocityGain, leak_y: float, bias_x: float, bias_y: float
 ) -> tuple[float, float]:
     """Return the velocity (forward, left) [m/s] that the vehicle gains in the block (0.05 s),
-    integrated from the accelerometers and corrected by two kinds of states: leak (share of a_y that
-    is gravity felt by the rolled body), and sensor offsets including the road's slope and bank
-    (lateral slope) [m/s^2].
+    integrated from the accelerometers.
 
+    It is corrected by the leak (share of a_y that is gravity felt by the rolled body) and by the
+    sensor offsets [m/s^2], to which the slope and bank (lateral slope) of the road have been added.
     An offset of a_y has the same effect as an offset of a_x, rotated by 90 degrees.
     """
     measured = gain.measured
@@ -98,8 +98,8 @@ def gained_velocity(
 
 @inlined
 def gained_by(gain: VelocityGain, mean: FloatArray) -> tuple[float, float]:
-    """Return the velocity (forward, left) [m/s] that each node of a group gained in the block
-    (0.05 s) by its states `mean` (n, LANES).
+    """Return the velocity (forward, left) [m/s] gained in the block (0.05 s), as each node
+    (friction hypothesis) of a group estimates it with its sensor offsets in `mean` (n, LANES).
     """
     return gained_velocity(
         gain,
@@ -111,8 +111,8 @@ def gained_by(gain: VelocityGain, mean: FloatArray) -> tuple[float, float]:
 
 @compiled
 def find_readings(features: BlockFeatures, node: NodeWorkspace) -> None:
-    """Compute node.rolling and node.steering: the speeds of the wheels and the offset of the
-    steering as the states node.point correct them.
+    """Compute the wheel speeds (node.rolling) and the offset of the steering (node.steering),
+    corrected by the filter states node.point, such as wheel radii and time lags.
 
     The offset of the steering includes the compliance of the front axle: steering column and
     bushings of production cars yield up to 35 mrad per g of lateral acceleration.
@@ -209,7 +209,7 @@ def find_ratios(
 @compiled
 def find_shape_force(curve: TyreCurve, features: BlockFeatures, node: NodeWorkspace) -> None:
     """Compute node.shape_force: how much the force over load at the slips node.slip changes if the
-    shape of the tyre curve changes by one standard deviation.
+    tyre curve becomes sharper by one standard deviation of its shape.
     """
     slip = node.slip
     for axle in range(2):
@@ -339,8 +339,8 @@ def _slip_at_force(curve: TyreCurve, mu: float, per_mu: float, force: float, oth
 def find_residuals(
     features: BlockFeatures, slip: NodeSlip, forces: NodeForces, out: FloatArray
 ) -> None:
-    """Compute out (6, LANES): for each measurement row (four wheels, two axles), the distance [1]
-    of the measured slip and force from the tyre curve; 0 if a reading is missing.
+    """Compute `out` (6, LANES): for each wheel (longitudinal) and then each axle (lateral), the
+    distance [1] of the measured slip and force from the tyre curve; 0 if a reading is missing.
     """
     for r in range(ROWS):
         if not is_measured(features, r):

@@ -1,4 +1,5 @@
-"""Operations on vectors with one number per measurement row (ROWS = 6: four wheels, two axles).
+"""Operations on vectors ("rows") with one number per measurement (ROWS = 6: four wheels, two
+axles).
 
 The vectors are tuples, so that the compiler keeps them in registers during a loop. Elements of an
 array would be read from memory again after each write to any array. Each number stands for LANES
@@ -18,7 +19,9 @@ Row: TypeAlias = tuple[float, float, float, float, float, float]
 
 @inlined
 def scale_row(rows: FloatArray, i: int, factor: float) -> Row:
-    """Return `factor` times vector i of `rows` (n, ROWS, LANES), one number per measurement row."""
+    """Return `factor` times vector i of `rows` (n, ROWS, LANES). A vector has one number per
+    measurement.
+    """
     return (
         factor * lanes_at(rows, (i, 0)),
         factor * lanes_at(rows, (i, 1)),
@@ -53,7 +56,7 @@ def multiply_row(row: Row, rows: FloatArray, i: int) -> float:
 
 @inlined
 def put_row(rows: FloatArray, i: int, row: Row) -> None:
-    """Write the vector `row` to place i of `rows` (n, ROWS, LANES)."""
+    """Write the vector `row` to rows[i]; `rows` has the shape (n, ROWS, LANES)."""
     put_lanes(rows, (i, 0), row[0])
     put_lanes(rows, (i, 1), row[1])
     put_lanes(rows, (i, 2), row[2])

@@ -24,8 +24,8 @@ def report_beliefs(
     """Write the friction belief of each filter, and its evidence from the current visit (passage of
     one map cell), on the 32 bins of the friction grid.
 
-    `own` (N, 32) receives log(posterior/uniform), `visit` (N, 32) the log-likelihood of the current
-    visit so far. Each row has maximum 0.
+    `own` (N, 32) receives the belief as log(posterior/uniform), and `visit` (N, 32) the evidence as
+    log-likelihood. Each vehicle's values have maximum 0.
     """
     design = contexts[0].design
     scratch = contexts[0].scratch

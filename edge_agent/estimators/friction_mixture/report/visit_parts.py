@@ -1,5 +1,5 @@
-"""Friction jumps inside a visit (passage of one map cell): detection, and evidence of the part of
-the visit before the surface changed.
+"""Friction jumps inside a visit (passage of one map cell): their detection, and the evidence of the
+part of the visit before the surface changed.
 
 The friction belief of a visit starts from the prior and follows the road, so at the end it
 describes only the last surface. In addition, the most informative belief of the visit so far is
@@ -10,7 +10,7 @@ replaces the kept belief nor counts as a jump.
 
 Legend
     w, s       probabilities of the nodes in the visit, and those of the kept belief   (K,)
-    p          prior of the nodes                                                 (K,)
+    p          prior of the nodes (K,)
     D          information, Σ w·ln(w/p) [nat]
 """
 
@@ -38,8 +38,8 @@ KNOWING = 0.7
 
 @compiled
 def begin_part(memory: MixtureMemory, design: MixtureDesign) -> None:
-    """Begin a new part of the visit (the stretch of the map cell on one surface), without evidence
-    on friction so far.
+    """Begin a new part of the visit (the passage of one map cell); a part is a stretch on one
+    surface. It has no evidence on friction yet.
     """
     copy_vector(memory.surest, design.prior)
     memory.information = 0.0

@@ -52,8 +52,8 @@ def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:
 
 
 def means_of(vehicles: Sequence[Vehicle], mean: FloatArray) -> FloatArray:
-    """Return the means (N, STATES) of the priors: `mean` (STATES,), with the understeer of a
-    vehicle where it is known.
+    """Return the means (N, STATES) of the states' priors: `mean` (STATES,), with the vehicle's own
+    understeer where it is known.
 
     Understeer learned from drives takes precedence over the value computed from the axle data of
     the vehicle file. If neither exists, the mean over all vehicles is used.

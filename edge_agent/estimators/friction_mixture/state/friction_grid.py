@@ -3,7 +3,7 @@ prior, change of the road, quantiles and evidence.
 
 Legend
     mu          node values, equidistant in sqrt(mu)              (K,)
-    prior       mass of a uniform prior on [.05, 1.20] per node    (K,)
+    prior       probability of each node under a uniform prior on [.05, 1.20]    (K,)
     w           probabilities of the nodes                        (K,)
     density     w/prior, the posterior over the uniform prior, linear between nodes
 """
@@ -119,7 +119,7 @@ def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> floa
 @compiled
 def probability_below(mu: FloatArray, prior: FloatArray, w: FloatArray, limit: float) -> float:
     """Return the probability that the friction is below `limit`, given probabilities w (K,) of the
-    grid values mu (K,). The density is the same as in `quantile`.
+    grid values mu (K,). The density between grid values is interpolated as in `quantile`.
     """
     count = mu.shape[0]
     below = total = 0.0
@@ -138,9 +138,9 @@ def probability_below(mu: FloatArray, prior: FloatArray, w: FloatArray, limit: f
 
 @compiled
 def _segment_mass(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
-    """Return the unnormalised probability mass between the friction values `mu` of the nodes j - 1
-    and j, for their prior and weights `w`. For j = 0 and for j equal to the number of nodes, one
-    end is the end of the friction range.
+    """Return the unnormalised probability mass between nodes j - 1 and j (grid values `mu` of
+    friction), for their prior and probabilities `w`. For j = 0, and for j equal to the number of
+    nodes, the segment extends from the outer node to the end of the friction range.
     """
     count = mu.shape[0]
     if j == 0:

@@ -1,4 +1,4 @@
-"""Memory of the friction mixture that is kept between samples: one record per vehicle."""
+"""Records of the data that the friction mixture keeps between samples, one set per vehicle."""
 
 from __future__ import annotations
 

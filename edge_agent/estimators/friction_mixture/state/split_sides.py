@@ -104,8 +104,8 @@ def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
 
 
 def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
-    """Return the probability that a triangular density of friction has in each cell (range of
-    friction), (cells,); `edges` (cells + 1,) are the borders of the cells.
+    """Return the probability of each cell (range of friction) under a triangular density, (cells,);
+    `edges` (cells + 1,) are the borders of the cells.
     """
     left, middle, right, _ = triangle
     rising = np.clip(edges - left, 0.0, middle - left)

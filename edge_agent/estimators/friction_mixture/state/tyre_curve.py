@@ -88,7 +88,7 @@ def curve_tables(curve: Curve) -> TyreCurve:
 @inlined
 def interpolate_table(table: FloatArray, place: float) -> float:
     """Return the value of a table over [0, 1] at `place`, interpolated linearly between the table's
-    points. `place` is a number, or one number per node of a group.
+    points. `place` is a number, or one number per node (friction hypothesis) of a group.
     """
     cells: int = table.shape[0] - 1
     scaled = place * cells

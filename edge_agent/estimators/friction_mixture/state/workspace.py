@@ -27,7 +27,7 @@ class BlockFeatures:
 
     The mean velocity of the block is rotation(cos, sin)*v + gains, where v is the velocity at the
     block's beginning. The order of wheels is fl, fr, rl, rr, and of axles front, rear. The order of
-    measurement rows is the four wheels (longitudinal), then the two axles (lateral).
+    measurements is the four wheels (longitudinal), then the two axles (lateral).
     """
 
     duration: float  # [s]
@@ -70,8 +70,8 @@ class BlockFeatures:
 
 
 class NodeSlip:
-    """Slips of the wheels and axles for one state vector of each node (filter of one friction
-    hypothesis) of a group, and the forces that the tyre curve gives for them.
+    """Slips of wheels and axles, and the forces that the tyre curve gives for them, for one state
+    vector of each node (filter of one friction hypothesis) in a group.
     """
 
     along: Annotated[LaneArray, 4]  # g_x, linear force over load [1]

@@ -1,1 +1,1 @@
-"""Reproduction of the five papers: conditions, figures and tables of each paper."""
+"""Reproduction of the five papers: the conditions, plots and tables of each paper."""

@@ -123,7 +123,9 @@ class PaperTable:
 
 @dataclass
 class Reproduction:
-    """All results of the reproduction of one paper: tables, plots, and further figures."""
+    """All results of the reproduction of one paper: tables, plots, and further figures (named
+    numbers).
+    """
 
     paper: str
     title: str
@@ -145,8 +147,8 @@ class Reproduction:
         return [row.name for row in self.rows if not row.holds]
 
     def all_figures(self) -> list[Figure]:
-        """Return all figures of the reproduction: those of its tables first, then the additional
-        ones.
+        """Return all figures (named numbers) of the reproduction: those of its tables first, then
+        the additional ones.
         """
         listed = []
         for row in self.rows:
