@@ -99,17 +99,23 @@ def parent(cell: ArrayLike, zoom: int, of: int = CELL_ZOOM) -> IntArray:
 
 
 def tile_of(cell: ArrayLike) -> IntArray:
-    """Return the quadint of the tile (zoom 14) that contains a cell; arrays of any shape."""
+    """Return the quadint (number) of the tile (zoom 14) that contains a cell; arrays of any
+    shape.
+    """
     return parent(cell, TILE_ZOOM)
 
 
 def region_of(cell: ArrayLike) -> IntArray:
-    """Return the quadint of the region (zoom 10) that contains a cell; arrays of any shape."""
+    """Return the quadint (number) of the region (zoom 10) that contains a cell; arrays of any
+    shape.
+    """
     return parent(cell, REGION_ZOOM)
 
 
 def zone_of(cell: ArrayLike) -> IntArray:
-    """Return the quadint of the zone (zoom 7) that contains a cell; arrays of any shape."""
+    """Return the quadint (number) of the zone (zoom 7) that contains a cell; arrays of any
+    shape.
+    """
     return parent(cell, ZONE_ZOOM)
 
 
@@ -184,13 +190,17 @@ def neighbours(cell: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
 
 
 def quadkey(cell: int, zoom: int) -> str:
-    """Return the quadkey of one quadint: a string of `zoom` digits 0–3."""
+    """Return the quadkey (digits of a quadtree path) of a grid square, given by its quadint
+    (number): a string of `zoom` digits 0–3.
+    """
     digits = f"{cell:x}".translate(_BASE_4).zfill(zoom)
     return digits[len(digits) - zoom :]
 
 
 def from_quadkey(digits: str) -> int:
-    """Return the quadint of a quadkey; its zoom is the number of digits."""
+    """Return the quadint (number of a grid square) of a quadkey (digits of a quadtree path). Its
+    zoom is the number of digits.
+    """
     return int(digits, 4)
 
 

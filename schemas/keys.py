@@ -29,9 +29,9 @@ class Topic(NamedTuple):
 
     Attributes:
         name: first chunk of the key after the root.
-        zoom: zoom of the quadint in the key; None if the key has no quadint.
+        zoom: zoom of the grid square in the key; None if the key has no grid square.
         named: True if the last chunk is a name (of a vehicle or a service).
-        message: payload; None for a liveliness token.
+        message: payload; None for a liveliness token (sign that a process is alive).
         priority: name of the Zenoh priority.
         block: congestion control: block (True) or drop (False).
         express: True to send at once, False to wait up to a millisecond for other messages in the
@@ -78,12 +78,16 @@ def chunks(quadint: int, zoom: int) -> str:
 
 
 def observation_key(region: int, vehicle: str) -> str:
-    """Return the key under which a vehicle publishes its observations of a region."""
+    """Return the key under which a vehicle publishes its observations (one report per visited map
+    cell) of a region.
+    """
     return f"{ROOT}/obs/{chunks(region, grid.REGION_ZOOM)}/{vehicle}"
 
 
 def state_key(region: int, vehicle: str) -> str:
-    """Return the key under which a vehicle publishes its states in a region."""
+    """Return the key under which a vehicle publishes its states (position, motion and friction at a
+    fixed rate) in a region.
+    """
     return f"{ROOT}/state/{chunks(region, grid.REGION_ZOOM)}/{vehicle}"
 
 

@@ -1,11 +1,11 @@
-"""The fixed friction grid, and the meaning of a log-likelihood on it.
+"""The fixed grid of friction values, and the meaning of a log-likelihood on it.
 
 Legend
     μ        peak tyre–road adhesion coefficient                      [-]
     EDGES    borders of the 32 equal bins on [0.05, 1.20]             (33,)
     CENTRES  middles of the bins                                      (32,)
-    PRIOR    belief for a road that was never measured: uniform       (32,)
-    ℓ        log p(a visit's measurements | μ), up to a constant      (…, 32), nats
+    PRIOR    distribution for a road that was never measured: uniform (32,)
+    ℓ        log p(measurements of one passage of a cell | μ), up to a constant  (…, 32), nats
 
 A log-likelihood is sent as 32 bytes: steps of 1/16 nat below the maximum, at most 255 steps. A flat
 log-likelihood (all zeros) contains no information about μ.

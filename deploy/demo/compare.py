@@ -1,8 +1,9 @@
 """Figures of the demo: the map compared with the true friction.
 
-The true values come from the simulator. For each visit of a vehicle to a cell it records the mean
-friction under the wheels, and the largest share of that friction that the vehicle used. A visit
-with a share of at least 0.6 is called *excited*, because only then can the friction be measured.
+The true values come from the simulator. For each visit (passage of a vehicle through a map cell) it
+records the mean friction under the wheels, and the largest share of that friction that the vehicle
+used. A visit with a share of at least 0.6 is called *excited*, because only then can the friction
+be measured.
 """
 
 from __future__ import annotations
@@ -91,8 +92,8 @@ class MapComparison:
 
 def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], float]:
     """Return the true friction of each visited (cell, sector) at the end of the demo. It is the
-    mean over the visits since the road changed at `changed_ns`, or over all visits if there were
-    none since.
+    mean over the visits (passages of a cell) since the road changed at `changed_ns` [ns], or over
+    all visits if there were none since.
     """
     keys = _cell_keys(visits)
     after = visits["enter_time"].cast(pa.int64()).to_numpy() >= changed_ns
@@ -137,13 +138,13 @@ def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison
 def delay_passes(
     visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
 ) -> float:
-    """Return how many excited passes (with enough grip used to measure the friction) drove over a
-    new patch of ice before its first alert: the median over all patches.
+    """Return the number of excited passes (with enough grip used to measure the friction) over a
+    new patch of ice before its first alert, as the median over all patches.
 
     A patch without an alert counts as infinite. Cells at most LINK_CELLS apart belong to one patch.
 
     Args:
-        visits: true values of all visits.
+        visits: true values of all visits (passages of a map cell).
         patch: (visits,) True for visits to a cell of a patch after the patch appeared.
         alerts: pairs of time of receipt [ns] and alert.
         changed_ns: time at which the patch appeared.
@@ -176,8 +177,8 @@ def known_patches(
 
 
 def count_passes(rows: pa.Table) -> int:
-    """Return the number of passes in a list of visits. Successive visits of one vehicle to
-    neighbouring cells are one pass.
+    """Return the number of passes in a list of visits. A visit is a passage of one map cell;
+    successive visits of one vehicle to neighbouring cells are one pass.
     """
     order = rows.sort_by([("vehicle", "ascending"), ("enter_time", "ascending")])
     vehicle = order["vehicle"].to_numpy(zero_copy_only=False)
@@ -188,8 +189,8 @@ def count_passes(rows: pa.Table) -> int:
 
 
 class DemoRun(NamedTuple):
-    """Results of one run of the demo: the true visits, the alerts with their times [ns], the time
-    [ns] at which ice appears, and the counts of the agents.
+    """Results of one run of the demo: the true values of all visits (passages of a map cell), the
+    alerts with their times [ns], the time [ns] at which ice appears, and the counts of the agents.
     """
 
     visits: pa.Table
@@ -318,8 +319,8 @@ def _vehicle_number(vehicle: str) -> int:
 
 
 def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
-    """Return a mask of visits, (visits,): True for visits after the change of the road that found
-    clearly less grip than all visits to the same cell before the change.
+    """Return a mask of visits (passages of a map cell), (visits,): True for visits after the change
+    of the road that found clearly less grip than all visits to the same cell before the change.
 
     Visits to cells that were slippery before the change, such as old snow, do not count.
     """

@@ -20,8 +20,9 @@ SPEED = 14.0  # [m/s]
 def main(
     endpoint: str, latitude: float, longitude: float, yaw: float = 0.0, within_s: float = 60.0
 ) -> str:
-    """Look ahead from a place and print warnings; return the first warning, or "" if there was none
-    within `within_s` [s]. `yaw` is in radians from east.
+    """Receive the map of the road ahead of a position, and print each warning. Return the first
+    warning, or "" if there was none within `within_s` [s]. `latitude` and `longitude` are in
+    degrees, `yaw` is in radians from east.
     """
     warnings: queue.Queue[str] = queue.Queue()
     lookout = edge_agent.Lookout(

@@ -83,8 +83,9 @@ def estimate(
     """Return the estimates of a log, one row per sample, with the columns of
     schemas.tables.ESTIMATES.
 
-    As in `edge-agent replay`, two kinds of error are corrected in the signals first: known sensor
-    errors of a calibrated vehicle file, and delays that the signal doctor measures.
+    As in `edge-agent replay`, two kinds of error are corrected in the signals first: sensor errors
+    that the vehicle file states (from a calibration), and delays that the signal doctor (automatic
+    check of the signals) measures.
     """
     log, vehicle, *_ = prepare_log(log, vehicle)
     bank = bank_of(estimator, [vehicle], memberships)

@@ -98,7 +98,7 @@ def reasons_not_publishing(
         watch: observer through which the source's blocks have passed.
         publisher: status of the publisher.
         endpoints: routers that the publisher tries to reach.
-        troubles: problems reported by the sources and by the signal doctor.
+        troubles: problems reported by the sources and by the signal doctor (automatic check).
     """
     found = list(troubles)
     if watch.is_missing("wheels"):

@@ -65,7 +65,7 @@ class Trip:
 
     Args:
         vehicle: vehicle file of the car.
-        profile: profile that maps its signals.
+        profile: assignment of the car's signals to channels.
         path: file with the stored knowledge about the car; it need not exist.
         trusted: True to publish regardless of the findings of the signal doctor (automatic check of
             the signals).

@@ -23,8 +23,8 @@ Count = Annotated[int, Field(ge=1)]
 
 
 class Record(BaseModel):
-    """Base class of the records in a file of tuned memberships; unknown field names are
-    rejected.
+    """Base class of the records in a file of tuned memberships (fuzzy sets); unknown field names
+    are rejected.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -79,8 +79,9 @@ class Budget(Record):
 
 
 class Provenance(Record):
-    """Origin of the scores in a file of memberships: all parameters needed to compute these scores
-    again."""
+    """Origin of the scores in a file of tuned memberships (fuzzy sets): all parameters needed to
+    compute these scores again.
+    """
 
     command: str
     seed: Annotated[int, Field(ge=0)]

@@ -29,7 +29,7 @@ def checked_name(name: str) -> str:
 
 
 def require_valid_signals(diagnosis: Diagnosis) -> None:
-    """Raise an error unless the signals of a log passed the signal doctor.
+    """Raise an error unless the signals of a log passed the signal doctor (automatic check).
 
     Raises:
         InputError: the signal doctor found a fault, or could not decide.
@@ -49,8 +49,8 @@ def require_valid_signals(diagnosis: Diagnosis) -> None:
 
 
 def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
-    """Print the faults that the signal doctor found in a log on stderr; return notes to print after
-    the estimates.
+    """Print on stderr the faults that the signal doctor (automatic check) found in a log. Return
+    notes to print after the estimates.
     """
     found = diagnosis.findings
     for fault in found:

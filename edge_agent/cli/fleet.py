@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the simulated fleet until the duration has passed or a signal (SIGTERM, Ctrl-C) arrives.
-    Before the end, write the file of the vehicles' true states.
+    Before the end, write a file with the vehicles' true motion and friction.
 
     Return the exit code.
     """

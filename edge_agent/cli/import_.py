@@ -1,5 +1,5 @@
 """`edge-agent import`: convert a car's recording to a signal log by a profile (assignment of
-signals to channels); without a profile, write a draft of one.
+signals to channels). Without a profile, write a draft profile for the user to check.
 """
 
 from __future__ import annotations

@@ -249,8 +249,9 @@ def _publish_log(
     publisher: Publisher,
     keep: Callable[[Block, Estimates], None],
 ) -> int:
-    """Estimate a log that begins at `start_ns` [ns UTC], and publish its records; `keep` is called
-    with each block and its estimates. Return 1 if a record was refused or not acknowledged.
+    """Estimate a log that begins at `start_ns` [ns UTC], and publish the resulting records. `keep`
+    is called with each block of samples and its estimates. Return 1 if a record was refused or not
+    acknowledged, else 0.
     """
     from edge_agent.app.live_loop import Progress
     from edge_agent.app.publishing import close_publisher

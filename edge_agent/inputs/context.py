@@ -1,9 +1,10 @@
-"""Context signals: flags of controllers and state of the surroundings, converted from readings of a
-source to rows of a log.
+"""Context signals: flags of controllers (ABS, ESC, traction control), air temperature and wiper.
+This module converts them from readings of a source to rows (samples) of a log.
 
-Flags and temperatures are not interpolated. A row of the log contains the last reading at or before
-its time, if that reading is at most HELD_S old. A channel that the profile marks as `lasting` is
-sent only when it changes; its last reading is valid until the next one.
+Flags and temperatures are not interpolated. A row contains the last reading at or before its time,
+if that reading is at most HELD_S old. Some channels are sent only when they change; the profile
+(assignment of signals to channels) marks them as `lasting`. The last reading of such a channel is
+valid until the next one.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def held_readings(name: str, series: Series, t: FloatArray, *, lasting: bool) ->
 
 def lasting_signals(profile: Profile) -> set[str]:
     """Return the full names of the signals of a profile's `lasting` channels, which are sent only
-    when they change.
+    when they change. A profile assigns signals to channels.
     """
     return {
         name

@@ -107,9 +107,9 @@ def free_rear_wheels(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
     """Return signals (T, 18) with the rear wheel speeds that freely rolling wheels would have at
     the measured yaw rate. The mean of both rear wheels does not change.
 
-    The function is for a locked axle, whose wheels turn at the same speed, so that in a turn each
-    wheel slips by half the track times the yaw rate. This slip is removed, because it contains no
-    information on the total force of the axle.
+    The function is for a locked axle. Its wheels turn at the same speed, so that in a turn each
+    wheel slips by half the track width times the yaw rate. This slip is removed, because it
+    contains no information on the total force of the axle.
     """
     signals = signals.copy()
     half = 0.5 * vehicle.track_rear * signals[..., S.YAW_RATE] / vehicle.wheel_radius

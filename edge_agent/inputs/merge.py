@@ -1,4 +1,5 @@
-"""Merging of recordings, each with its own clock, into one signal log by a profile.
+"""Merging of recordings, each with its own clock, into one signal log by a profile (assignment of
+signals to channels).
 
 Clocks: the log's time is that of the source with the wheel speeds. A source with a date is aligned
 by its date; a source without a date begins when the first source does. Some loggers write local
@@ -137,7 +138,8 @@ def merge_recordings(
 
 def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tuple[int, Channel]]:
     """Return, for each channel of the signal log, a pair (index, rule): the index of the recording
-    that contains its signals, and the profile's rule for converting these signals to the channel.
+    that contains the channel's signals, and the rule of the profile for converting these signals to
+    the channel.
 
     A recording of a position receiver provides those position channels for which the profile names
     no signal.

@@ -1,5 +1,5 @@
-"""Draft of a profile from the names of signals: the likely channel of each signal, for a person to
-check.
+"""Draft of a profile (assignment of signals to channels) from the names of the signals. It states
+the likely channel of each signal, for a person to check.
 
 Names are split into words at changes of case, digits and signs. A wheel is recognised by its two
 letters or words, in English or German (VL VR HL HR: vorn = front and hinten = rear, links = left
@@ -95,7 +95,8 @@ def place_of(plain: str) -> str | None:
 
 
 def draft_profile(signals: Mapping[str, str], name: str) -> Profile:
-    """Return a draft profile, with channels guessed from the names of the signals.
+    """Return a draft of a profile (assignment of signals to channels), guessed from the names of
+    the signals.
 
     Args:
         signals: name -> unit as recorded, "" where it is not given.

@@ -156,7 +156,9 @@ class Profile(Part):
         return self
 
     def needed_signals(self) -> set[str]:
-        """Return the names of all recorded signals from which the profile computes its channels."""
+        """Return the names of all recorded signals from which this profile computes the channels of
+        the signal log.
+        """
         return {name for channel in self.channels.values() for name in channel.needed_signals()}
 
     def to_json(self) -> str:

@@ -1,4 +1,5 @@
-"""Reader of a recorded drive: a Parquet signal log, delivered as blocks of one vehicle.
+"""Reader of a recorded drive: a Parquet signal log, delivered as blocks (consecutive samples) of
+one vehicle.
 
 Required columns: `t` [s] or `timestamp`; ax, ay, yaw_rate; the four omega; delta_fl or delta_fr.
 Each of them must have at least one reading. The other channels may be missing, and NaN or null is a

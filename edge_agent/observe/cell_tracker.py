@@ -74,8 +74,9 @@ class Located(NamedTuple):
 
     closes: True where the previous visit (passage of a cell) has ended: at the first sample in a
     new cell or sector, or in no cell. inside, outside: True where a position fix of this sample
-    lies inside or outside the visited cell. cell, sector: quadint z21 and heading sector, -1 when
-    in no cell. latitude, longitude [deg], yaw [rad]: as last received, NaN when too old.
+    lies inside or outside the visited cell. cell, sector: number of the cell (quadint, zoom 21) and
+    heading sector, -1 when in no cell. latitude, longitude [deg], yaw [rad]: as last received, NaN
+    when too old.
     """
 
     closes: BoolArray
@@ -103,13 +104,13 @@ def locate_vehicles(
     """Compute the cells of N vehicles in a block of samples.
 
     Args:
-        tracks: (N,) tracks after the previous block.
+        tracks: (N,) states of the cell tracking after the previous block.
         t: (T, N) [s].
         signals: (T, N, channels).
         lost: True to forget the last position fixes, which ends every visit (passage of a cell).
 
     Returns:
-        the tracks for the next block, and the cells per sample.
+        the states for the next block, and the cells per sample.
     """
     after = tracks.copy()
     if lost:
@@ -147,8 +148,8 @@ def _receiver_samples(signals: FloatArray) -> RecordArray:
 
 @compiled
 def _update_course(track: CellTrack, latitude: float, longitude: float) -> None:
-    """Update the course over ground [rad from east] in the vehicle's track if it has moved far
-    enough since the last update.
+    """Update the course over ground [rad from east] in `track`, the vehicle's state of the cell
+    tracking, if the vehicle has moved far enough since the last update.
     """
     north = (latitude - track.course_latitude) * METRES_PER_DEGREE
     east = (longitude - track.course_longitude) * METRES_PER_DEGREE * np.cos(np.radians(latitude))
@@ -177,7 +178,9 @@ def _stays_in_cell(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
 
 @compiled
 def _store_readings(track: CellTrack, fix: ReceiverSample, now: float) -> None:
-    """Store the position and the yaw of a sample in the vehicle's track, if they are valid."""
+    """Store the position and the yaw of a sample in `track`, the vehicle's state of the cell
+    tracking, if they are valid.
+    """
     if np.isfinite(fix.yaw):
         track.yaw_time = now
         track.yaw = fix.yaw

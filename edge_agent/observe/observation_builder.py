@@ -48,8 +48,9 @@ EXCLUDED_NATS: Final = (
 
 
 class RecordBlock(NamedTuple):
-    """Records of one kind (observations or states) that are ready for publication: columns of the
-    message (n, …), index of the vehicle (n,), and a mask (n,) of urgent records, which are sent
+    """Records of one kind, ready for publication: observations (one per visited map cell) or states
+    (position, motion and friction at a fixed rate). Attributes are the columns of the message (n,
+    …), the index of the vehicle (n,), and a mask (n,) of urgent records, which are sent
     immediately.
     """
 
@@ -155,8 +156,9 @@ def build_records(
     config: AgentConfig,
     readings: BlockReadings = NO_READINGS,
 ) -> tuple[OpenVisits, RecordBlock, RecordBlock]:
-    """Build the records of a block of samples with times (T, N) [ns UTC]; return (open visits,
-    observations, states).
+    """Build the records of a block of samples with times (T, N) [ns UTC]. Return the open visits
+    (passages of a map cell), the observations of ended visits, and the vehicles' states (position,
+    motion and friction at a fixed rate).
     """
     after = OpenVisits(before.visits.copy(), before.slot.copy())
     ended = records(Visit, int(np.count_nonzero(located.closes)))
@@ -461,8 +463,9 @@ def _likelihood_bytes(ended: RecordArray, evidence: FloatArray | None) -> NDArra
 def _build_states(
     after: OpenVisits, time: IntArray, located: Located, estimates: Estimates, config: AgentConfig
 ) -> RecordBlock:
-    """Return the states to publish: the first sample with a known position in each time slot
-    (reporting interval). The function updates `after.slot`, the number of the last slot.
+    """Return the states (position, motion and friction) to publish: the first sample with a known
+    position in each time slot (reporting interval). The function updates `after.slot`, the number
+    of the last slot.
     """
     slot = np.floor_divide(time, round(NS / config.state_rate_hz))
     earlier = np.vstack([after.slot[None], slot[:-1]])

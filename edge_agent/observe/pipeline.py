@@ -56,8 +56,8 @@ class Grip(NamedTuple):
 
 
 class Pipeline:
-    """A bank of estimators for N vehicles, with the open visits (passages of a map cell) of the
-    vehicles. Call `step` for each block in order, then `finish` once.
+    """Estimators of N vehicles (bank), with the open visits (passages of a map cell) of the
+    vehicles. Call `step` for each block of samples in order, then `finish` once.
     """
 
     def __init__(self, bank: EstimatorBank, vehicles: int, config: AgentConfig) -> None:
@@ -73,7 +73,9 @@ class Pipeline:
         self.places: IntArray = np.full(vehicles, NOWHERE)  # cell * 4 + sector at the block's end
 
     def step(self, block: Block) -> tuple[Estimates, RecordBlock, RecordBlock]:
-        """Process a block of at least one sample; return (estimates, observations, states).
+        """Process a block of at least one sample. Return the estimates, the observations of ended
+        visits (passages of a map cell), and the vehicles' states (position, motion and friction at
+        a fixed rate).
 
         For privacy, records near the beginning and end of a trip are left out.
         """
@@ -132,8 +134,9 @@ class Pipeline:
         """Close the open visits (passages of a map cell) and return their observations; None if no
         sample was processed.
 
-        The evidence of a visit becomes available only at the sample after its end. Therefore the
-        method first adds one sample without readings and without a position.
+        The evidence (log-likelihood of friction) of a visit becomes available only at the sample
+        after its end. Therefore the method first adds one sample without readings and without a
+        position.
         """
         if self._last is None:
             return None

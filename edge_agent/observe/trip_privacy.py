@@ -22,7 +22,7 @@ _TIME = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}
 
 class TripEnds:
     """Filter that removes the records near the ends of the trips of N vehicles. Call `advance` with
-    each block, then `release_records` with its records.
+    each block of samples, then `release_records` with the records of the block.
 
     Args:
         vehicles: number of vehicles.

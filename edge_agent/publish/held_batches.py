@@ -32,8 +32,8 @@ class Stream(NamedTuple):
 
 @dataclass(slots=True)
 class HeldBatch:
-    """State of a stored batch without its payload. While the batch is in flight (sent and not
-    answered), `due` is the time [s] of its next resend.
+    """Data of a batch in the outbox (store on disk), without its payload. While the batch is in
+    flight (sent and not answered), `due` is the time [s] of its next resend.
     """
 
     stream: Stream
@@ -47,7 +47,7 @@ class HeldBatch:
 @dataclass
 class _Sequence:
     """Sequence numbers of one stream (vehicle, start, kind, region): the next free number, and the
-    numbers of its batches in the outbox.
+    numbers of the stream's batches in the outbox (store on disk).
     """
 
     stream: Stream
@@ -169,9 +169,9 @@ class HeldBatches:
         return None
 
     def is_passed_over(self, batch: HeldBatch) -> bool:
-        """Return True if the service seems to ignore this batch: it is the oldest of its stream
-        (same vehicle, start, kind, region) in the outbox, and PASSED_OVER later batches of the
-        stream were settled (finally answered).
+        """Return True if the service seems to ignore this batch. That is the case if the batch is
+        the oldest one of its stream (vehicle, start, kind, region) in the outbox, and PASSED_OVER
+        later batches of the stream were settled (finally answered).
         """
         sequence = self._streams[batch.stream]
         later = sequence.next - batch.seq - len(sequence.held)
@@ -202,8 +202,9 @@ class HeldBatches:
 
 
 def _keys_within(held: dict[int, int], first: int, last: int) -> list[int]:
-    """Return the keys of the batches in the outbox with a sequence number in [first, last]. The
-    work does not grow with the range, because a hostile service may send a very large one.
+    """Return the keys of the batches with a sequence number in [first, last]; `held` maps sequence
+    numbers to keys. The work does not grow with the range, because a hostile service may send a
+    very large one.
     """
     if last - first < len(held):
         return [held[seq] for seq in range(first, last + 1) if seq in held]

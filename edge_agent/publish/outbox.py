@@ -1,16 +1,16 @@
-"""Outbox: stores batches on disk until they are acknowledged, so that no report is lost or counted
-twice.
+"""Outbox: stores batches (messages with records) on disk until they are acknowledged, so that no
+report is lost or counted twice.
 
-A batch is committed here before it is sent, and is removed only after the service has settled it.
-It is identified by its stream (vehicle, boot, kind, region) and its sequence number `seq`, which
-counts from 1 without gaps in each stream. `boot` is a random number per start. Therefore a
-restarted agent opens new streams and never reuses an identifier. Batches of an earlier start are
-sent again under their old identifier.
+A batch is committed here before it is sent. It is removed only after the service has settled it
+(stored or refused it for good). A batch is identified by its stream (vehicle, boot, kind, region)
+and its sequence number `seq`, which counts from 1 without gaps in each stream. `boot` is a random
+number per start. Therefore a restarted agent opens new streams and never reuses an identifier.
+Batches of an earlier start are sent again under their old identifier.
 
-The size is limited: when the payloads exceed the capacity, the oldest states are dropped first,
-then the oldest observations, and both are counted. SQLite runs in WAL mode with a sync per commit.
-The outbox keeps the exclusive lock of the database file while it is open, so that two agents never
-use the same file. Time is an argument, in monotonic seconds.
+The size is limited: when the payloads exceed the capacity, the oldest states (regular reports of
+motion) are dropped first, then the oldest observations, and both are counted. SQLite runs in WAL
+mode with a sync per commit. The outbox keeps the exclusive lock of the database file while it is
+open, so that two agents never use the same file. Time is an argument, in monotonic seconds.
 """
 
 from __future__ import annotations
@@ -118,8 +118,8 @@ class Outbox:
         self.counts.damaged += max(before - self.held.count_records(), 0)
 
     def _drop_batch(self, key: int) -> int:
-        """Remove a batch (message with records) from the outbox, and return the number of its
-        records.
+        """Remove a batch (message with records) from the outbox (store on disk), and return the
+        number of its records.
         """
         batch = self.held.remove_batch(key)
         self.schedule.record_removal(batch)
@@ -172,8 +172,8 @@ class Outbox:
         self.schedule.reset_in_flight(vehicle, now)
 
     def _evict_oldest(self) -> None:
-        """Drop batches until the capacity is respected: first the oldest states, then the oldest
-        observations.
+        """Drop batches until the capacity is respected: first the oldest batches of states (regular
+        reports of motion), then the oldest batches of observations.
         """
         for kind in EVICTION_ORDER:
             while self.held.bytes > self.capacity_bytes:

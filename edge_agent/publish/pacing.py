@@ -1,14 +1,14 @@
 """Pacing of one vehicle's batches for one region, so that unanswered batches do not flood the
-network. The module is pure.
+network. The module is pure (no I/O). A pacer is in one of two states.
 
-State "open", while acknowledgements arrive: fresh batches are sent immediately. Of waiting batches,
-as many are in flight (sent and not answered) as a window allows. The window grows with each settled
-batch and is halved when a batch is not answered in time (slow start and congestion avoidance,
-Jacobson 1988: loss indicates overload).
+"Open", while acknowledgements arrive: new batches are sent immediately. Batches that wait to be
+sent again are sent as long as fewer batches are in flight (sent and not answered) than a window
+allows. The window grows with each answered batch, and is halved when a batch is not answered in
+time (slow start and congestion avoidance, Jacobson 1988: loss indicates overload).
 
-State "silent", after SILENT_S without an answer: fresh batches stay on disk, and single batches are
-sent as probes at intervals that double up to LONGEST_PROBE_S. The first acknowledgement returns to
-the open state. Time is monotonic [s].
+"Silent", after SILENT_S without an answer: new batches stay on disk, and single batches are sent as
+probes at intervals that double up to LONGEST_PROBE_S. The first acknowledgement returns to the open
+state. Time is monotonic [s].
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Pacer:
 
     Attributes:
         flying: number of batches in flight: sent, not answered and not timed out.
-        silent: True in the state "silent", while the service does not answer.
+        silent: True while the service does not answer.
     """
 
     __slots__ = (
@@ -94,15 +94,17 @@ class Pacer:
             self._unanswered_since = now
 
     def record_settled(self) -> None:
-        """Record that a batch in flight (sent, not answered) was answered; the window may then
-        grow.
+        """Record that a batch in flight (sent, not answered) was answered. The window (limit of
+        batches in flight) may then grow.
         """
         self.flying -= 1
         grown = self._window + (1.0 if self._window < self._sure else 1.0 / self._window)
         self._window = min(grown, LARGEST_WINDOW)
 
     def record_answer(self) -> None:
-        """Record that an acknowledgement arrived, for any batch. It ends the silent state."""
+        """Record that an acknowledgement arrived for any batch of this vehicle and region. It ends
+        the silent state, in which only single batches are sent as probes.
+        """
         self._answered = True
         if self.silent:
             self.silent = False
@@ -111,8 +113,9 @@ class Pacer:
             self._stale = self.flying
 
     def record_timeout(self, now: float, jitter: float) -> None:
-        """Record that a batch in flight was not answered in time; halve the window or enter the
-        silent state.
+        """Record that a batch in flight (sent, not answered) was not answered in time. Halve the
+        window (limit of batches in flight), or enter the silent state, in which only single batches
+        are sent as probes.
         """
         self.flying -= 1
         if self.silent:
@@ -132,8 +135,8 @@ class Pacer:
             self._sure = self._window
 
     def record_reconnect(self, now: float) -> None:
-        """Record that a router is available again: batches in flight (sent and not answered) are
-        lost, and in the silent state a probe is sent immediately.
+        """Record that a router is available again. Batches in flight (sent and not answered) are
+        lost. In the silent state (no service answers), a probe is sent immediately.
         """
         self.flying = 0
         self._unanswered_since = None
@@ -142,7 +145,7 @@ class Pacer:
 
     def take_due(self, now: float, jitter: float, most: int, held: Container[int]) -> list[int]:
         """Return the keys of at most `most` batches to send now, oldest first. Keys of batches that
-        are no longer in the outbox (`held`) are dropped.
+        are no longer in the outbox (`held` has the keys in it) are dropped.
         """
         if self._answered:
             self._answered = False

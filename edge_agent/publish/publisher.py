@@ -2,8 +2,9 @@
 batches, stores and sends them, and sends them again until a service has answered.
 
 The loop only calls `offer`, which never blocks. Only the sender thread uses disk and network. Every
-batch is on disk before it is sent, and stays there until the service has settled it. A second
-thread opens the Zenoh sessions and waits for the routers as long as necessary.
+batch is on disk before it is sent, and stays there until the service has settled it (stored or
+refused it for good). A second thread opens the Zenoh sessions and waits for the routers as long as
+necessary.
 """
 
 from __future__ import annotations
@@ -162,8 +163,8 @@ class Publisher:
         self._resend_due()
 
     def _recover_outbox(self) -> None:
-        """Recover the readable content of an outbox (file of unsettled batches) that was damaged
-        during use, and continue with it.
+        """Recover the readable content of an outbox (store of batches on disk) that was damaged
+        during use, and continue with the recovered outbox.
         """
         try:
             self._outbox.recover_file()

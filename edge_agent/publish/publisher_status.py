@@ -1,5 +1,5 @@
-"""Status of a publisher for metrics, health checks and log lines: its sessions, its outbox, and the
-acknowledgements.
+"""Status of a publisher for metrics, health checks and log lines: its sessions, its outbox (store
+of batches on disk), and the acknowledgements.
 """
 
 from __future__ import annotations
@@ -54,22 +54,22 @@ class PublisherStatus:
 
     @property
     def unanswered_s(self) -> float:
-        """Return the time [s] for which sent batches have been unanswered."""
+        """Return the time [s] for which sent batches have been unanswered, in the region with the
+        longest wait.
+        """
         return self._outbox.schedule.unanswered_s(self._clock())
 
     @property
     def stranded_records(self) -> int:
-        """Return the number of records in the outbox (file of unsettled batches) that are not sent,
-        because they belong to other vehicle names than those of this agent, for example after a
+        """Return the number of records in the outbox (store of batches on disk) that are not sent
+        because they belong to vehicle names that this agent does not have, for example after a
         change of name.
         """
         return self._outbox.held.count_stranded(self._names)
 
     @property
     def fill_share(self) -> float:
-        """Return the used share of the outbox's capacity [1]; the outbox is the file of unsettled
-        batches.
-        """
+        """Return the used share [1] of the capacity of the outbox (store of batches on disk)."""
         return self._outbox.held.bytes / self._outbox.capacity_bytes
 
     @property
@@ -81,15 +81,15 @@ class PublisherStatus:
 
     @property
     def damage_counts(self) -> tuple[int, int]:
-        """Return (number of times that the outbox was found damaged, number of records known to be
-        lost by this).
+        """Return two numbers: how often the outbox (store of batches on disk) was found damaged,
+        and how many records are known to be lost by this.
         """
         return self._outbox.counts.damages, self._outbox.counts.damaged
 
     @property
     def dropped_records(self) -> int:
         """Return the number of records dropped for lack of space, in the queue or in the outbox
-        (file of unsettled batches).
+        (store of batches on disk).
         """
         return sum(self.counts.dropped.values()) + sum(self._outbox.counts.evicted.values())
 

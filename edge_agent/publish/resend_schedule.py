@@ -1,5 +1,6 @@
-"""Times at which the batches of an outbox are sent again: one `Pacer` per vehicle and region, and a
-time limit for each batch in flight. The module is pure; time is monotonic [s].
+"""Times at which the batches of an outbox (store on disk) are sent again. There is one `Pacer`
+(limit of unanswered batches) per vehicle and region, and a time limit for each batch that was sent
+and not answered. The module is pure (no I/O); time is monotonic [s].
 """
 
 from __future__ import annotations
@@ -74,8 +75,8 @@ class ResendSchedule:
         return True
 
     def record_answer(self, stream: Stream) -> None:
-        """Record that an acknowledgement arrived for any batch of the vehicle and region of
-        `stream`.
+        """Record that an acknowledgement arrived for any batch of the vehicle and region that
+        `stream` names.
         """
         pacer = self._pacers.get((stream.vehicle, stream.region))
         if pacer is not None:
@@ -123,7 +124,7 @@ class ResendSchedule:
 
     def take_due(self, now: float, limit: int, vehicles: Collection[str] | None) -> list[int]:
         """Return the keys of at most `limit` batches to send now, oldest first, of the given
-        vehicles or of all vehicles, and mark them as in flight.
+        vehicles or of all vehicles, and mark them as in flight (sent and not answered).
         """
         keys: list[int] = []
         for (vehicle, _), pacer in self._pacers.items():

@@ -16,10 +16,10 @@ from schemas.runtime.link_watch import LinkWatch
 
 
 class SessionLinks:
-    """Set of Zenoh sessions, one per vehicle name.
+    """Set of Zenoh sessions, one per vehicle.
 
-    `on_open(name, session)` is called when a session is open, and `on_ack(name, payload)` for each
-    acknowledgement.
+    `on_open(name, session)` is called when the session of the vehicle `name` is open, and
+    `on_ack(name, payload)` for each acknowledgement that the vehicle receives.
     """
 
     def __init__(
@@ -78,7 +78,8 @@ class SessionLinks:
         """Update the connection states, and return the names of the vehicles whose link to a router
         was replaced by a new one.
 
-        Batches in flight on the former link are lost, so the caller must send them again.
+        Batches in flight (sent and not answered) on the former link are lost, so the caller must
+        send them again.
         """
         replaced = []
         for name, link in list(self._links.items()):

@@ -26,8 +26,8 @@ def draft_of(path: Path) -> Path:
 def open_durably(
     path: Path, mode: int | None = None, *, named: bool = True
 ) -> Iterator[BufferedWriter]:
-    """Open a draft file for writing; when the block ends, rename it to `path`, complete and
-    durable. If the block fails, nothing changes.
+    """Open a draft (temporary file) for writing. When the `with` block ends, rename the draft to
+    `path`, complete and durable. If the block fails, nothing changes.
 
     Args:
         path: path of the file; an existing file is replaced.

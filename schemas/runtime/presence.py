@@ -1,5 +1,5 @@
-"""Liveliness tokens of services, which show which service serves which region: read once or tracked
-continuously.
+"""Liveliness tokens (signs that a process is alive) of services. They show which service serves
+which region, and are read once or tracked continuously.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Records of named fields as a NumPy structured array: the state of each vehicle in compiled code.
+"""Records of named fields as a NumPy structured array. They hold, for example, the state of each
+vehicle for compiled code.
 
 A record is defined by a class whose annotations are the fields. A field is a float, int, bool, a
 NumPy number, another record class, or Annotated[FloatArray, size, ...] and its counterparts for

@@ -90,7 +90,9 @@ class Outlook(NamedTuple):
 
 
 def encode_ahead(outlook: Outlook) -> bytes:
-    """Return the protobuf bytes of a vehicle's outlook (warnings and horizon)."""
+    """Return the protobuf bytes of a vehicle's outlook (warnings, and the map's values for the road
+    ahead).
+    """
     columns: dict[str, Any] = {
         name: column.tolist() for name, column in outlook.runs._asdict().items()
     }
@@ -103,8 +105,8 @@ def encode_ahead(outlook: Outlook) -> bytes:
 
 
 def decode_ahead(payload: bytes) -> Outlook:
-    """Decode the bytes of a message about the road ahead; return the outlook (warnings and
-    horizon).
+    """Decode the bytes of a message about the road ahead; return the outlook (warnings, and the
+    map's values for the road ahead).
 
     Raises:
         WireError: the payload is not an Ahead message, or its columns have different lengths.

@@ -90,11 +90,11 @@ class Decoded(NamedTuple):
 
     Attributes:
         indices: index of the message of each batch, (k,).
-        heads: heads of the batches.
+        heads: heads (fields other than records) of the batches.
         sizes: number of records of each batch, (k,).
         columns: every column of the kind's table, all records one after the other, (n,);
             `log_likelihood` is (n, 32).
-        with_likelihood: mask (n,), True if the record came with a log-likelihood.
+        with_likelihood: mask (n,), True if the record came with a log-likelihood of friction.
         errors: index and error of each message that is not a valid batch.
     """
 

@@ -87,8 +87,8 @@ WEATHER_ENCODING: Final = encoding_of(pb.Weather)
 
 @cache
 def column_types(kind: Kind) -> dict[str, np.dtype[Any]]:
-    """Return name and NumPy type of every column of a batch. Times are int64 [ns]; the likelihood
-    is uint8, (n, 32).
+    """Return name and NumPy type of every column of a batch. Times are int64 [ns]; the
+    log-likelihood of friction is uint8, (n, 32).
     """
     return {
         column.name: np.dtype(_TYPES.get(column.type, column.type)) for column in _COLUMNS[kind]
@@ -99,8 +99,8 @@ def column_types(kind: Kind) -> dict[str, np.dtype[Any]]:
 class Batch:
     """One to fifty records of one vehicle in one region.
 
-    `columns` holds every column of the kind's table, shape (n,); `log_likelihood` is (n, 32), or
-    (n, 0) where absent.
+    `columns` holds every column of the kind's table, shape (n,). The column `log_likelihood` is (n,
+    32), or (n, 0) where absent.
     """
 
     kind: Kind
@@ -185,11 +185,12 @@ def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> A
 
 
 class StreamAck(NamedTuple):
-    """Acknowledged batches of one stream, given by sequence numbers (`seq`).
+    """Acknowledged batches of one stream (batches of one vehicle, start, kind and region), given by
+    sequence numbers (`seq`).
 
     Attributes:
-        boot, kind, region: identity of the stream: start of the vehicle, kind of the batches,
-            region.
+        boot, kind, region: identity of the stream: random number of the agent's start, kind of the
+            batches, region.
         durable: ranges of batches that are stored safely, both ends included.
         rejected: sequence number, row and reason of each refused record.
         late: ranges of durable batches that arrived too late for the map to use them in order of
@@ -228,7 +229,8 @@ def encode_ack(vehicle: str, streams: list[StreamAck], time: int = 0) -> bytes:
 
 
 def decode_ack(payload: bytes) -> tuple[str, list[StreamAck]]:
-    """Decode the bytes of an acknowledgement; return its vehicle and its streams.
+    """Decode the bytes of an acknowledgement; return the name of its vehicle, and the acknowledged
+    batches per stream.
 
     Raises:
         WireError: the payload is not an Ack message, or has a kind of batch that this version does

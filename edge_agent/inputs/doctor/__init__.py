@@ -1,3 +1,3 @@
-"""The signal doctor: finds faults in a drive's signals by physical relations between them, and
-corrects the faults.
+"""The signal doctor, an automatic check of a drive's signals: it finds faults by physical relations
+between signals, and corrects them.
 """

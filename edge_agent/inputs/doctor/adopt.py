@@ -30,8 +30,8 @@ from schemas.vehicle import Vehicle
 
 
 class Adopted(NamedTuple):
-    """A signal log after correction, with its vehicle, the signal doctor's diagnosis of it, and
-    notes that describe the changes.
+    """A signal log after correction, with its vehicle, its diagnosis by the signal doctor
+    (automatic check of the signals), and notes that describe the changes.
     """
 
     log: SignalLog
@@ -92,11 +92,12 @@ def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
 def align_import(
     merged: Merged, profile: Profile, vehicle: Vehicle, merge_with: Callable[[Profile], Merged]
 ) -> tuple[Merged, Profile]:
-    """Correct the delays of devices in merged recordings; return the merged recordings and a
-    profile that contains the delays.
+    """Correct the delays of devices in merged recordings. Return the merged recordings, and a
+    profile (assignment of signals to channels) that contains the delays.
 
-    The signal doctor measures the delays. `merge_with` is a function that merges the same
-    recordings with a given profile. If no device is delayed, both arguments are returned unchanged.
+    The signal doctor (automatic check of the signals) measures the delays. `merge_with` is a
+    function that merges the same recordings with a given profile. If no device is delayed, both
+    arguments are returned unchanged.
     """
     signals = np.full((len(merged.t), len(CHANNELS)), np.nan)
     for index, name in enumerate(CHANNELS):

@@ -33,8 +33,8 @@ def wheels_speak_late(axle: Fit, seconds: float) -> bool:
 def measure_clocks(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, diagnosis: Diagnosis
 ) -> None:
-    """Measure the delays of wheel speeds and steering relative to the inertial unit, and add a
-    finding for each delay that is too large.
+    """Measure the delays of wheel speeds and steering relative to the inertial unit. Add a finding
+    (reported fault) to the diagnosis for each delay that is too large.
     """
     diagnosis.lags = measure_lags_twice(t, signals, vehicle, diagnosis.fits)
     listed = late_devices(diagnosis)

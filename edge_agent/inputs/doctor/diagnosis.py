@@ -1,5 +1,5 @@
-"""Records of the signal doctor: one fault (`Finding`), and the complete result for a log
-(`Diagnosis`).
+"""Records of the signal doctor (automatic check of the signals): one fault (`Finding`), and the
+complete result for a log (`Diagnosis`).
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class Finding:
 
 @dataclass
 class Diagnosis:
-    """Result of an examination: faults, channels without fault, channels about which the drive says
-    nothing, and the fitted physical relations between signals.
+    """Result of the check of a log: faults, channels without fault, channels about which the drive
+    says nothing, and the fitted physical relations between signals.
     """
 
     findings: list[Finding] = field(default_factory=list)

@@ -126,7 +126,7 @@ def prepare_drive(
     Args:
         t: times (T,) [s].
         signals: readings; readings of a wheel far from the median of the four are left out.
-        vehicle: its radius, tracks and wheelbase are used.
+        vehicle: its wheel radius, track widths and wheelbase are used.
         ground: speed measured by the position receiver (T,) [m/s], if it was recorded; it is more
             accurate than the speed computed from positions.
     """

@@ -1,9 +1,9 @@
-"""Findings (reported faults) of the signal doctor: one per fault, with its evidence, and the list
-of channels without fault.
+"""Findings of the signal doctor (automatic check of the signals). A finding is one reported fault
+with the reason for it. The module also lists the channels without fault.
 
-A channel is free of faults if a physical relation with enough excitation confirms it, and no fault
-explains the drive nearly as well. A channel is unknown if it is neither confirmed nor faulty. A log
-passes only if all its channels are free of faults.
+A channel is free of faults if a physical relation with enough excitation (change of the signals)
+confirms it, and no fault explains the drive nearly as well. A channel is unknown if it is neither
+confirmed nor faulty. A log passes only if all its channels are free of faults.
 """
 
 from __future__ import annotations
@@ -376,8 +376,9 @@ def _find_radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Fi
 
 
 def _compare_axles(drive: EvenDrive) -> list[Finding]:
-    """Return findings (faults) about exchanged axles. In a turn the front wheels travel further:
-    v_f² = v_r² + (L r)².
+    """Return a finding (fault) if the front and rear wheel speeds are exchanged. In a turn the
+    front wheels travel further than the rear wheels: v_f² = v_r² + (L r)², with the speeds v_f and
+    v_r of the axles, the wheelbase L and the yaw rate r.
     """
     front = drive.wheels[:, :2].mean(axis=1)
     rear = drive.wheels[:, 2:].mean(axis=1)

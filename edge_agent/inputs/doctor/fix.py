@@ -1,5 +1,5 @@
-"""Corrections of the signal doctor's findings (faults) in the profile (signal names and units) and
-in the vehicle file.
+"""Corrections of faults that the signal doctor (automatic check of the signals) has found. They are
+written into the profile (assignment of signals to channels) and into the vehicle file.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ def list_corrections(diagnosis: Diagnosis) -> list[Finding]:
 def apply_findings(
     findings: Sequence[Finding], profile: Profile, vehicle: Vehicle
 ) -> tuple[Profile, Vehicle, list[Finding]]:
-    """Return the profile (signal names and units) and the vehicle file, corrected by the findings
-    (faults), and those findings that cannot be corrected in a profile or vehicle file.
+    """Return the profile (assignment of signals to channels) and the vehicle file, both corrected
+    by the findings (faults), and the findings that cannot be corrected in either of them.
     """
     channels = dict(profile.channels)
     left = list[Finding]()

@@ -165,8 +165,8 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
         sides: the two sides of the identity (quantities that are equal by physics).
         moving: (n,) 1 where the car moves.
         grips: (n,) 0 where wheels slip; these samples are used for the lag, but not for the fit.
-        level: True to fit without an offset, and to use every sample in motion as one with
-            excitation.
+        level: True to fit without an offset, and to use every sample in motion; False to use only
+            samples in which the signals change enough.
     """
     left = sides.left
     right = sides.right
@@ -275,9 +275,8 @@ def _bend_of(
 def _fit_with_priors(
     table: FloatArray, y: FloatArray, loose: tuple[float, ...], count: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the gains (k,) of the terms of an identity `y` = Σ gain · term, with the terms as
-    columns of `table` (n, k), and the gains' standard deviations (k,). They are fitted by robust
-    least squares.
+    """Fit the gains of `y` = Σ gain · term by robust least squares, with the terms as columns of
+    `table` (n, k). Return the gains (k,) and their standard deviations (k,).
 
     The gains of the last columns have a prior with mean 0 and the standard deviations `loose`.
     """
@@ -299,8 +298,8 @@ def _fit_with_priors(
 
 def _gains_of_parts(x: FloatArray, y: FloatArray, excited: BoolArray) -> tuple[float, ...]:
     """Return the gain of an identity (ratio of two quantities that are equal by physics) in each of
-    PARTS consecutive parts of the time with excitation. Parts of the drive that are too short are
-    left out.
+    PARTS consecutive parts of the samples with enough excitation (mask `excited`). Parts that are
+    too short are left out.
     """
     rows = np.flatnonzero(excited)
     found = []

@@ -1,5 +1,5 @@
-"""The doctor's findings as text lines for a terminal, and as one self-contained HTML page with
-plots.
+"""The findings (faults) of the signal doctor as text lines for a terminal, and as one
+self-contained HTML page with plots. The signal doctor is an automatic check of the signals.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ def _finite_or_none(value: object) -> object:
 
 
 def publishing_advice(diagnosis: Diagnosis) -> str:
-    """Return one line with the signal doctor's verdict: either the log may be published, or it
-    states the steps that are necessary before.
+    """Return one line with the verdict of the signal doctor (automatic check of the signals). The
+    line states that the log may be published, or lists the steps that are necessary before.
     """
     if diagnosis.is_passed:
         return "passed: units, signs, clocks and offsets agree with each other"
@@ -102,8 +102,9 @@ def publishing_advice(diagnosis: Diagnosis) -> str:
 
 
 def report_page(diagnosis: Diagnosis, title: str) -> str:
-    """Return an HTML page with the verdict, the findings, and a plot of each identity (two
-    quantities that are equal by physics)."""
+    """Return an HTML page with the verdict, the findings (faults), and a plot of each identity (two
+    quantities that are equal by physics).
+    """
     rows = [
         f"<tr class='bad'><td>{escape(f.channel)}<td>{escape(f.kind)}<td>{escape(f.words)}"
         for f in diagnosis.findings

@@ -235,9 +235,9 @@ def _misfit_of(name: str, fit: Fit, guess: Mapping[str, Mistake]) -> float:
 
 
 def late_clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
-    """Return the one late device that best explains the lags of the identities, as device → (delay
-    of its clock [s], margin). The margin is by how much the best other explanation (another device,
-    or none) costs more.
+    """Return the one late device that best explains the lags of the identities (pairs of quantities
+    that are equal by physics), as device → (delay of its clock [s], margin). The margin is by how
+    much the best other explanation (another device, or none) costs more.
 
     The result is empty if the delay is below LATE_S, or if the explanation without a late device
     costs less.

@@ -26,7 +26,7 @@ class DatabrokerFeed(Feed):
         name: name of the source.
         clock: clock of the host.
         address: host and port.
-        paths: paths that the profile needs; paths that the broker does not know are left out.
+        paths: paths of the needed signals; paths that the broker does not know are left out.
         lasting: those of the paths that are sent only when they change.
         files: `ca`, file of the certificate authority (without it the connection does not use TLS),
             and `token`, file with a JSON web token.

@@ -1,5 +1,6 @@
 """Rows (samples) at a fixed rate, built from the messages of live sources, a tenth of a second at a
-time. Profile and merging are the same as in the importer of recordings.
+time. The same profile (assignment of signals to channels) and merging are used as in the importer
+of recordings.
 
 A row is built DELAY_S after its time, so that readings before and after it have arrived. If an
 active source is delayed because its host is busy, the row waits for up to PATIENCE_S. Readings that

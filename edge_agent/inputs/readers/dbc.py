@@ -202,8 +202,8 @@ def _parse_signal(found: re.Match[str]) -> tuple[Signal | None, str]:
 
 
 def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Database | None:
-    """Return the CAN database at the path `given` on the command line; without this path, the
-    profile's database; else None.
+    """Return the CAN database to use: the file `given` on the command line, else the file that the
+    profile names (in `folder`, or shipped with the package), else None.
     """
     if given is not None:
         return read_dbc(given)
