@@ -1,9 +1,9 @@
-"""Inbox: a bounded queue for messages that Zenoh subscribers receive, and the processing of their
-bytes to accepted rows.
+"""Inbox: a bounded queue for messages that Zenoh subscribers receive, and the conversion of these
+messages into accepted rows.
 
 The subscriber's callback only copies bytes into the queue. If the queue is full, the message is
-dropped and counted. It is not acknowledged, so its sender keeps it and sends it again. Senders are
-slowed down in this way (back-pressure).
+dropped and counted. It is not acknowledged, so its sender keeps it and sends it again. In this way,
+an overloaded service slows its senders down (back-pressure).
 """
 
 from __future__ import annotations

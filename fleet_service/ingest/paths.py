@@ -8,9 +8,9 @@ reception returns after a tunnel or a ferry. Therefore a vehicle has a budget of
 jumps. This budget refills slowly, so that a vehicle cannot jump with every row.
 
 Reports may come in any order, for example old reports between live ones. When a path is full, one
-anchor is dropped, so old anchors are farther apart than new ones. A later report about such a gap
-must be near the straight line between the anchors, because the vehicle's actual path in between is
-no longer known.
+anchor is dropped, preferably an old one. Therefore old anchors are farther apart than new ones. A
+report whose time lies between two distant anchors must be near the straight line between them,
+because the vehicle's actual path in between is no longer known.
 """
 
 from __future__ import annotations
@@ -96,11 +96,11 @@ Paths = tuple[IntArray, Float32Array, BoolArray, IntArray, FloatArray]
 
 @compiled
 def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: Paths) -> BoolArray:
-    """Find the rows that are implausible for their vehicle's path, and extend the paths by the
-    others. This is the compiled part of `VehiclePaths.find_implausible`.
+    """Find the rows that are implausible for their vehicle's path, and add the plausible rows to
+    the paths. This is the compiled part of `VehiclePaths.find_implausible`.
 
     `row` (n,) is the number of the vehicle's path, `time` (n,) in ns, `place` (n, 2) in degrees.
-    Return a mask (n,).
+    Return a mask (n,) that is True for implausible rows.
     """
     anchors, places, is_gap, count, leap = paths
     out = np.zeros(len(row), np.bool_)

@@ -1,4 +1,5 @@
-"""Validation of batches. Pure: time and batches are arguments.
+"""Validation of batches (messages with records of one vehicle). Pure (no I/O): the time is an
+argument.
 
 Three checks are made in this order, cheap ones first:
     identity   does the key belong to the sender, and do batch and key agree?      per message
@@ -63,6 +64,14 @@ RANGES: Final = {
 class Clock(NamedTuple):
     """Time according to the service, and how far the time of a record may be before or after it,
     all in ns.
+
+    Attributes:
+        now: the time.
+        ahead: how much later than `now` the time of an accepted record may be.
+        oldest: how much earlier than `now` (or `least`, if that is earlier) it may be.
+        doubt: how much later than `now` + `ahead` it may be without refusal. Such a record is
+            neither accepted nor refused; its sender repeats it.
+        least: lower bound of the true time; None if it is `now`.
     """
 
     now: int
@@ -73,8 +82,8 @@ class Clock(NamedTuple):
 
     @property
     def horizon(self) -> int:
-        """Oldest time [ns] that a record may have to be accepted; streams (vehicle, start, kind,
-        region) without newer records are dropped.
+        """Return the oldest time [ns] that an accepted record may have. Streams (batches of one
+        vehicle, start, kind and region) without newer records are dropped.
         """
         return (self.now if self.least is None else min(self.least, self.now)) - self.oldest
 

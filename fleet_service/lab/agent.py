@@ -12,11 +12,10 @@ Legend
     e      a standard normal, correlated along a drive                                 (n,)
 
 A visit (pass through one cell) with s ≥ .6 ("excited") sends ln p(z | μ) = -(z - μ)² / 2σ(μ)² - ln
-σ(μ). Apart from the errors b, a and k, this likelihood is calibrated: each visit's e alone is
-standard normal, even though successive e are correlated. Any other visit sends a lower bound, the
-grip used. Above the bound its likelihood has a slope of at most half a nat, which differs between
-vehicles (`schemas/mugrid.py` defines the log-likelihood). Both likelihoods are rounded to bytes as
-in the messages.
+σ(μ). Except for the errors b, a and k, this likelihood is calibrated, because the e of each single
+visit is standard normal. Any other visit sends a lower bound, the grip used. Above the bound its
+likelihood has a slope of at most half a nat, which differs between vehicles (`schemas/mugrid.py`
+defines the log-likelihood). Both likelihoods are rounded to bytes as in the messages.
 """
 
 from __future__ import annotations
@@ -196,7 +195,7 @@ def reading_likelihood(
     reading: FloatArray, relative: FloatArray, absolute: float = NOISE_ABSOLUTE
 ) -> FloatArray:
     """Return the log-likelihood of the friction μ on the friction grid, (n, 32), up to a constant,
-    for vehicles' readings of it (n,) with `relative` noise (n,) and `absolute` noise.
+    given vehicles' readings of the friction (n,) with `relative` noise (n,) and `absolute` noise.
     """
     std = np.hypot(absolute, relative[:, None] * mugrid.CENTRES)
     return -0.5 * np.square((reading[:, None] - mugrid.CENTRES) / std) - np.log(std)

@@ -5,8 +5,8 @@ The attackers of `claim_random`, `shifted_pose` and `flood_one_cell` are enrolle
 honest, and are therefore trusted, until the attack begins. `add_newcomers` uses new names.
 `replay_messages` sends messages through the service's admission: old messages again, other
 vehicles' messages under the attacker's key, and old visits under the attacker's name. A cell is
-counted if its alert differs at any minute from that of the same drive without the attack. Raised
-alerts are counted in dry or wet cells (μ > CLEARLY_DRY), suppressed alerts in icy cells (μ <
+counted if, at any minute, it has an alert with the attack but none without it, or the reverse.
+Raised alerts are counted in dry or wet cells (μ > CLEARLY_DRY), suppressed alerts in icy cells (μ <
 CLEARLY_ICY). Only cells are considered in which at least ENOUGH honest vehicles used enough grip to
 measure the friction.
 """
@@ -50,7 +50,8 @@ ENOUGH = 5
 @dataclass(frozen=True)
 class AttackedDrive:
     """Simulated drive of the honest fleet through a town, to which the attacks of this module are
-    added.
+    added. `counted` (cells,) is True for cells in which at least ENOUGH vehicles have measured the
+    friction before the attack begins.
     """
 
     town: Town
@@ -159,8 +160,8 @@ def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
 
 def add_newcomers(rng: Generator, drive: AttackedDrive) -> Visits:
     """Return the visits (passages of cells) of a drive and of the attackers: forty additional
-    vehicle names that each pass once and agree with each other. The attackers report ice on the
-    road of the driest cell, and a dry road at the iciest.
+    vehicle names that each pass once and agree with each other. They report ice on the road that
+    contains the driest cell, and a dry road on the road that contains the iciest cell.
     """
     roads = victim_cells(drive) // LENGTH * LENGTH
     who, which, along = (

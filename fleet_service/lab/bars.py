@@ -14,8 +14,12 @@ Side = Literal["less", "more", "within"]
 
 
 class MapBar(NamedTuple):
-    """Target (limit) for a figure of the map's evaluation; if `bar` (the limit) is None, the figure
-    is listed but not judged.
+    """Target (limit) for a figure of the map's evaluation.
+
+    Attributes:
+        bar: the limit, or two limits; None if the figure is listed but not judged.
+        better: side of the limit on which the figure meets the target, or `within` two limits.
+        unit: unit of the figure.
     """
 
     bar: float | tuple[float, float] | None

@@ -88,10 +88,10 @@ def drive_command(vehicles: int, seconds: float, world: World) -> Drive:
 
 
 def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float]:
-    """Return figures of one drive, by name. They include the share of cells whose 90 % interval
-    contains the true friction, among cells that at least SEVERAL vehicles visited; the error of μ,
-    among those of these cells in which friction was measured; and the numbers of alerts and
-    observations.
+    """Return figures of one drive, by name. Only cells that at least SEVERAL vehicles visited are
+    judged. The figures include the share of these cells whose 90 % interval contains the true
+    friction, and the error of μ in those in which friction was measured. They also include the
+    numbers of alerts and observations.
     """
     folder = folder / world.prefix.removeprefix("fusion.")
     drive(folder)
@@ -220,9 +220,9 @@ def observations_in(columns: dict[str, Any]) -> Observations:
 
 
 def slots_with_truth(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatArray]:
-    """Return the slots (cell and heading sector) that a vehicle truly visited, and the true
-    friction of each. It is the mean over the last half minute of the drive, or over all visits if
-    there were none in that time.
+    """Return the slots (cell and heading sector) that vehicles truly visited, and the true friction
+    of each. The friction is the mean over the visits in the last half minute of the drive, or over
+    all visits if there were none in that time.
     """
     cell = visits["cell"].to_numpy()
     sector = visits["sector"].to_numpy()

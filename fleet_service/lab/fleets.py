@@ -72,7 +72,8 @@ class Found:
         ours: scores of GripMap's map.
         theirs: scores of each of the simple rules.
         false_ice, missed_ice: masks of false and of missed alerts.
-        false_settled, missed_settled: the same, after the service has got to know the vehicles.
+        false_settled, missed_settled: the same, but only after minute `begin` of the fleet, when
+            the service has many earlier reports of each vehicle.
     """
 
     ours: list[Scores] = field(default_factory=list)

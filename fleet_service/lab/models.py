@@ -4,8 +4,8 @@ fleet that follows them. Pure (no I/O).
 Each fleet first drives half of the roads, so that the service gets to know its vehicles. It is
 judged on the other half, which no vehicle visited before. So the map there rests only on the
 vehicles that used enough grip in each cell to measure the friction. Towns, drives and errors are
-drawn with the judging seeds. One fleet follows no error model: its errors are those of the real
-estimator on simulated drives (`resampled`).
+drawn with random seeds that are used only for judging, not for tuning. One fleet follows no error
+model: its errors are those of the real estimator on simulated drives (`resampled`).
 """
 
 from __future__ import annotations

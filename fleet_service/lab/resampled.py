@@ -9,10 +9,11 @@ visit that this vehicle made on a road with nearly the same friction. Both visit
 
     μ, μ_w   friction of the town's road, and of the road in the visit that is drawn     (n,)
     c        μ/μ_w, scale factor: value, interval and grip used are multiplied by c, because
-             forces scale with the grip; ℓ(x) becomes ℓ(x/c)
+             forces scale with the grip; the log-likelihood ℓ(x) becomes ℓ(x/c)
 
 A pass over the border of two surfaces is drawn like any other. Each visit is drawn separately, so
-the error that all vehicles share in one place is lost; the complete drives cover it.
+an error that all vehicles share in one place does not occur here. The evaluation of complete drives
+(`end_to_end`) includes such errors.
 """
 
 from __future__ import annotations
@@ -105,8 +106,8 @@ def join_ways(ways: Sequence[DrivenVisits]) -> DrivenVisits:
 
 def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles: int) -> Visits:
     """Return the visits (passages of cells) in a town with reports drawn from the simulated drives
-    `ways`. Each of the `vehicles` of the town takes the reports of one vehicle of the drives; no
-    two take those of the same vehicle if there are enough.
+    `ways`. Each of the `vehicles` vehicles of the town takes all its reports from one vehicle of
+    the drives. If the drives have enough vehicles, no vehicle of the drives is used twice.
     """
     there = np.unique(ways.vehicle)
     who = rng.choice(there, vehicles, replace=vehicles > len(there))

@@ -1,18 +1,19 @@
-"""Simple rules by which vehicles' reports are combined into a map, for comparison; each stores a
-mean and a variance per cell. Pure, compiled.
+"""Simple rules that combine the reports of vehicles into a map, for comparison with the service's
+map. Each rule stores a mean and a variance of the friction per cell. Pure (no I/O), compiled.
 
-All rules get the reports that an agent of such a system would send: the *posterior* (m, P) of its
-own filter, which also contains information from the previous cell. Between reports, each rule
-increases its variance by the same drift as the service's map.
+A rule gets the reports that a vehicle in a system with this rule would send: the *posterior* (m, P)
+of the vehicle's own filter, which also contains information from the previous cell. Between
+reports, the variance of each rule grows by the same drift as in the service's map. "Added" below
+means that the rule adds 1/P to its own inverse variance.
 
     newest report         the last posterior
-    inverse variance      all posteriors: SAMPLES equal ones per pass, information is added
-    one per pass          one posterior per pass, information is added
+    inverse variance      each pass sends SAMPLES equal posteriors, and all of them are added
+    one per pass          each pass sends one posterior, and it is added
     covariance inters.    one per pass, with weights in proportion to information (W. Niehsen,
                           FUSION 2002)
-    federated reset       local filters start from the cell's estimate, so that only the reading
-                          is added (N. A. Carlson, IEEE Trans. Aerospace and Electronic Systems
-                          26(3), 1990)
+    federated reset       each pass sends a filter's result that started from the cell's estimate,
+                          so that only the reading is added (N. A. Carlson, IEEE Trans. Aerospace
+                          and Electronic Systems 26(3), 1990)
     median                median of the vehicles' last readings of an hour; the interval contains
                           6 % of shared error and 12 % per vehicle
 """
@@ -86,8 +87,9 @@ def fuse_by_rules(
     """Return mean and variance of μ by the first five of the simple rules in each cell at each time
     in `asked` [s], (times, 5, cells, 2).
 
-    A visit k is at the cell `place[k]` at the time `seconds[k]`. Its vehicle believes in mean and
-    variance `sent[k]`; it reads `readings[0][k]` with standard deviation `readings[1][k]`.
+    A visit k is in the cell `place[k]` at the time `seconds[k]`. The filter of the vehicle has the
+    mean and variance `sent[k]`; the reading of the visit is `readings[0][k]` with standard
+    deviation `readings[1][k]`.
     """
     reading, std = readings
     mean = np.full((5, cells), PRIOR_MEAN)
@@ -149,9 +151,9 @@ def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
 def score_rules(
     v: Visits, town: Town, at: tuple[int, ...], vehicles: int, where: BoolArray | bool = True
 ) -> list[Scores]:
-    """Return the scores of the maps that the simple rules RULES give at the minutes `at`. They
-    include those cells of the mask `where` that were reported by a vehicle with enough grip used to
-    measure the friction.
+    """Return the scores of the maps that the simple rules RULES compute, at the minutes `at`. Only
+    cells of the mask `where` are included in which a vehicle used enough grip to measure the
+    friction.
     """
     sent = vehicle_posteriors(v.vehicle, v.reports.reading, v.reports.std, vehicles)
     asked = 60.0 * np.array(at, float)

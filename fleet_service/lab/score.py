@@ -33,9 +33,9 @@ class Scores:
     one cell at one time.
 
     `vehicles` is the number of distinct excited vehicles that had visited the cell, that is,
-    vehicles that used enough grip to measure the friction. `slippery` is the answer's P(slippery),
-    and `crps` its continuous ranked probability score; both are NaN if an answer is an interval and
-    not a distribution.
+    vehicles that used enough grip to measure the friction. `interval` is the interval score, and
+    `rank` is P(μ ≤ true value). `slippery` is P(slippery), and `crps` the continuous ranked
+    probability score; both are NaN if an answer is an interval and not a distribution.
     """
 
     vehicles: IntArray
@@ -158,8 +158,8 @@ def score_snapshots(
     vehicles: int,
     where: BoolArray | bool = True,
 ) -> Scores:
-    """Return the scores of the map at the minutes `at`. They include those cells of the mask
-    `where` that were reported by a vehicle with enough grip used to measure the friction.
+    """Return the scores of the map at the minutes `at`. Only cells of the mask `where` are included
+    in which a vehicle used enough grip to measure the friction.
     """
     out = []
     for minute in at:

@@ -169,8 +169,8 @@ def _make_weather(temperature: float) -> Reports:
 
 
 def false_alert(rng: Generator) -> bool:
-    """Return True if an alert is raised in a wet curve through which CARS unknown vehicles on
-    winter tyres drive carefully.
+    """Return True if an alert is raised in a wet curve through which CARS vehicles on winter tyres
+    drive carefully. The service does not know these vehicles from earlier reports.
     """
     n = CARS
     who = np.arange(CARS)

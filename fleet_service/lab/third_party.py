@@ -145,9 +145,9 @@ def select_visits(v: Visits, rows: IntArray) -> Visits:
 
 
 def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, IntArray]:
-    """Return three items at the end of a drive without attackers: the scores of the map, a mask of
-    cells with an alert, and the number of visits of vehicles to each cell that used enough grip to
-    measure the friction.
+    """Return three items at the end of a drive of an honest fleet: the scores of the map, a mask of
+    cells with an alert, and the number of visits to each cell in which the vehicle used enough grip
+    to measure the friction.
     """
     drive, mu = drive_honest(rng, gain_std)
     fusion = Fusion(LATENESS_S)
@@ -200,8 +200,8 @@ def drive_change(rng: Generator, excitement: float) -> ForeignDrive:
     """Return a drive over cells that are dry (DRY), then icy (WHITE), then dry again. The same
     fleet also drives in a town.
 
-    The first CHANGE_CELLS cells are the changing ones; the cells of the town follow. The town is
-    driven for the same time.
+    The first CHANGE_CELLS cells are the changing ones; the cells of the town follow. The vehicles
+    drive in the town during all three phases.
     """
     town_mu = np.repeat(rng.choice(FRICTIONS, CELLS // STRETCH), STRETCH)
     changing = CHANGE_CELLS * CHANGE_VISITS * 3
@@ -232,7 +232,7 @@ def drive_change(rng: Generator, excitement: float) -> ForeignDrive:
 
 def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]:
     """Return two counts of excited passes (with enough grip used to measure the friction) over each
-    changing cell: until the alert, and until its end.
+    changing cell: until the alert is raised, and until it is cleared.
 
     The first count begins at the change to WHITE, the second at the change back to DRY. Both are
     (CHANGE_CELLS,), with NEVER if the event did not occur.

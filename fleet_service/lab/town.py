@@ -188,8 +188,8 @@ def select_visits(v: Visits, rows: IntArray | BoolArray) -> Visits:
 
 
 def claim_falsely(v: Visits, liars: BoolArray, claim: float) -> Visits:
-    """Return the visits with the friction values of the vehicles that the mask `liars` (V,) selects
-    replaced with `claim`, with high confidence.
+    """Return the visits with false reports: the vehicles that the mask `liars` (V,) selects report
+    the friction `claim` with high confidence, instead of their own values.
     """
     lying = liars[v.vehicle]
     readings = np.where(lying, claim, v.reports.reading)

@@ -1,4 +1,6 @@
-"""HTTP routes of the map: cells by tile, live changes, roads, areas, and situations."""
+"""HTTP routes of the map: cells by tile, live changes, roads, areas, and the slippery stretches as
+a DATEX II publication.
+"""
 
 from __future__ import annotations
 

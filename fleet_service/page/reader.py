@@ -1,5 +1,5 @@
-"""Zenoh client of the page, with the rights of a reader. It receives tiles and alerts, queries
-those that it has missed.
+"""Zenoh client of the page, with the rights of a reader. It receives changes of tiles and alerts,
+and queries those that it has missed.
 
 It publishes nothing. If the access list hides liveliness tokens, it works without them.
 """

@@ -18,8 +18,8 @@ THINNED_S: Final = 60
 
 
 class RecentMoments:
-    """Map at several recent moments: records of all tiles [s since 1970], oldest first. The arrays
-    are shared with the live map and never copied.
+    """Map at several recent moments, oldest first: for each moment [s since 1970], the records
+    (encoded cells) of all tiles. The arrays are shared with the live map and never copied.
     """
 
     def __init__(self) -> None:

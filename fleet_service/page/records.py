@@ -131,12 +131,12 @@ def as_values(row: Any) -> dict[str, Any]:  # noqa: ANN401 one record
 
 
 def aggregate_worst(records: Records, level: int) -> Records:
-    """Return records of cells (n,) combined to larger squares (ancestors) at the zoom `level`,
-    from 14 to 21. All headings of a square are combined.
+    """Return records of cells (n,) combined to larger squares (ancestors) at the zoom `level`, from
+    14 to 21. All headings of a square are combined.
 
-    For each quantile of mu, an ancestor has the minimum over the measured cells in it, and the
-    largest P(slippery). So no cell is more slippery than its ancestor appears. `unknown` is the
-    share of cells and headings in it that have only lower bounds.
+    A larger square gets, for each quantile of mu, the minimum over the measured cells in it, and
+    the largest P(slippery). So it never appears less slippery than a cell in it. `unknown` is the
+    share of the cells and headings in the square that have only lower bounds.
     """
     if not len(records):
         return records

@@ -120,11 +120,11 @@ def learned_lines(cell: IntArray, sector: IntArray) -> list[Line]:
 
 
 def _merge_side_by_side(cells: list[tuple[int, int]], heading: int) -> dict[int, list[float]]:
-    """Return the position or positions of the road across the heading, for each step along the
-    heading. The cells at one step form a column.
+    """Group the cells of one heading by their step along this heading. Return, for each step, the
+    position or positions of the road across the heading.
 
-    The receiver's error spreads one lane over neighbouring cells. Therefore cells of one column
-    that are at most AHEAD apart become one position, their mean.
+    The error of the satellite receiver spreads one lane over neighbouring cells. Therefore cells of
+    one step that are at most AHEAD apart become one position, their mean.
     """
     dx, dy = _STEP[heading]
     columns: dict[int, list[int]] = {}

@@ -19,7 +19,7 @@ STATIC: Final = Path(__file__).with_name("static")
 
 
 class SiteRoutes:
-    """Request handlers for what does not depend on the map."""
+    """Request handlers for everything that does not depend on the map."""
 
     def __init__(self, sources: Sources, features: FeatureRoutes) -> None:
         self._of = sources

@@ -1,5 +1,5 @@
-"""Queues for requests. One client can then not block the page, or its queries about the past, for
-other clients.
+"""Queues for requests, so that one client cannot block the page, or the page's queries about the
+past, for other clients.
 
 At most RUNNING requests of one client are computed at a time; its other requests wait.
 

@@ -123,8 +123,9 @@ def pseudonym_numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntAr
 class Since(NamedTuple):
     """Selection of rows for a replay.
 
-    Once the vehicles' weights are known, cells do not depend on each other. Therefore cells well
-    inside a box get the same belief as in a complete replay.
+    Once the vehicles' weights are known, a cell does not depend on distant cells. Therefore cells
+    inside a box get the same belief as in a complete replay, if the rows of a margin around the box
+    are read too.
 
     Attributes:
         begin: day and segment at which the replay starts.

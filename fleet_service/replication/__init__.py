@@ -6,6 +6,7 @@ objects) before it serves. `archive/` does not import this package: the segment 
 rows) calls `BucketReplica.upload_segments` through a callback.
 
 **States of one service.** A turn is one renewal of the lease; a token announces a live service.
+HINT is the share of `lease_s` that suffices if the holder's token is gone.
 
 | state | event | next state | action |
 |---|---|---|---|

@@ -72,7 +72,8 @@ class FencedBucket:
 
     def admit_objects(self, names: Iterable[str]) -> None:
         """Add uploaded objects to the fence (list of valid objects) if they would not be valid
-        without it: files that were compacted by a service that started before.
+        without it: such a file was compacted by a service that started earlier, so its name has an
+        older epoch.
         """
         if strays := [name for name in names if not self._fence.counts_object(name)]:
             fence = self._fence._replace(names=self._fence.names.union(strays))

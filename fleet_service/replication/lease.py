@@ -125,8 +125,13 @@ class LeaseRecord(NamedTuple):
 
 
 class Standby(NamedTuple):
-    """Functions that a standby (a service that waits for the lease) gives to `Lease.wait`; see the
-    comments of the fields.
+    """Functions that a standby (a service that waits for the lease) gives to `Lease.wait`.
+
+    Attributes:
+        may: returns True if the standby reaches a router and so could serve if it took over now.
+        stands: returns True if the service with the given name has a liveliness token.
+        alive: called at each check of the lease.
+        get_ahead: downloads new objects from the bucket in advance.
     """
 
     may: Callable[[], bool]  # whether it would be heard if it took over now

@@ -160,8 +160,9 @@ class Alerts:
 
     def _can_clear(self, slots: IntArray) -> BoolArray:
         """Return a mask of slots (cells with heading sectors), (k,): True if the alert may be
-        cleared. Within the hour, two more vehicles must have reported grip than ice, or as many
-        vehicles grip as the map remembers per cell.
+        cleared. Within the hour before the last report, at least two more vehicles must have
+        reported grip than ice. If the map remembers only SOURCES vehicles per cell, SOURCES reports
+        of grip are enough.
         """
         grip = (self._own_sources(slots, GRIP) > 0).sum(axis=1)
         ice = (self._own_sources(slots, ICE) > 0).sum(axis=1)

@@ -1,8 +1,9 @@
 """Number of distinct vehicles that were recently in a cell: a lower bound, in sixteen bytes per
 cell. Pure (no I/O).
 
-The data of k vehicles hide each single vehicle only while there are k of them. If a cell stayed
-public for ever, a single car at night would be visible in it.
+This number decides whether readers may see a cell, because a single vehicle is hidden only among
+several recent vehicles. If a cell stayed public for ever, a single car at night would be visible in
+it.
 """
 
 from __future__ import annotations
